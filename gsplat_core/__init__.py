@@ -1,0 +1,1 @@
+"""The splatting core: Gaussians, cameras, rasterization, deformation, losses, training and file formats."""

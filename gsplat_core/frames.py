@@ -1,0 +1,73 @@
+"""One frame of endoscopic video with what is known about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidInput
+
+
+class FrameStatus(Enum):
+    """Where a frame's picture comes from."""
+
+    LIVE = "live"
+    REPLAY = "replay"
+    STALE = "stale"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame; operators add fields on its way and never change the ones it has."""
+
+    seq: int
+    """Position in the stream, from 0, without gaps."""
+    pts_ns: int
+    """Presentation time in nanoseconds of the recording's clock."""
+    image: NDArray[np.uint8]
+    """RGB uint8 [H, W, 3]."""
+    right_image: NDArray[np.uint8] | None = None
+    """The right eye of a rectified stereo pair, RGB uint8 [H, W, 3]."""
+    depth: NDArray[np.float32] | None = None
+    """z in millimetres [H, W]; 0 = unknown."""
+    mask: NDArray[np.uint8] | None = None
+    """[H, W]; 1 = tissue (keep), 0 = tool."""
+    pose: NDArray[np.float64] | None = None
+    """World-to-camera [4, 4], OpenCV axes."""
+    status: FrameStatus = FrameStatus.REPLAY
+
+    def __post_init__(self) -> None:
+        image = self.image
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise InvalidInput(f"frame {self.seq}: image must be RGB uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
+        size = image.shape[:2]
+        if self.right_image is not None and self.right_image.shape != image.shape:
+            raise InvalidInput(f"frame {self.seq}: right image {list(self.right_image.shape)} differs from left {list(image.shape)}")
+        for name, plane in (("depth", self.depth), ("mask", self.mask)):
+            if plane is not None and plane.shape != size:
+                raise InvalidInput(f"frame {self.seq}: {name} is {list(plane.shape)}, the image is {list(size)}")
+        if self.pose is not None and self.pose.shape != (4, 4):
+            raise InvalidInput(f"frame {self.seq}: pose must be [4, 4] world-to-camera, got {list(self.pose.shape)}")
+
+    @property
+    def time_s(self) -> float:
+        """Presentation time in seconds."""
+        return self.pts_ns * 1e-9
+
+    @property
+    def height_px(self) -> int:
+        """Height of the image."""
+        return int(self.image.shape[0])
+
+    @property
+    def width_px(self) -> int:
+        """Width of the image."""
+        return int(self.image.shape[1])
+
+    def with_fields(self, **fields: Any) -> Frame:
+        """A copy with more fields known."""
+        return replace(self, **fields)
