@@ -43,10 +43,14 @@ class Frame:
     def __post_init__(self) -> None:
         image = self.image
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise InvalidInput(f"frame {self.seq}: image must be RGB uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
+            raise InvalidInput(
+                f"frame {self.seq}: image must be RGB uint8 [H, W, 3], got {image.dtype} {list(image.shape)}"
+            )
         size = image.shape[:2]
         if self.right_image is not None and self.right_image.shape != image.shape:
-            raise InvalidInput(f"frame {self.seq}: right image {list(self.right_image.shape)} differs from left {list(image.shape)}")
+            raise InvalidInput(
+                f"frame {self.seq}: right image {list(self.right_image.shape)} differs from left {list(image.shape)}"
+            )
         for name, plane in (("depth", self.depth), ("mask", self.mask)):
             if plane is not None and plane.shape != size:
                 raise InvalidInput(f"frame {self.seq}: {name} is {list(plane.shape)}, the image is {list(size)}")

@@ -18,7 +18,7 @@ Isa active_isa();
   }
 
 #if defined(GSPLAT_X86)
-#define GSPLAT_DECLARE_KERNELS(Type, name)  \
+#define GSPLAT_DECLARE_KERNELS(Type, name)   \
   GSPLAT_DECLARE_TABLE(baseline, Type, name) \
   GSPLAT_DECLARE_TABLE(avx2, Type, name)     \
   GSPLAT_DECLARE_TABLE(avx512, Type, name)   \

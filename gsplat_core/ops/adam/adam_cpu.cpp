@@ -1,5 +1,4 @@
 #include "adam.h"
-
 #include "simd.h"
 
 namespace GSPLAT_ISA {
