@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from gsplat_core.cameras import Camera
 from gsplat_core.frames import Frame
-from gsplat_core.gaussians import Gaussians
+from gsplat_core.gaussians import SH_C0, Gaussians
 
-SH_DEGREE_0 = 0.28209479177387814
-"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
 SIGMA_IN_SPACINGS = 0.55
 """Standard deviation of a fresh Gaussian in grid spacings: neighbours overlap and leave no holes."""
 THICKNESS = 0.3
@@ -68,7 +66,7 @@ def gaussians_at_pixels(
     sigma = SIGMA_IN_SPACINGS * spacing_px * z / camera.K[0, 0]
     count = len(pixels)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
-    sh[:, 0] = (colour - 0.5) / SH_DEGREE_0
+    sh[:, 0] = (colour - 0.5) / SH_C0
     return Gaussians(
         means=torch.tensor(points, dtype=torch.float32),
         quats=torch.tensor(facing(camera_to_world[:3, :3]), dtype=torch.float32).repeat(count, 1),
