@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 from typing import Literal
 
 from gsplat_core.errors import InvalidInput
@@ -61,7 +62,7 @@ class ReconstructorConfig:
     """Weight of the inverse-depth term where the recording has depth."""
     default_depth_mm: float = 60.0
     """Distance of the plane on which a recording without depth starts."""
-    rates: LearningRates = field(default_factory=LearningRates)
+    rates: LearningRates = dataclasses.field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:
         if self.field not in ("auto", "basis", "hexplane"):
