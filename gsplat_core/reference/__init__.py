@@ -1,0 +1,17 @@
+"""Every operation in plain torch, for any floating-point dtype and device: the oracle of the tests."""
+
+from gsplat_core.reference.covariance import quat_scale_to_covar_preci
+from gsplat_core.reference.interim import isect_offset_encode, isect_tiles, rasterize_to_pixels
+from gsplat_core.reference.projection import fully_fused_projection
+from gsplat_core.reference.rendering import rasterization
+from gsplat_core.reference.spherical_harmonics import spherical_harmonics
+
+__all__ = [
+    "fully_fused_projection",
+    "isect_offset_encode",
+    "isect_tiles",
+    "quat_scale_to_covar_preci",
+    "rasterization",
+    "rasterize_to_pixels",
+    "spherical_harmonics",
+]
