@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -62,7 +63,7 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         """Highest degree of the spherical harmonics, 0 to 4."""
-        return int(round(self.sh.shape[1] ** 0.5)) - 1
+        return math.isqrt(self.sh.shape[1]) - 1
 
     @property
     def scales(self) -> Tensor:

@@ -1,0 +1,15 @@
+"""Recordings of endoscopic video: open, validate, synthesize."""
+
+from gsplat_core.io.recordings.findings import Finding, ValidationReport
+from gsplat_core.io.recordings.recording import FileRecording, Recording, open_recording, validate_recording
+from gsplat_core.io.recordings.split import is_heldout
+
+__all__ = [
+    "FileRecording",
+    "Finding",
+    "Recording",
+    "ValidationReport",
+    "is_heldout",
+    "open_recording",
+    "validate_recording",
+]

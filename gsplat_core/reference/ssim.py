@@ -1,0 +1,47 @@
+"""Structural similarity (Wang et al. 2004) in plain torch: any floating type, differentiable by autograd.
+
+The field's convention: 11x11 Gaussian window of sigma 1.5, zero padding at the border, C1 = 0.01^2, C2 = 0.03^2, values in 0..1.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+WINDOW_RADIUS_PX = 5
+WINDOW_SIGMA_PX = 1.5
+C1 = 0.01**2
+C2 = 0.03**2
+
+
+def gaussian_window(dtype: torch.dtype = torch.float64) -> Tensor:
+    """The 11 taps of the separable window; they sum to 1."""
+    offsets = torch.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1, dtype=torch.float64)
+    taps = torch.exp(-0.5 * (offsets / WINDOW_SIGMA_PX) ** 2)
+    return (taps / taps.sum()).to(dtype)
+
+
+def _blur(planes: Tensor) -> Tensor:
+    """[P, H, W] filtered by the window, zero outside of the image."""
+    taps = gaussian_window(planes.dtype).to(planes.device)
+    rows = torch.nn.functional.conv2d(planes[:, None], taps.view(1, 1, -1, 1), padding=(WINDOW_RADIUS_PX, 0))
+    return torch.nn.functional.conv2d(rows, taps.view(1, 1, 1, -1), padding=(0, WINDOW_RADIUS_PX))[:, 0]
+
+
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity of each pixel and channel (Wang et al. 2004, equation 13).
+
+    Args:
+        image: [H, W, C], values in 0..1.
+        target: [H, W, C], the same type.
+
+    Returns:
+        [H, W, C], in -1..1.
+    """
+    x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)
+    mean_x, mean_y, square_x, square_y, product = _blur(torch.cat([x, y, x * x, y * y, x * y])).chunk(5)
+    variances = square_x + square_y - mean_x * mean_x - mean_y * mean_y
+    covariance = product - mean_x * mean_y
+    similarity = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
+    similarity = similarity / ((mean_x * mean_x + mean_y * mean_y + C1) * (variances + C2))
+    return similarity.permute(1, 2, 0)

@@ -1,0 +1,154 @@
+"""Image quality in the field's measures: PSNR over tissue, PSNR over the frame, SSIM of masked images.
+
+Two facts that a table of such figures needs:
+
+* Equal images have no finite PSNR; it is capped at `PSNR_CAP_DB`, so that reports stay valid JSON.
+* A frame without one tissue pixel has no quality: the functions return NaN, and `QualityTracker` leaves it out of its means.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.reference.ssim import ssim_map
+
+ImageLike: TypeAlias = NDArray[np.generic] | Tensor
+"""RGB [H, W, 3]: uint8, or floats in 0..1."""
+
+PSNR_CAP_DB = 100.0
+"""PSNR of equal images, and the highest that is reported (a mean squared error of 1e-10)."""
+
+
+def _unit_image(image: ImageLike, name: str) -> Tensor:
+    """The image as float32 [H, W, 3] in 0..1 on the CPU."""
+    tensor = image.detach().cpu() if isinstance(image, Tensor) else torch.from_numpy(np.ascontiguousarray(image))
+    if tensor.ndim != 3 or tensor.shape[2] != 3:
+        raise InvalidInput(f"{name} must be RGB [H, W, 3], got {list(tensor.shape)}")
+    if tensor.dtype == torch.uint8:
+        return tensor.to(torch.float32) / 255
+    if not tensor.is_floating_point():
+        raise InvalidInput(f"{name} must be uint8 (0..255) or floating point (0..1), got {tensor.dtype}")
+    return tensor.to(torch.float32)
+
+
+def _prepare(image: ImageLike, target: ImageLike, mask: ImageLike | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Both images as floats, and the tissue mask as booleans [H, W]."""
+    x, y = _unit_image(image, "image"), _unit_image(target, "target")
+    if x.shape != y.shape:
+        raise InvalidInput(f"image {list(x.shape)} and target {list(y.shape)} must have one size")
+    if mask is None:
+        return x, y, None
+    tissue = mask.detach().cpu() if isinstance(mask, Tensor) else torch.from_numpy(np.ascontiguousarray(mask))
+    if tissue.shape != x.shape[:2]:
+        raise InvalidInput(f"mask must be [H, W] = {list(x.shape[:2])}, got {list(tissue.shape)}")
+    return x, y, tissue != 0
+
+
+def _squared_error(x: Tensor, y: Tensor, tissue: Tensor | None) -> tuple[float, int]:
+    """Squared error summed over tissue (in float64: a frame has a million terms), and the number of tissue pixels."""
+    error = x - y if tissue is None else (x - y)[tissue]
+    return float((error * error).sum(dtype=torch.float64)), error.numel() // 3
+
+
+def _decibels(mean_squared_error: float) -> float:
+    if mean_squared_error <= 10 ** (-PSNR_CAP_DB / 10):
+        return PSNR_CAP_DB
+    return -10 * math.log10(mean_squared_error)
+
+
+def psnr_tissue_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
+    """PSNR in dB over tissue pixels only: squared error over tissue / (3 x tissue pixels). EndoGaussian's PSNR*.
+
+    Args:
+        image: [H, W, 3], uint8 or floats in 0..1.
+        target: [H, W, 3], uint8 or floats in 0..1.
+        mask: [H, W], non-zero = tissue; None = all of it.
+
+    Returns:
+        At most PSNR_CAP_DB; NaN when the mask has no tissue or a value is NaN.
+    """
+    error, pixels = _squared_error(*_prepare(image, target, mask))
+    return _decibels(error / (3 * pixels)) if pixels else math.nan
+
+
+def psnr_frame_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
+    """PSNR in dB of masked images over the whole frame: squared error over tissue / (3 x all pixels).
+
+    The variant that most papers print; it rises with the tool's size, so it stands beside `psnr_tissue_db`, never alone.
+    Arguments and return as there.
+    """
+    x, y, tissue = _prepare(image, target, mask)
+    error, pixels = _squared_error(x, y, tissue)
+    return _decibels(error / x.numel()) if pixels else math.nan
+
+
+def ssim(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
+    """Mean structural similarity of the masked images over the whole frame (Wang et al. 2004).
+
+    11x11 Gaussian of sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, range 1: the convention of the field's tables. The masked-out
+    part counts as equal. Arguments as in `psnr_tissue_db`; NaN when the mask has no tissue.
+    """
+    x, y, tissue = _prepare(image, target, mask)
+    if x.numel() == 0 or (tissue is not None and not bool(tissue.any())):
+        return math.nan
+    if tissue is not None:
+        x, y = (torch.where(tissue[..., None], plane, torch.zeros(())) for plane in (x, y))
+    return float(ssim_map(x, y).mean(dtype=torch.float64))
+
+
+@dataclass(frozen=True)
+class FrameQuality:
+    """The measures of one frame; NaN where the frame has no tissue."""
+
+    seq: int
+    psnr_tissue_db: float
+    psnr_frame_db: float
+    ssim: float
+
+
+MEASURES = ("psnr_tissue_db", "psnr_frame_db", "ssim")
+
+
+@dataclass
+class QualityTracker:
+    """Collects the quality of frames as they are displayed."""
+
+    frames: list[FrameQuality] = field(default_factory=list)
+
+    def observe(self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> FrameQuality:
+        """Score one frame and keep the result; arguments as in `psnr_tissue_db`."""
+        quality = FrameQuality(
+            seq, psnr_tissue_db(image, target, mask), psnr_frame_db(image, target, mask), ssim(image, target, mask)
+        )
+        self.frames.append(quality)
+        return quality
+
+    def means(self) -> dict[str, float | None]:
+        """Mean of each measure over the frames that have one (PSNR averaged in dB, as the field does); None without any."""
+        return {name: mean_of_scored([getattr(frame, name) for frame in self.frames]) for name in MEASURES}
+
+    def series(self) -> list[dict[str, float | int | None]]:
+        """Per-frame values ready for JSON; None where a frame has no tissue."""
+        return [
+            {"seq": frame.seq} | {name: _finite_or_none(getattr(frame, name)) for name in MEASURES}
+            for frame in self.frames
+        ]
+
+
+def _finite_or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def mean_of_scored(values: Sequence[float]) -> float | None:
+    """Mean of the finite values; None without any."""
+    scored = [value for value in values if math.isfinite(value)]
+    return math.fsum(scored) / len(scored) if scored else None

@@ -1,0 +1,120 @@
+"""The plain losses: values worked out by hand, gradients by finite differences, and nothing from nothing."""
+
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.training import losses
+
+
+def images(height=9, width=13, dtype=torch.float64, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    image, target = torch.rand(2, height, width, 3, generator=generator, dtype=dtype)
+    mask = (torch.rand(height, width, generator=generator) > 0.3).to(torch.uint8)
+    return image.requires_grad_(), target, mask
+
+
+def depths(height=7, width=5, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    depth, target = 30 + 40 * torch.rand(2, height, width, generator=generator, dtype=torch.float64)
+    return depth.requires_grad_(), target
+
+
+def test_masked_l1_averages_over_tissue_only():
+    image = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]])
+    target = torch.tensor([[[0.3, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+    assert losses.masked_l1(image, target, torch.tensor([[1, 0]])).item() == pytest.approx(0.1)
+    assert losses.masked_l1(image, target).item() == pytest.approx(3.3 / 6)
+
+
+def test_ssim_loss_is_zero_for_equal_images_and_blind_under_the_tool():
+    image, _, mask = images()
+    assert losses.masked_ssim_loss(image, image.detach(), mask).item() == pytest.approx(0, abs=1e-12)
+    changed = torch.where(mask[..., None] != 0, image, torch.ones_like(image))
+    assert losses.masked_ssim_loss(changed, image.detach(), mask).item() == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("loss", [losses.masked_l1, losses.masked_ssim_loss])
+def test_image_losses_pass_gradcheck(loss):
+    image, target, mask = images(6, 7)
+    assert torch.autograd.gradcheck(lambda x: loss(x, target, mask), (image,))
+
+
+@pytest.mark.parametrize("loss", [losses.inverse_depth_l1, losses.pearson_depth_loss])
+def test_depth_losses_pass_gradcheck(loss):
+    depth, target = depths()
+    target[0, 0] = 0
+    mask = torch.ones(7, 5)
+    mask[3] = 0
+    assert torch.autograd.gradcheck(lambda x: loss(x, target, mask), (depth,))
+
+
+@pytest.mark.parametrize("loss", [losses.masked_l1, losses.masked_ssim_loss])
+def test_an_empty_mask_gives_zero_loss_and_zero_gradient(loss):
+    image, target, mask = images()
+    value = loss(image, target, torch.zeros_like(mask))
+    value.backward()
+    assert value.item() == 0
+    assert torch.equal(image.grad, torch.zeros_like(image))
+
+
+@pytest.mark.parametrize("loss", [losses.masked_l1, losses.masked_ssim_loss])
+def test_a_nan_under_the_tool_reaches_neither_value_nor_gradient(loss):
+    image, target, mask = images()
+    with torch.no_grad():
+        image[mask == 0] = torch.nan
+    value = loss(image, target, mask)
+    value.backward()
+    assert torch.isfinite(value)
+    assert torch.isfinite(image.grad).all()
+
+
+@pytest.mark.parametrize("loss", [losses.inverse_depth_l1, losses.pearson_depth_loss])
+def test_unknown_depth_gives_zero_loss_and_zero_gradient(loss):
+    depth, target = depths()
+    value = loss(depth, torch.zeros_like(target))
+    value.backward()
+    assert value.item() == 0
+    assert torch.equal(depth.grad, torch.zeros_like(depth))
+
+
+def test_inverse_depth_l1_by_hand():
+    depth = torch.tensor([[50.0, 20.0, 0.0]], requires_grad=True)
+    target = torch.tensor([[100.0, 0.0, 40.0]])
+    value = losses.inverse_depth_l1(depth, target)
+    value.backward()
+    assert value.item() == pytest.approx(0.01)
+    assert torch.allclose(depth.grad, torch.tensor([[-1 / 2500, 0, 0]]))
+
+
+def test_pearson_ignores_scale_and_shift_and_refuses_constants():
+    depth, target = depths()
+    assert losses.pearson_depth_loss(depth, 3 * depth.detach() + 7).item() == pytest.approx(0, abs=1e-12)
+    assert losses.pearson_depth_loss(depth, 100 - depth.detach()).item() == pytest.approx(2)
+    assert losses.pearson_depth_loss(depth, torch.full_like(target, 70.1)).item() == 0
+
+
+def test_plane_terms_by_hand():
+    ramp = torch.arange(4.0)[None, :, None].expand(2, 4, 3)  # grows by 1 along height, constant along width
+    assert losses.total_variation(2 * ramp).item() == pytest.approx(2)
+    assert losses.plane_smoothness(2 * ramp).item() == pytest.approx(4)
+    assert losses.time_smoothness(ramp).item() == 0
+    assert losses.time_smoothness(ramp**2).item() == pytest.approx(4)  # the second difference of t^2 is 2
+    assert losses.time_smoothness(ramp.transpose(1, 2) ** 2, time_dim=-1).item() == pytest.approx(4)
+
+
+@pytest.mark.parametrize("loss", [losses.total_variation, losses.plane_smoothness, losses.time_smoothness])
+def test_plane_terms_of_one_cell_are_zero_with_zero_gradient(loss):
+    plane = torch.ones(2, 1, 1, requires_grad=True)
+    value = loss(plane)
+    value.backward()
+    assert value.item() == 0
+    assert torch.equal(plane.grad, torch.zeros_like(plane))
+
+
+def test_shapes_that_do_not_match_are_refused():
+    image, target, mask = images()
+    with pytest.raises(InvalidInput, match="image and target"):
+        losses.masked_l1(image, target[:-1], mask)
+    with pytest.raises(InvalidInput, match="mask must be"):
+        losses.masked_ssim_loss(image, target, mask[:-1])

@@ -1,0 +1,102 @@
+"""Image quality against values worked out by hand and an independent SSIM."""
+
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.training.metrics import PSNR_CAP_DB, QualityTracker, psnr_frame_db, psnr_tissue_db, ssim
+
+
+@pytest.fixture
+def pair():
+    rng = np.random.default_rng(0)
+    target = cv2.GaussianBlur(rng.integers(0, 256, (40, 52, 3), dtype=np.uint8), (0, 0), 2)
+    image = np.clip(target.astype(int) + rng.integers(-20, 21, target.shape), 0, 255).astype(np.uint8)
+    mask = np.ones((40, 52), np.uint8)
+    mask[10:25, 20:] = 0
+    return image, target, mask
+
+
+def test_psnr_by_hand():
+    image = np.zeros((2, 2, 3))
+    target = image.copy()
+    target[0, 0] = 0.1
+    target[1, 1] = 1
+    mask = np.array([[1, 1], [1, 0]])
+    assert psnr_tissue_db(image, target, mask) == pytest.approx(-10 * math.log10(0.01 / 3))
+    assert psnr_frame_db(image, target, mask) == pytest.approx(-10 * math.log10(0.01 / 4))
+    assert psnr_tissue_db(image, target) == psnr_frame_db(image, target) == pytest.approx(-10 * math.log10(1.01 / 4))
+
+
+def test_psnr_agrees_with_opencv(pair):
+    image, target, _ = pair
+    assert psnr_tissue_db(image, target) == pytest.approx(cv2.PSNR(image, target), abs=1e-4)
+
+
+def test_ssim_agrees_with_opencvs_windows(pair):
+    image, target, mask = pair
+    x, y = (plane.astype(np.float64) / 255 * mask[..., None] for plane in (image, target))
+    blur = lambda plane: cv2.GaussianBlur(plane, (11, 11), 1.5, borderType=cv2.BORDER_CONSTANT)
+    mx, my = blur(x), blur(y)
+    sxx, syy, sxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    expected = (2 * mx * my + 1e-4) * (2 * sxy + 9e-4) / ((mx**2 + my**2 + 1e-4) * (sxx + syy + 9e-4))
+    assert ssim(image, target, mask) == pytest.approx(expected.mean(), abs=1e-5)
+
+
+def test_types_of_images_do_not_matter(pair):
+    image, target, mask = pair
+    floats = torch.from_numpy(image).double() / 255
+    for measure in (psnr_tissue_db, psnr_frame_db, ssim):
+        expected = measure(image, target, mask)
+        assert measure(floats, target, torch.from_numpy(mask) != 0) == pytest.approx(expected, abs=1e-4)
+        assert measure(image[..., ::-1], target[..., ::-1], mask * 255) == pytest.approx(expected, abs=1e-4)
+
+
+def test_equal_images_have_the_stated_cap(pair):
+    image, _, mask = pair
+    assert psnr_tissue_db(image, image, mask) == psnr_frame_db(image, image, mask) == PSNR_CAP_DB
+    assert ssim(image, image, mask) == pytest.approx(1)
+
+
+def test_frames_without_tissue_are_left_out_of_means_and_none_in_json(pair):
+    image, target, mask = pair
+    tracker = QualityTracker()
+    scored = tracker.observe(0, image, target, mask)
+    assert math.isnan(tracker.observe(1, image, target, np.zeros_like(mask)).psnr_tissue_db)
+    assert tracker.means() == {
+        "psnr_tissue_db": scored.psnr_tissue_db,
+        "psnr_frame_db": scored.psnr_frame_db,
+        "ssim": scored.ssim,
+    }
+    assert json.loads(json.dumps(tracker.series(), allow_nan=False))[1] == {
+        "seq": 1,
+        "psnr_tissue_db": None,
+        "psnr_frame_db": None,
+        "ssim": None,
+    }
+    assert QualityTracker().means() == dict.fromkeys(("psnr_tissue_db", "psnr_frame_db", "ssim"))
+
+
+def test_a_nan_under_the_tool_is_not_seen(pair):
+    image, target, mask = pair
+    floats = image.astype(np.float32) / 255
+    floats[mask == 0] = np.nan
+    for measure in (psnr_tissue_db, psnr_frame_db, ssim):
+        assert measure(floats, target, mask) == pytest.approx(measure(image, target, mask), abs=1e-5)
+
+
+def test_wrong_shapes_and_types_are_refused(pair):
+    image, target, mask = pair
+    with pytest.raises(InvalidInput, match="one size"):
+        psnr_tissue_db(image[:-1], target, mask)
+    with pytest.raises(InvalidInput, match="mask must be"):
+        ssim(image, target, mask.T)
+    with pytest.raises(InvalidInput, match=r"RGB \[H, W, 3\]"):
+        psnr_frame_db(image[..., 0], target, mask)
+    with pytest.raises(InvalidInput, match="int64"):
+        psnr_frame_db(image.astype(np.int64), target, mask)
