@@ -34,4 +34,22 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "quat_scale_to_covar_preci_backward(Tensor quats, Tensor scales, Tensor? v_covars, Tensor? v_precis, bool triu) -> "
       "(Tensor v_quats, Tensor v_scales)");
+  // Tiles: which splats each tile has, in depth order. `images` counts batch x cameras; image_ids is for packed splats.
+  m.def(
+      "isect_tiles(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
+      "int tile_size, int tile_width, int tile_height, bool sort) -> (Tensor tiles_per_gauss, Tensor isect_ids, Tensor flatten_ids)");
+  m.def(
+      "bin_splats(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
+      "int tile_size, int tile_width, int tile_height) -> (Tensor tiles_per_gauss, Tensor flatten_ids, Tensor isect_offsets)");
+  m.def("isect_offset_encode(Tensor isect_ids, int images, int tile_width, int tile_height) -> Tensor");
+
+  // Compositing: splats over pixels. `last` is the last blended position of flatten_ids per pixel, -1 where there is none.
+  m.def(
+      "composite(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor isect_offsets, Tensor flatten_ids, "
+      "Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size) -> (Tensor colors, Tensor alphas, Tensor last)");
+  m.def(
+      "composite_backward(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor isect_offsets, "
+      "Tensor flatten_ids, Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size, Tensor alphas, Tensor last, "
+      "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
+      "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 }
