@@ -52,4 +52,14 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor flatten_ids, Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size, Tensor alphas, Tensor last, "
       "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
       "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
+  // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
+  m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, float tau) -> Tensor");
+  m.def(
+      "basis_field_backward(Tensor gradient, Tensor centers, Tensor log_widths, Tensor weights, float tau) "
+      "-> (Tensor, Tensor, Tensor)");
+  m.def(
+      "basis_field_backward_adam_(Tensor gradient, float tau, Tensor(a!) centers, Tensor(b!) log_widths, Tensor(c!) weights, "
+      "Tensor(d!) m_centers, Tensor(e!) m_log_widths, Tensor(f!) m_weights, Tensor(g!) v_centers, Tensor(h!) v_log_widths, "
+      "Tensor(i!) v_weights, Tensor(j!) steps, float position_rate, float rotation_rate, float scale_rate, float colour_rate, "
+      "float center_rate, float width_rate, float beta1, float beta2, float epsilon) -> ()");
 }
