@@ -39,9 +39,7 @@ def quat_scale_to_covar_preci(
 
 
 @torch.library.register_fake("gsplat_core::quat_scale_to_covar_preci")
-def _fake(
-    quats: Tensor, scales: Tensor, compute_covar: bool, compute_preci: bool, triu: bool
-) -> tuple[Tensor, Tensor]:
+def _fake(quats: Tensor, scales: Tensor, compute_covar: bool, compute_preci: bool, triu: bool) -> tuple[Tensor, Tensor]:
     shape = (quats.shape[0], 6) if triu else (quats.shape[0], 3, 3)
     return quats.new_empty(shape if compute_covar else (0,)), quats.new_empty(shape if compute_preci else (0,))
 
