@@ -11,6 +11,30 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "adam_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, int step, "
       "float learning_rate, float beta1, float beta2, float epsilon) -> ()");
 
+  // Projection to the image: B batches, C cameras, N Gaussians. Covariances as [B, N, 6], or quats and scales.
+  m.def(
+      "project_gaussians(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
+      "Tensor Ks, int width, int height, float eps2d, float near_plane, float far_plane, float radius_clip, bool compensate, "
+      "int camera_model) -> (Tensor radii, Tensor means2d, Tensor depths, Tensor conics, Tensor compensations)");
+  m.def(
+      "project_gaussians_backward(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor viewmats, Tensor Ks, "
+      "Tensor radii, Tensor? v_means2d, Tensor? v_depths, Tensor? v_conics, Tensor? v_compensations, int width, int height, "
+      "float eps2d, int camera_model, bool needs_viewmats) -> (Tensor v_means, Tensor v_covars, Tensor v_quats, "
+      "Tensor v_scales, Tensor v_viewmats)");
+
+  // R rows of directions [R, M, 3] with coefficients [M, K, 3] that the rows share; where the mask is false the sum is 0.
+  m.def("spherical_harmonics(int degree, Tensor dirs, Tensor coeffs, Tensor? masks) -> Tensor");
+  m.def(
+      "spherical_harmonics_backward(int degree, Tensor dirs, Tensor coeffs, Tensor? masks, Tensor v_colors, bool needs_dirs) "
+      "-> (Tensor v_dirs, Tensor v_coeffs)");
+
+  // Covariance and precision of M rotations and scales, as upper triangles [M, 6] or matrices [M, 3, 3]; empty if not asked.
+  m.def(
+      "quat_scale_to_covar_preci(Tensor quats, Tensor scales, bool compute_covar, bool compute_preci, bool triu) -> "
+      "(Tensor covars, Tensor precis)");
+  m.def(
+      "quat_scale_to_covar_preci_backward(Tensor quats, Tensor scales, Tensor? v_covars, Tensor? v_precis, bool triu) -> "
+      "(Tensor v_quats, Tensor v_scales)");
   // Tiles: which splats each tile has, in depth order. `images` counts batch x cameras; image_ids is for packed splats.
   m.def(
       "isect_tiles(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
