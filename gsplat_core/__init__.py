@@ -1,1 +1,70 @@
-"""The splatting core: Gaussians, cameras, rasterization, deformation, losses, training and file formats."""
+"""The splatting core: Gaussians, cameras, rasterization, deformation, losses, training and file formats.
+
+Names are loaded when they are first used: importing the package alone loads neither torch nor the compiled library, so
+`gsplat_core.reference` works where the library was not built.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gsplat_core.cameras import Camera
+    from gsplat_core.errors import CoreError, InvalidInput
+    from gsplat_core.frames import Frame, FrameStatus
+    from gsplat_core.gaussians import Gaussians
+    from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
+    from gsplat_core.ops.projection.projection import fully_fused_projection
+    from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
+    from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
+    from gsplat_core.rendering import RenderOutput, rasterization, rasterize_to_pixels, render
+
+__all__ = [
+    "Camera",
+    "CoreError",
+    "Frame",
+    "FrameStatus",
+    "Gaussians",
+    "InvalidInput",
+    "RenderOutput",
+    "fully_fused_projection",
+    "isect_offset_encode",
+    "isect_tiles",
+    "quat_scale_to_covar_preci",
+    "rasterization",
+    "rasterize_to_pixels",
+    "render",
+    "spherical_harmonics",
+]
+
+_HOME = {
+    "Camera": "cameras",
+    "CoreError": "errors",
+    "Frame": "frames",
+    "FrameStatus": "frames",
+    "Gaussians": "gaussians",
+    "InvalidInput": "errors",
+    "RenderOutput": "rendering",
+    "fully_fused_projection": "ops.projection.projection",
+    "isect_offset_encode": "ops.tiles.tiles",
+    "isect_tiles": "ops.tiles.tiles",
+    "quat_scale_to_covar_preci": "ops.covariance.covariance",
+    "rasterization": "rendering",
+    "rasterize_to_pixels": "rendering",
+    "render": "rendering",
+    "spherical_harmonics": "ops.spherical_harmonics.spherical_harmonics",
+}
+"""The module that each public name lives in."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

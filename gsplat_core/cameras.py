@@ -1,0 +1,117 @@
+"""A camera: intrinsics, pose, size and projection model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+
+CameraModel = Literal["pinhole", "ortho", "fisheye"]
+CAMERA_MODELS: tuple[str, ...] = get_args(CameraModel)
+
+
+def _matrix(value: ArrayLike, size: int, name: str) -> NDArray[np.float64]:
+    matrix = np.array(value, dtype=np.float64)
+    if matrix.shape != (size, size):
+        raise InvalidInput(f"camera: {name} must be [{size}, {size}], got {list(matrix.shape)}")
+    if not np.isfinite(matrix).all():
+        raise InvalidInput(f"camera: {name} holds values that are not finite: {matrix.tolist()}")
+    matrix.setflags(write=False)
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """An immutable camera in OpenCV axes (x right, y down, z forward).
+
+    A pixel (column i, row j) has its centre at (i + 0.5, j + 0.5). The models map a camera-space point (x, y, z) to:
+    pinhole (fx x/z + cx, fy y/z + cy); fisheye (equidistant) (fx θ x/r + cx, fy θ y/r + cy) with r = |(x, y)| and
+    θ = atan2(r, z); ortho (fx x + cx, fy y + cy), where fx and fy are pixels per unit of length.
+
+    Raises InvalidInput for a wrong shape, a value that is not finite, a focal length or size that is not positive,
+    a pose whose last row is not (0, 0, 0, 1), or an unknown model.
+    """
+
+    K: NDArray[np.float64]
+    """Intrinsics [3, 3], in pixels."""
+    width_px: int
+    height_px: int
+    world_to_camera: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    """Pose [4, 4]; lengths in the unit of the scene (millimetres where it has a scale)."""
+    model: CameraModel = "pinhole"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "K", _matrix(self.K, 3, "K"))
+        object.__setattr__(self, "world_to_camera", _matrix(self.world_to_camera, 4, "world_to_camera"))
+        if self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
+            raise InvalidInput(f"camera: focal lengths must be positive, got {self.K[0, 0]} and {self.K[1, 1]} px")
+        if self.K[0, 1] != 0 or self.K[1, 0] != 0 or self.K[2].tolist() != [0, 0, 1]:
+            raise InvalidInput(
+                f"camera: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew), got {self.K.tolist()}"
+            )
+        if self.world_to_camera[3].tolist() != [0, 0, 0, 1]:
+            raise InvalidInput(
+                f"camera: the pose's last row must be (0, 0, 0, 1), got {self.world_to_camera[3].tolist()}"
+            )
+        if self.width_px < 1 or self.height_px < 1:
+            raise InvalidInput(f"camera: the size must be at least 1x1 px, got {self.width_px}x{self.height_px}")
+        if self.model not in CAMERA_MODELS:
+            raise InvalidInput(f"camera: unknown model {self.model!r}; the models are {', '.join(CAMERA_MODELS)}")
+
+    @classmethod
+    def from_focal(
+        cls, focal_px: float, width_px: int, height_px: int, world_to_camera: ArrayLike | None = None
+    ) -> Camera:
+        """A pinhole with square pixels and its principal point in the middle of the image."""
+        K = np.array([[focal_px, 0, width_px / 2], [0, focal_px, height_px / 2], [0, 0, 1]])
+        pose = np.eye(4) if world_to_camera is None else np.asarray(world_to_camera, dtype=np.float64)
+        return cls(K, width_px, height_px, pose)
+
+    @property
+    def viewmat(self) -> Tensor:
+        """World-to-camera as a float32 tensor [4, 4]."""
+        return torch.tensor(self.world_to_camera, dtype=torch.float32)
+
+    @property
+    def intrinsics(self) -> Tensor:
+        """K as a float32 tensor [3, 3]."""
+        return torch.tensor(self.K, dtype=torch.float32)
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """The camera's centre in the world [3]."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return np.asarray(-np.linalg.solve(rotation, translation))
+
+    def scaled(self, factor: float) -> Camera:
+        """The same view at another resolution; the intrinsics follow the rounded size exactly."""
+        if not factor > 0:
+            raise InvalidInput(f"camera: the scale factor must be positive, got {factor}")
+        width_px, height_px = max(1, round(self.width_px * factor)), max(1, round(self.height_px * factor))
+        K = self.K.copy()
+        K[0] *= width_px / self.width_px
+        K[1] *= height_px / self.height_px
+        return replace(self, K=K, width_px=width_px, height_px=height_px)
+
+    def with_pose(self, world_to_camera: ArrayLike) -> Camera:
+        """The same camera somewhere else."""
+        return replace(self, world_to_camera=np.asarray(world_to_camera, dtype=np.float64))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Camera):
+            return NotImplemented
+        return self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def _key(self) -> tuple[bytes, bytes, int, int, str]:
+        # Adding 0.0 makes -0.0 and 0.0 the same bytes, as they are the same number.
+        pose = self.world_to_camera + 0.0
+        return (self.K + 0.0).tobytes(), pose.tobytes(), self.width_px, self.height_px, self.model

@@ -1,0 +1,278 @@
+"""Per-Gaussian basis functions in time: bumps that move, turn, scale and colour each Gaussian, local in time.
+
+The idea is Deform3DGS's (Yang et al. 2024), with one timing per bump shared by all channels, colour added, and truncated
+bumps, so that one time touches few of them: reading, training and storing a stretch of time costs the same however long
+the stream is.
+
+Inside the field time is counted in bump spacings from the first column, tau = (time_s - origin_s) / spacing_s, so column b
+starts with centre b and width 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from gsplat_core.deformation.field import DeformationField, checked_window, count_of
+from gsplat_core.errors import InvalidInput
+from gsplat_core.gaussians import Gaussians
+from gsplat_core.ops.basis_field import basis_field as compiled
+from gsplat_core.reference import deformation as reference
+from gsplat_core.reference.deformation import BUMP_REACH, CHANNEL_GROUPS
+
+CHANNELS = sum(CHANNEL_GROUPS)
+
+
+@dataclass(frozen=True)
+class BasisRates:
+    """Learning rates of `BasisField.adam_step`, in the units of the parameters (mm, quaternion, log, SH; bump spacings)."""
+
+    position: float = 1e-2
+    rotation: float = 1e-3
+    log_scale: float = 5e-3
+    colour: float = 5e-3
+    centers: float = 1e-3
+    widths: float = 1e-3
+
+
+@dataclass
+class _Moments:
+    """Adam's state of the bumps: first and second moments of (centers, log_widths, weights) and updates per bump."""
+
+    first: list[Tensor]
+    second: list[Tensor]
+    steps: Tensor
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> _Moments:
+        """The same change of rows or columns applied to every tensor."""
+        return _Moments([change(t) for t in self.first], [change(t) for t in self.second], change(self.steps))
+
+
+class BasisField(DeformationField):
+    """B bumps per Gaussian, 13 channels each: position 3, rotation 4, log-scale 3, colour 3 (added to the SH DC term).
+
+    Parameters: `centers` [N, B] and `log_widths` [N, B] in bump spacings, `weights` [N, B, 13], zero at first. The columns
+    cover the window plus one spacing at each end. A bump more than 4 widths away contributes nothing and gets no gradient.
+
+    Training has two ways: `forward` is differentiable for any optimiser; `deltas`, `displaced` and `adam_step` do the same with
+    the gradient and a lazy Adam step fused, which touches only the bumps active at that time.
+    """
+
+    kind = "basis"
+
+    def __init__(
+        self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26, spacing_s: float | None = None
+    ) -> None:
+        """`bumps` columns spread over the window, or as many as it takes at a distance of `spacing_s`."""
+        super().__init__(time_window_s)
+        start, end = self._time_window_s
+        if spacing_s is not None:
+            if not (math.isfinite(spacing_s) and spacing_s > 0):
+                raise InvalidInput(f"spacing_s must be a positive number of seconds, got {spacing_s}")
+            bumps = max(4, math.ceil((end - start) / spacing_s - 1e-6) + 3)
+        if bumps < 4:
+            raise InvalidInput(f"bumps must be at least 4 (one past each end of the window), got {bumps}")
+        self._spacing_s = spacing_s or ((end - start) or 1.0) / (bumps - 3)
+        self._origin_s = start - self._spacing_s
+        self.centers = torch.nn.Parameter(torch.arange(bumps, dtype=torch.float32).repeat(count, 1))
+        self.log_widths = torch.nn.Parameter(torch.zeros(count, bumps))
+        self.weights = torch.nn.Parameter(torch.zeros(count, bumps, CHANNELS))
+        self._moments: _Moments | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians N."""
+        return int(self.weights.shape[0])
+
+    @property
+    def bumps(self) -> int:
+        """Number of bumps per Gaussian B."""
+        return int(self.weights.shape[1])
+
+    @property
+    def spacing_s(self) -> float:
+        """Seconds between neighbouring bumps as they are laid out."""
+        return self._spacing_s
+
+    def tau(self, time_s: float) -> float:
+        """Time in bump spacings from the first column, clamped to the window."""
+        return (self.clamp_time(time_s) - self._origin_s) / self._spacing_s
+
+    def deltas(self, time_s: float) -> Tensor:
+        """What the field adds at `time_s`: [N, 13] position, rotation, log-scale, colour. Differentiable."""
+        return cast(Tensor, self._ops.basis_field(self.centers, self.log_widths, self.weights, self.tau(time_s)))
+
+    def displaced(self, gaussians: Gaussians, deltas: Tensor) -> Gaussians:
+        """The Gaussians with `deltas` [N, 13] added; differentiable in both."""
+        if gaussians.count != deltas.shape[0]:
+            raise InvalidInput(
+                f"the field holds bumps for {deltas.shape[0]} Gaussians, got {gaussians.count}; keep them in step with"
+                " select and append"
+            )
+        position, rotation, log_scale, colour = torch.split(deltas, list(CHANNEL_GROUPS), dim=1)
+        sh = gaussians.sh
+        base = sh[:, :1] + colour[:, None]
+        return Gaussians(
+            means=gaussians.means + position,
+            quats=gaussians.quats + rotation,
+            log_scales=gaussians.log_scales + log_scale,
+            logit_opacities=gaussians.logit_opacities,
+            sh=base if sh.shape[1] == 1 else torch.cat([base, sh[:, 1:]], dim=1),
+        )
+
+    def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
+        """The Gaussians at `time_s`; outside the window the state of its nearest end."""
+        return self.displaced(gaussians, self.deltas(time_s))
+
+    def adam_step(
+        self,
+        time_s: float,
+        gradient: Tensor,
+        rates: BasisRates,
+        beta1: float = 0.9,
+        beta2: float = 0.999,
+        epsilon: float = 1e-8,
+    ) -> None:
+        """Lazy Adam of the bumps active at `time_s`, given dL/d(deltas) `gradient` [N, 13]; the others are left alone.
+
+        The moments live in the field, follow `select`, `append` and `extend`, and are not part of a bundle.
+        """
+        parameters = (self.centers.data, self.log_widths.data, self.weights.data)
+        if self._moments is None:
+            self._moments = _Moments(
+                [torch.zeros_like(p) for p in parameters],
+                [torch.zeros_like(p) for p in parameters],
+                torch.zeros(self.centers.shape, dtype=torch.int32),
+            )
+        self._ops.basis_field_backward_adam_(
+            gradient,
+            self.tau(time_s),
+            *parameters,
+            self._moments.first,
+            self._moments.second,
+            self._moments.steps,
+            (rates.position, rates.rotation, rates.log_scale, rates.colour, rates.centers, rates.widths),
+            beta1,
+            beta2,
+            epsilon,
+        )
+
+    def cached(self, gaussians: Gaussians) -> Callable[[float], Gaussians]:
+        """Nothing of this field is the same at all times, so the function is `forward` without a graph."""
+        gaussians = gaussians.detach()
+
+        def at(time_s: float) -> Gaussians:
+            with torch.no_grad():
+                return self.forward(gaussians, time_s)
+
+        return at
+
+    def extend(self, time_window_s: tuple[float, float], *, hold: bool = False) -> None:
+        """Move the window on: new bumps at the head, and bumps that ended before the new start dropped.
+
+        The start and the end may only grow. New bumps start still (zero weights), or with `hold` as copies of the newest
+        column, which keeps the last deformation. Past the window the field holds its last state, so a window may be extended
+        ahead of time: each change of the columns copies the field, so extend by several spacings at once. A bump is dropped
+        when its laid-out place is more than 4 spacings before the new start.
+        """
+        start, end = checked_window(time_window_s)
+        if start < self._time_window_s[0] or end < self._time_window_s[1]:
+            raise InvalidInput(f"the window {self._time_window_s} can only move forward, got {(start, end)}")
+        spacing = self._spacing_s
+        last_s = self._origin_s + (self.bumps - 1) * spacing
+        added = max(0, math.ceil((end + spacing - last_s) / spacing - 1e-6))
+        dropped = max(0, math.floor((start - self._origin_s) / spacing - BUMP_REACH))
+        dropped = min(dropped, self.bumps + added - 4)
+        if added:
+            self._append_columns(added, hold)
+        if dropped:
+            self._set_parameters(*(p.data[:, dropped:] for p in self._parameters_in_order()))
+            self.centers.data -= dropped
+            self._change_moments(lambda t: t[:, dropped:].contiguous())
+            self._origin_s += dropped * spacing
+        self._time_window_s = (start, end)
+
+    def select(self, index: Tensor) -> None:
+        """Keep the bumps of the Gaussians in `index`."""
+        self._set_parameters(*(p.data[index] for p in self._parameters_in_order()))
+        self._change_moments(lambda t: t[index])
+
+    def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
+        """Add still bumps for new Gaussians, or copies of the bumps of `parents`; their Adam state starts afresh."""
+        count = count_of(added)
+        if parents is not None:
+            if parents.shape != (count,):
+                raise InvalidInput(f"parents must be [{count}], one for each new Gaussian, got {list(parents.shape)}")
+            new = [p.data[parents] for p in self._parameters_in_order()]
+        else:
+            columns = torch.arange(self.bumps, dtype=self.centers.dtype)
+            new = [
+                columns.repeat(count, 1),
+                self.log_widths.new_zeros(count, self.bumps),
+                self.weights.new_zeros(count, self.bumps, CHANNELS),
+            ]
+        self._set_parameters(*(torch.cat([p.data, n]) for p, n in zip(self._parameters_in_order(), new, strict=True)))
+        self._change_moments(lambda t: torch.cat([t, t.new_zeros(count, *t.shape[1:])]))
+
+    def config(self) -> dict[str, Any]:
+        """Kind, window and the layout of the columns."""
+        return {
+            "kind": self.kind,
+            "time_window_s": list(self._time_window_s),
+            "bumps": self.bumps,
+            "channels": CHANNELS,
+            "origin_s": self._origin_s,
+            "spacing_s": self._spacing_s,
+        }
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any], count: int) -> BasisField:
+        """An untrained field of the architecture that `config` describes."""
+        start, end = config["time_window_s"]
+        if config["channels"] != CHANNELS:
+            raise InvalidInput(f"a basis field has {CHANNELS} channels, the config says {config['channels']}")
+        field = cls(count, (start, end), bumps=config["bumps"])
+        field._origin_s, field._spacing_s = float(config["origin_s"]), float(config["spacing_s"])
+        if not (math.isfinite(field._origin_s) and math.isfinite(field._spacing_s) and field._spacing_s > 0):
+            raise InvalidInput(f"spacing_s must be positive and origin_s finite, got {config}")
+        return field
+
+    def _training_state(self) -> Sequence[object]:
+        return (self._moments,)
+
+    def _append_columns(self, added: int, hold: bool) -> None:
+        centers, log_widths, weights = (p.data for p in self._parameters_in_order())
+        columns = torch.arange(self.bumps, self.bumps + added, dtype=centers.dtype).repeat(self.count, 1)
+        new_weights = weights[:, -1:].repeat(1, added, 1) if hold else weights.new_zeros(self.count, added, CHANNELS)
+        self._set_parameters(
+            torch.cat([centers, columns], dim=1),
+            torch.cat([log_widths, log_widths.new_zeros(self.count, added)], dim=1),
+            torch.cat([weights, new_weights], dim=1),
+        )
+        self._change_moments(lambda t: torch.cat([t, t.new_zeros(self.count, added, *t.shape[2:])], dim=1))
+
+    @property
+    def _ops(self) -> ModuleType:
+        """The compiled ops where they exist, plain torch for other dtypes and devices."""
+        is_native = self.weights.dtype == torch.float32 and self.weights.device.type == "cpu"
+        return compiled if is_native else reference
+
+    def _parameters_in_order(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.centers, self.log_widths, self.weights
+
+    def _set_parameters(self, centers: Tensor, log_widths: Tensor, weights: Tensor) -> None:
+        """New parameters of other sizes; an optimiser that holds the old ones must be given the new ones."""
+        requires_grad = self.weights.requires_grad
+        self.centers = torch.nn.Parameter(centers.contiguous(), requires_grad)
+        self.log_widths = torch.nn.Parameter(log_widths.contiguous(), requires_grad)
+        self.weights = torch.nn.Parameter(weights.contiguous(), requires_grad)
+
+    def _change_moments(self, change: Callable[[Tensor], Tensor]) -> None:
+        if self._moments is not None:
+            self._moments = self._moments.map(change)

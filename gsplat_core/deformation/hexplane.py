@@ -1,0 +1,221 @@
+"""HexPlane with an MLP: six feature planes over space and time, and a small network that turns features into motion.
+
+Planes after HexPlane (Cao and Johnson 2023, eq. 3), used for Gaussians as in 4D Gaussian Splatting (Wu et al. 2024,
+section 4.2) and in G-SHARP: product over the six planes, concatenation over the levels, a trunk, and heads for position,
+log-scale, rotation and opacity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from gsplat_core.deformation import regularisers
+from gsplat_core.deformation.field import DeformationField, checked_window
+from gsplat_core.errors import InvalidInput
+from gsplat_core.gaussians import Gaussians
+from gsplat_core.reference import deformation as reference
+from gsplat_core.reference.deformation import PLANE_AXES
+
+HEAD_CHANNELS = (3, 3, 4, 1)
+"""Outputs of the head: position, log-scale, rotation (wxyz), opacity logit."""
+
+PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")
+SPACE_PLANES, TIME_PLANES = PLANE_NAMES[:3], PLANE_NAMES[3:]
+BOX_MARGIN = 0.05
+"""Share of the box's longest side added on every side, so that Gaussians can move a little and stay inside."""
+
+
+def box_around(means: Tensor) -> Tensor:
+    """[2, 3]: corners of the finite positions with a margin; the unit box around the origin when there are none."""
+    box = torch.tensor([[-1.0] * 3, [1.0] * 3])
+    if means.is_meta:  # only the shape is wanted
+        return box
+    finite = means.detach().to(torch.float32)
+    finite = finite[finite.isfinite().all(dim=1)]
+    if finite.shape[0] == 0:
+        return box
+    low, high = finite.amin(dim=0), finite.amax(dim=0)
+    margin = max(float((high - low).max()) * BOX_MARGIN, 1e-3)
+    return torch.stack([low - margin, high + margin])
+
+
+class HexPlaneField(DeformationField):
+    """Six planes per level, `channels` features each; a trunk of `depth` layers of `width`; one linear head of 11 channels.
+
+    `resolution` is the grid of (x, y, z, t) at level 1; a level m multiplies x, y and z by m, as in 4D Gaussian Splatting.
+    Planes are stored channels-last [V, U, C]. Space planes start uniform in 0.1..0.5, time planes at 1, and the head at
+    zero, so an untrained field is the identity. `box` [2, 3] is the corner-to-corner range of the canonical positions; it is
+    set from the Gaussians when the field is made. Positions outside it are clamped to its surface.
+    """
+
+    kind = "hexplane"
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        time_window_s: tuple[float, float],
+        *,
+        channels: int = 32,
+        resolution: Sequence[int] = (64, 64, 64, 25),
+        levels: Sequence[int] = (1, 2),
+        width: int = 64,
+        depth: int = 3,
+    ) -> None:
+        super().__init__(time_window_s)
+        if len(resolution) != 4 or min(resolution) < 2:
+            raise InvalidInput(f"resolution must be four sizes (x, y, z, t) of at least 2, got {list(resolution)}")
+        if not levels or min(levels) < 1 or channels < 1 or width < 1 or depth < 1:
+            raise InvalidInput(
+                f"levels, channels, width and depth must be at least 1, got {list(levels)}, {channels}, {width}, {depth}"
+            )
+        self.channels, self.resolution, self.levels = channels, tuple(resolution), tuple(levels)
+        self.width, self.depth = width, depth
+        self.box: Tensor
+        self.register_buffer("box", box_around(gaussians.means))
+        self.planes = torch.nn.ModuleList(self._new_planes(level) for level in self.levels)
+        sizes = [channels * len(self.levels)] + [width] * depth
+        self.trunk = torch.nn.ModuleList(torch.nn.Linear(a, b) for a, b in pairwise(sizes))
+        self.head = torch.nn.Linear(width, sum(HEAD_CHANNELS))
+        torch.nn.init.zeros_(self.head.weight)
+        torch.nn.init.zeros_(self.head.bias)
+
+    def coordinates(self, means: Tensor, time_s: float) -> Tensor:
+        """[N, 4] in [-1, 1]: the one place where space and time are normalised. Outside the box or window: clamped."""
+        start, end = self.time_window_s
+        t = 2 * (self.clamp_time(time_s) - start) / (end - start) - 1 if end > start else 0.0
+        low, high = self.box.to(means.dtype)
+        space = (2 * (means - low) / (high - low) - 1).clamp(-1, 1)
+        return torch.cat([space, torch.full_like(space[:, :1], t)], dim=1)
+
+    def features(self, means: Tensor, time_s: float) -> Tensor:
+        """[N, levels * channels]: product over the planes, levels side by side."""
+        coordinates = self.coordinates(means, time_s)
+        return torch.cat(
+            [reference.hexplane_features(coordinates, *level) for level in self._levels(PLANE_NAMES)], dim=1
+        )
+
+    def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
+        """The Gaussians at `time_s`; outside the window the state of its nearest end."""
+        return self._displaced(gaussians, self._decode(self.features(gaussians.means, time_s)))
+
+    def cached(self, gaussians: Gaussians) -> Callable[[float], Gaussians]:
+        """Factorised inference: the product of the space planes is kept per Gaussian, and at a new time the time planes
+        are interpolated into lines once, then sampled and multiplied. Exact up to rounding."""
+        gaussians = gaussians.detach()
+        with torch.no_grad():
+            coordinates = self.coordinates(gaussians.means, self.time_window_s[0])
+            spaces = [reference.hexplane_space(coordinates, *level) for level in self._levels(SPACE_PLANES)]
+
+        def at(time_s: float) -> Gaussians:
+            with torch.no_grad():
+                features = [
+                    reference.hexplane_modulate(space, coordinates, *self._lines(planes, time_s))
+                    for space, planes in zip(spaces, self._levels(TIME_PLANES), strict=True)
+                ]
+                return self._displaced(gaussians, self._decode(torch.cat(features, dim=1)))
+
+        return at
+
+    def plane_smoothness(self) -> Tensor:
+        """Scalar: total variation of the space planes, mean over planes (see `regularisers`)."""
+        return regularisers.mean_over_planes(regularisers.total_variation, self._named(SPACE_PLANES))
+
+    def time_smoothness(self) -> Tensor:
+        """Scalar: squared second difference along time of the time planes, mean over planes."""
+        return regularisers.mean_over_planes(regularisers.second_difference_in_time, self._named(TIME_PLANES))
+
+    def time_sparsity(self) -> Tensor:
+        """Scalar: distance of the time planes from 1, their value without motion."""
+        return regularisers.mean_over_planes(regularisers.distance_from_one, self._named(TIME_PLANES))
+
+    def extend(self, time_window_s: tuple[float, float]) -> None:
+        """Cover another window with the same number of time rows: what was learned keeps its place in time.
+
+        The rows are interpolated linearly, so a longer window has coarser rows; beyond the old window they hold the nearest
+        end. Parameters are changed in place, so that an optimiser can go on with them.
+        """
+        start, end = checked_window(time_window_s)
+        old_start, old_end = self.time_window_s
+        rows = self.resolution[3]
+        times = torch.linspace(start, end, rows, dtype=torch.float64)
+        at = ((times - old_start) / ((old_end - old_start) or 1.0)).clamp(0, 1) * (rows - 1)
+        row = at.long().clamp(max=rows - 2)
+        share = (at - row).to(torch.float32)[:, None, None]
+        for plane in self._named(TIME_PLANES):
+            plane.data.copy_(torch.lerp(plane.data[row], plane.data[row + 1], share))
+        self._time_window_s = (start, end)
+
+    def select(self, index: Tensor) -> None:
+        """The field holds no state per Gaussian; nothing to do."""
+
+    def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
+        """The field holds no state per Gaussian; nothing to do."""
+
+    def config(self) -> dict[str, Any]:
+        """Kind, window and architecture; the box is stored with the tensors."""
+        return {
+            "kind": self.kind,
+            "time_window_s": list(self.time_window_s),
+            "channels": self.channels,
+            "resolution": list(self.resolution),
+            "levels": list(self.levels),
+            "width": self.width,
+            "depth": self.depth,
+        }
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any], gaussians: Gaussians) -> HexPlaneField:
+        """An untrained field of the architecture that `config` describes."""
+        start, end = config["time_window_s"]
+        names = ("channels", "resolution", "levels", "width", "depth")
+        return cls(gaussians, (start, end), **{name: config[name] for name in names})
+
+    def check_state(self) -> None:
+        """InvalidInput when the box is not one: its lower corner must be below its upper one."""
+        if not bool((self.box[1] > self.box[0]).all()):
+            raise InvalidInput(
+                f"the field's box must have its lower corner before its upper one, got {self.box.tolist()}"
+            )
+
+    def _new_planes(self, level: int) -> torch.nn.ParameterDict:
+        sizes = [size * level for size in self.resolution[:3]] + [self.resolution[3]]
+        planes = torch.nn.ParameterDict()
+        for name, (u, v) in zip(PLANE_NAMES, PLANE_AXES, strict=True):
+            plane = torch.ones(sizes[v], sizes[u], self.channels)
+            planes[name] = torch.nn.Parameter(plane if name in TIME_PLANES else plane.uniform_(0.1, 0.5))
+        return planes
+
+    def _named(self, names: Sequence[str]) -> list[Tensor]:
+        return [plane for level in self._levels(names) for plane in level]
+
+    def _levels(self, names: Sequence[str]) -> list[list[Tensor]]:
+        """The planes of these names, level by level."""
+        return [[cast(torch.nn.ParameterDict, planes)[name] for name in names] for planes in self.planes]
+
+    def _lines(self, planes: Sequence[Tensor], time_s: float) -> list[Tensor]:
+        """The time planes of one level interpolated at `time_s`: three lines [U, C]."""
+        rows = self.resolution[3]
+        t = self.coordinates(self.box[:1], time_s)[0, 3]
+        at = float((t + 1) / 2 * (rows - 1))
+        row = min(int(at), rows - 2)
+        return [torch.lerp(plane[row], plane[row + 1], at - row) for plane in planes]
+
+    def _decode(self, features: Tensor) -> Tensor:
+        for layer in self.trunk:
+            features = torch.relu(layer(features))
+        return cast(Tensor, self.head(features))
+
+    def _displaced(self, gaussians: Gaussians, deltas: Tensor) -> Gaussians:
+        position, log_scale, rotation, opacity = torch.split(deltas, list(HEAD_CHANNELS), dim=1)
+        return Gaussians(
+            means=gaussians.means + position,
+            quats=gaussians.quats + rotation,
+            log_scales=gaussians.log_scales + log_scale,
+            logit_opacities=gaussians.logit_opacities + opacity[:, 0],
+            sh=gaussians.sh,
+        )

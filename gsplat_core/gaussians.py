@@ -1,0 +1,133 @@
+"""The scene: a set of 3D Gaussians in the raw parametrisation that is optimised."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+
+MAX_SH_DEGREE = 4
+SH_C0 = 0.28209479177387814
+"""The constant basis function Y00 = 1 / (2 sqrt(pi)); a colour c has the coefficient (c - 0.5) / SH_C0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """N Gaussians (Kerbl et al. 2023, section 4), all tensors of one dtype on one device.
+
+    Raises InvalidInput when a shape, the dtypes or the devices do not fit together.
+    """
+
+    means: Tensor
+    """Centres [N, 3], world units."""
+    quats: Tensor
+    """Rotations [N, 4] as wxyz; need not be of unit length."""
+    log_scales: Tensor
+    """Natural logarithm of the standard deviations along the own axes [N, 3]."""
+    logit_opacities: Tensor
+    """Logit of the opacities [N]."""
+    sh: Tensor
+    """Spherical-harmonics coefficients [N, K, 3], K = (degree + 1)²; the colour is their sum plus 0.5, at least 0."""
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0] if self.means.dim() else -1
+        expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
+        for name, shape in expected.items():
+            seen = tuple(getattr(self, name).shape)
+            if seen != shape:
+                wanted = ", ".join(["N", *map(str, shape[1:])])
+                raise InvalidInput(f"gaussians: {name} must be [{wanted}] with N = {n}, got {list(seen)}")
+        bases = [(degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1)]
+        if self.sh.dim() != 3 or self.sh.shape[0] != n or self.sh.shape[1] not in bases or self.sh.shape[2] != 3:
+            raise InvalidInput(
+                f"gaussians: sh must be [N, K, 3] with N = {n} and K one of {bases}, got {list(self.sh.shape)}"
+            )
+        kinds = {(tensor.dtype, tensor.device) for tensor in self.tensors().values()}
+        if len(kinds) != 1 or not self.means.is_floating_point():
+            found = {name: f"{t.dtype} on {t.device}" for name, t in self.tensors().items()}
+            raise InvalidInput(f"gaussians: all tensors must have one floating-point dtype and one device, got {found}")
+
+    @property
+    def count(self) -> int:
+        """How many Gaussians there are."""
+        return int(self.means.shape[0])
+
+    def __len__(self) -> int:
+        return self.count
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of the spherical harmonics, 0 to 4."""
+        return math.isqrt(self.sh.shape[1]) - 1
+
+    @property
+    def scales(self) -> Tensor:
+        """Standard deviations [N, 3], world units."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """Opacities [N] in 0..1."""
+        return self.logit_opacities.sigmoid()
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return self.means.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The tensors' dtype."""
+        return self.means.dtype
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The five tensors by name, in the order of the fields."""
+        return {
+            "means": self.means,
+            "quats": self.quats,
+            "log_scales": self.log_scales,
+            "logit_opacities": self.logit_opacities,
+            "sh": self.sh,
+        }
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
+        """The Gaussians with `function` applied to each of the five tensors."""
+        return Gaussians(**{name: function(tensor) for name, tensor in self.tensors().items()})
+
+    def detach(self) -> Gaussians:
+        """The same values outside of the autograd graph, sharing memory."""
+        return self.map(Tensor.detach)
+
+    def clone(self) -> Gaussians:
+        """A copy with its own memory (still in the autograd graph; `detach().clone()` leaves it)."""
+        return self.map(Tensor.clone)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
+        """The Gaussians on another device or in another floating-point dtype."""
+        return self.map(lambda tensor: tensor.to(device=device, dtype=dtype))
+
+    def requires_grad_(self, requires_grad: bool = True) -> Gaussians:
+        """Mark the five tensors as leaves to differentiate; returns self."""
+        for tensor in self.tensors().values():
+            tensor.requires_grad_(requires_grad)
+        return self
+
+    def select(self, index: Tensor | slice) -> Gaussians:
+        """The Gaussians that a mask [N], a tensor of indices or a slice picks, in that order."""
+        return self.map(lambda tensor: tensor[index])
+
+    def append(self, other: Gaussians) -> Gaussians:
+        """These followed by the others; both must have the same SH degree, dtype and device."""
+        if other.sh_degree != self.sh_degree:
+            raise InvalidInput(f"gaussians: cannot append SH degree {other.sh_degree} to degree {self.sh_degree}")
+        if (other.dtype, other.device) != (self.dtype, self.device):
+            raise InvalidInput(
+                f"gaussians: cannot append {other.dtype} on {other.device} to {self.dtype} on {self.device}"
+            )
+        theirs = other.tensors()
+        return Gaussians(**{name: torch.cat([tensor, theirs[name]]) for name, tensor in self.tensors().items()})

@@ -1,0 +1,17 @@
+"""Recordings of endoscopic video: open, validate, synthesize."""
+
+from gsplat_core.io.recordings.findings import Finding, ValidationReport
+from gsplat_core.io.recordings.recording import FileRecording, Recording, open_recording, validate_recording
+from gsplat_core.io.recordings.split import is_heldout
+from gsplat_core.io.recordings.synthetic.synthesize import synthesize
+
+__all__ = [
+    "FileRecording",
+    "Finding",
+    "Recording",
+    "ValidationReport",
+    "is_heldout",
+    "open_recording",
+    "synthesize",
+    "validate_recording",
+]

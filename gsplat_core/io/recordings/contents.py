@@ -1,0 +1,106 @@
+"""What a recording's files hold, whatever their layout: images, sidecars, cameras."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.frames import Frame
+from gsplat_core.io.recordings.calibration import Calibration
+from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.recordings.planes import DepthFiles, MaskFiles
+
+
+class FrameImages(Protocol):
+    """Images of one size in frame order: a video or a list of files."""
+
+    files: tuple[Path, ...]
+    numbers: list[int | None]
+    frame_count: int
+    width_px: int
+    height_px: int
+    fps: float | None
+    """None where the files do not say."""
+
+    def frames(self, findings: Findings) -> Iterator[NDArray[np.uint8] | None]:
+        """RGB uint8 [H, W, 3]; None where a frame cannot be read."""
+        ...
+
+
+@dataclass(frozen=True)
+class Contents:
+    """A recording that has passed the checks that need no decoding."""
+
+    root: Path
+    layout: str
+    images: FrameImages
+    calibration: Calibration
+    fps: float
+    right: FrameImages | None = None
+    masks: MaskFiles | None = None
+    valid_mask: NDArray[np.uint8] | None = None
+    """[H, W]; 1 inside the scope's circle. What lies outside is not tissue in any frame."""
+    depth: DepthFiles | None = None
+    tool_share: float | None = None
+    stereo_baseline_mm: float | None = None
+    other_files: tuple[Path, ...] = ()
+    """Calibration and description files."""
+
+    @property
+    def fields(self) -> frozenset[str]:
+        """The optional fields that every frame has."""
+        has = {
+            "right_image": self.right is not None,
+            "depth": self.depth is not None,
+            "mask": self.masks is not None or self.valid_mask is not None,
+            "pose": self.calibration.poses is not None,
+        }
+        return frozenset(name for name, there in has.items() if there)
+
+    def frames(self, findings: Findings, limit: int | None = None) -> Iterator[Frame | None]:
+        """Frame after frame at full size, decoded when asked for; None where one has a problem."""
+        images = islice(self.images.frames(findings), limit)
+        rights = self.right.frames(findings) if self.right else None
+        for index, image in enumerate(images):
+            known = len(findings.problems)
+            right_image = next(rights, None) if rights else None
+            depth = self.depth.read(index, findings) if self.depth else None
+            mask = self.masks.read(index, findings) if self.masks else None
+            if image is None or len(findings.problems) > known:
+                yield None
+                continue
+            if self.valid_mask is not None:
+                mask = self.valid_mask if mask is None else mask & self.valid_mask
+            poses = self.calibration.poses
+            yield Frame(
+                seq=index,
+                pts_ns=round(index * 1e9 / self.fps),
+                image=image,
+                right_image=right_image,
+                depth=depth,
+                mask=mask,
+                pose=None if poses is None else poses[index],
+            )
+
+    def files(self) -> list[Path]:
+        """Every file that is read, sorted."""
+        parts = (self.images, self.right, self.masks, self.depth)
+        return sorted({*self.other_files, *(path for part in parts if part for path in part.files)})
+
+    def digest(self) -> str:
+        """sha256 over the input files: for each in order of name, its name, its length and its bytes."""
+        digest = hashlib.sha256()
+        for path in self.files():
+            name = path.relative_to(self.root).as_posix() if path != self.root else path.name
+            digest.update(f"{name}\0{path.stat().st_size}\0".encode())
+            with path.open("rb") as stream:
+                while block := stream.read(1 << 20):
+                    digest.update(block)
+        return digest.hexdigest()

@@ -1,0 +1,224 @@
+"""The parts of a recording: images, masks and depth, one file for each frame, checked as they are read."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.recordings.image_files import (
+    MAX_PIXELS,
+    UnreadableImage,
+    decode_image,
+    frame_number,
+    image_size,
+)
+
+POLARITY_SAMPLES = 16
+MAX_TOOL_SHARE = 0.5
+"""Tools cover 5-35 % of surgical frames; a class that covers more than half of the pixels is the tissue."""
+
+
+class ImageFiles:
+    """One image file for each frame."""
+
+    def __init__(self, files: Sequence[Path], width_px: int, height_px: int, fps: float | None = None) -> None:
+        self.files = tuple(files)
+        self.numbers = [frame_number(path) for path in self.files]
+        self.frame_count = len(self.files)
+        self.width_px = width_px
+        self.height_px = height_px
+        self.fps = fps
+
+    def frames(self, findings: Findings) -> Iterator[NDArray[np.uint8] | None]:
+        """RGB uint8 [H, W, 3], frame after frame; None where one cannot be decoded."""
+        for path in self.files:
+            try:
+                yield decode_image(path, colour=True).astype(np.uint8, copy=False)
+            except UnreadableImage as error:
+                findings.problem(path, str(error), "Export this frame again, or remove it with its sidecars")
+                yield None
+
+
+class MaskFiles:
+    """Tool masks: 255 (or 1) = tool in the files, 1 = tissue in what is read."""
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        self.files = tuple(files)
+
+    def read(self, index: int, findings: Findings) -> NDArray[np.uint8] | None:
+        """[H, W]; 1 = tissue, 0 = tool."""
+        path = self.files[index]
+        try:
+            mask = decode_image(path, colour=False)
+        except UnreadableImage as error:
+            findings.problem(path, str(error), "Export this mask again")
+            return None
+        if mask.ndim == 3:
+            if np.ptp(mask[..., :3], axis=2).any():
+                findings.problem(path, "the mask is a colour picture", "Save masks as grey PNG, 255 = tool, 0 = tissue")
+                return None
+            mask = mask[..., 0]
+        tool = mask != 0
+        top = int(mask.max(initial=0))
+        if top not in (0, 1, 255, 65535) or np.any(mask[tool] != top):
+            findings.problem(
+                path,
+                f"the mask holds {len(np.unique(mask))} different values (up to {top}) in place of 0 and 255",
+                "Threshold it and save it as PNG; JPEG cannot hold a mask",
+            )
+            return None
+        return (~tool).astype(np.uint8)
+
+    def check_polarity(self, findings: Findings) -> float | None:
+        """The share of tool pixels over frames spread evenly; a problem where it cannot be that of tools."""
+        indices = np.unique(np.linspace(0, len(self.files) - 1, POLARITY_SAMPLES).round().astype(int))
+        shares = []
+        for index in indices:
+            mask = self.read(int(index), findings)
+            if mask is None:
+                return None
+            shares.append(1 - float(mask.mean()))
+        share = float(np.mean(shares))
+        if share > MAX_TOOL_SHARE:
+            findings.problem(
+                self.files[0].parent,
+                f"the masks mark {share:.0%} of the pixels as tool ({len(indices)} frames looked at)",
+                "They are probably inverted: 255 means tool, 0 means tissue. Invert them",
+            )
+            return None
+        return share
+
+
+class DepthFiles:
+    """Depth maps: 8- or 16-bit PNG in units of `unit_mm`, or float .npy in millimetres; 0 = unknown."""
+
+    def __init__(self, files: Sequence[Path], width_px: int, height_px: int, unit_mm: float) -> None:
+        self.files = tuple(files)
+        self.unit_mm = unit_mm
+        self._shape = (height_px, width_px)
+
+    def read(self, index: int, findings: Findings) -> NDArray[np.float32] | None:
+        """z in millimetres, float32 [H, W]."""
+        path = self.files[index]
+        if path.suffix.lower() == ".npy":
+            try:
+                depth = np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float32)
+            except (OSError, ValueError, EOFError, SyntaxError) as error:
+                findings.problem(path, f"it is not a plain NumPy array: {str(error).splitlines()[0]}", _DEPTH_ADVICE)
+                return None
+        else:
+            try:
+                stored = decode_image(path, colour=False)
+            except UnreadableImage as error:
+                findings.problem(path, str(error), "Export this depth map again")
+                return None
+            if stored.ndim == 3:
+                if np.ptp(stored[..., :3], axis=2).any():
+                    findings.problem(path, "the depth map is a colour picture", _DEPTH_ADVICE)
+                    return None
+                stored = stored[..., 0]
+            depth = stored.astype(np.float32) * np.float32(self.unit_mm)
+        if depth.shape != self._shape:
+            findings.problem(
+                path,
+                f"the depth map is {list(depth.shape)}, the images are {list(self._shape)} (rows, columns)",
+                _DEPTH_ADVICE,
+            )
+            return None
+        wrong = ~np.isfinite(depth) | (depth < 0)
+        if wrong.any():
+            row, column = np.argwhere(wrong)[0]
+            findings.problem(
+                path,
+                f"{int(wrong.sum())} pixels are NaN, infinite or negative (first: {depth[row, column]} in row {row}, "
+                f"column {column})",
+                "Write 0 where the depth is not known",
+            )
+            return None
+        return depth
+
+
+_DEPTH_ADVICE = "Give one grey 8- or 16-bit PNG, or float .npy [H, W] in millimetres, of the images' size per frame"
+
+
+def check_sizes(
+    files: Sequence[Path], size: tuple[int, int] | None, what: str, findings: Findings
+) -> tuple[int, int] | None:
+    """All files are of one size (that of the images where it is given); from the headers alone."""
+    sizes: dict[Path, tuple[int, int]] = {}
+    for path in files:
+        try:
+            sizes[path] = _npy_size(path) if path.suffix.lower() == ".npy" else image_size(path)
+        except UnreadableImage as error:
+            findings.problem(path, str(error), f"Export this {what} again", missing=not path.exists())
+            return None
+    expected = size or Counter(sizes.values()).most_common(1)[0][0]
+    different = [path for path in files if sizes[path] != expected]
+    if different:
+        path = different[0]
+        of_what = "the images are" if size else "most of the others are"
+        findings.problem(
+            path,
+            f"the {what} is {sizes[path][0]}x{sizes[path][1]}, {of_what} {expected[0]}x{expected[1]}"
+            + (f" ({len(different)} such files)" if len(different) > 1 else ""),
+            f"Export every {what} in the size of the images" if size else "All frames must have one size",
+        )
+        return None
+    return expected
+
+
+def _npy_size(path: Path) -> tuple[int, int]:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError, SyntaxError) as error:
+        raise UnreadableImage(f"it is not a plain NumPy array: {str(error).splitlines()[0]}") from error
+    if array.ndim != 2 or array.dtype.kind not in "fiu" or array.size > MAX_PIXELS:
+        raise UnreadableImage(f"it holds {array.dtype} {list(array.shape)} in place of [H, W] numbers")
+    return array.shape[1], array.shape[0]
+
+
+def check_pairing(
+    numbers: Sequence[int | None], files: Sequence[Path], folder: Path, what: str, findings: Findings
+) -> bool:
+    """As many files as frames; and, where both are numbered, none skipped."""
+    if len(files) != len(numbers):
+        findings.problem(
+            folder,
+            f"{len(files)} {what}s for {len(numbers)} frames",
+            f"Give one {what} for each frame, named in frame order, or remove the folder",
+        )
+        return False
+    offset: int | None = None
+    for number, path in zip(numbers, files, strict=True):
+        own = frame_number(path)
+        if number is None or own is None:
+            continue
+        if offset is None:
+            offset = own - number
+        elif own - number != offset:
+            findings.problem(
+                path,
+                f"the {what}'s number {own} does not follow the frame's number {number} as those before it do "
+                f"(expected {number + offset})",
+                f"A {what} is missing or superfluous; number them like the frames",
+            )
+            return False
+    return True
+
+
+def resize_area(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
+    """An image at another size: mean over each pixel's area when smaller."""
+    shrinks = width_px <= image.shape[1] and height_px <= image.shape[0]
+    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=interpolation), dtype=np.uint8)
+
+
+def resize_nearest(plane: NDArray, width_px: int, height_px: int) -> NDArray:
+    """A mask or depth map at another size: no value that was not there (the pixel whose centre is nearest)."""
+    return cv2.resize(plane, (width_px, height_px), interpolation=cv2.INTER_NEAREST_EXACT)

@@ -1,0 +1,157 @@
+"""Opening and validating recordings."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from gsplat_core.cameras import Camera
+from gsplat_core.errors import InvalidInput
+from gsplat_core.frames import Frame
+from gsplat_core.io.recordings.contents import Contents
+from gsplat_core.io.recordings.findings import Findings, ValidationReport
+from gsplat_core.io.recordings.layouts import inspect
+from gsplat_core.io.recordings.planes import resize_area, resize_nearest
+
+MAX_REPORTED_PROBLEMS = 100
+
+
+@runtime_checkable
+class Recording(Protocol):
+    """Frames that can be read again and again, one at a time."""
+
+    name: str
+    frame_count: int
+    width_px: int
+    height_px: int
+    fps: float
+    camera: Camera
+    """The camera of frame 0."""
+    notes: tuple[str, ...]
+    """Fallbacks that were taken, in sentences."""
+    fields: frozenset[str]
+    """Which of mask, depth, right_image and pose the frames have."""
+    stereo_baseline_mm: float | None
+    """Distance of the right eye along the camera's x axis, where it is known."""
+
+    @property
+    def digest(self) -> str:
+        """sha256 of the input files."""
+        ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        """The frames from the first to the last, decoded as they are asked for."""
+        ...
+
+    def camera_at(self, index: int) -> Camera:
+        """The camera of one frame."""
+        ...
+
+
+class FileRecording:
+    """A recording on disk, seen at a scale. Holds one frame at a time, whatever its length."""
+
+    def __init__(self, contents: Contents, scale: float, max_frames: int | None, notes: tuple[str, ...]) -> None:
+        self._contents = contents
+        # A relative path such as `.` has no name of its own.
+        self.name = contents.root.name or contents.root.resolve().name
+        self.camera = contents.calibration.camera.scaled(scale)
+        self.width_px, self.height_px = self.camera.width_px, self.camera.height_px
+        self.frame_count = min(contents.images.frame_count, max_frames or contents.images.frame_count)
+        self.fps = contents.fps
+        self.fields = contents.fields
+        self.stereo_baseline_mm = contents.stereo_baseline_mm
+        self.notes = notes
+
+    @cached_property
+    def digest(self) -> str:
+        """sha256 of the input files: all of them, whatever scale and number of frames are read."""
+        return self._contents.digest()
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Frames in order. Raises RecordingInvalid at the first one that cannot be read."""
+        for frame in self._contents.frames(Findings(strict=True), self.frame_count):
+            assert frame is not None  # a strict collector has raised
+            yield self._resized(frame)
+
+    def __len__(self) -> int:
+        return self.frame_count
+
+    def camera_at(self, index: int) -> Camera:
+        """The camera of one frame; where poses are not known, that of frame 0."""
+        if not 0 <= index < self.frame_count:
+            raise InvalidInput(f"frame {index} is not in the recording {self.name} of {self.frame_count} frames")
+        poses = self._contents.calibration.poses
+        return self.camera if poses is None else self.camera.with_pose(poses[index])
+
+    def _resized(self, frame: Frame) -> Frame:
+        size = self.width_px, self.height_px
+        if size == (frame.width_px, frame.height_px):
+            return frame
+        return frame.with_fields(
+            image=resize_area(frame.image, *size),
+            right_image=None if frame.right_image is None else resize_area(frame.right_image, *size),
+            depth=None if frame.depth is None else resize_nearest(frame.depth, *size),
+            mask=None if frame.mask is None else resize_nearest(frame.mask, *size),
+        )
+
+
+def open_recording(path: str | os.PathLike[str], *, scale: float = 1.0, max_frames: int | None = None) -> FileRecording:
+    """Open a recording; its layout is recognised by what is there (see `layouts`).
+
+    path: a video, or a folder. scale: images by the mean over areas, masks and depth by the nearest pixel, the camera
+    along with them. max_frames: read only the beginning.
+
+    Counts, header sizes, calibration and mask polarity are checked here, each frame's data while iterating.
+    Raises RecordingMissing or RecordingInvalid, naming the file, the value that is wrong, and what to do; InvalidInput
+    for a scale that is not positive and finite, or max_frames below 1.
+    """
+    if not 0 < scale < float("inf"):
+        raise InvalidInput(f"scale must be a positive number, got {scale}")
+    if max_frames is not None and max_frames < 1:
+        raise InvalidInput(f"max_frames must be at least 1, got {max_frames}")
+    findings = Findings(strict=True)
+    contents = inspect(Path(path), findings)
+    assert contents is not None  # a strict collector has raised
+    return FileRecording(contents, scale, max_frames, tuple(str(finding) for finding in findings.warnings))
+
+
+def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
+    """Read a recording from the first frame to the last and list what is wrong. Never raises for a bad recording."""
+    findings = Findings()
+    contents = inspect(Path(path), findings)
+    if contents is None:
+        return ValidationReport({"path": str(path)}, findings.problems, findings.warnings)
+    decoded = 0
+    tissue = 0.0
+    for frame in contents.frames(findings):
+        if len(findings.problems) >= MAX_REPORTED_PROBLEMS:
+            findings.warn(contents.root, f"more than {MAX_REPORTED_PROBLEMS} problems", "The rest was not looked at")
+            break
+        if frame is not None:
+            decoded += 1
+            tissue += 1.0 if frame.mask is None else float(frame.mask.mean())
+    images, calibration = contents.images, contents.calibration
+    facts: dict[str, object] = {
+        "path": str(path),
+        "layout": contents.layout,
+        "frames": images.frame_count,
+        "frames_decoded": decoded,
+        "width_px": images.width_px,
+        "height_px": images.height_px,
+        "fps": contents.fps,
+        "duration_s": images.frame_count / contents.fps,
+        "fields": sorted(contents.fields),
+        "calibration": calibration.source,
+        "focal_px": [float(calibration.camera.K[0, 0]), float(calibration.camera.K[1, 1])],
+        "camera_moves": calibration.poses is not None and bool(np.ptp(calibration.poses, axis=0).max() > 1e-9),
+        "tissue_share": tissue / decoded if decoded else None,
+        "tool_share": contents.tool_share,
+        "stereo_baseline_mm": contents.stereo_baseline_mm,
+    }
+    return ValidationReport(facts, findings.problems, findings.warnings)

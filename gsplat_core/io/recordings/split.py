@@ -1,0 +1,13 @@
+"""The field's held-out protocol: frames with (i - 1) % 8 == 0 (1, 9, 17, …) are for testing, the rest for training.
+
+It is that of EndoGaussian, Deform3DGS and SurgicalGaussian on EndoNeRF's clips, which have no official split.
+"""
+
+from __future__ import annotations
+
+HELDOUT_STRIDE = 8
+
+
+def is_heldout(index: int) -> bool:
+    """Whether a frame, counted from 0, is kept from training."""
+    return (index - 1) % HELDOUT_STRIDE == 0

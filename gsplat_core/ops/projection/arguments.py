@@ -1,0 +1,119 @@
+"""What projection takes and returns: checks, and the packed form. Shared by the compiled op and the reference."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_same_kind, require_shape, require_trailing
+from gsplat_core.cameras import CAMERA_MODELS
+from gsplat_core.errors import InvalidInput
+
+MAX_EXTENT_SIGMAS = 3.33
+"""Beyond this many standard deviations a fully opaque Gaussian falls below the alpha cut-off of 1/255."""
+ALPHA_CUTOFF = 1.0 / 255.0
+COMPENSATION_FLOOR = 0.005
+"""Smallest antialiasing compensation (Yu et al. 2024, Mip-Splatting, as published in its code)."""
+MAX_RADIUS_PX = 1e9
+"""Radii are clamped to this, to fit an int32."""
+FOV_MARGIN = 0.3
+"""The pinhole Jacobian is taken at a point at most (1 + 0.3) half fields of view off the axis (Kerbl et al. 2023)."""
+
+
+class DenseProjection(NamedTuple):
+    """One row per camera and Gaussian; zeros where the Gaussian is culled."""
+
+    radii: Tensor
+    """int32 [..., C, N, 2]: half width and half height of the bounding box in pixels; (0, 0) = culled."""
+    means2d: Tensor
+    """[..., C, N, 2] in pixels."""
+    depths: Tensor
+    """[..., C, N]: z in the camera."""
+    conics: Tensor
+    """[..., C, N, 3]: inverse of the blurred 2D covariance as (xx, xy, yy)."""
+    compensations: Tensor | None
+    """[..., C, N]: factor on the opacity for antialiasing, or None."""
+
+
+class PackedProjection(NamedTuple):
+    """One row per camera and Gaussian that is not culled, ordered by batch, camera, Gaussian."""
+
+    batch_ids: Tensor
+    """int64 [nnz], over the flattened batch dimensions."""
+    camera_ids: Tensor
+    """int64 [nnz]."""
+    gaussian_ids: Tensor
+    """int64 [nnz]."""
+    radii: Tensor
+    means2d: Tensor
+    depths: Tensor
+    conics: Tensor
+    compensations: Tensor | None
+
+
+def check_projection_arguments(
+    means: Tensor,
+    covars: Tensor | None,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    sparse_grad: bool,
+    camera_model: str,
+    opacities: Tensor | None,
+) -> tuple[int, ...]:
+    """Raise InvalidInput or NotImplementedError on what projection cannot take; returns the batch dimensions."""
+    *batch, n = require_trailing("means", means, (3,), "[..., N, 3]") or (None,)
+    if n is None:
+        raise InvalidInput(f"means must be [..., N, 3], got {list(means.shape)}")
+    batch_dims = tuple(batch)
+    if covars is not None:
+        if quats is not None or scales is not None:
+            raise InvalidInput("give covars, or quats and scales, not both")
+        require_shape("covars", covars, (*batch_dims, n, 6), "[..., N, 6] (upper triangle)")
+    elif quats is None or scales is None:
+        raise InvalidInput("give covars, or both quats and scales")
+    else:
+        require_shape("quats", quats, (*batch_dims, n, 4), "[..., N, 4]")
+        require_shape("scales", scales, (*batch_dims, n, 3), "[..., N, 3]")
+    if opacities is not None:
+        require_shape("opacities", opacities, (*batch_dims, n), "[..., N]")
+    c = viewmats.shape[-3] if viewmats.dim() >= 3 else 0
+    require_shape("viewmats", viewmats, (*batch_dims, c, 4, 4), "[..., C, 4, 4]")
+    require_shape("Ks", Ks, (*batch_dims, c, 3, 3), "[..., C, 3, 3]")
+    require_same_kind(
+        means=means, covars=covars, quats=quats, scales=scales, opacities=opacities, viewmats=viewmats, Ks=Ks
+    )
+    if width < 1 or height < 1:
+        raise InvalidInput(f"the image must be at least 1x1 px, got width={width}, height={height}")
+    if sparse_grad:
+        raise NotImplementedError("sparse_grad=True is not supported; gradients are dense (use sparse_grad=False)")
+    if camera_model not in CAMERA_MODELS:
+        if camera_model in ("ftheta", "lidar"):
+            raise NotImplementedError(
+                f"camera_model={camera_model!r} is not supported; the models are {', '.join(CAMERA_MODELS)}"
+            )
+        raise InvalidInput(f"unknown camera_model {camera_model!r}; the models are {', '.join(CAMERA_MODELS)}")
+    return batch_dims
+
+
+def pack(dense: DenseProjection) -> PackedProjection:
+    """Keep only the rows that are not culled."""
+    n_cameras, n_gaussians = dense.radii.shape[-3:-1]
+    rows = dense.radii.detach().reshape(-1, 2)[:, 0].nonzero().squeeze(-1)
+    images = torch.div(rows, max(n_gaussians, 1), rounding_mode="floor")
+    compensations = dense.compensations
+    return PackedProjection(
+        batch_ids=torch.div(images, max(n_cameras, 1), rounding_mode="floor"),
+        camera_ids=images % max(n_cameras, 1),
+        gaussian_ids=rows % max(n_gaussians, 1),
+        radii=dense.radii.reshape(-1, 2)[rows],
+        means2d=dense.means2d.reshape(-1, 2)[rows],
+        depths=dense.depths.reshape(-1)[rows],
+        conics=dense.conics.reshape(-1, 3)[rows],
+        compensations=None if compensations is None else compensations.reshape(-1)[rows],
+    )

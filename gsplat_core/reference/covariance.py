@@ -1,0 +1,54 @@
+"""Covariance and precision matrices from rotations and scales (Zwicker et al. 2001; Kerbl et al. 2023, equation 6)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_same_kind, require_shape, require_trailing
+
+TRIU_ROWS = (0, 0, 0, 1, 1, 2)
+TRIU_COLUMNS = (0, 1, 2, 1, 2, 2)
+
+
+def check_covariance_arguments(quats: Tensor, scales: Tensor) -> None:
+    """Raise InvalidInput unless quats are [..., 4] and scales [..., 3], of one dtype and device."""
+    leading = require_trailing("quats", quats, (4,), "[..., 4] (wxyz)")
+    require_shape("scales", scales, (*leading, 3), "[..., 3]")
+    require_same_kind(quats=quats, scales=scales)
+
+
+def quat_to_rotmat(quats: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4] as wxyz, which need not be of unit length."""
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def matrix_to_triu(matrix: Tensor) -> Tensor:
+    """The upper triangle (xx, xy, xz, yy, yz, zz) [..., 6] of matrices [..., 3, 3]."""
+    return matrix[..., TRIU_ROWS, TRIU_COLUMNS]
+
+
+def triu_to_matrix(triu: Tensor) -> Tensor:
+    """Symmetric matrices [..., 3, 3] from upper triangles [..., 6]."""
+    return triu[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*triu.shape[:-1], 3, 3)
+
+
+def quat_scale_to_covar_preci(
+    quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
+) -> tuple[Tensor | None, Tensor | None]:
+    """Covariances R S S Rᵀ and precisions R S⁻¹ S⁻¹ Rᵀ; see `gsplat_core.quat_scale_to_covar_preci`."""
+    check_covariance_arguments(quats, scales)
+    rotation = quat_to_rotmat(quats)
+
+    def outer(factors: Tensor) -> Tensor:
+        half = rotation * factors[..., None, :]
+        matrix = half @ half.transpose(-1, -2)
+        return matrix_to_triu(matrix) if triu else matrix
+
+    return outer(scales) if compute_covar else None, outer(1 / scales) if compute_preci else None

@@ -1,0 +1,162 @@
+"""Projection of 3D Gaussians to screen-space ellipses in plain torch (EWA splatting, Zwicker et al. 2001)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsplat_core.ops.projection.arguments import (
+    ALPHA_CUTOFF,
+    COMPENSATION_FLOOR,
+    FOV_MARGIN,
+    MAX_EXTENT_SIGMAS,
+    MAX_RADIUS_PX,
+    DenseProjection,
+    PackedProjection,
+    check_projection_arguments,
+    pack,
+)
+from gsplat_core.reference.covariance import quat_scale_to_covar_preci, triu_to_matrix
+
+FISHEYE_SERIES_BELOW = 0.01
+"""For tan θ below this the fisheye's quotients by r are taken from their Taylor series."""
+
+
+def _pinhole(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Image points [..., C, N, 2] and Jacobians [..., C, N, 2, 3] of camera-space points [..., C, N, 3]."""
+    x, y, z = p.unbind(-1)
+    fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
+    # The linearisation explodes far off axis, so it is taken at the border of a slightly larger field of view.
+    slope_x = torch.minimum(torch.maximum(x / z, -(cx / fx + margin_x)), (width - cx) / fx + margin_x)
+    slope_y = torch.minimum(torch.maximum(y / z, -(cy / fy + margin_y)), (height - cy) / fy + margin_y)
+    zero = torch.zeros_like(x)
+    jacobian = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1)
+    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
+    return means2d, jacobian.unflatten(-1, (2, 3))
+
+
+def _ortho(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    x, y, _ = p.unbind(-1)
+    fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    zero = torch.zeros_like(x)
+    jacobian = torch.stack([fx.expand_as(x), zero, zero, zero, fy.expand_as(x), zero], -1)
+    return torch.stack([fx * x + cx, fy * y + cy], -1), jacobian.unflatten(-1, (2, 3))
+
+
+def _fisheye(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Equidistant: the image radius is f θ. With s = θ/r and q = (dθ/dr - s)/r², du/dx = fx (s + q x²)."""
+    x, y, z = p.unbind(-1)
+    fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    near_axis = (x * x + y * y < (FISHEYE_SERIES_BELOW * z) ** 2) & (z > 0)
+    r2 = torch.where(near_axis, torch.ones_like(x), x * x + y * y)
+    r = r2.sqrt()
+    squared = r2 + z * z
+    s_far = torch.atan2(r, z) / r
+    q_far = (z / squared - s_far) / r2
+    z_near = torch.where(near_axis, z, torch.ones_like(z))
+    t2 = torch.where(near_axis, (x * x + y * y) / (z_near * z_near), torch.zeros_like(x))
+    s_near = (1 - t2 / 3 + t2**2 / 5 - t2**3 / 7) / z_near
+    q_near = (-2 / 3 + 4 / 5 * t2 - 6 / 7 * t2**2 + 8 / 9 * t2**3) / z_near**3
+    s, q = torch.where(near_axis, s_near, s_far), torch.where(near_axis, q_near, q_far)
+    inverse = 1 / (x * x + y * y + z * z)
+    jacobian = torch.stack(
+        [
+            fx * (s + q * x * x),
+            fx * q * x * y,
+            -fx * x * inverse,
+            fy * q * x * y,
+            fy * (s + q * y * y),
+            -fy * y * inverse,
+        ],
+        -1,
+    )
+    return torch.stack([fx * x * s + cx, fy * y * s + cy], -1), jacobian.unflatten(-1, (2, 3))
+
+
+_MODELS = {"pinhole": _pinhole, "ortho": _ortho, "fisheye": _fisheye}
+
+
+def fully_fused_projection(
+    means: Tensor,
+    covars: Tensor | None,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    eps2d: float = 0.3,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    packed: bool = False,
+    sparse_grad: bool = False,
+    calc_compensations: bool = False,
+    camera_model: str = "pinhole",
+    opacities: Tensor | None = None,
+) -> DenseProjection | PackedProjection:
+    """Project Gaussians to image ellipses; see `gsplat_core.fully_fused_projection`."""
+    check_projection_arguments(
+        means, covars, quats, scales, viewmats, Ks, width, height, sparse_grad, camera_model, opacities
+    )
+    # Unusable Gaussians are replaced before any arithmetic: a NaN behind a mask would still be a NaN in the gradient.
+    usable = means.isfinite().all(-1)
+    if covars is not None:
+        usable = usable & covars.isfinite().all(-1)
+    elif quats is not None and scales is not None:
+        usable = usable & quats.isfinite().all(-1) & (quats != 0).any(-1) & scales.isfinite().all(-1)
+    if opacities is not None:
+        usable = usable & opacities.isfinite()
+    means = torch.where(usable[..., None], means, torch.zeros_like(means))
+    if covars is not None:
+        identity = covars.new_tensor([1, 0, 0, 1, 0, 1])
+        covariance = triu_to_matrix(torch.where(usable[..., None], covars, identity))
+    else:
+        assert quats is not None and scales is not None
+        quats = torch.where(usable[..., None], quats, quats.new_tensor([1, 0, 0, 0]))
+        scales = torch.where(usable[..., None], scales, torch.ones_like(scales))
+        covar, _ = quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+        assert covar is not None
+        covariance = covar
+
+    rotation, translation = viewmats[..., :3, :3], viewmats[..., :3, 3]
+    p = torch.einsum("...cij,...nj->...cni", rotation, means) + translation[..., None, :]
+    z = p[..., 2]
+    in_range = usable[..., None, :] & (z >= near_plane) & (z <= far_plane)
+    p = torch.where(in_range[..., None], p, p.new_tensor([0, 0, 1]))
+    means2d, jacobian = _MODELS[camera_model](p, Ks, width, height)
+
+    # covariance in the image: (J W) Σ (J W)ᵀ
+    affine = jacobian @ rotation[..., None, :, :]
+    covars2d = affine @ covariance[..., None, :, :, :] @ affine.transpose(-1, -2)
+    a0, b, c0 = covars2d[..., 0, 0], covars2d[..., 0, 1], covars2d[..., 1, 1]
+    a, c = a0 + eps2d, c0 + eps2d
+    det = a * c - b * b
+    positive = det > 0
+    det = torch.where(positive, det, torch.ones_like(det))
+    conics = torch.stack([c / det, -b / det, a / det], -1)
+    compensations = ((a0 * c0 - b * b) / det).clamp(min=COMPENSATION_FLOOR**2).sqrt()
+
+    with torch.no_grad():
+        extent = torch.full_like(det, MAX_EXTENT_SIGMAS)
+        valid = in_range & positive & means2d.isfinite().all(-1) & conics.isfinite().all(-1)
+        if opacities is not None:
+            effective = opacities[..., None, :] * (compensations if calc_compensations else 1)
+            valid = valid & (effective >= ALPHA_CUTOFF)
+            extent = extent.minimum((2 * (effective / ALPHA_CUTOFF).clamp(min=1).log()).sqrt())
+        half_sizes = (extent[..., None] * torch.stack([a, c], -1).clamp(min=0).sqrt()).ceil().clamp(max=MAX_RADIUS_PX)
+        valid = valid & (half_sizes > radius_clip).any(-1)
+        size = means2d.new_tensor([width, height])
+        valid = valid & ((means2d + half_sizes > 0) & (means2d - half_sizes < size)).all(-1)
+        radii = torch.where(valid[..., None], half_sizes, torch.zeros_like(half_sizes)).to(torch.int32)
+
+    zero = torch.zeros_like(det)
+    dense = DenseProjection(
+        radii=radii,
+        means2d=torch.where(valid[..., None], means2d, zero[..., None]),
+        depths=torch.where(valid, p[..., 2], zero),
+        conics=torch.where(valid[..., None], conics, zero[..., None]),
+        compensations=torch.where(valid, compensations, zero) if calc_compensations else None,
+    )
+    return pack(dense) if packed else dense

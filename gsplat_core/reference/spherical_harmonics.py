@@ -1,0 +1,99 @@
+"""Real spherical harmonics up to degree 4 in plain torch (Sloan 2013, "Efficient Spherical Harmonic Evaluation")."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_same_kind, require_trailing
+from gsplat_core.errors import InvalidInput
+from gsplat_core.gaussians import MAX_SH_DEGREE
+
+
+def check_spherical_harmonics_arguments(
+    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None
+) -> None:
+    """Raise InvalidInput unless dirs are [..., 3], coeffs [..., K, 3] with K >= (degree + 1)² and masks bool [...].
+
+    The leading dimensions of coeffs and masks must broadcast to those of dirs.
+    """
+    leading = require_trailing("dirs", dirs, (3,), "[..., 3]")
+    if not 0 <= degrees_to_use <= MAX_SH_DEGREE:
+        raise InvalidInput(f"degrees_to_use must be 0 to {MAX_SH_DEGREE}, got {degrees_to_use}")
+    bases = (degrees_to_use + 1) ** 2
+    if coeffs.dim() < 2 or coeffs.shape[-1] != 3 or coeffs.shape[-2] < bases:
+        raise InvalidInput(
+            f"coeffs must be [..., K, 3] with K >= {bases} for degree {degrees_to_use}, got {list(coeffs.shape)}"
+        )
+    require_same_kind(dirs=dirs, coeffs=coeffs)
+    if masks is not None and masks.dtype != torch.bool:
+        raise InvalidInput(f"masks must be bool, got {masks.dtype}")
+    for name, shape in (("coeffs", coeffs.shape[:-2]), ("masks", () if masks is None else masks.shape)):
+        pairs = zip(reversed(shape), reversed(leading), strict=False)
+        if len(shape) > len(leading) or any(have not in (1, want) for have, want in pairs):
+            raise InvalidInput(
+                f"{name} must have the leading dimensions of dirs, {list(leading)}, or broadcast to them;"
+                f" got {list(shape)}"
+            )
+
+
+def spherical_harmonics_bases(degree: int, directions: Tensor) -> Tensor:
+    """The (degree + 1)² basis functions [..., K] at unit directions [..., 3], in the field's order and signs."""
+    x, y, z = directions.unbind(-1)
+    bases = [torch.full_like(x, 0.28209479177387814)]
+    if degree >= 1:
+        bases += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        c2, s2 = xx - yy, 2 * x * y
+        bases += [
+            0.5462742152960395 * s2,
+            -1.0925484305920792 * y * z,
+            0.9461746957575601 * zz - 0.31539156525252005,
+            -1.0925484305920792 * x * z,
+            0.5462742152960395 * c2,
+        ]
+    if degree >= 3:
+        c3, s3 = x * c2 - y * s2, x * s2 + y * c2
+        lift = 0.4570457994644658 - 2.285228997322329 * zz
+        bases += [
+            -0.5900435899266435 * s3,
+            1.445305721320277 * z * s2,
+            lift * y,
+            z * (1.865881662950577 * zz - 1.1195289977703462),
+            lift * x,
+            1.445305721320277 * z * c2,
+            -0.5900435899266435 * c3,
+        ]
+    if degree >= 4:
+        c4, s4 = x * c3 - y * s3, x * s3 + y * c3
+        tilt = z * (2.0071396306718676 - 4.683325804901025 * zz)
+        ring = 3.31161143515146 * zz - 0.47308734787878
+        bases += [
+            0.6258357354491761 * s4,
+            -1.7701307697799304 * z * s3,
+            ring * s2,
+            tilt * y,
+            0.10578554691520431 * (35 * zz * zz - 30 * zz + 3),
+            tilt * x,
+            ring * c2,
+            -1.7701307697799304 * z * c3,
+            0.6258357354491761 * c4,
+        ]
+    return torch.stack(bases, -1)
+
+
+def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
+    """Sums of spherical harmonics; see `gsplat_core.spherical_harmonics`."""
+    check_spherical_harmonics_arguments(degrees_to_use, dirs, coeffs, masks)
+    count = (degrees_to_use + 1) ** 2
+    coeffs = coeffs[..., :count, :]
+    if masks is not None:
+        # Replaced before any arithmetic: a NaN behind a mask would still be a NaN in the gradient.
+        dirs = torch.where(masks[..., None], dirs, torch.ones_like(dirs))
+        coeffs = torch.where(masks[..., None, None], coeffs, torch.zeros_like(coeffs))
+    if degrees_to_use == 0:
+        bases = torch.full_like(dirs[..., :1], 0.28209479177387814)
+    else:
+        bases = spherical_harmonics_bases(degrees_to_use, dirs / dirs.norm(dim=-1, keepdim=True))
+    return (bases[..., None] * coeffs).sum(-2)

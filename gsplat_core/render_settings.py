@@ -1,0 +1,65 @@
+"""The options of `rasterization` that are no tensors, and which of gsplat's are refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.gaussians import MAX_SH_DEGREE
+
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+RasterizeMode = Literal["classic", "antialiased"]
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """What `rasterization` was asked for, beyond tensors; the checks that need no tensor are made here."""
+
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    sh_degree: int | None
+    packed: bool
+    tile_size: int
+    render_mode: RenderMode
+    absgrad: bool
+    rasterize_mode: RasterizeMode
+    camera_model: str
+
+    def __post_init__(self) -> None:
+        for name, value, known in (
+            ("render_mode", self.render_mode, get_args(RenderMode)),
+            ("rasterize_mode", self.rasterize_mode, get_args(RasterizeMode)),
+        ):
+            if value not in known:
+                raise InvalidInput(f"unknown {name} {value!r}; the modes are {', '.join(known)}")
+        if self.tile_size < 1:
+            raise InvalidInput(f"tile_size must be at least 1 px, got {self.tile_size}")
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
+            raise InvalidInput(f"sh_degree must be None or 0 to {MAX_SH_DEGREE}, got {self.sh_degree}")
+
+    @property
+    def has_colors(self) -> bool:
+        """Whether colours are among the channels."""
+        return self.render_mode.startswith("RGB")
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether depth is the last channel."""
+        return self.render_mode.endswith("D")
+
+
+def refuse_unsupported(**arguments: Any) -> None:
+    """Raise NotImplementedError for the first argument that asks for something: it is neither None nor False.
+
+    A rolling shutter named GLOBAL is gsplat's way of saying none.
+    """
+    for name, value in arguments.items():
+        if value is None or value is False or getattr(value, "name", None) == "GLOBAL":
+            continue
+        shown = f"a tensor {list(value.shape)}" if hasattr(value, "shape") else repr(value)
+        raise NotImplementedError(f"{name} is not supported, got {shown}; leave it out")

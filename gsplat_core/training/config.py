@@ -1,0 +1,81 @@
+"""Settings of the reconstructor: what is learned, how fast, from which frames."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal
+
+from gsplat_core.errors import InvalidInput
+
+FieldChoice = Literal["auto", "basis", "hexplane"]
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam's rates. Those of positions are in pixels of the training image: they are multiplied by depth / focal length."""
+
+    means_px: float = 0.03
+    quats: float = 2e-3
+    log_scales: float = 5e-3
+    logit_opacities: float = 2e-2
+    sh: float = 5e-3
+    basis_means_px: float = 0.1
+    basis_quats: float = 5e-3
+    basis_log_scales: float = 5e-3
+    basis_sh: float = 1e-2
+    basis_timing: float = 1e-3
+    hexplane_planes: float = 5e-3
+    hexplane_network: float = 5e-4
+
+    def __post_init__(self) -> None:
+        for name, rate in vars(self).items():
+            if not 0 <= rate < 10:
+                raise InvalidInput(f"learning rate {name} is {rate}; it must be between 0 and 10")
+
+
+@dataclass(frozen=True)
+class ReconstructorConfig:
+    """What a `Reconstructor` learns and how much work it does."""
+
+    field: FieldChoice = "auto"
+    """Deformation field; `auto` takes basis functions, the better one in `benchmarks/RESULTS.md`."""
+    gaussians: int = 30_000
+    """Gaussians that the first frame starts with; frames that uncover new tissue add to them."""
+    max_gaussians: int = 60_000
+    """Bound on Gaussians over the whole stream."""
+    sh_degree: int = 0
+    """Degree of the view-dependent colour; 0 suits a scope whose light moves with the camera."""
+    steps_per_frame: int = 8
+    """Optimiser steps that each new frame gets."""
+    first_frame_steps: int = 60
+    """Steps on the very first frame, from which the model starts."""
+    newest_share: float = 0.5
+    """Share of the steps that go to the newest frame; the rest goes to the window."""
+    window_frames: int = 30
+    """Recent frames that are trained on again, so that the model does not forget them."""
+    bump_spacing_s: float = 0.2
+    """Time between the basis functions of the basis field."""
+    ssim_weight: float = 0.0
+    """Weight of 1 - SSIM beside L1, 0..1."""
+    depth_weight: float = 0.02
+    """Weight of the inverse-depth term where the recording has depth."""
+    default_depth_mm: float = 60.0
+    """Distance of the plane on which a recording without depth starts."""
+    rates: LearningRates = dataclasses.field(default_factory=LearningRates)
+
+    def __post_init__(self) -> None:
+        if self.field not in ("auto", "basis", "hexplane"):
+            raise InvalidInput(f"field is {self.field!r}; choose auto, basis or hexplane")
+        for name in ("gaussians", "max_gaussians", "steps_per_frame", "first_frame_steps", "window_frames"):
+            if getattr(self, name) < 1:
+                raise InvalidInput(f"{name} is {getattr(self, name)}; it must be at least 1")
+        if not 0 <= self.sh_degree <= 4:
+            raise InvalidInput(f"sh_degree is {self.sh_degree}; it must be 0 to 4")
+        if not 0 < self.newest_share <= 1:
+            raise InvalidInput(f"newest_share is {self.newest_share}; it must be in (0, 1]")
+
+    @property
+    def chosen_field(self) -> Literal["basis", "hexplane"]:
+        """The field that `auto` stands for."""
+        return "basis" if self.field == "auto" else self.field

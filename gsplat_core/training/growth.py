@@ -1,0 +1,50 @@
+"""New Gaussians where a frame shows tissue that the model does not cover yet."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from gsplat_core.frames import Frame
+from gsplat_core.gaussians import Gaussians
+from gsplat_core.rendering import render
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.initialisation import gaussians_at_pixels, tissue_colours, tissue_depth
+from gsplat_core.training.observations import Observation
+
+UNCOVERED_ALPHA = 0.5
+"""A pixel whose accumulated opacity is below this shows nothing of the model."""
+SMALLEST_SHARE = 0.002
+"""Uncovered share of the frame from which on Gaussians are added; single pixels between Gaussians close by training."""
+
+
+def gaussians_for_uncovered_tissue(
+    frame: Frame, observation: Observation, current: Gaussians, config: ReconstructorConfig, room: int
+) -> Gaussians | None:
+    """Gaussians for the tissue pixels of `frame` that `current` (the model at the frame's time) leaves uncovered.
+
+    At most `room`, as dense as the first frame's. Their depth is measured where the frame has depth, else that of the nearest covered
+    pixel. None when there is nothing worth adding.
+    """
+    camera = observation.camera
+    output = render(current, camera)
+    height, width = frame.image.shape[:2]
+    bare = (output.alpha.numpy() < UNCOVERED_ALPHA) & (observation.mask.numpy() > 0)
+    if bare.sum() < SMALLEST_SHARE * height * width:
+        return None
+    spacing = math.sqrt(height * width / config.gaussians)
+    columns = np.arange(spacing / 2, width, spacing)
+    rows = np.arange(spacing / 2, height, spacing)
+    grid = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    wanted = grid[bare[grid[:, 1].astype(np.int64), grid[:, 0].astype(np.int64)]]
+    if len(wanted) == 0:
+        return None
+    wanted = wanted[:: math.ceil(len(wanted) / room)]
+    if frame.depth is None:
+        covered = np.where(output.alpha.numpy() >= UNCOVERED_ALPHA, output.depth.numpy(), 0).astype(np.float32)
+        depth = tissue_depth(frame.with_fields(depth=cv2.medianBlur(covered, 5)), config.default_depth_mm)
+    else:
+        depth = tissue_depth(frame, config.default_depth_mm)
+    return gaussians_at_pixels(wanted, spacing, tissue_colours(frame), depth, camera, sh_degree=config.sh_degree)

@@ -1,0 +1,140 @@
+"""Gaussians from the pixels of one frame: a jittered grid at the tissue's depth, coloured by the picture."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsplat_core.cameras import Camera
+from gsplat_core.frames import Frame
+from gsplat_core.gaussians import SH_C0, Gaussians
+
+SIGMA_IN_SPACINGS = 0.55
+"""Standard deviation of a fresh Gaussian in grid spacings: neighbours overlap and leave no holes."""
+THICKNESS = 0.3
+"""Depth of a fresh Gaussian relative to its width: tissue is a surface."""
+
+
+def gaussians_from_frame(
+    frame: Frame, camera: Camera, count: int, *, sh_degree: int, default_depth_mm: float, seed: int = 0
+) -> Gaussians:
+    """About `count` Gaussians that cover the whole frame, tools included.
+
+    Pixels under a tool take colour and depth from the tissue around them (Telea 2004 in-painting), so that tissue which a tool uncovers
+    has Gaussians to learn with. Depth comes from the frame where it is known, else from the plane z = `default_depth_mm`.
+    """
+    height, width = frame.image.shape[:2]
+    spacing = math.sqrt(height * width / count)
+    columns, rows = max(1, round(width / spacing)), max(1, round(height / spacing))
+    jitter = np.random.default_rng(seed).uniform(-0.3, 0.3, (2, rows, columns))
+    u = (np.arange(columns)[None, :] + 0.5 + jitter[0]) * (width / columns)
+    v = (np.arange(rows)[:, None] + 0.5 + jitter[1]) * (height / rows)
+    return gaussians_at_pixels(
+        np.stack([u.ravel(), v.ravel()], -1),
+        spacing,
+        tissue_colours(frame),
+        tissue_depth(frame, default_depth_mm),
+        camera,
+        sh_degree=sh_degree,
+    )
+
+
+def gaussians_at_pixels(
+    pixels: NDArray[np.float64],
+    spacing_px: float,
+    image: NDArray[np.uint8],
+    depth_mm: NDArray[np.float32],
+    camera: Camera,
+    *,
+    sh_degree: int,
+) -> Gaussians:
+    """One Gaussian at each of `pixels` [M, 2] (x, y; pixel centres at +0.5), `spacing_px` wide, at `depth_mm` [H, W], coloured by `image`."""
+    height, width = depth_mm.shape
+    column = np.clip(pixels[:, 0].astype(np.int64), 0, width - 1)
+    row = np.clip(pixels[:, 1].astype(np.int64), 0, height - 1)
+    smooth = cv2.GaussianBlur(image, (0, 0), max(0.3, 0.3 * spacing_px))
+    colour = smooth[row, column].astype(np.float64) / 255
+    z = depth_mm[row, column].astype(np.float64)
+    x = (pixels[:, 0] - camera.K[0, 2]) / camera.K[0, 0] * z
+    y = (pixels[:, 1] - camera.K[1, 2]) / camera.K[1, 1] * z
+    camera_to_world = np.linalg.inv(camera.world_to_camera)
+    points = np.stack([x, y, z], -1) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
+    sigma = SIGMA_IN_SPACINGS * spacing_px * z / camera.K[0, 0]
+    count = len(pixels)
+    sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = (colour - 0.5) / SH_C0
+    return Gaussians(
+        means=torch.tensor(points, dtype=torch.float32),
+        quats=torch.tensor(facing(camera_to_world[:3, :3]), dtype=torch.float32).repeat(count, 1),
+        log_scales=torch.tensor(np.log(sigma[:, None] * np.array([1, 1, THICKNESS])), dtype=torch.float32),
+        logit_opacities=torch.full((count,), math.log(0.8 / 0.2)),
+        sh=torch.tensor(sh, dtype=torch.float32),
+    )
+
+
+def facing(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternion wxyz of a rotation matrix [3, 3] (Shepperd 1978, the stable branch for any rotation)."""
+    trace_terms = np.array([np.trace(rotation), *np.diag(rotation)])
+    largest = int(np.argmax(trace_terms))
+    if largest == 0:
+        q = np.array(
+            [
+                1 + trace_terms[0],
+                rotation[2, 1] - rotation[1, 2],
+                rotation[0, 2] - rotation[2, 0],
+                rotation[1, 0] - rotation[0, 1],
+            ]
+        )
+    else:
+        i = largest - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q = np.empty(4)
+        q[0] = rotation[k, j] - rotation[j, k]
+        q[1 + i] = 1 + rotation[i, i] - rotation[j, j] - rotation[k, k]
+        q[1 + j] = rotation[j, i] + rotation[i, j]
+        q[1 + k] = rotation[k, i] + rotation[i, k]
+    return q / np.linalg.norm(q)
+
+
+def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
+    """The image with tools painted over by the tissue around them; RGB uint8 [H, W, 3]."""
+    if frame.mask is None or frame.mask.all() or not frame.mask.any():
+        return frame.image
+    tool = cv2.dilate((frame.mask == 0).astype(np.uint8), np.ones((5, 5), np.uint8))
+    return inpaint_quarter_size(frame.image, tool)
+
+
+def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Fill `hole` (non-zero) of `image`. At a quarter of the size: what lies under a tool is a guess, and large holes take seconds at full size."""
+    height, width = hole.shape
+    small = (max(1, width // 4), max(1, height // 4))
+    filled = cv2.inpaint(
+        cv2.resize(image, small, interpolation=cv2.INTER_AREA),
+        (cv2.resize(hole, small, interpolation=cv2.INTER_AREA) > 0).astype(np.uint8),
+        3,
+        cv2.INPAINT_TELEA,
+    )
+    large = cv2.resize(filled, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.where(hole[..., None] > 0, large, image).astype(np.uint8)
+
+
+def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
+    """z in millimetres for every pixel [H, W]: measured where known and not a tool, the nearest measured one elsewhere, else the default."""
+    height, width = frame.image.shape[:2]
+    if frame.depth is None:
+        return np.full((height, width), default_depth_mm, np.float32)
+    known = frame.depth > 0
+    if frame.mask is not None:
+        known &= frame.mask > 0
+    if not known.any():
+        return np.full((height, width), default_depth_mm, np.float32)
+    _, label = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.zeros(int(label.max()) + 1, np.float32)
+    nearest[label[known]] = frame.depth[known]
+    return nearest[label]

@@ -1,0 +1,85 @@
+"""The frames that a reconstructor may train on, and which of them a step takes."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsplat_core.cameras import Camera
+from gsplat_core.errors import InvalidInput
+from gsplat_core.frames import Frame
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One frame as the training step wants it."""
+
+    seq: int
+    time_s: float
+    camera: Camera
+    image: Tensor
+    """uint8 [H, W, 3]."""
+    mask: Tensor
+    """uint8 [H, W]; 1 = tissue."""
+    depth: Tensor | None
+    """float32 [H, W] in millimetres; 0 = unknown."""
+
+    @staticmethod
+    def of(frame: Frame, camera: Camera) -> Observation:
+        """A frame seen by `camera`, which has the frame's size; the frame's own pose wins over the camera's."""
+        if (frame.width_px, frame.height_px) != (camera.width_px, camera.height_px):
+            raise InvalidInput(
+                f"frame {frame.seq} is {frame.width_px}x{frame.height_px}, its camera {camera.width_px}x{camera.height_px};"
+                " scale the camera with Camera.scaled"
+            )
+        mask = np.ones(frame.image.shape[:2], np.uint8) if frame.mask is None else frame.mask
+        return Observation(
+            seq=frame.seq,
+            time_s=frame.time_s,
+            camera=camera if frame.pose is None else camera.with_pose(frame.pose),
+            image=tensor_of(frame.image),
+            mask=tensor_of(mask.astype(np.uint8, copy=False)),
+            depth=None if frame.depth is None else tensor_of(frame.depth.astype(np.float32, copy=False)),
+        )
+
+
+def tensor_of(array: NDArray) -> Tensor:
+    """A tensor that shares the array's memory when torch allows it."""
+    array = np.ascontiguousarray(array)
+    return torch.from_numpy(array if array.flags.writeable else array.copy())
+
+
+class ObservationWindow:
+    """The newest frames, bounded; draws the newest one or an older one by a seeded generator."""
+
+    def __init__(self, capacity: int, newest_share: float, seed: int) -> None:
+        self._frames: deque[Observation] = deque(maxlen=capacity)
+        self._newest_share = newest_share
+        self._random = np.random.default_rng(seed)
+
+    def add(self, observation: Observation) -> None:
+        """Make `observation` the newest; the oldest leaves a full window."""
+        self._frames.append(observation)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def schedule(self, steps: int) -> list[Observation]:
+        """Observations for the next `steps` steps. The last one is the newest frame, which is about to be shown."""
+        newest = self._frames[-1]
+        older = len(self._frames) - 1
+        if older == 0:
+            return [newest] * steps
+        to_newest = max(1, round(steps * self._newest_share))
+        chosen = [self._frames[int(i)] for i in self._random.integers(0, older, steps - to_newest)]
+        # Spread the newest frame's steps evenly among the others, ending with it.
+        order: list[Observation] = []
+        for k in range(steps):
+            newest_turn = (k + 1) * to_newest // steps > k * to_newest // steps
+            order.append(newest if newest_turn else chosen.pop())
+        return order

@@ -1,0 +1,178 @@
+"""Learns a deforming scene from frames: online as they arrive, or offline from all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsplat_core.cameras import Camera
+from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
+from gsplat_core.errors import InvalidInput
+from gsplat_core.frames import Frame
+from gsplat_core.gaussians import Gaussians
+from gsplat_core.model import Model
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.growth import gaussians_for_uncovered_tissue
+from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.observations import Observation, ObservationWindow
+from gsplat_core.training.step import TrainingStep
+
+EXTEND_AHEAD_BUMPS = 4
+"""Bumps that the online basis field keeps ahead of the newest frame: as far as a bump reaches."""
+
+
+@dataclass(frozen=True)
+class ObserveReport:
+    """What one frame changed."""
+
+    seq: int
+    steps: int
+    loss: float | None
+    """Loss of the last step, None when the frame was not trained on."""
+    gaussians: int
+
+
+class Reconstructor:
+    """Owns the model that is being learned.
+
+    Online: `observe` each frame in order, `snapshot` whenever the result is to be shown. Offline: `fit`. Deterministic: the same frames,
+    settings and seed give the same model, whatever the number of threads.
+    """
+
+    def __init__(
+        self, config: ReconstructorConfig, camera: Camera, *, seed: int = 0, recording_digest: str | None = None
+    ) -> None:
+        self.config = config
+        self.camera = camera
+        self._seed = seed
+        self._recording_digest = recording_digest
+        self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
+        self._step: TrainingStep | None = None
+        self._version = 0
+        self._first_time_s = 0.0
+        self._last_time_s = 0.0
+
+    @property
+    def gaussians(self) -> int:
+        """How many Gaussians the model has now."""
+        return 0 if self._step is None else self._step.gaussians.count
+
+    def observe(self, frame: Frame, *, steps: int | None = None, train: bool = True) -> ObserveReport:
+        """Take the next frame in order and train on it; with `train=False` only move on to its time.
+
+        `steps` overrides the configured number for this frame. Raises InvalidInput when the first frame is not to be trained on (there is
+        nothing to show yet), when time runs backwards, or when the frame does not fit the camera.
+        """
+        observation = Observation.of(frame, self.camera)
+        first = self._step is None
+        if first:
+            if not train:
+                raise InvalidInput(f"frame {frame.seq} is the first one: a model can only start from a training frame")
+            self._start(frame, observation)
+        elif observation.time_s < self._last_time_s:
+            raise InvalidInput(
+                f"frame {frame.seq} is at {observation.time_s:.3f} s, before the last one at {self._last_time_s:.3f} s;"
+                " frames must come in order"
+            )
+        assert self._step is not None
+        self._last_time_s = observation.time_s
+        self._cover_time(observation.time_s)
+        if not train:
+            return ObserveReport(frame.seq, 0, None, self.gaussians)
+        self._window.add(observation)
+        if not first:
+            self._grow(frame, observation)
+        count = steps if steps is not None else self.config.first_frame_steps if first else self.config.steps_per_frame
+        loss = None
+        for chosen in self._window.schedule(count):
+            loss = self._step(chosen)
+        return ObserveReport(frame.seq, count, loss, self.gaussians)
+
+    def fit(
+        self, frames: Iterable[Frame], steps: int, progress: Callable[[int, float], None] | None = None
+    ) -> ObserveReport:
+        """Train offline on all of `frames`, in random order, the rates decaying exponentially to a tenth.
+
+        `progress(step, loss)` is called after each step. All frames are held in memory (1 byte per channel).
+        """
+        observations = [(frame, Observation.of(frame, self.camera)) for frame in frames]
+        if not observations:
+            raise InvalidInput("there are no frames to train on")
+        first_frame, first = observations[0]
+        self._start(first_frame, first, end_s=observations[-1][1].time_s)
+        assert self._step is not None
+        self._last_time_s = observations[-1][1].time_s
+        for frame, observation in observations[1:]:
+            self._grow(frame, observation)
+        random = np.random.default_rng(self._seed)
+        order: list[int] = []
+        loss = 0.0
+        for step in range(steps):
+            if not order:
+                order = random.permutation(len(observations)).tolist()
+            loss = self._step(observations[order.pop()][1], rate_scale=0.1 ** (step / steps))
+            if progress is not None:
+                progress(step + 1, loss)
+        return ObserveReport(observations[-1][0].seq, steps, loss, self.gaussians)
+
+    def snapshot(self) -> Model:
+        """An immutable copy of the model as it is now; each one has the next version number."""
+        if self._step is None:
+            raise InvalidInput("there is no model yet: observe a frame first")
+        self._version += 1
+        gaussians, field = self._step.copy()
+        return Model(
+            version=self._version,
+            gaussians=gaussians,
+            field=field,
+            camera=self.camera,
+            time_window_s=(self._first_time_s, self._last_time_s),
+            training_digest=self._recording_digest,
+        )
+
+    def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
+        gaussians = gaussians_from_frame(
+            frame,
+            observation.camera,
+            self.config.gaussians,
+            sh_degree=self.config.sh_degree,
+            default_depth_mm=self.config.default_depth_mm,
+            seed=self._seed,
+        )
+        self._first_time_s = observation.time_s
+        self._step = TrainingStep(gaussians, self._new_field(gaussians, end_s), self.config, self.camera)
+
+    def _new_field(self, gaussians: Gaussians, end_s: float | None) -> DeformationField:
+        start = self._first_time_s
+        spacing = self.config.bump_spacing_s
+        if self.config.chosen_field == "hexplane":
+            return HexPlaneField(gaussians, (start, start + spacing if end_s is None else end_s))
+        ahead = EXTEND_AHEAD_BUMPS * spacing
+        span = ahead if end_s is None else max(end_s - start, spacing)
+        bumps = max(4, round(span / spacing) + 3)
+        return BasisField(gaussians.count, (start, start + span), bumps=bumps)
+
+    def _cover_time(self, time_s: float) -> None:
+        """Move the field's window on, so that the frame's time is inside."""
+        assert self._step is not None
+        field = self._step.field
+        start, end = field.time_window_s
+        if isinstance(field, BasisField):
+            ahead = EXTEND_AHEAD_BUMPS * field.spacing_s
+            if time_s + ahead > end:
+                field.extend((start, end + field.spacing_s + max(0.0, time_s + ahead - end)), hold=True)
+        elif time_s > end:
+            field.extend((start, start + 2 * (time_s - start)))
+
+    def _grow(self, frame: Frame, observation: Observation) -> None:
+        """Add Gaussians where the frame shows tissue that the model does not cover."""
+        assert self._step is not None
+        room = self.config.max_gaussians - self._step.gaussians.count
+        if room > 0:
+            added = gaussians_for_uncovered_tissue(
+                frame, observation, self._step.at(observation.time_s), self.config, room
+            )
+            if added is not None:
+                self._step.append(added)

@@ -1,0 +1,114 @@
+"""One optimiser step: deform, render, compare, go back, update."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsplat_core.cameras import Camera
+from gsplat_core.deformation import BasisField, BasisRates, DeformationField
+from gsplat_core.gaussians import Gaussians
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.optimiser import FusedAdam
+from gsplat_core.training.photometric import LossWeights, loss_and_gradients
+
+
+class TrainingStep:
+    """The scene being learned, its optimiser, and the step that improves it by one frame.
+
+    What a field adds to a Gaussian's raw parameters has the same gradient as those parameters, so the picture's gradient is taken once, at
+    the deformed Gaussians, and handed to both. No autograd graph is built for the basis field.
+    """
+
+    def __init__(
+        self, gaussians: Gaussians, field: DeformationField, config: ReconstructorConfig, camera: Camera
+    ) -> None:
+        self.gaussians = gaussians
+        self.field = field
+        self._config = config
+        self._weights = LossWeights(config.ssim_weight, config.depth_weight)
+        # World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres.
+        centre = torch.from_numpy(camera.world_to_camera).float()
+        distance = (
+            (gaussians.means @ centre[2, :3] + centre[2, 3]).abs().median() if gaussians.count else torch.ones(())
+        )
+        self._pixel_mm = float(distance) / float(camera.K[0, 0])
+        self._adam = FusedAdam(gaussians.tensors())
+        self._network_adam = self._new_network_adam()
+
+    def __call__(self, observation: Observation, rate_scale: float = 1.0) -> float:
+        """Train on one observation; returns its loss before the update."""
+        if isinstance(self.field, BasisField):
+            return self._basis_step(self.field, observation, rate_scale)
+        return self._network_step(observation, rate_scale)
+
+    def at(self, time_s: float) -> Gaussians:
+        """The scene at a time, as it is now."""
+        with torch.no_grad():
+            return self.field(self.gaussians, time_s)
+
+    def copy(self) -> tuple[Gaussians, DeformationField]:
+        """Gaussians and field with memory of their own, free of training state."""
+        return self.gaussians.detach().clone(), self.field.detached_copy()
+
+    def append(self, added: Gaussians) -> None:
+        """Add Gaussians, which start still."""
+        self.gaussians = self.gaussians.append(added)
+        self.field.append(added)
+        self._adam.append(self.gaussians.tensors())
+
+    def _basis_step(self, field: BasisField, observation: Observation, rate_scale: float) -> float:
+        deformed = self.at(observation.time_s)
+        loss, gradients = loss_and_gradients(deformed, observation, self._weights)
+        rates = self._config.rates
+        deltas = torch.cat(
+            [gradients["means"], gradients["quats"], gradients["log_scales"], gradients["sh"][:, 0]], dim=1
+        )
+        field.adam_step(
+            observation.time_s,
+            deltas,
+            BasisRates(
+                position=rates.basis_means_px * self._pixel_mm * rate_scale,
+                rotation=rates.basis_quats * rate_scale,
+                log_scale=rates.basis_log_scales * rate_scale,
+                colour=rates.basis_sh * rate_scale,
+                centers=rates.basis_timing * rate_scale,
+                widths=rates.basis_timing * rate_scale,
+            ),
+        )
+        self._update_gaussians(gradients, rate_scale)
+        return loss
+
+    def _network_step(self, observation: Observation, rate_scale: float) -> float:
+        canonical = self.gaussians.detach().requires_grad_()
+        with torch.enable_grad():
+            deformed = self.field(canonical, observation.time_s)
+        loss, gradients = loss_and_gradients(deformed.detach(), observation, self._weights)
+        pairs = [(t, gradients[name]) for name, t in deformed.tensors().items() if t.requires_grad]
+        torch.autograd.backward([t for t, _ in pairs], [g for _, g in pairs])
+        assert self._network_adam is not None
+        self._network_adam.zero_missing()
+        for group in self._network_adam.param_groups:
+            group["lr"] = group["rate"] * rate_scale
+        self._network_adam.step()
+        self._network_adam.zero_grad(set_to_none=True)
+        own = {name: t.grad for name, t in canonical.tensors().items()}
+        self._update_gaussians(
+            {name: g if g is not None else torch.zeros_like(getattr(canonical, name)) for name, g in own.items()},
+            rate_scale,
+        )
+        return loss
+
+    def _update_gaussians(self, gradients: dict[str, Tensor], rate_scale: float) -> None:
+        rates = self._config.rates
+        self._adam.step(
+            gradients,
+            {
+                "means": rates.means_px * self._pixel_mm * rate_scale,
+                "quats": rates.quats * rate_scale,
+                "log_scales": rates.log_scales * rate_scale,
+                "logit_opacities": rates.logit_opacities * rate_scale,
+                "sh": rates.sh * rate_scale,
+            },
+        )
