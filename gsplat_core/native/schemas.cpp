@@ -20,4 +20,12 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor(d!) m_centers, Tensor(e!) m_log_widths, Tensor(f!) m_weights, Tensor(g!) v_centers, Tensor(h!) v_log_widths, "
       "Tensor(i!) v_weights, Tensor(j!) steps, float position_rate, float rotation_rate, float scale_rate, float colour_rate, "
       "float center_rate, float width_rate, float beta1, float beta2, float epsilon) -> ()");
+
+  // HexPlane features of one level: the product of six plane samples [N, C], its gradients, and the parts used for inference.
+  m.def("hexplane_features(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
+  m.def(
+      "hexplane_features_backward(Tensor gradient, Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, "
+      "Tensor zt) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+  m.def("hexplane_space(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz) -> Tensor");
+  m.def("hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
 }
