@@ -6,6 +6,7 @@ the CPU. Gradients are the same for any number of threads.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -38,6 +39,24 @@ def hexplane_modulate(space: Tensor, coordinates: Tensor, xt: Tensor, yt: Tensor
     return torch.ops.gsplat_core.hexplane_modulate(space, coordinates, xt, yt, zt)
 
 
+def hexplane_decode(
+    spaces: Sequence[Tensor],
+    coordinates: Tensor,
+    lines: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+) -> Tensor:
+    """Features of all levels (`spaces` [N, C], times three `lines` [U, C] each when given) through an MLP: [N, outputs].
+
+    For inference (not differentiable): a block of Gaussians passes all layers without leaving the cache. Arguments as
+    `gsplat_core.reference.hexplane_decode`; RuntimeError when the layers do not fit together.
+    """
+    for tensor in (coordinates, *spaces, *lines, *weights, *biases):
+        if tensor.dtype != torch.float32:
+            raise InvalidInput(f"got {tensor.dtype}; this op is float32, gsplat_core.reference has every dtype")
+    return torch.ops.gsplat_core.hexplane_decode(list(spaces), coordinates, list(lines), list(weights), list(biases))
+
+
 def _check(coordinates: Tensor, planes: tuple[Tensor, ...], dims: int) -> None:
     if coordinates.dim() != 2 or coordinates.shape[1] != 4:
         raise InvalidInput(f"coordinates must be [N, 4] (x, y, z, t), got {list(coordinates.shape)}")
@@ -68,6 +87,13 @@ def _(coordinates: Tensor, xy: Tensor, xz: Tensor, yz: Tensor) -> Tensor:
 @torch.library.register_fake("gsplat_core::hexplane_modulate")
 def _(space: Tensor, coordinates: Tensor, xt: Tensor, yt: Tensor, zt: Tensor) -> Tensor:
     return space.new_empty(space.shape)
+
+
+@torch.library.register_fake("gsplat_core::hexplane_decode")
+def _(
+    spaces: list[Tensor], coordinates: Tensor, lines: list[Tensor], weights: list[Tensor], biases: list[Tensor]
+) -> Tensor:
+    return coordinates.new_empty(coordinates.shape[0], weights[-1].shape[0])
 
 
 def _setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:

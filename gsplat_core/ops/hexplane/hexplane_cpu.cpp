@@ -1,5 +1,6 @@
 // Channels are side by side in memory, so each corner of a bilinear sample is one run of vectors.
 #include "hexplane.h"
+#include "line_position.h"
 #include "simd_partial.h"
 
 namespace GSPLAT_ISA {
@@ -12,25 +13,8 @@ struct Corners {
   float du, dv;                        // cells per unit of the coordinate, zero at the border and beyond
 };
 
-struct Position {
-  int64_t cell;
-  float fraction, slope;
-};
-
-// NaN lands in the first cell with a NaN fraction, so that it shows in the result and nothing outside is read.
-GSPLAT_INLINE Position position_on(float coordinate, int32_t size) {
-  const float scale = 0.5f * float(size - 1);
-  const float unclamped = (coordinate + 1.0f) * scale;
-  float at = unclamped;
-  if (at < 0.0f) at = 0.0f;
-  if (at > float(size - 1)) at = float(size - 1);
-  int64_t cell = at >= 0.0f ? int64_t(at) : 0;
-  if (cell > size - 2) cell = size > 1 ? size - 2 : 0;
-  return {cell, at - float(cell), unclamped > 0.0f && unclamped < float(size - 1) ? scale : 0.0f};
-}
-
 GSPLAT_INLINE Corners corners_of(const FeaturePlane& plane, float u, float v, int64_t channels) {
-  const Position a = position_on(u, plane.width), b = position_on(v, plane.height);
+  const LinePosition a = position_on(u, plane.width), b = position_on(v, plane.height);
   const int64_t right = plane.width > 1 ? channels : 0, below = plane.height > 1 ? plane.width * channels : 0;
   const float* p = plane.values + (b.cell * plane.width + a.cell) * channels;
   return {p, p + right, p + below, p + right + below, a.fraction, b.fraction, a.slope, b.slope};
@@ -128,7 +112,7 @@ void modulate(const HexPlanes& level, const float* space, float* features, int64
     float fraction[3];
     for (int axis = 0; axis < 3; ++axis) {
       const FeaturePlane& line = level.planes[axis];
-      const Position at = position_on(level.coordinates[n * 4 + axis], line.width);
+      const LinePosition at = position_on(level.coordinates[n * 4 + axis], line.width);
       left[axis] = line.values + at.cell * channels;
       right[axis] = line.width > 1 ? channels : 0;
       fraction[axis] = at.fraction;
