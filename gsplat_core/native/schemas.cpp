@@ -44,9 +44,11 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def("isect_offset_encode(Tensor isect_ids, int images, int tile_width, int tile_height) -> Tensor");
 
   // Compositing: splats over pixels. `last` is the last blended position of flatten_ids per pixel, -1 where there is none.
+  // `absgrad_probe` is not read: its gradient is the sum over pixels of |dL/dmeans2d|.
   m.def(
       "composite(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor isect_offsets, Tensor flatten_ids, "
-      "Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size) -> (Tensor colors, Tensor alphas, Tensor last)");
+      "Tensor? backgrounds, Tensor? masks, Tensor? absgrad_probe, int width, int height, int tile_size) -> "
+      "(Tensor colors, Tensor alphas, Tensor last)");
   m.def(
       "composite_backward(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor isect_offsets, "
       "Tensor flatten_ids, Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size, Tensor alphas, Tensor last, "
