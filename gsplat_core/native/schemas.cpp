@@ -15,7 +15,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "project_gaussians(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
       "Tensor Ks, int width, int height, float eps2d, float near_plane, float far_plane, float radius_clip, bool compensate, "
-      "int camera_model) -> (Tensor radii, Tensor means2d, Tensor depths, Tensor conics, Tensor compensations)");
+      "int camera_model) -> (Tensor means2d, Tensor depths, Tensor conics, Tensor compensations, Tensor radii)");
   m.def(
       "project_gaussians_backward(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor viewmats, Tensor Ks, "
       "Tensor radii, Tensor? v_means2d, Tensor? v_depths, Tensor? v_conics, Tensor? v_compensations, int width, int height, "
