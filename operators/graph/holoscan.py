@@ -9,7 +9,7 @@ Hazards of the SDK (4.6) and what is done about them:
   while an operator could go on raises EngineError.
 - `stop_execution` does not wake a graph that waits for an event: stopping goes through the gates.
 - The greedy scheduler sleeps through events until the next appointed time: appointments are kept short.
-- The greedy scheduler gives up when a check has just changed what another may do: it is told to look again.
+- Its schedulers give up before they have seen what a check or a thread just changed: they wait half a second first.
 - An exception in compute can end a run silently: none ever reaches the SDK.
 - It drops without counting: edges keep the policy themselves, and the SDK's queues never overflow.
 """
@@ -25,7 +25,7 @@ from operators.graph.conditions import SchedulingStatus
 from operators.graph.graph import Graph, Scheduler
 from operators.graph.greedy import GreedyScheduler
 from operators.graph.multithread import MultiThreadScheduler
-from operators.graph.queues import LockedEdge, Message
+from operators.graph.queues import CarriedEdge
 from operators.graph.sdk import load_sdk
 from operators.graph.spec import QueuePolicy
 from operators.graph.task import OperatorTask
@@ -38,38 +38,7 @@ _PortCondition = _sdk.core.ConditionType
 _QUEUE = _sdk.core.IOSpec.ConnectorType.DOUBLE_BUFFER
 _STATUS = {status: getattr(_sdk.core.SchedulingStatusType, status.name) for status in SchedulingStatus}
 _APPOINTMENT_NS = 10_000_000
-_GIVE_UP_MS = 20
-
-
-class HoloscanEdge(LockedEdge):
-    """An edge whose messages travel through the SDK.
-
-    The queue here mirrors the SDK's, counts and applies the policy. When `drop_oldest` makes room, no further message
-    is sent: the one under way stands for what is then the oldest.
-    """
-
-    port = ""
-    sender: Any = None
-    receiver: Any = None
-
-    def push(self, message: Message) -> None:
-        """As Edge.push."""
-        with self._lock:
-            length = len(self.queue)
-            super().push(message)
-            grown = len(self.queue) > length
-        if grown:
-            self.sender.emit(message, self.port)
-
-    def pop(self) -> Message | None:
-        """As Edge.pop."""
-        carried = self.receiver.receive(self.port)
-        if carried is None:
-            return None
-        message = super().pop()
-        if self.policy is QueuePolicy.BLOCK and message is not carried:
-            raise EngineError(f"the Holoscan SDK delivered another message on {self.name} than was due")
-        return message
+_GIVE_UP_MS = 500
 
 
 class Gate(_Condition):
@@ -80,15 +49,6 @@ class Gate(_Condition):
         self.ready_at_ns = 0
         self.checked = False
         super().__init__(fragment, name=f"{task.name}_gate")
-
-    def setup(self, spec: Any) -> None:
-        """No parameters."""
-
-    def update_state(self, timestamp: int) -> None:
-        """The state is the task's."""
-
-    def on_execute(self, timestamp: int) -> None:
-        """OperatorTask.tick tells the conditions."""
 
     def check(self, timestamp: int) -> tuple[Any, int | None]:
         """May the operator compute, as far as the SDK cannot tell from its queues?"""
@@ -115,8 +75,8 @@ class Bridge(_Operator):
 
     def __init__(self, fragment: Any, task: OperatorTask, gate: Gate) -> None:
         self.task, self.gate = task, gate
-        self.in_edges = cast("list[HoloscanEdge]", task.in_edges)
-        self.out_edges = cast("list[HoloscanEdge]", task.out_edges)
+        self.in_edges = cast("list[CarriedEdge]", task.in_edges)
+        self.out_edges = cast("list[CarriedEdge]", task.out_edges)
         super().__init__(fragment, gate, name=task.name)
 
     def setup(self, spec: Any) -> None:
@@ -162,9 +122,9 @@ class HoloscanScheduler:
         self._gates: list[Gate] = []
         self._edge_count = 0
 
-    def make_edge(self, name: str, capacity: int, policy: QueuePolicy) -> HoloscanEdge:
+    def make_edge(self, name: str, capacity: int, policy: QueuePolicy) -> CarriedEdge:
         """An edge with a port name of its own."""
-        edge = HoloscanEdge(name, capacity, policy, self._lock)
+        edge = CarriedEdge(name, capacity, policy, self._lock)
         self._edge_count += 1
         edge.port = f"edge{self._edge_count}"
         return edge
@@ -219,7 +179,7 @@ class HoloscanScheduler:
                 for bridge in bridges.values():
                     self.add_operator(bridge)
                 for producer, edge, consumer in graph.ends:
-                    port = cast("HoloscanEdge", edge).port
+                    port = cast("CarriedEdge", edge).port
                     self.add_flow(bridges[producer], bridges[consumer], {(port, port)})
 
         app = Composed()

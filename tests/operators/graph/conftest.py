@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import faulthandler
+import itertools
 import os
 import threading
 from collections.abc import Callable, Iterable
@@ -140,7 +141,7 @@ class Wired(Application):
 
     def chain(self, *operators: Operator, **kwargs: Any) -> None:
         """Connect one after the other."""
-        for one, other in zip(operators, operators[1:], strict=False):
+        for one, other in itertools.pairwise(operators):
             self.add_flow(one, other, **kwargs)
 
 
@@ -151,7 +152,7 @@ def guarded(call: Callable[[], Any], timeout_s: float = GUARD_S, on_hang: Callab
     def work() -> None:
         try:
             outcome["value"] = call()
-        except BaseException as error:  # raised again in the test's thread
+        except BaseException as error:  # noqa: BLE001 - raised again in the test's thread
             outcome["error"] = error
 
     thread = threading.Thread(target=work, daemon=True, name="guarded")
@@ -197,7 +198,7 @@ class Runner:
         def work() -> None:
             try:
                 outcome.append(run(app, self.engine))
-            except Exception as error:  # for the test to look at
+            except Exception as error:  # noqa: BLE001 - for the test to look at
                 outcome.append(error)
 
         thread = threading.Thread(target=work, daemon=True)
