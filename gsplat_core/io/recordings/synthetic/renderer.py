@@ -189,7 +189,7 @@ def _upsample(coarse: Array, rows: int, columns: int, step: int) -> Array:
 def _shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8]) -> Array:
     """Linear radiance [N, 3] of the tool: dark polymer shaft, brushed steel that mirrors the pink surroundings."""
     metal = (material != SHAFT)[:, None]
-    base = np.where(metal, np.array([0.20, 0.205, 0.22], np.float32), np.array([0.085, 0.093, 0.108], np.float32))
+    base = np.where(metal, np.array([0.26, 0.265, 0.28], np.float32), np.array([0.085, 0.093, 0.108], np.float32))
     base = np.where((material == RING)[:, None], np.array([0.10, 0.105, 0.12], np.float32), base)
     gloss = np.where(metal[:, 0], np.float32(64), np.float32(14))
     glint = np.where(metal[:, 0], np.float32(2.6), np.float32(0.16))

@@ -180,12 +180,15 @@ def _write(
 
     rows, tracks = [], []
     # A frame depends on its index alone, so the order in which threads finish does not matter.
-    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+    pool = ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1))
+    try:
         for done, (row, track) in enumerate(pool.map(write_frame, range(frames)), start=1):
             rows.append(row)
             tracks.append(track)
             if progress is not None:
                 progress(done, frames)
+    finally:
+        pool.shutdown(cancel_futures=True)  # after Ctrl-C or a full disk the frames not begun are not rendered
     np.save(folder / "poses_bounds.npy", np.stack(rows))
     np.save(folder / "tracks.npy", np.stack(tracks).astype(np.float32))
 
