@@ -200,8 +200,9 @@ def test_parameters_become_attributes(kit):
         Ports(app, ports=declare)
     with pytest.raises(GraphInvalid, match=r"has no parameter 'stepz'; it has \['path', 'steps'\]"):
         Ports(app, ports=declare, path="", stepz=1)
-    with pytest.raises(GraphInvalid, match="would hide an attribute"):
-        Ports(app, ports=lambda spec: spec.param("metadata", None))
+    for taken in ("metadata", "start", "fault_policy"):
+        with pytest.raises(GraphInvalid, match=f"parameter '{taken}' would hide an attribute"):
+            Ports(app, ports=lambda spec, taken=taken: spec.param(taken, None))
 
 
 def test_conditions_are_positional(kit):
