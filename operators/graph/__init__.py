@@ -1,0 +1,74 @@
+"""The operator graph, with the Python surface of NVIDIA's Holoscan SDK.
+
+Operators written for it run on our own schedulers and on the Holoscan SDK. Nothing here imports the SDK until
+`run(app, engine="holoscan")`.
+"""
+
+from operators.graph.application import Application, Fragment
+from operators.graph.clock import Clock, ManualClock, RealtimeClock
+from operators.graph.conditions import (
+    AsynchronousCondition,
+    AsynchronousEventState,
+    BooleanCondition,
+    Condition,
+    CountCondition,
+    DownstreamMessageAffordableCondition,
+    MessageAvailableCondition,
+    PeriodicCondition,
+    PeriodicConditionPolicy,
+    SchedulingStatus,
+)
+from operators.graph.engines import Engine, run
+from operators.graph.faults import DISABLE_BRANCH, STOP_GRAPH, Fault, FaultAction, FaultPolicy
+from operators.graph.graph import RunResult, StopReason
+from operators.graph.greedy import GreedyScheduler
+from operators.graph.metadata import MetadataPolicy
+from operators.graph.multithread import MultiThreadScheduler
+from operators.graph.operator import Operator
+from operators.graph.queues import EdgeStats
+from operators.graph.spec import REQUIRED, ConditionType, ConnectorType, IOSpec, OperatorSpec, QueuePolicy
+from operators.graph.task import ExecutionContext, InputContext, OutputContext
+from operators.graph.tracking import DurationSummary, FlowTracker
+
+__all__ = [
+    "DISABLE_BRANCH",
+    "REQUIRED",
+    "STOP_GRAPH",
+    "Application",
+    "AsynchronousCondition",
+    "AsynchronousEventState",
+    "BooleanCondition",
+    "Clock",
+    "Condition",
+    "ConditionType",
+    "ConnectorType",
+    "CountCondition",
+    "DownstreamMessageAffordableCondition",
+    "DurationSummary",
+    "EdgeStats",
+    "Engine",
+    "ExecutionContext",
+    "Fault",
+    "FaultAction",
+    "FaultPolicy",
+    "FlowTracker",
+    "Fragment",
+    "GreedyScheduler",
+    "IOSpec",
+    "InputContext",
+    "ManualClock",
+    "MessageAvailableCondition",
+    "MetadataPolicy",
+    "MultiThreadScheduler",
+    "Operator",
+    "OperatorSpec",
+    "OutputContext",
+    "PeriodicCondition",
+    "PeriodicConditionPolicy",
+    "QueuePolicy",
+    "RealtimeClock",
+    "RunResult",
+    "SchedulingStatus",
+    "StopReason",
+    "run",
+]

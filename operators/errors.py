@@ -1,0 +1,86 @@
+"""Errors of the operators. Each says what happened, the value that was seen, and what to do.
+
+OperatorsError
+├── GraphError
+│   ├── GraphInvalid (also ValueError)     the graph cannot be built: names, ports, types, connections
+│   ├── PortError (also ValueError)        compute used a port that is not there, or emitted a value of another type
+│   ├── QueueFull                          more was emitted into a blocking edge than it holds
+│   ├── MetadataConflict                   two messages of one compute disagree under MetadataPolicy.RAISE
+│   ├── OperatorFailed                     an operator raised; names the operator and the frame
+│   ├── OperatorStuck                      an operator did not return from compute when the graph stopped
+│   ├── GraphDeadlock                      nothing can go on although not everything is done; says who waits on what
+│   └── GraphBusy                          run() while the application already runs
+└── EngineError
+    ├── EngineMissing                      the engine's package is not installed or cannot be loaded
+    └── EngineUnsupported                  the engine cannot run this graph faithfully
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+
+class OperatorsError(Exception):
+    """Base of everything the operators raise on purpose."""
+
+
+class GraphError(OperatorsError):
+    """Building or running an operator graph went wrong."""
+
+
+class GraphInvalid(GraphError, ValueError):
+    """The graph cannot be built; raised before any operator runs."""
+
+
+class PortError(GraphError, ValueError):
+    """compute used a port that is not there, or emitted a value of another type than the port declares."""
+
+
+class QueueFull(GraphError):
+    """More was emitted into a blocking edge than it holds."""
+
+
+class MetadataConflict(GraphError):
+    """Two messages of one compute disagree on a key under MetadataPolicy.RAISE."""
+
+
+class OperatorFailed(GraphError):
+    """An operator raised. The original exception is the `__cause__`.
+
+    `operator` is its name, `phase` the method that raised, `seq` the frame it worked on (None when unknown).
+    """
+
+    def __init__(self, operator: str, phase: str, cause: BaseException, seq: int | None = None) -> None:
+        frame = "" if seq is None else f" on frame {seq}"
+        super().__init__(f"operator {operator!r} failed in {phase}{frame}: {type(cause).__name__}: {cause}")
+        self.operator, self.phase, self.seq = operator, phase, seq
+        self.__cause__ = cause
+
+
+class OperatorStuck(GraphError):
+    """An operator did not return from compute within the scheduler's stop timeout."""
+
+
+class GraphDeadlock(GraphError):
+    """Nothing can go on although not everything is done. `waiting` maps each operator to what it waits for."""
+
+    def __init__(self, waiting: Mapping[str, str]) -> None:
+        lines = "; ".join(f"{name} waits for {what}" for name, what in waiting.items())
+        super().__init__(f"the graph is in deadlock: {lines}. Enlarge a queue, or make an input optional to compute.")
+        self.waiting = dict(waiting)
+
+
+class GraphBusy(GraphError):
+    """The application already runs."""
+
+
+class EngineError(OperatorsError):
+    """An engine cannot run the graph."""
+
+
+class EngineMissing(EngineError):
+    """The engine's package is not installed or cannot be loaded."""
+
+
+class EngineUnsupported(EngineError):
+    """The engine cannot run this graph faithfully."""

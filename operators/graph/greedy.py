@@ -1,0 +1,80 @@
+"""The single-threaded scheduler: deterministic, and the one that replays."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING, Any
+
+from operators.graph.clock import Clock, ManualClock, RealtimeClock
+from operators.graph.conditions import SchedulingStatus
+from operators.graph.queues import Edge
+from operators.graph.spec import QueuePolicy
+
+if TYPE_CHECKING:
+    from operators.graph.graph import Graph
+
+
+class GreedyScheduler:
+    """Goes round the operators in topological order; each computes once per round if it may.
+
+    Everything happens in the thread that calls run(). The order of computes depends only on the graph and on what
+    the operators do, so with a ManualClock a replay has the same result each time.
+    """
+
+    def __init__(self, fragment: Any = None, *, clock: Clock | None = None, name: str = "greedy_scheduler") -> None:
+        self.clock: Clock = clock or RealtimeClock()
+        self.name = name
+        self._woken = threading.Event()
+
+    def make_edge(self, name: str, capacity: int, policy: QueuePolicy) -> Edge:
+        """One thread: no locks."""
+        return Edge(name, capacity, policy)
+
+    def wake(self) -> None:
+        """Look again; from any thread."""
+        self._woken.set()
+
+    def execute(self, graph: Graph) -> None:
+        """Compute round by round."""
+        ready, wait_time, never = SchedulingStatus.READY, SchedulingStatus.WAIT_TIME, SchedulingStatus.NEVER
+        wait_event = SchedulingStatus.WAIT_EVENT
+        timestamp = self.clock.timestamp
+        live = [task for task in graph.tasks if not task.finished]
+        while live:
+            progressed = event_awaited = False
+            due_ns: int | None = None
+            for task in live:
+                if graph.stopping:
+                    return
+                now_ns = timestamp() if task.conditions else 0
+                status, at_ns = task.poll(now_ns)
+                if status is ready:
+                    task.tick(now_ns)
+                    progressed = True
+                elif status is never:
+                    task.finish()
+                    progressed = True
+                elif status is wait_time:
+                    due_ns = at_ns if due_ns is None else min(due_ns, at_ns)
+                elif status is wait_event:
+                    event_awaited = True
+            if progressed:
+                live = [task for task in live if not task.finished]
+            elif not self._await(due_ns, event_awaited):
+                graph.declare_deadlock(timestamp())
+                return
+
+    def _await(self, due_ns: int | None, event_awaited: bool) -> bool:
+        """Nobody could compute: wait for the time or the event. False when neither is to come."""
+        if self._woken.is_set():
+            self._woken.clear()
+        elif due_ns is not None:
+            if isinstance(self.clock, ManualClock):
+                self.clock.advance_to(due_ns)
+            else:
+                self._woken.wait(max(0, due_ns - self.clock.timestamp()) * 1e-9)
+        elif event_awaited:
+            self._woken.wait()
+        else:
+            return False
+        return True

@@ -1,0 +1,134 @@
+"""The multi-threaded scheduler: a thread per operator, woken by what happens on its edges; nothing polls."""
+
+from __future__ import annotations
+
+import threading
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from operators.errors import GraphInvalid, OperatorStuck
+from operators.graph.clock import Clock, ManualClock, RealtimeClock
+from operators.graph.conditions import SchedulingStatus
+from operators.graph.queues import LockedEdge
+from operators.graph.spec import QueuePolicy
+
+if TYPE_CHECKING:
+    from operators.graph.graph import Graph
+    from operators.graph.task import OperatorTask
+
+
+class MultiThreadScheduler:
+    """Operators compute side by side. An operator itself computes in one thread, one compute at a time.
+
+    When the graph stops, operators get `stop_timeout_s` to return from compute; else run() raises OperatorStuck
+    naming them (their threads are daemons and do not keep the process alive).
+    """
+
+    def __init__(
+        self,
+        fragment: Any = None,
+        *,
+        clock: Clock | None = None,
+        stop_timeout_s: float = 30.0,
+        name: str = "multithread_scheduler",
+    ) -> None:
+        if isinstance(clock, ManualClock):
+            raise GraphInvalid("a ManualClock needs the GreedyScheduler: with threads its time would be a race")
+        self.clock: Clock = clock or RealtimeClock()
+        self.name = name
+        self.stop_timeout_s = stop_timeout_s
+        # Reentrant: a condition may be changed, and so wake us, while it is being checked.
+        self._lock = threading.RLock()
+        self._over = threading.Event()
+        self._wakers: dict[OperatorTask, threading.Condition] = {}
+        self._asleep: dict[OperatorTask, SchedulingStatus] = {}
+        self._interrupt: BaseException | None = None
+
+    def make_edge(self, name: str, capacity: int, policy: QueuePolicy) -> LockedEdge:
+        """An edge that wakes the operators at its ends."""
+        return LockedEdge(name, capacity, policy, self._lock)
+
+    def wake(self) -> None:
+        """Every operator looks again; from any thread."""
+        with self._lock:
+            for task in tuple(self._asleep):
+                self._rouse(task)
+
+    def execute(self, graph: Graph) -> None:
+        """Run the operators' threads until all have ended."""
+        self._over.clear()
+        self._interrupt = None
+        self._asleep = {}
+        self._wakers = {task: threading.Condition(self._lock) for task in graph.tasks}
+        for producer, edge, consumer in graph.ends:
+            assert isinstance(edge, LockedEdge)
+            edge.wake_producer = partial(self._rouse, producer)
+            edge.wake_consumer = partial(self._rouse, consumer)
+        threads = [
+            threading.Thread(target=self._work, args=(graph, task), name=task.name, daemon=True)
+            for task in graph.tasks
+            if not task.finished
+        ]
+        try:
+            for thread in threads:
+                thread.start()
+            self._over.wait()
+        finally:
+            graph.stop()
+            self._join(threads)
+        if self._interrupt is not None:
+            raise self._interrupt
+
+    def _work(self, graph: Graph, task: OperatorTask) -> None:
+        """The life of one operator's thread."""
+        try:
+            while (now_ns := self._await_ready(graph, task)) is not None:
+                task.tick(now_ns)
+        except BaseException as error:  # noqa: BLE001 - carried to the thread that called run()
+            self._interrupt = self._interrupt or error
+            graph.stop()
+        if graph.stopping or all(other.finished for other in graph.tasks):
+            self._over.set()
+
+    def _await_ready(self, graph: Graph, task: OperatorTask) -> int | None:
+        """The time at which the operator was found ready, or None when its thread is to end."""
+        with self._lock:
+            while not graph.stopping:
+                now_ns = self.clock.timestamp() if task.conditions else 0
+                status, due_ns = task.poll(now_ns)
+                if status is SchedulingStatus.READY:
+                    return now_ns
+                if status is SchedulingStatus.NEVER:
+                    task.finish()
+                    self.wake()
+                    self._check_deadlock(graph)
+                    return None
+                self._asleep[task] = status
+                self._check_deadlock(graph)
+                if graph.stopping:
+                    break
+                timed = status is SchedulingStatus.WAIT_TIME
+                self._wakers[task].wait(max(0, due_ns - self.clock.timestamp()) * 1e-9 if timed else None)
+                self._asleep.pop(task, None)
+            return None
+
+    def _rouse(self, task: OperatorTask) -> None:
+        """Wake one operator if it sleeps; under the lock."""
+        # Taken off the list here and not by its thread, so that nobody takes it for asleep before the thread runs.
+        if self._asleep.pop(task, None) is not None:
+            self._wakers[task].notify()
+
+    def _check_deadlock(self, graph: Graph) -> None:
+        """Under the lock: everyone sleeps and neither a time nor an event will wake anyone."""
+        live = [task for task in graph.tasks if not task.finished]
+        if live and all(self._asleep.get(task) is SchedulingStatus.WAIT for task in live):
+            graph.declare_deadlock(self.clock.timestamp())
+            self._over.set()
+
+    def _join(self, threads: list[threading.Thread]) -> None:
+        deadline_ns = self.clock.timestamp() + int(self.stop_timeout_s * 1e9)
+        for thread in threads:
+            thread.join(max(0, deadline_ns - self.clock.timestamp()) * 1e-9)
+        stuck = [thread.name for thread in threads if thread.is_alive()]
+        if stuck:
+            raise OperatorStuck(f"still in compute {self.stop_timeout_s} s after the graph stopped: {', '.join(stuck)}")

@@ -1,0 +1,166 @@
+"""What an operator declares in `setup`: ports, their conditions and queues, parameters."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Any, ClassVar
+
+from operators.errors import GraphInvalid
+
+
+class ConditionType(Enum):
+    """What a port asks of its queue before the operator computes."""
+
+    NONE = "none"
+    """Nothing: compute goes on with an empty input, or with a full output."""
+    MESSAGE_AVAILABLE = "message_available"
+    """An input has `min_size` messages (the default of inputs)."""
+    DOWNSTREAM_MESSAGE_AFFORDABLE = "downstream_message_affordable"
+    """Every blocking edge of an output has room for `min_size` messages (the default of outputs)."""
+
+
+class QueuePolicy(Enum):
+    """What an edge does with a message when it is full."""
+
+    BLOCK = "block"
+    """Nothing is lost: upstream does not compute until there is room. Emitting more than fits raises QueueFull."""
+    DROP_OLDEST = "drop_oldest"
+    """The newest wins: the oldest message gives way and is counted."""
+    DROP_NEW = "drop_new"
+    """The message is not taken and is counted."""
+    # Holoscan's names for the same.
+    FAULT = "block"  # noqa: PIE796
+    POP = "drop_oldest"  # noqa: PIE796
+    REJECT = "drop_new"  # noqa: PIE796
+
+
+class ConnectorType(Enum):
+    """How an edge holds its messages; both are the same bounded queue."""
+
+    DEFAULT = "default"
+    DOUBLE_BUFFER = "double_buffer"
+
+
+PolicyLike = QueuePolicy | str | None
+_Connector = ConnectorType
+
+
+class IOSpec:
+    """One port. `condition` and `connector` return the port, so that they chain."""
+
+    ANY_SIZE: ClassVar[int] = -1
+    """Size of an input that takes any number of connections; `receive` returns a tuple, one entry per connection."""
+    ConnectorType = ConnectorType
+    QueuePolicy = QueuePolicy
+
+    def __init__(self, name: str, *, is_input: bool, size: int, policy: PolicyLike, type: Any, optional: bool) -> None:
+        if size < 1 and not (is_input and size == IOSpec.ANY_SIZE):
+            raise GraphInvalid(f"port {name!r}: size must be at least 1, got {size}")
+        self.name, self.is_input, self.size, self.type, self.optional = name, is_input, size, type, optional
+        self.policy = queue_policy(policy)
+        self.condition_type = (
+            ConditionType.MESSAGE_AVAILABLE if is_input else ConditionType.DOWNSTREAM_MESSAGE_AFFORDABLE
+        )
+        # Holoscan's default: a port of size n hands over n messages at once.
+        self.min_size = max(1, size) if is_input else 1
+        self.capacity = max(1, size)
+
+    def condition(self, kind: ConditionType, *, min_size: int = 1) -> IOSpec:
+        """Replace the port's condition."""
+        own = ConditionType.MESSAGE_AVAILABLE if self.is_input else ConditionType.DOWNSTREAM_MESSAGE_AFFORDABLE
+        if kind not in (own, ConditionType.NONE):
+            raise GraphInvalid(f"port {self.name!r}: condition {kind.name} does not fit, use {own.name} or NONE")
+        if min_size < 1:
+            raise GraphInvalid(f"port {self.name!r}: min_size must be at least 1, got {min_size}")
+        self.condition_type, self.min_size = kind, min_size
+        return self
+
+    def connector(self, kind: _Connector, *, capacity: int | None = None, policy: PolicyLike = None) -> IOSpec:
+        """Set the capacity and the policy of the edges into this input."""
+        if not self.is_input:
+            raise GraphInvalid(f"port {self.name!r}: a queue belongs to the input it feeds, or to add_flow(capacity=)")
+        if capacity is not None:
+            if capacity < 1:
+                raise GraphInvalid(f"port {self.name!r}: capacity must be at least 1, got {capacity}")
+            self.capacity = capacity
+        if policy is not None:
+            self.policy = queue_policy(policy)
+        return self
+
+    @property
+    def batched(self) -> bool:
+        """Whether `receive` returns a tuple."""
+        return self.size != 1
+
+
+class _Required:
+    def __repr__(self) -> str:
+        return "REQUIRED"
+
+
+REQUIRED = _Required()
+"""Default of a parameter that has none."""
+
+
+class OperatorSpec:
+    """Collects what `setup` declares. Names are unique per direction."""
+
+    def __init__(self, owner: str = "operator") -> None:
+        self.owner = owner
+        self.inputs: dict[str, IOSpec] = {}
+        self.outputs: dict[str, IOSpec] = {}
+        self.params: dict[str, Any] = {}
+
+    def input(
+        self,
+        name: str,
+        *,
+        size: int = 1,
+        policy: PolicyLike = None,
+        type: Any = None,
+        optional: bool = False,
+    ) -> IOSpec:
+        """Declare an input.
+
+        `type` is the Python type (or union) it takes, checked against the output it is connected to when the graph
+        is built. An `optional` input may stay unconnected; `receive` then returns None.
+        """
+        return self._add(
+            self.inputs, name, IOSpec(name, is_input=True, size=size, policy=policy, type=type, optional=optional)
+        )
+
+    def output(
+        self,
+        name: str,
+        *,
+        size: int = 1,
+        policy: PolicyLike = None,
+        type: Any = None,
+        optional: bool = False,
+    ) -> IOSpec:
+        """Declare an output. An `optional` output may stay unconnected; what is emitted there goes nowhere."""
+        port = IOSpec(name, is_input=False, size=size, policy=policy, type=type, optional=optional)
+        return self._add(self.outputs, name, port)
+
+    def param(self, name: str, default_value: Any = REQUIRED, **_described: Any) -> None:
+        """Declare a parameter; it becomes an attribute of the operator. Headline and description are for readers."""
+        if name in self.params:
+            raise GraphInvalid(f"{self.owner}: parameter {name!r} is declared twice")
+        self.params[name] = default_value
+
+    def _add(self, ports: dict[str, IOSpec], name: str, port: IOSpec) -> IOSpec:
+        if name in ports:
+            raise GraphInvalid(f"{self.owner}: port {name!r} is declared twice")
+        ports[name] = port
+        return port
+
+
+def queue_policy(policy: PolicyLike) -> QueuePolicy:
+    """The policy by member or value; None is BLOCK."""
+    if policy is None:
+        return QueuePolicy.BLOCK
+    try:
+        return QueuePolicy(policy)
+    except ValueError:
+        known = ", ".join(member.value for member in QueuePolicy)
+        raise GraphInvalid(f"unknown queue policy {policy!r}; choose one of {known}") from None

@@ -1,0 +1,320 @@
+"""One operator of a running graph: what the schedulers of every engine poll and execute."""
+
+from __future__ import annotations
+
+from time import perf_counter_ns
+from typing import TYPE_CHECKING, Any
+
+from operators.errors import OperatorFailed, PortError
+from operators.graph.clock import Clock
+from operators.graph.conditions import SchedulingStatus
+from operators.graph.faults import FaultAction
+from operators.graph.metadata import merge_metadata
+from operators.graph.operator import Operator
+from operators.graph.queues import Edge, Message
+from operators.graph.spec import ConditionType, QueuePolicy
+from operators.graph.tracking import FlowTracker, Trail
+
+if TYPE_CHECKING:
+    from operators.graph.graph import Graph
+
+READY, WAIT_TIME, WAIT, WAIT_EVENT, NEVER = SchedulingStatus
+
+
+class InputContext:
+    """The inputs of an operator during compute."""
+
+    __slots__ = ("_ports", "_single", "_task")
+
+    def __init__(self, task: OperatorTask) -> None:
+        self._task = task
+        ports = task.operator.spec.inputs
+        self._ports = {name: (port, task.inputs.get(name, [])) for name, port in ports.items()}
+        self._single = {name: edges[0] for name, (port, edges) in self._ports.items() if edges and not port.batched}
+
+    def receive(self, name: str, *, kind: str = "") -> Any:
+        """The oldest message's value, or None when there is none.
+
+        A port of size n > 1 gives a tuple of everything queued, one of ANY_SIZE a tuple with one entry per connection.
+        """
+        edge = self._single.get(name)
+        if edge is not None:
+            message = edge.pop()
+            if message is None:
+                return None
+            task = self._task
+            task.received.append(message)
+            if message.metadata:
+                merge_metadata(task.operator.metadata, message.metadata, task.operator.metadata_policy)
+            return message.value
+        return self._receive_batch(name)
+
+    def _receive_batch(self, name: str) -> Any:
+        if name not in self._ports:
+            raise PortError(f"operator {self._task.name!r} has no input {name!r}; it has {sorted(self._ports)}")
+        port, edges = self._ports[name]
+        if not edges:
+            return None
+        popped: list[Message | None]
+        if port.size == port.ANY_SIZE:
+            popped = [edge.pop() for edge in edges]
+        else:
+            popped = []
+            while (message := edges[0].pop()) is not None:
+                popped.append(message)
+        task = self._task
+        values: list[Any] = []
+        for message in popped:
+            if message is None:
+                values.append(None)
+                continue
+            task.received.append(message)
+            if message.metadata:
+                merge_metadata(task.operator.metadata, message.metadata, task.operator.metadata_policy)
+            values.append(message.value)
+        return tuple(values) if values else None
+
+
+class OutputContext:
+    """The outputs of an operator during compute."""
+
+    __slots__ = ("_ports", "_task")
+
+    def __init__(self, task: OperatorTask) -> None:
+        self._task = task
+        ports = task.operator.spec.outputs
+        self._ports = {name: (task.outputs.get(name, []), runtime_type(port.type)) for name, port in ports.items()}
+
+    def emit(self, data: Any, name: str = "", emitter_name: str = "", acq_timestamp: int = -1) -> None:
+        """Send a value, with the operator's metadata, along every edge of the output; `name` may be left out when
+        there is one. Raises PortError (no such output, wrong type) and QueueFull."""
+        task = self._task
+        try:
+            edges, declared = self._ports[name]
+        except KeyError:
+            edges, declared = self._only_port(name)
+        if declared is not None and not isinstance(data, declared):
+            raise PortError(
+                f"operator {task.name!r} emitted {type(data).__name__} on output {name!r}, which declares {declared}"
+            )
+        metadata = task.operator.metadata
+        trail = () if task.tracker is None else task.trail(task.tracker)
+        message = Message(data, metadata.copy() if metadata else None, trail)
+        for edge in edges:
+            edge.push(message)
+
+    def _only_port(self, name: str) -> tuple[list[Edge], Any]:
+        if name == "" and len(self._ports) == 1:
+            return next(iter(self._ports.values()))
+        raise PortError(f"operator {self._task.name!r} has no output {name!r}; it has {sorted(self._ports)}")
+
+
+class ExecutionContext:
+    """What an operator may know of its surroundings during compute."""
+
+    __slots__ = ("_task", "input", "output")
+
+    def __init__(self, task: OperatorTask) -> None:
+        self._task = task
+        self.input = InputContext(task)
+        self.output = OutputContext(task)
+
+    @property
+    def clock(self) -> Clock:
+        """The scheduler's clock: `timestamp()` in ns, `time()` in s, from the beginning of the run."""
+        return self._task.graph.clock
+
+    def find_operator(self, name: str = "") -> Operator | None:
+        """An operator of the graph by name; without a name, this one."""
+        task = self._task.graph.tasks_by_name.get(name or self._task.name)
+        return None if task is None else task.operator
+
+
+class OperatorTask:
+    """An operator with its edges, its conditions and its state in this run."""
+
+    def __init__(self, operator: Operator, graph: Graph, tracker: FlowTracker | None) -> None:
+        self.operator = operator
+        self.name = operator.name
+        self.graph = graph
+        self.tracker = tracker
+        self.conditions = operator.conditions
+        self.inputs: dict[str, list[Edge]] = {}
+        self.outputs: dict[str, list[Edge]] = {}
+        self.received: list[Message] = []
+        """Messages of the compute under way."""
+        self.computes = 0
+        self.restarts = 0
+        self.faults = 0
+        self.started = False
+        self.finished = False
+        self._trail: Trail | None = None
+        self._trail_length = 0
+        self._began_ns = 0
+
+    def connect(self) -> None:
+        """Call once, when all edges are known."""
+        spec = self.operator.spec
+        self.in_edges = [edge for edges in self.inputs.values() for edge in edges]
+        self.out_edges = [edge for edges in self.outputs.values() for edge in edges]
+        self._needs = [
+            (edge.queue, edge, 1 if spec.inputs[name].size == -1 else spec.inputs[name].min_size)
+            for name, edges in self.inputs.items()
+            if spec.inputs[name].condition_type is not ConditionType.NONE
+            for edge in edges
+        ]
+        self._rooms = [
+            (edge.queue, edge, edge.capacity - spec.outputs[name].min_size)
+            for name, edges in self.outputs.items()
+            if spec.outputs[name].condition_type is not ConditionType.NONE
+            for edge in edges
+            if edge.policy is QueuePolicy.BLOCK
+        ]
+        self.context = ExecutionContext(self)
+        self._durations = None if self.tracker is None else self.tracker.operator(self.name)
+
+    def gates(self, edge: Edge) -> int:
+        """How many messages this edge must hold before compute (0: any), as its consumer."""
+        return next((need for _, gating, need in self._needs if gating is edge), 0)
+
+    def ports_ready(self) -> bool:
+        """Whether every input that gates has its messages and every output that gates has room."""
+        for queue, _, need in self._needs:
+            if len(queue) < need:
+                return False
+        for queue, edge, most in self._rooms:  # noqa: SIM110 - all() of a generator costs more than the rest of a poll
+            if len(queue) > most and not edge.closed:
+                return False
+        return True
+
+    def poll(self, now_ns: int) -> tuple[SchedulingStatus, int]:
+        """May the operator compute now? With WAIT_TIME, when."""
+        status, due_ns = READY, 0
+        for condition in self.conditions:
+            verdict, at_ns = condition.check(now_ns)
+            if verdict is WAIT_TIME:
+                due_ns = max(due_ns, at_ns)
+            if verdict > status:
+                status = verdict
+        if status is NEVER or self.exhausted():
+            return NEVER, 0
+        if not self.ports_ready() and status < WAIT:
+            return WAIT, 0
+        return status, due_ns
+
+    def exhausted(self) -> bool:
+        """Whether the operator can do nothing more: told to stop, starved for good, or with nobody listening."""
+        if self.operator._finish:
+            return True
+        for _, edge, need in self._needs:
+            if edge.ended and len(edge) < need:
+                return True
+        ins, outs = self.in_edges, self.out_edges
+        if ins and all(edge.ended and not len(edge) for edge in ins):
+            return True
+        return bool(outs) and all(edge.closed for edge in outs)
+
+    def finish(self) -> None:
+        """Be done: tell the neighbours through the edges."""
+        self.finished = True
+        for edge in self.out_edges:
+            edge.ended = True
+        for edge in self.in_edges:
+            edge.close()
+
+    def waits_for(self, now_ns: int) -> str:
+        """In words, what keeps the operator from computing."""
+        reasons = [
+            f"condition {condition.name} ({status.name})"
+            for condition in self.conditions
+            if (status := condition.check(now_ns)[0]) is not READY
+        ]
+        reasons += [f"a message on {edge.name}" for _, edge, need in self._needs if len(edge) < need]
+        reasons += [
+            f"room on {edge.name} ({len(edge)} of {edge.capacity} taken)"
+            for _, edge, most in self._rooms
+            if len(edge) > most and not edge.closed
+        ]
+        return " and ".join(reasons) or "nothing"
+
+    def execute(self) -> None:
+        """One compute, with metadata, tracking and the fault policy. Lets only KeyboardInterrupt and its like out."""
+        operator, context = self.operator, self.context
+        operator.metadata = {}
+        tracker = self.tracker
+        if tracker is not None:
+            self._trail = None
+            self._began_ns = perf_counter_ns()
+        try:
+            operator.compute(context.input, context.output, context)
+        except Exception as error:  # noqa: BLE001 - the boundary of the operator's fault policy
+            self._answer(error, "compute")
+        self.computes += 1
+        if tracker is not None and self._durations is not None:
+            self._durations.record(perf_counter_ns() - self._began_ns)
+            if not self.out_edges and self.received:
+                tracker.finish(self.name, [message.trail for message in self.received])
+        self.received.clear()
+
+    def tick(self, now_ns: int) -> None:
+        """execute, and let the conditions know."""
+        self.execute()
+        for condition in self.conditions:
+            condition.on_execute(now_ns)
+
+    def trail(self, tracker: FlowTracker) -> Trail:
+        """Where what is emitted now comes from."""
+        if self._trail is None or self._trail_length != len(self.received):
+            self._trail_length = len(self.received)
+            if self.received:
+                self._trail = tracker.extend(self.name, [message.trail for message in self.received])
+            else:
+                self._trail = tracker.begin(self.name, self._began_ns)
+        return self._trail
+
+    def start(self) -> None:
+        """Start the operator under its fault policy."""
+        try:
+            self.operator.start()
+            self.started = True
+        except Exception as error:  # noqa: BLE001 - the boundary of the operator's fault policy
+            self._answer(error, "start")
+
+    def stop(self) -> None:
+        """Stop the operator if it is started; what it raises fails the graph."""
+        if not self.started:
+            return
+        self.started = False
+        try:
+            self.operator.stop()
+        except Exception as error:  # noqa: BLE001 - the other operators must still be stopped
+            self.graph.fail(OperatorFailed(self.name, "stop", error))
+
+    def _answer(self, error: Exception, phase: str) -> None:
+        """Do what the fault policy says."""
+        self.faults += 1
+        failure = OperatorFailed(self.name, phase, error, self._seq() if phase == "compute" else None)
+        action = self.operator.fault_policy.action_after(self.restarts)
+        self.graph.record_fault(failure, action)
+        if action is FaultAction.STOP_GRAPH:
+            self.graph.fail(failure)
+        elif action is FaultAction.DISABLE_BRANCH:
+            self.operator._finish = True
+        else:
+            self.restarts += 1
+            self.stop()
+            if not self.graph.stopping:
+                self.start()
+
+    def _seq(self) -> int | None:
+        """The frame under work: `seq` in the metadata, or an attribute of a received message."""
+        found = [self.operator.metadata.get("seq")]
+        found += [getattr(message.value, "seq", None) for message in self.received]
+        return next((seq for seq in found if isinstance(seq, int)), None)
+
+
+def runtime_type(declared: Any) -> Any:
+    """The part of a port's type that isinstance can check; None for anything."""
+    if declared in (None, Any, object):
+        return None
+    return getattr(declared, "__origin__", declared)
