@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from torch import Tensor
 from gsplat_core.deformation.field import DeformationField, checked_window, count_of
 from gsplat_core.errors import InvalidInput
 from gsplat_core.gaussians import Gaussians
+from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.reference import deformation as reference
 from gsplat_core.reference.deformation import BUMP_REACH, CHANNEL_GROUPS
 
@@ -64,12 +66,19 @@ class BasisField(DeformationField):
 
     kind = "basis"
 
-    def __init__(self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26) -> None:
+    def __init__(
+        self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26, spacing_s: float | None = None
+    ) -> None:
+        """`bumps` columns spread over the window, or as many as it takes at a distance of `spacing_s`."""
         super().__init__(time_window_s)
+        start, end = self._time_window_s
+        if spacing_s is not None:
+            if not (math.isfinite(spacing_s) and spacing_s > 0):
+                raise InvalidInput(f"spacing_s must be a positive number of seconds, got {spacing_s}")
+            bumps = max(4, math.ceil((end - start) / spacing_s - 1e-6) + 3)
         if bumps < 4:
             raise InvalidInput(f"bumps must be at least 4 (one past each end of the window), got {bumps}")
-        start, end = self._time_window_s
-        self._spacing_s = ((end - start) or 1.0) / (bumps - 3)
+        self._spacing_s = spacing_s or ((end - start) or 1.0) / (bumps - 3)
         self._origin_s = start - self._spacing_s
         self.centers = torch.nn.Parameter(torch.arange(bumps, dtype=torch.float32).repeat(count, 1))
         self.log_widths = torch.nn.Parameter(torch.zeros(count, bumps))
@@ -97,7 +106,7 @@ class BasisField(DeformationField):
 
     def deltas(self, time_s: float) -> Tensor:
         """What the field adds at `time_s`: [N, 13] position, rotation, log-scale, colour. Differentiable."""
-        return reference.basis_field(self.centers, self.log_widths, self.weights, self.tau(time_s))
+        return self._ops.basis_field(self.centers, self.log_widths, self.weights, self.tau(time_s))
 
     def displaced(self, gaussians: Gaussians, deltas: Tensor) -> Gaussians:
         """The Gaussians with `deltas` [N, 13] added; differentiable in both."""
@@ -141,7 +150,7 @@ class BasisField(DeformationField):
                 [torch.zeros_like(p) for p in parameters],
                 torch.zeros(self.centers.shape, dtype=torch.int32),
             )
-        reference.basis_field_backward_adam_(
+        self._ops.basis_field_backward_adam_(
             gradient,
             self.tau(time_s),
             *parameters,
@@ -208,9 +217,7 @@ class BasisField(DeformationField):
                 self.log_widths.new_zeros(count, self.bumps),
                 self.weights.new_zeros(count, self.bumps, CHANNELS),
             ]
-        self._set_parameters(
-            *(torch.cat([p.data, n]) for p, n in zip(self._parameters_in_order(), new, strict=True))
-        )
+        self._set_parameters(*(torch.cat([p.data, n]) for p, n in zip(self._parameters_in_order(), new, strict=True)))
         self._change_moments(lambda t: torch.cat([t, t.new_zeros(count, *t.shape[1:])]))
 
     def config(self) -> dict[str, Any]:
@@ -246,6 +253,12 @@ class BasisField(DeformationField):
             torch.cat([weights, new_weights], dim=1),
         )
         self._change_moments(lambda t: torch.cat([t, t.new_zeros(self.count, added, *t.shape[2:])], dim=1))
+
+    @property
+    def _ops(self) -> ModuleType:
+        """The compiled ops where they exist, plain torch for other dtypes and devices."""
+        is_native = self.weights.dtype == torch.float32 and self.weights.device.type == "cpu"
+        return compiled if is_native else reference
 
     def _parameters_in_order(self) -> tuple[Tensor, Tensor, Tensor]:
         return self.centers, self.log_widths, self.weights

@@ -1,13 +1,27 @@
 """Every operation in plain torch, for any floating-point dtype and device: the oracle of the tests."""
 
 from gsplat_core.reference.covariance import quat_scale_to_covar_preci
+from gsplat_core.reference.deformation import (
+    basis_field,
+    basis_field_backward,
+    basis_field_backward_adam_,
+    hexplane_features,
+    hexplane_modulate,
+    hexplane_space,
+)
 from gsplat_core.reference.interim import isect_offset_encode, isect_tiles, rasterize_to_pixels
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
 
 __all__ = [
+    "basis_field",
+    "basis_field_backward",
+    "basis_field_backward_adam_",
     "fully_fused_projection",
+    "hexplane_features",
+    "hexplane_modulate",
+    "hexplane_space",
     "isect_offset_encode",
     "isect_tiles",
     "quat_scale_to_covar_preci",

@@ -85,9 +85,7 @@ def sample_plane(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Bilinear samples [N, C] of `plane` [V, U, C] at `u`, `v` in [-1, 1] (corners aligned, clamped at the border)."""
     grid = torch.stack([u, v], dim=-1)[None, None]
     image = plane.permute(2, 0, 1)[None]
-    sampled = torch.nn.functional.grid_sample(
-        image, grid, mode="bilinear", padding_mode="border", align_corners=True
-    )
+    sampled = torch.nn.functional.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)
     return sampled[0, :, 0].T
 
 

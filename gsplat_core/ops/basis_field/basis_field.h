@@ -1,0 +1,38 @@
+// Truncated bumps in time per Gaussian, 13 channels each (position 3, rotation 4, log-scale 3, colour 3).
+#pragma once
+
+#include <cstdint>
+
+#include "isa.h"
+
+constexpr int64_t kBasisChannels = 13;
+
+// One field at one time: centres and log-widths [N, B], weights [N, B, 13].
+struct BasisBumps {
+  const float *centers, *log_widths, *weights;
+  int64_t bumps;
+  float tau;
+};
+
+// The same, updated in place by Adam, with moments of the same shapes and the updates counted per bump.
+struct BasisAdam {
+  float *centers, *log_widths, *weights;
+  float *m_centers, *m_log_widths, *m_weights, *v_centers, *v_log_widths, *v_weights;
+  int32_t* steps;
+  int64_t bumps;
+  float tau;
+  float channel_rates[16];  // by channel; the last three are unused
+  float center_rate, width_rate, beta1, beta2, epsilon;
+  // Bias corrections after k updates, k < table_size: 1 / (1 - beta1^k) and 1 / sqrt(1 - beta2^k); later ones are the last.
+  const float *inverse_bias1, *inverse_root_bias2;
+  int64_t table_size;
+};
+
+struct BasisFieldKernels {
+  void (*forward)(const BasisBumps& field, float* deltas, int64_t begin, int64_t end);
+  // Writes every element of the three gradients, zero where a bump is inactive.
+  void (*backward)(const BasisBumps& field, const float* gradient, float* centers, float* log_widths, float* weights,
+                   int64_t begin, int64_t end);
+  void (*adam)(const BasisAdam& field, const float* gradient, int64_t begin, int64_t end);
+};
+GSPLAT_DECLARE_KERNELS(BasisFieldKernels, basis_field_kernels)

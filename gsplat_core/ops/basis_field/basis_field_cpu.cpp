@@ -1,0 +1,161 @@
+// One Gaussian at a time: its bumps side by side in a vector to find the active ones, then a row of 13 channels per active bump.
+#include "basis_field.h"
+#include "simd_partial.h"
+
+namespace GSPLAT_ISA {
+
+constexpr int kRowVectors = 16 / kLanes;
+constexpr float kReach = 4.0f;  // widths; a bump further away is left out (BUMP_REACH of the reference)
+constexpr float kLog2e = 1.44269504f;
+
+// 13 channels in as few vectors as hold 16; the last three lanes are zero.
+struct Row {
+  vfloat v[kRowVectors];
+};
+
+GSPLAT_INLINE int64_t row_lanes(int i) {
+  const int64_t left = kBasisChannels - int64_t(i) * kLanes;
+  return left < kLanes ? left : kLanes;
+}
+
+GSPLAT_INLINE Row load_row(const float* p) {
+  Row r;
+  for (int i = 0; i < kRowVectors; ++i) r.v[i] = load_first(p + i * kLanes, row_lanes(i));
+  return r;
+}
+
+GSPLAT_INLINE void store_row(float* p, const Row& r) {
+  for (int i = 0; i < kRowVectors; ++i) store_first(p + i * kLanes, r.v[i], row_lanes(i));
+}
+
+GSPLAT_INLINE float dot(const Row& a, const Row& b) {
+  vfloat s = a.v[0] * b.v[0];
+  for (int i = 1; i < kRowVectors; ++i) s += a.v[i] * b.v[i];
+  return sum(s);
+}
+
+// A vector of neighbouring bumps of one Gaussian at one time.
+struct Bumps {
+  vfloat u, inverse_width, height;  // height is exp(-u^2), zero where inactive
+  vint active;
+  uint32_t mask;  // `active`, one bit per bump
+};
+
+// NaN in a centre or width is active, so that it shows in the result.
+GSPLAT_INLINE Bumps bumps_at(const float* centers, const float* log_widths, int64_t count, float tau) {
+  Bumps b;
+  const vfloat log_width = load_first(log_widths, count);
+  const vfloat exponent = min(max(log_width * -kLog2e, splat(-126.0f)), splat(126.0f));
+  b.inverse_width = select(log_width == log_width, exp2(exponent), log_width);
+  b.u = (tau - load_first(centers, count)) * b.inverse_width;
+  b.active = ~((b.u > kReach) | (b.u < -kReach)) & first_lanes(count);
+  const vfloat height = exp2(max(b.u * b.u * -kLog2e, splat(-126.0f)));
+  b.height = select(b.active, select(b.u == b.u, height, b.u), vfloat{});
+  b.mask = bits(b.active);
+  return b;
+}
+
+GSPLAT_INLINE int64_t lanes_left(int64_t from, int64_t bumps) { return bumps - from < kLanes ? bumps - from : kLanes; }
+
+static void forward(const BasisBumps& field, float* deltas, int64_t begin, int64_t end) {
+  for (int64_t n = begin; n < end; ++n) {
+    Row total = {};
+    const int64_t first = n * field.bumps;
+    for (int64_t from = 0; from < field.bumps; from += kLanes) {
+      const Bumps b =
+          bumps_at(field.centers + first + from, field.log_widths + first + from, lanes_left(from, field.bumps), field.tau);
+      float heights[kLanes];
+      store(heights, b.height);
+      for (uint32_t left = b.mask; left != 0; left &= left - 1) {
+        const int lane = __builtin_ctz(left);
+        const Row w = load_row(field.weights + (first + from + lane) * kBasisChannels);
+        for (int i = 0; i < kRowVectors; ++i) total.v[i] += heights[lane] * w.v[i];
+      }
+    }
+    store_row(deltas + n * kBasisChannels, total);
+  }
+}
+
+static void backward(const BasisBumps& field, const float* gradient, float* centers, float* log_widths, float* weights,
+                     int64_t begin, int64_t end) {
+  for (int64_t n = begin; n < end; ++n) {
+    const Row g = load_row(gradient + n * kBasisChannels);
+    const int64_t first = n * field.bumps;
+    __builtin_memset(weights + first * kBasisChannels, 0, size_t(field.bumps * kBasisChannels) * sizeof(float));
+    for (int64_t from = 0; from < field.bumps; from += kLanes) {
+      const int64_t at = first + from, count = lanes_left(from, field.bumps);
+      const Bumps b = bumps_at(field.centers + at, field.log_widths + at, count, field.tau);
+      float heights[kLanes], along[kLanes] = {};  // along = g . w
+      store(heights, b.height);
+      for (uint32_t left = b.mask; left != 0; left &= left - 1) {
+        const int lane = __builtin_ctz(left);
+        along[lane] = dot(g, load_row(field.weights + (at + lane) * kBasisChannels));
+        Row w;
+        for (int i = 0; i < kRowVectors; ++i) w.v[i] = heights[lane] * g.v[i];
+        store_row(weights + (at + lane) * kBasisChannels, w);
+      }
+      const vfloat slope = b.height * 2.0f * b.u * load(along);
+      store_first(centers + at, select(b.active, slope * b.inverse_width, vfloat{}), count);
+      store_first(log_widths + at, select(b.active, slope * b.u, vfloat{}), count);
+    }
+  }
+}
+
+// One Adam update of a vector: parameter, moments, gradient, rate / (1 - beta1^k), 1 / sqrt(1 - beta2^k).
+GSPLAT_INLINE void adam_update(vfloat& p, vfloat& m, vfloat& v, vfloat g, vfloat rate, vfloat inverse_root_bias2,
+                               const BasisAdam& a) {
+  m += (1 - a.beta1) * (g - m);
+  v += (1 - a.beta2) * (g * g - v);
+  p -= rate * m / (square_root(v) * inverse_root_bias2 + a.epsilon);
+}
+
+// The same for the active lanes of one [N, B] tensor.
+GSPLAT_INLINE void adam_update_active(float* p, float* m, float* v, vfloat g, vint active, vfloat rate, vfloat inverse_root_bias2,
+                                      int64_t count, const BasisAdam& a) {
+  const vfloat p0 = load_first(p, count), m0 = load_first(m, count), v0 = load_first(v, count);
+  vfloat p1 = p0, m1 = m0, v1 = v0;
+  adam_update(p1, m1, v1, g, rate, inverse_root_bias2, a);
+  store_first(p, select(active, p1, p0), count);
+  store_first(m, select(active, m1, m0), count);
+  store_first(v, select(active, v1, v0), count);
+}
+
+static void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t end) {
+  Row rates;
+  for (int i = 0; i < kRowVectors; ++i) rates.v[i] = load(field.channel_rates + i * kLanes);
+  for (int64_t n = begin; n < end; ++n) {
+    const Row g = load_row(gradient + n * kBasisChannels);
+    const int64_t first = n * field.bumps;
+    for (int64_t from = 0; from < field.bumps; from += kLanes) {
+      const int64_t at = first + from, count = lanes_left(from, field.bumps);
+      const Bumps b = bumps_at(field.centers + at, field.log_widths + at, count, field.tau);
+      if (b.mask == 0) continue;
+      float heights[kLanes], along[kLanes] = {}, bias1[kLanes] = {}, bias2[kLanes] = {};
+      store(heights, b.height);
+      for (uint32_t left = b.mask; left != 0; left &= left - 1) {
+        const int lane = __builtin_ctz(left);
+        const int64_t updates = ++field.steps[at + lane];
+        const int64_t entry = updates < field.table_size ? updates : field.table_size - 1;
+        bias1[lane] = field.inverse_bias1[entry];
+        bias2[lane] = field.inverse_root_bias2[entry];
+        const int64_t row = (at + lane) * kBasisChannels;
+        Row w = load_row(field.weights + row), m = load_row(field.m_weights + row), v = load_row(field.v_weights + row);
+        along[lane] = dot(g, w);  // before the update
+        for (int i = 0; i < kRowVectors; ++i)
+          adam_update(w.v[i], m.v[i], v.v[i], heights[lane] * g.v[i], rates.v[i] * bias1[lane], splat(bias2[lane]), field);
+        store_row(field.weights + row, w);
+        store_row(field.m_weights + row, m);
+        store_row(field.v_weights + row, v);
+      }
+      const vfloat slope = b.height * 2.0f * b.u * load(along), rate = load(bias1), root = load(bias2);
+      adam_update_active(field.centers + at, field.m_centers + at, field.v_centers + at, slope * b.inverse_width, b.active,
+                         field.center_rate * rate, root, count, field);
+      adam_update_active(field.log_widths + at, field.m_log_widths + at, field.v_log_widths + at, slope * b.u, b.active,
+                         field.width_rate * rate, root, count, field);
+    }
+  }
+}
+
+extern const BasisFieldKernels basis_field_kernels = {forward, backward, adam};
+
+}  // namespace GSPLAT_ISA

@@ -1,0 +1,117 @@
+// What the forward and the backward kernel share: the blocks of a window, which of them a splat touches, and its alpha there.
+#pragma once
+
+#include "compositing.h"
+#include "simd.h"
+
+namespace GSPLAT_ISA {
+namespace {
+
+constexpr int kBlockWidth = 4;
+constexpr int kBlockHeight = kLanes / kBlockWidth;
+constexpr int kColumns = kWindow / kBlockWidth;
+constexpr int kRows = kWindow / kBlockHeight;
+constexpr int kBlocks = kColumns * kRows;
+constexpr int kPixels = kWindow * kWindow;
+
+constexpr float kFaintest = -7.99435344f;   // log2(1/255): a splat fainter than this at a pixel is skipped there
+constexpr float kOpaque = -0.01449957f;     // log2(0.99): the most opaque that a splat can be
+constexpr float kStop = 1e-4f;              // a splat that would leave less transmittance ends the pixel, unblended
+
+// Where pixel (x, y) of a window is in its block-wise arrays.
+GSPLAT_INLINE int place(int x, int y) {
+  return (y / kBlockHeight * kColumns + x / kBlockWidth) * kLanes + y % kBlockHeight * kBlockWidth + x % kBlockWidth;
+}
+
+// Offsets of a block's pixels from its first.
+GSPLAT_INLINE vfloat lane_x() {
+  vfloat v;
+  for (int i = 0; i < kLanes; ++i) v[i] = float(i % kBlockWidth);
+  return v;
+}
+GSPLAT_INLINE vfloat lane_y() {
+  vfloat v;
+  for (int i = 0; i < kLanes; ++i) v[i] = float(i / kBlockWidth);
+  return v;
+}
+
+// log2(alpha) of a splat at the pixels (x, y), before the cut-offs.
+struct Falloff {
+  vfloat dx, dy, power;
+};
+GSPLAT_INLINE Falloff falloff(const SplatRecord& splat_, vfloat x, vfloat y) {
+  Falloff f;
+  f.dx = x - splat_.x;
+  f.dy = y - splat_.y;
+  const vfloat across = fma(splat(splat_.b), f.dy, f.dx * splat_.a);
+  const vfloat down = fma(f.dy * splat_.c, f.dy, splat(splat_.l));
+  f.power = fma(across, f.dx, down);
+  return f;
+}
+
+// Tests kLanes splats, one per lane, against every block of the window whose first pixel centre is (x, y):
+// on_block(block, the lanes whose ellipse may reach a pixel of it).
+//
+// The part of an ellipse in a strip of pixel rows reaches in x from the left to the right solution of
+// a dx^2 + 2 b dx dy + c dy^2 = k at the dy of the strip that is nearest to the outermost point.
+template <class OnBlock>
+GSPLAT_INLINE void test_blocks(const SplatRecord* records, const int32_t* ids, int count, float x, float y, const OnBlock& on_block) {
+  alignas(64) float fields[6][kLanes];
+  for (int i = 0; i < kLanes; ++i) {
+    const SplatRecord& record = records[ids[i < count ? i : 0]];
+    fields[0][i] = record.x;
+    fields[1][i] = record.y;
+    fields[2][i] = record.a;
+    fields[3][i] = record.b;
+    fields[4][i] = record.c;
+    fields[5][i] = i < count ? record.l : -__builtin_inff();
+  }
+  const vfloat zero = {}, ux = load(fields[0]) - x, uy = load(fields[1]) - y;
+  const vfloat a = -load(fields[2]), b = load(fields[3]) * -0.5f, c = -load(fields[4]);
+  const vfloat k = load(fields[5]) + (2e-3f - kFaintest);  // a little outside of the contour, against rounding
+  const vfloat ac = a * c, det = fma(-b, b, ac) - ac * 5e-7f;
+  const vmask reaches = at_least(k, zero);
+  // What is no proper ellipse in float32 is tested pixel by pixel.
+  const vfloat proper_det = det - ac * 1e-6f;
+  const vmask proper = above(a, zero) & above(c, zero) & above(proper_det, zero);
+  const vfloat inverse = 1.0f / a;
+  const vfloat slope = -b * inverse, offset = k * inverse, curve = det * inverse * inverse;
+  const vfloat top = -b * sqrt(k / (c * det));
+  const vmask everywhere = reaches & ~(proper & at_least(splat(1e30f), larger(top, -top)));
+  for (int row = 0; row < kRows; ++row) {
+    const vfloat low = float(row * kBlockHeight) - uy, high = low + float(kBlockHeight - 1);
+    const vfloat at_right = smaller(larger(top, low), high), at_left = smaller(larger(-top, low), high);
+    const vfloat right_square = fma(-curve * at_right, at_right, offset), left_square = fma(-curve * at_left, at_left, offset);
+    const vmask inside = reaches & at_least(smaller(right_square, left_square), zero);
+    const vfloat right = fma(slope, at_right, ux) + sqrt(larger(right_square, zero)) + 2e-3f;
+    const vfloat left = fma(slope, at_left, ux) - sqrt(larger(left_square, zero)) - 2e-3f;
+    for (int column = 0; column < kColumns; ++column) {
+      const float first = float(column * kBlockWidth);
+      const vmask hit = inside & at_least(right, splat(first)) & at_least(splat(first + float(kBlockWidth - 1)), left);
+      on_block(row * kColumns + column, vmask(hit | everywhere));
+    }
+  }
+}
+
+// One tile as the kernels see it.
+struct Tile {
+  int64_t image, begin, end;  // its instances
+  int x, y, right, bottom;    // its pixels
+  bool masked;
+};
+GSPLAT_INLINE Tile tile_of(const Compositing& in, int64_t tile) {
+  const int64_t tiles = int64_t(in.tile_width) * in.tile_height, image = tile / tiles, inside = tile % tiles;
+  Tile t;
+  t.image = image;
+  t.begin = in.offsets[tile];
+  t.end = tile + 1 < tiles * in.images ? in.offsets[tile + 1] : in.instances;
+  t.x = int(inside % in.tile_width) * in.tile_size;
+  t.y = int(inside / in.tile_width) * in.tile_size;
+  t.right = t.x + in.tile_size < in.width ? t.x + in.tile_size : in.width;
+  t.bottom = t.y + in.tile_size < in.height ? t.y + in.tile_size : in.height;
+  t.masked = in.masks != nullptr && !in.masks[tile];
+  return t;
+}
+
+}  // namespace
+}  // namespace GSPLAT_ISA

@@ -1,0 +1,115 @@
+#include "compositing.h"
+
+#include <atomic>
+#include <new>
+#include <optional>
+#include <tuple>
+
+#include "counting_sort.h"
+#include "tensor_checks.h"
+
+namespace {
+
+constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
+
+// The inputs of either pass, checked, and the record of every splat.
+struct Call {
+  Tensor means2d, conics, colors, opacities, offsets, flatten_ids;
+  std::optional<Tensor> backgrounds, masks;
+  std::unique_ptr<SplatRecord[]> records;
+  Compositing in;
+  int64_t count, tiles;
+
+  Call(const Tensor& means2d_, const Tensor& conics_, const Tensor& colors_, const Tensor& opacities_, const Tensor& offsets_,
+       const Tensor& flatten_ids_, const std::optional<Tensor>& backgrounds_, const std::optional<Tensor>& masks_, int64_t width,
+       int64_t height, int64_t tile_size)
+      : means2d(floats(means2d_, "means2d")),
+        conics(floats(conics_, "conics")),
+        colors(floats(colors_, "colors")),
+        opacities(floats(opacities_, "opacities")),
+        offsets(ints(offsets_, "isect_offsets")),
+        flatten_ids(ints(flatten_ids_, "flatten_ids")) {
+    const int64_t channels = colors.size(-1), images = offsets.size(0);
+    const int64_t tile_height = offsets.size(1), tile_width = offsets.size(2);
+    count = opacities.numel();
+    tiles = offsets.numel();
+    STD_TORCH_CHECK(means2d.numel() == 2 * count && conics.numel() == 3 * count && colors.numel() == channels * count,
+                    "composite: means2d, conics, colors and opacities must be of the same splats");
+    STD_TORCH_CHECK(tile_size > 0 && width >= 0 && height >= 0 && width < kMostInts && height < kMostInts &&
+                        tile_size < kMostInts && tile_width * tile_size >= width && tile_height * tile_size >= height,
+                    "composite: the tiles of isect_offsets do not cover the image");
+    if (backgrounds_) backgrounds = floats(*backgrounds_, "backgrounds");
+    if (masks_) {
+      STD_TORCH_CHECK(masks_->is_cpu() && masks_->scalar_type() == ScalarType::Bool && masks_->numel() == tiles,
+                      "composite: masks must have one bool per tile");
+      masks = masks_->is_contiguous() ? *masks_ : torch::stable::contiguous(*masks_);
+    }
+    check_lists();
+    records = uninitialised<SplatRecord>(count);
+    in = {records.get(),
+          data(colors),
+          data(means2d),
+          data(conics),
+          data(opacities),
+          int32_t(channels),
+          offsets.const_data_ptr<int32_t>(),
+          flatten_ids.const_data_ptr<int32_t>(),
+          flatten_ids.numel(),
+          int32_t(images),
+          int32_t(width),
+          int32_t(height),
+          int32_t(tile_size),
+          int32_t(tile_width),
+          int32_t(tile_height),
+          backgrounds ? data(*backgrounds) : nullptr,
+          masks ? masks->const_data_ptr<bool>() : nullptr};
+    torch::stable::parallel_for(0, count, 2048, [&](int64_t begin, int64_t end) {
+      compositing_kernels().records(in, begin, end, records.get());
+    });
+  }
+
+  // The lists come from the caller, and a wrong index would read foreign memory.
+  void check_lists() const {
+    const int32_t *starts = offsets.const_data_ptr<int32_t>(), *ids = flatten_ids.const_data_ptr<int32_t>();
+    const int64_t instances = flatten_ids.numel();
+    int32_t before = 0;
+    bool ordered = true;
+    for (int64_t i = 0; i < tiles; ++i) ordered &= starts[i] >= before, before = starts[i];
+    STD_TORCH_CHECK(ordered && before <= instances, "isect_offsets must rise from 0 to at most the length of flatten_ids");
+    uint32_t most = 0;
+    for (int64_t i = 0; i < instances; ++i) most = std::max(most, uint32_t(ids[i]));
+    STD_TORCH_CHECK(instances == 0 || most < count, "flatten_ids must be in [0, ", count, "), found ", int32_t(most));
+  }
+
+  // run(tile, scratch) for all tiles: threads take the next free one, and no result depends on which takes which.
+  template <class Run>
+  void for_tiles(const Run& run) const {
+    std::atomic<int64_t> next{0};
+    const int64_t workers = std::max<int64_t>(1, std::min<int64_t>(torch::stable::get_num_threads(), tiles));
+    const int64_t scratch = compositing_kernels().scratch_floats(in.channels);
+    torch::stable::parallel_for(0, workers, 1, [&](int64_t, int64_t) {
+      struct alignas(64) Line {
+        float floats[16];
+      };
+      const auto lines = uninitialised<Line>(scratch / 16 + 1);
+      for (int64_t tile; (tile = next.fetch_add(1, std::memory_order_relaxed)) < tiles;) run(tile, lines[0].floats);
+    });
+  }
+};
+
+std::tuple<Tensor, Tensor, Tensor> composite(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor offsets,
+                                             Tensor flatten_ids, std::optional<Tensor> backgrounds, std::optional<Tensor> masks,
+                                             int64_t width, int64_t height, int64_t tile_size) {
+  const Call call(means2d, conics, colors, opacities, offsets, flatten_ids, backgrounds, masks, width, height, tile_size);
+  const int64_t images = call.in.images;
+  Tensor out_colors = empty_floats({images, height, width, call.in.channels});
+  Tensor out_alphas = empty_floats({images, height, width, 1});
+  Tensor out_last = empty_ints({images, height, width});
+  const CompositedPixels out = {mutable_data(out_colors), mutable_data(out_alphas), out_last.mutable_data_ptr<int32_t>()};
+  call.for_tiles([&](int64_t tile, float* scratch) { compositing_kernels().tile(call.in, tile, out, scratch); });
+  return {out_colors, out_alphas, out_last};
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) { m.impl("composite", TORCH_BOX(&composite)); }

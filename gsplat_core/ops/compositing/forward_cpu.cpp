@@ -1,0 +1,126 @@
+#include "blocks.h"
+#include "passes.h"
+
+namespace GSPLAT_ISA {
+namespace {
+
+constexpr int kBatch = 64;  // splats per pass over the blocks: one bit each in a block's word
+
+// The state of a window's pixels between batches, block by block. D channels, or `channels` of them when D is 0.
+struct Window {
+  float* through;  // transmittance behind the splats so far, also past the stop
+  float* kept;     // the same, but from the last splat that was blended
+  int32_t* last;
+  float* colors;  // [channels][kPixels]
+};
+
+template <int D>
+void blend_block(const Compositing& in, const int32_t* ids, int64_t position, uint64_t splats, vfloat x, vfloat y,
+                 const Window& w, int block, uint64_t& alive) {
+  const int at = block * kLanes;
+  vfloat through = load(w.through + at), kept = load(w.kept + at);
+  vint last;
+  __builtin_memcpy(&last, w.last + at, sizeof(last));
+  vfloat sum[D > 0 ? D : 1];
+  for (int d = 0; d < D; ++d) sum[d] = load(w.colors + d * kPixels + at);
+  for (; splats != 0; splats &= splats - 1) {
+    const int i = __builtin_ctzll(splats);
+    const SplatRecord& record = in.records[ids[i]];
+    const vfloat power = falloff(record, x, y).power;
+    const vmask valid = at_least(power, splat(kFaintest)) & at_least(splat(record.cap), power);
+    const vfloat alpha = zero_unless(valid, exp2(smaller(power, splat(kOpaque))));
+    const vfloat next = fma(-alpha, through, through);
+    // Past the stop the transmittance only falls, so this test alone ends a pixel for good.
+    const vmask open = above(next, splat(kStop));
+    const vfloat weight = zero_unless(open, alpha * through);
+    if constexpr (D > 0) {
+      for (int d = 0; d < D; ++d) sum[d] = fma(weight, splat(record.colors[d]), sum[d]);
+    } else {
+      const float* color = in.colors + int64_t(ids[i]) * in.channels;
+      for (int d = 0; d < in.channels; ++d) {
+        float* const to = w.colors + d * kPixels + at;
+        store(to, fma(weight, splat(color[d]), load(to)));
+      }
+    }
+    last = where(vmask(open & valid), splat_int(int32_t(position + i)), last);
+    kept = where(open, next, kept);
+    through = next;
+    if (lanes_of(open) == 0) {
+      alive &= ~(uint64_t(1) << block);
+      break;
+    }
+  }
+  store(w.through + at, through);
+  store(w.kept + at, kept);
+  __builtin_memcpy(w.last + at, &last, sizeof(last));
+  for (int d = 0; d < D; ++d) store(w.colors + d * kPixels + at, sum[d]);
+}
+
+template <int D>
+void blend_window(const Compositing& in, const Tile& tile, int x0, int y0, const CompositedPixels& out, float* scratch) {
+  const int width = tile.right - x0 < kWindow ? tile.right - x0 : kWindow;
+  const int height = tile.bottom - y0 < kWindow ? tile.bottom - y0 : kWindow;
+  alignas(64) float through[kPixels], kept[kPixels];
+  alignas(64) int32_t last[kPixels];
+  const int channels = D > 0 ? D : in.channels;
+  alignas(64) float own_colors[D > 0 ? D * kPixels : 1];
+  const Window w = {through, kept, last, D > 0 ? own_colors : scratch};
+  for (int i = 0; i < channels * kPixels; ++i) w.colors[i] = 0;
+  uint64_t alive = 0;
+  for (int i = 0; i < kPixels; ++i) through[i] = 0, kept[i] = 1, last[i] = -1;
+  for (int y = 0; y < height; ++y)
+    for (int x = 0; x < width; ++x) {
+      const int at = place(x, y);
+      through[at] = 1;
+      alive |= uint64_t(1) << (at / kLanes);
+    }
+  const vfloat block_x = lane_x() + (float(x0) + 0.5f), block_y = lane_y() + (float(y0) + 0.5f);
+  for (int64_t first = tile.begin; first < tile.end && alive != 0; first += kBatch) {
+    const int32_t* const ids = in.flatten_ids + first;
+    const int count = tile.end - first < kBatch ? int(tile.end - first) : kBatch;
+    uint64_t splats[kBlocks] = {};
+    for (int i = 0; i < count; i += kLanes)
+      test_blocks(in.records, ids + i, count - i, float(x0) + 0.5f, float(y0) + 0.5f,
+                  [&](int block, vmask hit) { splats[block] |= uint64_t(lanes_of(hit)) << i; });
+    for (uint64_t left = alive; left != 0; left &= left - 1) {
+      const int block = __builtin_ctzll(left);
+      if (splats[block] == 0) continue;
+      blend_block<D>(in, ids, first, splats[block], block_x + float(block % kColumns * kBlockWidth),
+                     block_y + float(block / kColumns * kBlockHeight), w, block, alive);
+    }
+  }
+  const float* const background = in.backgrounds != nullptr ? in.backgrounds + tile.image * channels : nullptr;
+  for (int y = 0; y < height; ++y) {
+    const int64_t row = (tile.image * in.height + y0 + y) * in.width + x0;
+    for (int x = 0; x < width; ++x) {
+      const int at = place(x, y);
+      out.alphas[row + x] = 1 - kept[at];
+      if (out.last != nullptr) out.last[row + x] = last[at];
+      float* const to = out.colors + (row + x) * channels;
+      for (int d = 0; d < channels; ++d)
+        to[d] = background != nullptr ? w.colors[d * kPixels + at] + kept[at] * background[d] : w.colors[d * kPixels + at];
+    }
+  }
+}
+
+template <int D>
+void blend_tile(const Compositing& in, Tile tile, const CompositedPixels& out, float* scratch) {
+  if (tile.masked) tile.end = tile.begin;  // nothing but the background
+  for (int y = tile.y; y < tile.bottom; y += kWindow)
+    for (int x = tile.x; x < tile.right; x += kWindow) blend_window<D>(in, tile, x, y, out, scratch);
+}
+
+}  // namespace
+
+void composite_tile(const Compositing& in, int64_t tile, const CompositedPixels& out, float* scratch) {
+  const Tile t = tile_of(in, tile);
+  switch (in.channels) {
+    case 1: return blend_tile<1>(in, t, out, scratch);
+    case 3: return blend_tile<3>(in, t, out, scratch);
+    case 4: return blend_tile<4>(in, t, out, scratch);
+    case 5: return blend_tile<5>(in, t, out, scratch);
+    default: return blend_tile<0>(in, t, out, scratch);
+  }
+}
+
+}  // namespace GSPLAT_ISA

@@ -1,0 +1,175 @@
+"""Which tiles each splat touches, and every tile's splats in depth order."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+
+
+def isect_tiles(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    sort: bool = True,
+    segmented: bool = False,
+    packed: bool = False,
+    n_images: int | None = None,
+    image_ids: Tensor | None = None,
+    gaussian_ids: Tensor | None = None,
+    *,
+    conics: Tensor | None = None,
+    opacities: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Pairs of a splat and a tile that it touches, by image, tile and depth. Names and results of gsplat 1.5.3.
+
+    Args:
+        means2d: [..., N, 2] pixels, float32; `...` are the images. Packed: [nnz, 2].
+        radii: [..., N, 2] pixels, int32; a splat with a radius of 0 is invisible. Packed: [nnz, 2].
+        depths: [..., N], float32. Packed: [nnz].
+        tile_size: pixels on a side; tile_width, tile_height: tiles across and down.
+        sort: by image, tile and depth (ties by index); otherwise by splat.
+        segmented: accepted for gsplat's sake; the result is the same.
+        packed: with n_images, image_ids [nnz] and gaussian_ids [nnz] (the latter is not needed here).
+        conics, opacities: [..., N, 3] and [..., N]. With both, only tiles in which alpha reaches 1/255 (over the rectangle of
+            the tile's pixel centres) are listed, else all tiles of the box mean +- radius, as gsplat does.
+
+    Returns:
+        tiles_per_gauss int32 [..., N], isect_ids int64 [M] (image | tile | 32 bits of depth), flatten_ids int32 [M] (index into
+        the flattened [..., N], or into nnz).
+
+    Raises InvalidInput for wrong shapes or types.
+    """
+    images, chosen = _check(means2d, radii, depths, packed, n_images, image_ids, conics, opacities)
+    tiles_per_gauss, isect_ids, flatten_ids = torch.ops.gsplat_core.isect_tiles(
+        *_flat(means2d, radii, depths, conics, opacities), chosen, images, tile_size, tile_width, tile_height, sort
+    )
+    return tiles_per_gauss.reshape(depths.shape), isect_ids, flatten_ids
+
+
+def bin_splats(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    packed: bool = False,
+    n_images: int | None = None,
+    image_ids: Tensor | None = None,
+    *,
+    conics: Tensor | None = None,
+    opacities: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`isect_tiles` (sorted) and `isect_offset_encode` in one, without the 64-bit ids that only they need.
+
+    Returns tiles_per_gauss int32 [..., N], flatten_ids int32 [M], isect_offsets int32 [..., tile_height, tile_width].
+    """
+    images, chosen = _check(means2d, radii, depths, packed, n_images, image_ids, conics, opacities)
+    tiles_per_gauss, flatten_ids, offsets = torch.ops.gsplat_core.bin_splats(
+        *_flat(means2d, radii, depths, conics, opacities), chosen, images, tile_size, tile_width, tile_height
+    )
+    image_dims = (images,) if packed else depths.shape[:-1]
+    return tiles_per_gauss.reshape(depths.shape), flatten_ids, offsets.reshape(*image_dims, tile_height, tile_width)
+
+
+def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
+    """Where each tile's entries start in the sorted `isect_ids` of `isect_tiles`: int32 [n_images, tile_height, tile_width]."""
+    return torch.ops.gsplat_core.isect_offset_encode(isect_ids, n_images, tile_width, tile_height)
+
+
+def _check(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    packed: bool,
+    n_images: int | None,
+    image_ids: Tensor | None,
+    conics: Tensor | None,
+    opacities: Tensor | None,
+) -> tuple[int, Tensor | None]:
+    """The number of images, and the image of every packed splat."""
+    shape = tuple(depths.shape)
+    expected = {"means2d": (means2d, 2), "radii": (radii, 2)} | ({} if conics is None else {"conics": (conics, 3)})
+    for name, (tensor, last) in expected.items():
+        if tuple(tensor.shape) != (*shape, last):
+            raise InvalidInput(f"{name} must have shape {(*shape, last)} to go with depths {shape}, got {tuple(tensor.shape)}")
+    if (conics is None) != (opacities is None):
+        raise InvalidInput("the exact tile test needs both conics and opacities; give both or neither")
+    if opacities is not None and tuple(opacities.shape) != shape:
+        raise InvalidInput(f"opacities must have the shape of depths, {shape}, got {tuple(opacities.shape)}")
+    for name, value in {"means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities}.items():
+        if value is not None and value.dtype != torch.float32:
+            raise InvalidInput(f"{name} must be float32, got {value.dtype}; gsplat_core.reference.isect_tiles takes any dtype")
+    if radii.dtype != torch.int32:
+        raise InvalidInput(f"radii must be int32 pixels, got {radii.dtype}")
+    if not packed:
+        if not shape:
+            raise InvalidInput("depths must have shape [..., N], got a scalar")
+        return math.prod(shape[:-1]), None
+    if n_images is None or image_ids is None or len(shape) != 1 or image_ids.shape != depths.shape:
+        raise InvalidInput("packed splats need depths [nnz], n_images and image_ids [nnz]")
+    return n_images, image_ids.int()
+
+
+def _flat(
+    means2d: Tensor, radii: Tensor, depths: Tensor, conics: Tensor | None, opacities: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
+    """All images in one row, without gradients: which tiles a splat touches has none."""
+    return (
+        means2d.detach().reshape(-1, 2),
+        radii.reshape(-1, 2),
+        depths.detach().reshape(-1),
+        None if conics is None else conics.detach().reshape(-1, 3),
+        None if opacities is None else opacities.detach().reshape(-1),
+    )
+
+
+@torch.library.register_fake("gsplat_core::isect_tiles")
+def _isect_tiles_fake(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    conics: Tensor | None,
+    opacities: Tensor | None,
+    image_ids: Tensor | None,
+    images: int,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    sort: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    found = torch.library.get_ctx().new_dynamic_size()
+    counts = depths.new_empty(depths.numel(), dtype=torch.int32)
+    return counts, depths.new_empty(found, dtype=torch.int64), depths.new_empty(found, dtype=torch.int32)
+
+
+@torch.library.register_fake("gsplat_core::bin_splats")
+def _bin_splats_fake(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    conics: Tensor | None,
+    opacities: Tensor | None,
+    image_ids: Tensor | None,
+    images: int,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    found = torch.library.get_ctx().new_dynamic_size()
+    counts = depths.new_empty(depths.numel(), dtype=torch.int32)
+    offsets = depths.new_empty(images, tile_height, tile_width, dtype=torch.int32)
+    return counts, depths.new_empty(found, dtype=torch.int32), offsets
+
+
+@torch.library.register_fake("gsplat_core::isect_offset_encode")
+def _isect_offset_encode_fake(isect_ids: Tensor, images: int, tile_width: int, tile_height: int) -> Tensor:
+    return isect_ids.new_empty(images, tile_height, tile_width, dtype=torch.int32)

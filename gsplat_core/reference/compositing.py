@@ -1,0 +1,137 @@
+"""Alpha compositing of depth-ordered splats in plain torch, any dtype, differentiable: the oracle of the compiled op.
+
+Equations of Kerbl et al. 2023 ("3D Gaussian Splatting", eq. 3), with the constants of gsplat.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+ALPHA_MAX = 0.99
+ALPHA_MIN = 1.0 / 255.0
+TRANSMITTANCE_STOP = 1e-4
+SPLATS_AT_A_TIME = 2048  # bounds the memory of a tile with very many splats
+
+
+def rasterize_to_pixels(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    backgrounds: Tensor | None = None,
+    masks: Tensor | None = None,
+    packed: bool = False,
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Blend splats front to back over every pixel; the same arguments and results as `gsplat_core.rasterize_to_pixels`.
+
+    Tile by tile, each recomputed in the backward pass, so memory stays bounded by one tile and `SPLATS_AT_A_TIME` splats.
+    """
+    image_dims = isect_offsets.shape[:-2]
+    tile_height, tile_width = isect_offsets.shape[-2:]
+    channels = colors.shape[-1]
+    splats = _Splats(means2d, conics, colors, opacities, absgrad)
+    starts = [*isect_offsets.flatten().tolist(), flatten_ids.numel()]
+    images = image_dims.numel()
+    background = None if backgrounds is None else backgrounds.reshape(images, channels)
+    shown = None if masks is None else masks.reshape(-1).tolist()
+    all_colors, all_alphas = [], []
+    for image in range(images):
+        rows = []
+        for tile_y in range(tile_height):
+            row = []
+            for tile_x in range(tile_width):
+                tile = (image * tile_height + tile_y) * tile_width + tile_x
+                ids = flatten_ids[starts[tile] : starts[tile + 1]].long()
+                if shown is not None and not shown[tile]:
+                    ids = ids[:0]
+                ids = ids[splats.usable[ids]]
+                x = torch.arange(tile_x * tile_size, min((tile_x + 1) * tile_size, image_width), device=means2d.device)
+                y = torch.arange(tile_y * tile_size, min((tile_y + 1) * tile_size, image_height), device=means2d.device)
+                grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2).to(means2d.dtype) + 0.5
+                tile_colors, through = splats.blend(ids, grid)
+                if background is not None:
+                    tile_colors = tile_colors + through[:, None] * background[image]
+                row.append(torch.cat([tile_colors, (1 - through)[:, None]], -1).reshape(len(y), len(x), channels + 1))
+            rows.append(torch.cat(row, 1) if row else means2d.new_zeros(0, image_width, channels + 1))
+        picture = torch.cat(rows, 0) if rows else means2d.new_zeros(image_height, image_width, channels + 1)
+        all_colors.append(picture[..., :channels])
+        all_alphas.append(picture[..., channels:])
+    shape = (*image_dims, image_height, image_width)
+    if not all_colors:
+        return means2d.new_zeros(*shape, channels), means2d.new_zeros(*shape, 1)
+    return torch.stack(all_colors).reshape(*shape, channels), torch.stack(all_alphas).reshape(*shape, 1)
+
+
+class _Splats:
+    """The splats of all images in one row, and how some of them blend over some pixels."""
+
+    def __init__(self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, absgrad: bool) -> None:
+        self.means2d = means2d.reshape(-1, 2)
+        self.conics = conics.reshape(-1, 3)
+        self.colors = colors.reshape(-1, colors.shape[-1])
+        self.opacities = opacities.reshape(-1)
+        with torch.no_grad():
+            values = torch.cat([self.means2d, self.conics, self.colors, self.opacities[:, None]], -1)
+            self.usable = values.isfinite().all(-1)
+        self.absolute: Tensor | None = None
+        if absgrad:
+            absolute = torch.zeros_like(means2d)
+            means2d.absgrad = absolute  # type: ignore[attr-defined]
+            self.absolute = absolute.view(-1, 2)
+
+    def blend(self, ids: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Colours [P, D] and transmittance [P] behind the splats `ids` at the pixel centres [P, 2]."""
+        colors = pixels.new_zeros(len(pixels), self.colors.shape[-1])
+        product = through = pixels.new_ones(len(pixels))
+        for part in ids.split(SPLATS_AT_A_TIME) if len(ids) else ():
+            if not bool((product > TRANSMITTANCE_STOP).any()):
+                break
+            inputs = (self.means2d[part], self.conics[part], self.colors[part], self.opacities[part])
+            if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+                result = checkpoint(self._blend_part, part, pixels, *inputs, product, through, use_reentrant=False)
+            else:
+                result = self._blend_part(part, pixels, *inputs, product, through)
+            more, product, through = result
+            colors = colors + more
+        return colors, through
+
+    def _blend_part(
+        self,
+        ids: Tensor,
+        pixels: Tensor,
+        means2d: Tensor,
+        conics: Tensor,
+        colors: Tensor,
+        opacities: Tensor,
+        product: Tensor,
+        through: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One part of the list. `product` is the transmittance had no pixel stopped, `through` the one that is left."""
+        means = means2d[None].expand(len(pixels), -1, -1)
+        if self.absolute is not None and means.requires_grad:
+            absolute = self.absolute
+
+            def add(gradient: Tensor) -> None:
+                absolute.index_add_(0, ids, gradient.abs().sum(0))
+
+            means.register_hook(add)
+        dx, dy = (means - pixels[:, None]).unbind(-1)
+        a, b, c = conics.unbind(-1)
+        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+        alpha = (opacities * torch.exp(-sigma.clamp(min=0))).clamp(max=ALPHA_MAX)
+        alpha = torch.where((sigma >= 0) & (alpha >= ALPHA_MIN), alpha, 0)
+        after = product[:, None] * torch.cumprod(1 - alpha, 1)
+        before = torch.cat([product[:, None], after[:, :-1]], 1)
+        # The product only falls, so a pixel that has stopped stays stopped.
+        blended = after > TRANSMITTANCE_STOP
+        weights = torch.where(blended, alpha * before, 0)
+        left = through * torch.where(blended, 1 - alpha, 1).prod(1)
+        return weights @ colors, after[:, -1], left
