@@ -62,7 +62,7 @@ def depth_map(rendered: RenderedFrame) -> NDArray[np.uint8]:
         near, far = np.percentile(depth[known], (2, 98))
         # A flat scene has no range of its own: without this floor its rounding noise would be drawn as relief.
         span = max(float(far - near), 1e-3 * float(far))
-        level = np.clip((far - np.where(known, depth, far)) / span, 0, 1)
+        level = np.clip(0.5 + ((near + far) / 2 - np.where(known, depth, far)) / span, 0, 1)
         colours[known] = _coloured((level * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[known]
     return colours
 

@@ -121,6 +121,7 @@ def synthesize(
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
     width: Annotated[int, typer.Option(help="Width in pixels.")] = 320,
     height: Annotated[int, typer.Option(help="Height in pixels.")] = 256,
+    fps: Annotated[float, typer.Option(help="Frames per second.")] = 30.0,
     seed: SeedOption = 0,
     moving_camera: Annotated[bool, typer.Option("--moving-camera/--fixed-camera", help="Let the scope move.")] = False,
     json: JsonOption = False,
@@ -128,7 +129,7 @@ def synthesize(
     """Make a recording with exact ground truth: tissue, tool, stereo, depth, masks, poses."""
     from services.cli.synthesize import synthesize_command
 
-    return synthesize_command(out, frames, width, height, seed, moving_camera, as_json=json)
+    return synthesize_command(out, frames, width, height, fps, seed, moving_camera, as_json=json)
 
 
 @app.command()

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-WIDTH, HEIGHT = 720, 300
+HEIGHT = 290
+WIDE, NARROW = 1068, 500
+"""Widths in CSS pixels of the places that a chart may have, so that its text is as large as the page's."""
 LEFT, RIGHT, TOP, BOTTOM = 56, 16, 14, 44
 
 
@@ -38,28 +40,29 @@ class Chart:
     y_unit: str = ""
     y_range: tuple[float, float] | None = None
     x_log: bool = False
+    width: int = WIDE
 
     def svg(self) -> str:
         """The chart as one `<svg>` element with a text alternative."""
         x_low, x_high = self._extent([v for line in self.lines for v in line.x])
         values = [v for line in self.lines for v in line.y if v is not None]
-        x_axis = _log_axis(x_low, x_high) if self.x_log else _axis(x_low, x_high, 7, tight=True)
+        x_axis = _log_axis(x_low, x_high) if self.x_log else _axis(x_low, x_high, self.width // 110, tight=True)
         y_axis = _axis(*(self.y_range or self._extent(values)), 5, tight=self.y_range is not None)
-        x_of = lambda v: LEFT + x_axis.position(v) * (WIDTH - LEFT - RIGHT)
+        x_of = lambda v: LEFT + x_axis.position(v) * (self.width - LEFT - RIGHT)
         y_of = lambda v: HEIGHT - BOTTOM - y_axis.position(v) * (HEIGHT - TOP - BOTTOM)
         parts = [
-            f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(self.title + ". " + self.description)}">',
+            f'<svg viewBox="0 0 {self.width} {HEIGHT}" role="img" aria-label="{escape(self.title + ". " + self.description)}">',
             '<g class="grid">',
         ]
         for tick in y_axis.ticks:
             y = y_of(tick)
-            parts.append(f'<line x1="{LEFT}" y1="{y:.1f}" x2="{WIDTH - RIGHT}" y2="{y:.1f}"/>')
+            parts.append(f'<line x1="{LEFT}" y1="{y:.1f}" x2="{self.width - RIGHT}" y2="{y:.1f}"/>')
             parts.append(f'<text x="{LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{_number(tick)}</text>')
         for tick in x_axis.ticks:
             x = x_of(tick)
             parts.append(f'<line class="tick" x1="{x:.1f}" y1="{HEIGHT - BOTTOM}" x2="{x:.1f}" y2="{HEIGHT - BOTTOM + 5}"/>')
             parts.append(f'<text x="{x:.1f}" y="{HEIGHT - BOTTOM + 19}" text-anchor="middle">{_number(tick)}</text>')
-        middle = LEFT + (WIDTH - LEFT - RIGHT) / 2
+        middle = LEFT + (self.width - LEFT - RIGHT) / 2
         parts.append(f'<text class="axis" x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(self.x_label)}</text>')
         height = TOP + (HEIGHT - TOP - BOTTOM) / 2
         parts.append(
@@ -74,7 +77,7 @@ class Chart:
     def figure(self) -> str:
         """The chart with its legend and caption."""
         keys = "".join(
-            f'<li><span class="key {line.style}{" dot" if line.marks else ""}"></span>{escape(line.name)}</li>'
+            f'<li><span class="key {line.style}{" round" if line.marks else ""}"></span>{escape(line.name)}</li>'
             for line in self.lines
         )
         return f'<figure class="chart"><ul class="legend">{keys}</ul>{self.svg()}<figcaption>{escape(self.description)}</figcaption></figure>'

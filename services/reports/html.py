@@ -8,7 +8,7 @@ from html import escape
 from importlib.resources import files
 from pathlib import Path
 
-from services.reports.charts import Chart, Line
+from services.reports.charts import NARROW, Chart, Line
 from services.reports.pictures import KeyframePictures
 from services.reports.schema import Quality, RunReport, write_text_whole
 
@@ -184,15 +184,15 @@ def _baselines(report: RunReport) -> str:
         ("Held-out frames: mean of all training frames", baselines.train_mean_db, False),
     ]
     known = [value for _, value, _ in rows if value is not None]
-    low, high = (max(0.0, min(known) - 6), max(known)) if known else (0.0, 1.0)
+    low, high = (min(known) - 1, max(known) + 1) if known else (0.0, 1.0)
     body = ""
     for name, value, ours in rows:
         if value is None:
             continue
-        share = 100 * (value - low) / (high - low) if high > low else 100
+        share = 100 * (value - low) / (high - low)
         body += (
             f'<tr{" class=ours" if ours else ""}><th scope="row">{escape(name)}</th><td class="n">{value:.2f}</td>'
-            f'<td class="track"><span class="bar" style="width:{share:.1f}%"></span></td></tr>'
+            f'<td class="track"><span class="rail"><span class="dot" style="left:{share:.1f}%"></span></span></td></tr>'
         )
     extra = ""
     for name, part in (("Live", quality.live), ("Held out", quality.heldout)):
@@ -201,7 +201,7 @@ def _baselines(report: RunReport) -> str:
             extra += f"{name}: whole-frame PSNR {_decibels(part.psnr_frame_db)} dB, SSIM {ssim}. "
     return (
         '<section><h2>Against doing nothing</h2><p class="lead">Tissue PSNR in dB, mean over frames.</p>'
-        '<table><thead><tr><th scope="col">What is shown</th><th scope="col" class="n">dB</th><th scope="col"></th></tr></thead>'
+        f'<table><thead><tr><th scope="col">What is shown</th><th scope="col" class="n">dB</th><th scope="col" class="ends"><span>{low:.0f}</span><span>{high:.0f}</span></th></tr></thead>'
         f'<tbody>{body}</tbody></table><p class="note">{extra}</p></section>'
     )
 
@@ -225,6 +225,7 @@ def _latency(report: RunReport) -> str:
         x_unit=" ms",
         y_range=(0.0, 1.0),
         x_log=True,
+        width=NARROW,
     )
     rows = "".join(
         f'<tr><th scope="row">{escape(path.rsplit(",", 1)[-1])}</th>'
