@@ -14,7 +14,11 @@ if TYPE_CHECKING:
     from gsplat_core.errors import CoreError, InvalidInput
     from gsplat_core.frames import Frame, FrameStatus
     from gsplat_core.gaussians import Gaussians
-    from gsplat_core.rendering import RenderOutput, rasterization, render
+    from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
+    from gsplat_core.ops.projection.projection import fully_fused_projection
+    from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
+    from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
+    from gsplat_core.rendering import RenderOutput, rasterization, rasterize_to_pixels, render
 
 __all__ = [
     "Camera",
@@ -24,8 +28,14 @@ __all__ = [
     "Gaussians",
     "InvalidInput",
     "RenderOutput",
+    "fully_fused_projection",
+    "isect_offset_encode",
+    "isect_tiles",
+    "quat_scale_to_covar_preci",
     "rasterization",
+    "rasterize_to_pixels",
     "render",
+    "spherical_harmonics",
 ]
 
 _HOME = {
@@ -36,8 +46,14 @@ _HOME = {
     "Gaussians": "gaussians",
     "InvalidInput": "errors",
     "RenderOutput": "rendering",
+    "fully_fused_projection": "ops.projection.projection",
+    "isect_offset_encode": "ops.tiles.tiles",
+    "isect_tiles": "ops.tiles.tiles",
+    "quat_scale_to_covar_preci": "ops.covariance.covariance",
     "rasterization": "rendering",
+    "rasterize_to_pixels": "rendering",
     "render": "rendering",
+    "spherical_harmonics": "ops.spherical_harmonics.spherical_harmonics",
 }
 """The module that each public name lives in."""
 

@@ -10,9 +10,21 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_shape
 from gsplat_core.cameras import Camera
 from gsplat_core.gaussians import Gaussians
-from gsplat_core.reference.rendering import rasterization
+from gsplat_core.ops.projection.projection import fully_fused_projection
+from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
+from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
+from gsplat_core.pipeline import Operations
+from gsplat_core.reference.compositing import rasterize_to_pixels
 
 __all__ = ["RenderOutput", "rasterization", "render"]
+
+rasterization = Operations(
+    fully_fused_projection=fully_fused_projection,
+    spherical_harmonics=spherical_harmonics,
+    isect_tiles=isect_tiles,
+    isect_offset_encode=isect_offset_encode,
+    rasterize_to_pixels=rasterize_to_pixels,
+).rasterization
 
 
 class RenderOutput(NamedTuple):

@@ -5,11 +5,36 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // The instruction set in use: 0 baseline, 1 AVX2, 2 AVX-512.
   m.def("active_isa() -> int");
 
-  // Adam over one dense tensor, in place; `step` counts from 1.
+  // Adam over one dense tensor, in place; `step` counts from 1. Rows of row_size values whose gradient is not finite are left
+  // alone and counted in the result (int64 scalar).
   m.def(
       "adam_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, int step, "
       "float learning_rate, float beta1, float beta2, float epsilon) -> ()");
 
+  // Projection to the image: B batches, C cameras, N Gaussians. Covariances as [B, N, 6], or quats and scales.
+  m.def(
+      "project_gaussians(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
+      "Tensor Ks, int width, int height, float eps2d, float near_plane, float far_plane, float radius_clip, bool compensate, "
+      "int camera_model) -> (Tensor radii, Tensor means2d, Tensor depths, Tensor conics, Tensor compensations)");
+  m.def(
+      "project_gaussians_backward(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor viewmats, Tensor Ks, "
+      "Tensor radii, Tensor? v_means2d, Tensor? v_depths, Tensor? v_conics, Tensor? v_compensations, int width, int height, "
+      "float eps2d, int camera_model, bool needs_viewmats) -> (Tensor v_means, Tensor v_covars, Tensor v_quats, "
+      "Tensor v_scales, Tensor v_viewmats)");
+
+  // R rows of directions [R, M, 3] with coefficients [M, K, 3] that the rows share; where the mask is false the sum is 0.
+  m.def("spherical_harmonics(int degree, Tensor dirs, Tensor coeffs, Tensor? masks) -> Tensor");
+  m.def(
+      "spherical_harmonics_backward(int degree, Tensor dirs, Tensor coeffs, Tensor? masks, Tensor v_colors, bool needs_dirs) "
+      "-> (Tensor v_dirs, Tensor v_coeffs)");
+
+  // Covariance and precision of M rotations and scales, as upper triangles [M, 6] or matrices [M, 3, 3]; empty if not asked.
+  m.def(
+      "quat_scale_to_covar_preci(Tensor quats, Tensor scales, bool compute_covar, bool compute_preci, bool triu) -> "
+      "(Tensor covars, Tensor precis)");
+  m.def(
+      "quat_scale_to_covar_preci_backward(Tensor quats, Tensor scales, Tensor? v_covars, Tensor? v_precis, bool triu) -> "
+      "(Tensor v_quats, Tensor v_scales)");
   // Tiles: which splats each tile has, in depth order. `images` counts batch x cameras; image_ids is for packed splats.
   m.def(
       "isect_tiles(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
@@ -20,9 +45,11 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def("isect_offset_encode(Tensor isect_ids, int images, int tile_width, int tile_height) -> Tensor");
 
   // Compositing: splats over pixels. `last` is the last blended position of flatten_ids per pixel, -1 where there is none.
+  // `absgrad_probe` is not read: its gradient is the sum over pixels of |dL/dmeans2d|.
   m.def(
       "composite(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor isect_offsets, Tensor flatten_ids, "
-      "Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size) -> (Tensor colors, Tensor alphas, Tensor last)");
+      "Tensor? backgrounds, Tensor? masks, Tensor? absgrad_probe, int width, int height, int tile_size) -> "
+      "(Tensor colors, Tensor alphas, Tensor last)");
   m.def(
       "composite_backward(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor isect_offsets, "
       "Tensor flatten_ids, Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size, Tensor alphas, Tensor last, "
@@ -38,4 +65,14 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor(d!) m_centers, Tensor(e!) m_log_widths, Tensor(f!) m_weights, Tensor(g!) v_centers, Tensor(h!) v_log_widths, "
       "Tensor(i!) v_weights, Tensor(j!) steps, float position_rate, float rotation_rate, float scale_rate, float colour_rate, "
       "float center_rate, float width_rate, float beta1, float beta2, float epsilon) -> ()");
+      "float learning_rate, float beta1, float beta2, float epsilon, int row_size) -> Tensor");
+
+  // Structural similarity of each pixel and channel of [H, W, C] images.
+  m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
+  m.def("ssim_map_backward(Tensor gradient, Tensor image, Tensor target) -> Tensor");
+
+  // Loss over tissue and its gradients in one go: (loss, [l1, 1 - ssim, inverse-depth l1], dL/dimage, dL/ddepth or empty).
+  m.def(
+      "image_loss(Tensor image, Tensor target, Tensor? mask, Tensor? depth, Tensor? target_depth, float ssim_weight, "
+      "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
 }

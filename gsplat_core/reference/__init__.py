@@ -1,5 +1,6 @@
 """Every operation in plain torch, for any floating-point dtype and device: the oracle of the tests."""
 
+from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.covariance import quat_scale_to_covar_preci
 from gsplat_core.reference.deformation import (
     basis_field,
@@ -9,10 +10,11 @@ from gsplat_core.reference.deformation import (
     hexplane_modulate,
     hexplane_space,
 )
-from gsplat_core.reference.interim import isect_offset_encode, isect_tiles, rasterize_to_pixels
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
+from gsplat_core.reference.ssim import ssim_map
+from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 
 __all__ = [
     "basis_field",
@@ -28,4 +30,5 @@ __all__ = [
     "rasterization",
     "rasterize_to_pixels",
     "spherical_harmonics",
+    "ssim_map",
 ]

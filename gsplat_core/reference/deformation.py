@@ -68,8 +68,8 @@ def basis_field_backward_adam_(
         count = steps.clamp(min=1).to(centers.dtype)
         bias1, bias2 = 1 - beta1**count, 1 - beta2**count
         groups = torch.tensor(CHANNEL_GROUPS)
-        channel_rates = torch.tensor(learning_rates[:4], dtype=centers.dtype).repeat_interleave(groups)
-        rates = (learning_rates[4], learning_rates[5], channel_rates)
+        channel_rates = centers.new_tensor(learning_rates[:4]).repeat_interleave(groups)
+        rates = (centers.new_tensor(learning_rates[4]), centers.new_tensor(learning_rates[5]), channel_rates)
         for parameter, g, m, v, rate in zip(
             (centers, log_widths, weights), gradients, first_moments, second_moments, rates, strict=True
         ):

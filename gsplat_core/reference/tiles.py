@@ -65,7 +65,9 @@ def isect_tiles(
     return tiles_of.int().reshape(depths.shape), ids, splat.int()
 
 
-def _ellipse_touches(means: Tensor, conics: Tensor, opacities: Tensor, column: Tensor, row: Tensor, size: int) -> Tensor:
+def _ellipse_touches(
+    means: Tensor, conics: Tensor, opacities: Tensor, column: Tensor, row: Tensor, size: int
+) -> Tensor:
     """Whether alpha reaches 1/255 somewhere in the rectangle of each tile's pixel centres (sigma is convex there)."""
     low = torch.stack([column, row], -1) * size + 0.5 - means
     high = low + (size - 1)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import copy
-
 import torch
 from torch import Tensor
 
 from gsplat_core.cameras import Camera
-from gsplat_core.deformation import BasisField, BasisRates, DeformationField, HexPlaneField
+from gsplat_core.deformation import BasisField, BasisRates, DeformationField
 from gsplat_core.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.observations import Observation
@@ -32,7 +30,9 @@ class TrainingStep:
         self._weights = LossWeights(config.ssim_weight, config.depth_weight)
         # World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres.
         centre = torch.from_numpy(camera.world_to_camera).float()
-        distance = (gaussians.means @ centre[2, :3] + centre[2, 3]).abs().median() if gaussians.count else torch.ones(())
+        distance = (
+            (gaussians.means @ centre[2, :3] + centre[2, 3]).abs().median() if gaussians.count else torch.ones(())
+        )
         self._pixel_mm = float(distance) / float(camera.K[0, 0])
         self._adam = FusedAdam(gaussians.tensors())
         self._network_adam = self._new_network_adam()
@@ -94,7 +94,10 @@ class TrainingStep:
         self._network_adam.step()
         self._network_adam.zero_grad(set_to_none=True)
         own = {name: t.grad for name, t in canonical.tensors().items()}
-        self._update_gaussians({name: g if g is not None else torch.zeros_like(getattr(canonical, name)) for name, g in own.items()}, rate_scale)
+        self._update_gaussians(
+            {name: g if g is not None else torch.zeros_like(getattr(canonical, name)) for name, g in own.items()},
+            rate_scale,
+        )
         return loss
 
     def _update_gaussians(self, gradients: dict[str, Tensor], rate_scale: float) -> None:

@@ -73,7 +73,7 @@ struct Call {
     const int32_t *starts = offsets.const_data_ptr<int32_t>(), *ids = flatten_ids.const_data_ptr<int32_t>();
     const int64_t instances = flatten_ids.numel();
     int32_t before = 0;
-    bool ordered = true;
+    bool ordered = tiles > 0 ? starts[0] == 0 : instances == 0;  // every instance is in some tile
     for (int64_t i = 0; i < tiles; ++i) ordered &= starts[i] >= before, before = starts[i];
     STD_TORCH_CHECK(ordered && before <= instances, "isect_offsets must rise from 0 to at most the length of flatten_ids");
     uint32_t most = 0;
@@ -99,7 +99,7 @@ struct Call {
 
 std::tuple<Tensor, Tensor, Tensor> composite(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor offsets,
                                              Tensor flatten_ids, std::optional<Tensor> backgrounds, std::optional<Tensor> masks,
-                                             int64_t width, int64_t height, int64_t tile_size) {
+                                             std::optional<Tensor> absgrad_probe, int64_t width, int64_t height, int64_t tile_size) {
   const Call call(means2d, conics, colors, opacities, offsets, flatten_ids, backgrounds, masks, width, height, tile_size);
   const int64_t images = call.in.images;
   Tensor out_colors = empty_floats({images, height, width, call.in.channels});
@@ -110,6 +110,60 @@ std::tuple<Tensor, Tensor, Tensor> composite(Tensor means2d, Tensor conics, Tens
   return {out_colors, out_alphas, out_last};
 }
 
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
+    Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor offsets, Tensor flatten_ids,
+    std::optional<Tensor> backgrounds, std::optional<Tensor> masks, int64_t width, int64_t height, int64_t tile_size, Tensor alphas,
+    Tensor last, Tensor v_colors, Tensor v_alphas, bool absgrad) {
+  const Call call(means2d, conics, colors, opacities, offsets, flatten_ids, backgrounds, masks, width, height, tile_size);
+  const int64_t count = call.count, instances = call.in.instances, channels = call.in.channels, images = call.in.images;
+  const int64_t pixels = images * height * width;
+  const Tensor alphas_ = floats(alphas, "alphas"), last_ = ints(last, "last");
+  const Tensor v_colors_ = floats(v_colors, "v_colors"), v_alphas_ = floats(v_alphas, "v_alphas");
+  STD_TORCH_CHECK(alphas_.numel() == pixels && last_.numel() == pixels && v_alphas_.numel() == pixels &&
+                      v_colors_.numel() == pixels * channels,
+                  "composite_backward: alphas, last, v_colors and v_alphas must be of the image's size");
+
+  // A row for every instance, those of one splat next to each other in the order of the lists.
+  auto first = uninitialised<int32_t>(count + 1), slots = uninitialised<int32_t>(instances);
+  const int32_t* const ids = call.in.flatten_ids;
+  const auto add = [&](int64_t begin, int64_t end, int32_t* counters) {
+    for (int64_t i = begin; i < end; ++i) ++counters[ids[i]];
+  };
+  counting_sort(instances, count, first.get(), add, [&](int64_t begin, int64_t end, int32_t* cursors) {
+    for (int64_t i = begin; i < end; ++i) slots[i] = cursors[ids[i]]++;
+  });
+  first[count] = int32_t(instances);
+
+  const auto rows = uninitialised<float>(instances * (kMoments + channels + (absgrad ? 2 : 0)));
+  std::vector<float> background_parts(backgrounds ? size_t(call.tiles * channels) : 0, 0.0f);
+  const CompositingGradients gradients = {data(alphas_),   last_.const_data_ptr<int32_t>(),
+                                          data(v_colors_), data(v_alphas_),
+                                          absgrad,         slots.get(),
+                                          rows.get(),      backgrounds ? background_parts.data() : nullptr};
+  call.for_tiles(
+      [&](int64_t tile, float* scratch) { compositing_kernels().tile_backward(call.in, tile, gradients, scratch); });
+
+  Tensor v_means2d = empty_floats({count, 2}), v_conics = empty_floats({count, 3}), v_splat_colors = empty_floats({count, channels});
+  Tensor v_opacities = empty_floats({count}), v_absolute = empty_floats({absgrad ? count : 0, 2});
+  torch::stable::parallel_for(0, count, 2048, [&](int64_t begin, int64_t end) {
+    compositing_kernels().gather(call.in, gradients, first.get(), begin, end, mutable_data(v_means2d), mutable_data(v_conics),
+                                 mutable_data(v_splat_colors), mutable_data(v_opacities), mutable_data(v_absolute));
+  });
+
+  Tensor v_backgrounds = zero_floats({backgrounds ? images : 0, channels});
+  for (int64_t image = 0; backgrounds && image < images; ++image)
+    for (int64_t d = 0; d < channels; ++d) {
+      double total = 0;
+      for (int64_t tile = image * (call.tiles / images); tile < (image + 1) * (call.tiles / images); ++tile)
+        total += background_parts[size_t(tile * channels + d)];
+      mutable_data(v_backgrounds)[image * channels + d] = float(total);
+    }
+  return {v_means2d, v_conics, v_splat_colors, v_opacities, v_backgrounds, v_absolute};
+}
+
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) { m.impl("composite", TORCH_BOX(&composite)); }
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) {
+  m.impl("composite", TORCH_BOX(&composite));
+  m.impl("composite_backward", TORCH_BOX(&composite_backward));
+}

@@ -39,10 +39,38 @@ void make_records(const Compositing& in, int64_t begin, int64_t end, SplatRecord
   }
 }
 
-int64_t scratch_floats(int channels) { return 2 * int64_t(channels) * kPixels + 64; }
+// Colours (forward) or their gradients (backward) of a window; then, in the backward pass, a splat's sums by lane and in all.
+int64_t scratch_floats(int channels) { return int64_t(channels) * (kPixels + kLanes + 1); }
+
+void gather(const Compositing& in, const CompositingGradients& from, const int32_t* first, int64_t begin, int64_t end,
+            float* v_means2d, float* v_conics, float* v_colors, float* v_opacities, float* v_means2d_abs) {
+  const int channels = in.channels, row_size = kMoments + channels + (from.absgrad ? 2 : 0);
+  for (int64_t splat = begin; splat < end; ++splat) {
+    float m[kMoments] = {}, absolute[2] = {};
+    float* const v_color = v_colors + channels * splat;
+    for (int d = 0; d < channels; ++d) v_color[d] = 0;
+    const bool usable = in.records[splat].l > -__builtin_inff();
+    for (int64_t i = first[splat]; usable && i < first[splat + 1]; ++i) {
+      const float* const row = from.rows + i * row_size;
+      for (int r = 0; r < kMoments; ++r) m[r] += row[r];
+      for (int d = 0; d < channels; ++d) v_color[d] += row[kMoments + d];
+      if (from.absgrad)
+        for (int r = 0; r < 2; ++r) absolute[r] += row[kMoments + channels + r];
+    }
+    const float a = usable ? in.conics[3 * splat] : 0, b = usable ? in.conics[3 * splat + 1] : 0;
+    const float c = usable ? in.conics[3 * splat + 2] : 0;
+    v_means2d[2 * splat] = a * m[1] + b * m[2];
+    v_means2d[2 * splat + 1] = b * m[1] + c * m[2];
+    v_conics[3 * splat] = -0.5f * m[3];
+    v_conics[3 * splat + 1] = -m[4];
+    v_conics[3 * splat + 2] = -0.5f * m[5];
+    v_opacities[splat] = usable ? m[0] / in.opacities[splat] : 0;
+    for (int r = 0; from.absgrad && r < 2; ++r) v_means2d_abs[2 * splat + r] = absolute[r];
+  }
+}
 
 }  // namespace
 
-extern const CompositingKernels compositing_kernels = {make_records, scratch_floats, composite_tile, nullptr, nullptr};
+extern const CompositingKernels compositing_kernels = {make_records, scratch_floats, composite_tile, composite_tile_backward, gather};
 
 }  // namespace GSPLAT_ISA

@@ -100,14 +100,18 @@ def _check(
     expected = {"means2d": (means2d, 2), "radii": (radii, 2)} | ({} if conics is None else {"conics": (conics, 3)})
     for name, (tensor, last) in expected.items():
         if tuple(tensor.shape) != (*shape, last):
-            raise InvalidInput(f"{name} must have shape {(*shape, last)} to go with depths {shape}, got {tuple(tensor.shape)}")
+            raise InvalidInput(
+                f"{name} must have shape {(*shape, last)} to go with depths {shape}, got {tuple(tensor.shape)}"
+            )
     if (conics is None) != (opacities is None):
         raise InvalidInput("the exact tile test needs both conics and opacities; give both or neither")
     if opacities is not None and tuple(opacities.shape) != shape:
         raise InvalidInput(f"opacities must have the shape of depths, {shape}, got {tuple(opacities.shape)}")
     for name, value in {"means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities}.items():
         if value is not None and value.dtype != torch.float32:
-            raise InvalidInput(f"{name} must be float32, got {value.dtype}; gsplat_core.reference.isect_tiles takes any dtype")
+            raise InvalidInput(
+                f"{name} must be float32, got {value.dtype}; gsplat_core.reference.isect_tiles takes any dtype"
+            )
     if radii.dtype != torch.int32:
         raise InvalidInput(f"radii must be int32 pixels, got {radii.dtype}")
     if not packed:

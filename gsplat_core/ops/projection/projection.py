@@ -1,0 +1,148 @@
+"""Projection of 3D Gaussians to screen-space ellipses, compiled (EWA splatting, Zwicker et al. 2001)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_float32_cpu
+from gsplat_core.cameras import CAMERA_MODELS
+from gsplat_core.ops import native  # noqa: F401  registers the compiled op
+from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, check_projection_arguments, pack
+
+
+def fully_fused_projection(
+    means: Tensor,
+    covars: Tensor | None,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    eps2d: float = 0.3,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    packed: bool = False,
+    sparse_grad: bool = False,
+    calc_compensations: bool = False,
+    camera_model: str = "pinhole",
+    opacities: Tensor | None = None,
+) -> DenseProjection | PackedProjection:
+    """Project Gaussians to image ellipses, as gsplat 1.5.3 does.
+
+    Args:
+        means: [..., N, 3]; `...` are any batch dimensions, the same everywhere.
+        covars: upper triangles [..., N, 6], or None with quats and scales given.
+        quats: [..., N, 4] wxyz, of any length but zero.
+        scales: [..., N, 3].
+        viewmats: world to camera [..., C, 4, 4], OpenCV axes. Ks: [..., C, 3, 3] in pixels, without skew.
+        eps2d: blur in pixels² added to the diagonal of the 2D covariance.
+        near_plane, far_plane: a Gaussian whose centre's z lies outside is culled.
+        radius_clip: a Gaussian with both radii at or below this many pixels is culled.
+        packed: one row per Gaussian that is not culled.
+        calc_compensations: also sqrt(max(0.005², det Σ / det (Σ + blur))) (Yu et al. 2024).
+        camera_model: "pinhole" (Jacobian clamped at 1.3 times the field of view), "ortho" or "fisheye" (equidistant).
+        opacities: [..., N]; makes the box as tight as the opacity allows, min(3.33, sqrt(2 ln(255 o))) standard
+            deviations, and culls Gaussians that cannot reach an alpha of 1/255.
+
+    Returns:
+        `DenseProjection` (radii, means2d, depths, conics, compensations), zero where culled, or `PackedProjection`.
+
+    A Gaussian with a NaN or an infinity (or a value whose square leaves float32's range) is culled and gets zero
+    gradients. Differentiable in means, covars, quats, scales and viewmats; sums over Gaussians run in a fixed order.
+
+    Raises InvalidInput for wrong shapes, dtypes (float64 is for `gsplat_core.reference`) or devices, NotImplementedError
+    for sparse_grad and gsplat's other camera models.
+    """
+    batch_dims = check_projection_arguments(
+        means, covars, quats, scales, viewmats, Ks, width, height, sparse_grad, camera_model, opacities
+    )
+    require_float32_cpu(
+        "fully_fused_projection", means=means, covars=covars, quats=quats, scales=scales, viewmats=viewmats, Ks=Ks,
+        opacities=opacities,
+    )  # fmt: skip
+    n, c = means.shape[-2], viewmats.shape[-3]
+
+    def flat(tensor: Tensor | None, *trailing: int) -> Tensor | None:
+        return None if tensor is None else tensor.reshape(math.prod(batch_dims), *trailing)
+
+    radii, means2d, depths, conics, compensations = torch.ops.gsplat_core.project_gaussians(
+        flat(means, n, 3), flat(covars, n, 6), flat(quats, n, 4), flat(scales, n, 3),
+        None if opacities is None else flat(opacities.detach(), n), flat(viewmats, c, 4, 4), flat(Ks.detach(), c, 3, 3),
+        width, height, eps2d, near_plane, far_plane, radius_clip, calc_compensations, CAMERA_MODELS.index(camera_model),
+    )  # fmt: skip
+    dense = DenseProjection(
+        radii.reshape(*batch_dims, c, n, 2),
+        means2d.reshape(*batch_dims, c, n, 2),
+        depths.reshape(*batch_dims, c, n),
+        conics.reshape(*batch_dims, c, n, 3),
+        compensations.reshape(*batch_dims, c, n) if calc_compensations else None,
+    )
+    return pack(dense) if packed else dense
+
+
+@torch.library.register_fake("gsplat_core::project_gaussians")
+def _fake(
+    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, opacities: Tensor | None,
+    viewmats: Tensor, Ks: Tensor, width: int, height: int, eps2d: float, near_plane: float, far_plane: float,
+    radius_clip: float, compensate: bool, camera_model: int,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    b, n, _ = means.shape
+    c = viewmats.shape[1]
+    return (
+        means.new_empty((b, c, n, 2), dtype=torch.int32),
+        means.new_empty((b, c, n, 2)),
+        means.new_empty((b, c, n)),
+        means.new_empty((b, c, n, 3)),
+        means.new_empty((b, c, n) if compensate else (0,)),
+    )
+
+
+@torch.library.register_fake("gsplat_core::project_gaussians_backward")
+def _fake_backward(
+    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
+    radii: Tensor, v_means2d: Tensor | None, v_depths: Tensor | None, v_conics: Tensor | None,
+    v_compensations: Tensor | None, width: int, height: int, eps2d: float, camera_model: int, needs_viewmats: bool,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    b, n, _ = means.shape
+    return (
+        means.new_empty((b, n, 3)),
+        means.new_empty((0,) if covars is None else (b, n, 6)),
+        means.new_empty((0,) if covars is not None else (b, n, 4)),
+        means.new_empty((0,) if covars is not None else (b, n, 3)),
+        means.new_empty(tuple(viewmats.shape) if needs_viewmats else (0,)),
+    )
+
+
+def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    means, covars, quats, scales, _, viewmats, Ks = inputs[:7]
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(means, covars, quats, scales, viewmats, Ks, output[0])
+    ctx.width, ctx.height, ctx.eps2d, ctx.compensate, ctx.camera_model = *inputs[7:10], inputs[13], inputs[14]
+
+
+def _backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
+    means, covars, quats, scales, viewmats, Ks, radii = ctx.saved_tensors
+    needs = ctx.needs_input_grad
+    v_compensations = v[4] if ctx.compensate else None
+    v_means, v_covars, v_quats, v_scales, v_viewmats = torch.ops.gsplat_core.project_gaussians_backward(
+        means, covars, quats, scales, viewmats, Ks, radii, v[1], v[2], v[3], v_compensations,
+        ctx.width, ctx.height, ctx.eps2d, ctx.camera_model, needs[5],
+    )  # fmt: skip
+    return (
+        v_means if needs[0] else None,
+        v_covars if needs[1] else None,
+        v_quats if needs[2] else None,
+        v_scales if needs[3] else None,
+        None,
+        v_viewmats if needs[5] else None,
+        *[None] * 9,
+    )
+
+
+torch.library.register_autograd("gsplat_core::project_gaussians", _backward, setup_context=_setup_context)
