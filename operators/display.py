@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+from numpy.typing import NDArray
 
 from operators.errors import OutputError
 from operators.graph import Operator, OperatorSpec
 from operators.messages import RenderedFrame
 from operators.pictures import side_by_side
-from operators.storage import StorageReserve, storage_errors
+from operators.storage import StorageReserve, storage_errors, write_whole
 from operators.video_file import VideoFile
 
 
@@ -117,8 +118,8 @@ class CallbackSinkOp(Operator):
         self.displayed += 1
 
 
-def write_png(path: Path, image: Any, reserve: StorageReserve | None = None) -> None:
-    """An RGB or one-channel image as PNG, whole or not at all.
+def write_png(path: Path, image: NDArray[Any], reserve: StorageReserve | None = None) -> None:
+    """Write an RGB uint8 [H, W, 3] or a one-channel image [H, W] as PNG, whole or not at all.
 
     Raises:
         StorageFull: there is no room.
@@ -126,13 +127,5 @@ def write_png(path: Path, image: Any, reserve: StorageReserve | None = None) -> 
     """
     coded, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
     if not coded:
-        raise OutputError(f"{path}: an image {list(image.shape)} of {image.dtype} cannot be coded as PNG")
-    if reserve is not None:
-        reserve.require(len(data))
-    partial = path.with_suffix(".png.part")
-    try:
-        with storage_errors(path.parent):
-            partial.write_bytes(data.tobytes())
-            partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+        raise OutputError(f"{path}: an image {list(image.shape)} of {image.dtype} cannot be coded as PNG; give uint8 or uint16")
+    write_whole(path, data.tobytes(), reserve)

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from operators.errors import OutputFolderInUse
-from operators.storage import storage_errors
+from operators.storage import storage_errors, write_whole
 
 MARKER = ".intrasplat.json"
 """Lies in every folder that this program has made, and only there."""
@@ -41,5 +41,5 @@ def claim_output_folder(folder: Path, made_by: str) -> bool:
     earlier = check_output_folder(folder)
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / MARKER).write_text(json.dumps({"format": _FORMAT, "version": 1, "made_by": made_by}) + "\n")
+    write_whole(folder / MARKER, (json.dumps({"format": _FORMAT, "version": 1, "made_by": made_by}) + "\n").encode())
     return earlier

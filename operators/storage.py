@@ -1,4 +1,4 @@
-"""Room on the disk: stop while there is still enough to finish what was begun."""
+"""Writing to disks that may be full: stop while there is still room to finish what was begun; a file is whole or not there."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsplat_core.io.atomic_files import replace_durably, write_durably
 from operators.errors import StorageFull
 
 
@@ -51,3 +52,16 @@ def storage_errors(folder: Path) -> Iterator[None]:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise StorageFull(f"the disk of {folder} is full ({error.strerror}); {_advice(folder)}") from error
         raise
+
+
+def write_whole(path: Path, data: bytes, reserve: StorageReserve | None = None) -> None:
+    """Write a file under another name and rename it, so that nobody ever sees half of it, and an earlier one stays until then.
+
+    Raises StorageFull.
+    """
+    if reserve is not None:
+        reserve.require(len(data))
+    partial = path.with_name(path.name + ".part")
+    with storage_errors(path.parent):
+        write_durably(partial, [data])
+        replace_durably(partial, path)

@@ -33,7 +33,7 @@ def exit_code_of(error: BaseException) -> int:
 def user_sentence(error: BaseException) -> str | None:
     """What happened, the value, what to do; None for a bug."""
     from gsplat_core.errors import CoreError
-    from operators.errors import EngineError, OperatorFailed, OutputError, RunError
+    from operators.errors import EngineError, OperatorFailed, OutputError, RunError, RunFailed
 
     where = ""
     for link in _causes(error):
@@ -41,6 +41,8 @@ def user_sentence(error: BaseException) -> str | None:
             # The operator is where it happened; its cause is what happened.
             frame = "" if link.seq is None else f" on frame {link.seq}"
             where = f"\n  in operator {link.operator}{frame}"
+        elif isinstance(link, RunFailed):
+            continue  # says that a run ended early; what it is raised from says why
         elif isinstance(link, CoreError | EngineError | OutputError | RunError):
             return f"{link}{where}"
         elif isinstance(link, OSError) and link.filename is not None:

@@ -8,9 +8,10 @@ from html import escape
 from importlib.resources import files
 from pathlib import Path
 
+from operators.storage import write_whole
 from services.reports.charts import NARROW, Chart, Line
 from services.reports.pictures import KeyframePictures
-from services.reports.schema import Quality, RunReport, write_text_whole
+from services.reports.schema import Quality, RunReport
 
 # Nothing may be fetched, whatever a later edit writes into the page.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
@@ -18,7 +19,7 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-ur
 
 def write_html(report: RunReport, keyframes: Sequence[KeyframePictures], path: Path, worst_seq: int | None = None) -> None:
     """Write the page; the file is whole or not there."""
-    write_text_whole(path, render_html(report, keyframes, worst_seq))
+    write_whole(path, render_html(report, keyframes, worst_seq).encode())
 
 
 def render_html(report: RunReport, keyframes: Sequence[KeyframePictures], worst_seq: int | None = None) -> str:

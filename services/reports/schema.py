@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from operators.storage import storage_errors
+from operators.storage import write_whole
 
 NOTICE = "Research use only, not a medical device."
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -154,20 +154,10 @@ class RunReport(_Part):
 
     def write(self, path: Path) -> None:
         """Write JSON; the file is whole or not there."""
-        write_text_whole(path, json.dumps(self.model_dump(mode="json"), indent=2) + "\n")
+        text = json.dumps(self.model_dump(mode="json"), indent=2, allow_nan=False)
+        write_whole(path, (text + "\n").encode())
 
     @classmethod
     def read(cls, path: Path) -> RunReport:
         """Read a report back; raises pydantic.ValidationError where it does not fit."""
         return cls.model_validate_json(path.read_text(encoding="utf-8"))
-
-
-def write_text_whole(path: Path, text: str) -> None:
-    """Write a text file by way of a partial one, so that a reader never sees half of it."""
-    partial = path.with_name(path.name + ".part")
-    try:
-        with storage_errors(path.parent):
-            partial.write_text(text, encoding="utf-8")
-            partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
