@@ -9,7 +9,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // alone and counted in the result (int64 scalar).
   m.def(
       "adam_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, int step, "
-      "float learning_rate, float beta1, float beta2, float epsilon) -> ()");
+      "float learning_rate, float beta1, float beta2, float epsilon, int row_size) -> Tensor");
 
   // Projection to the image: B batches, C cameras, N Gaussians. Covariances as [B, N, 6], or quats and scales.
   m.def(
@@ -35,6 +35,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "quat_scale_to_covar_preci_backward(Tensor quats, Tensor scales, Tensor? v_covars, Tensor? v_precis, bool triu) -> "
       "(Tensor v_quats, Tensor v_scales)");
+
   // Tiles: which splats each tile has, in depth order. `images` counts batch x cameras; image_ids is for packed splats.
   m.def(
       "isect_tiles(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
@@ -55,6 +56,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor flatten_ids, Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size, Tensor alphas, Tensor last, "
       "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
       "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
+
   // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
   m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, float tau) -> Tensor");
   m.def(
@@ -65,7 +67,6 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor(d!) m_centers, Tensor(e!) m_log_widths, Tensor(f!) m_weights, Tensor(g!) v_centers, Tensor(h!) v_log_widths, "
       "Tensor(i!) v_weights, Tensor(j!) steps, float position_rate, float rotation_rate, float scale_rate, float colour_rate, "
       "float center_rate, float width_rate, float beta1, float beta2, float epsilon) -> ()");
-      "float learning_rate, float beta1, float beta2, float epsilon, int row_size) -> Tensor");
 
   // Structural similarity of each pixel and channel of [H, W, C] images.
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
