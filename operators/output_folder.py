@@ -23,7 +23,8 @@ def check_output_folder(folder: Path) -> bool:
     if not folder.is_dir():
         raise OutputFolderInUse(f"{folder} is a file; give a folder that does not exist yet or is empty")
     try:
-        return bool(json.loads((folder / MARKER).read_text(encoding="utf-8")).get("format") == _FORMAT)
+        if json.loads((folder / MARKER).read_text(encoding="utf-8")).get("format") == _FORMAT:
+            return True
     except (FileNotFoundError, ValueError, AttributeError):
         pass
     others = sorted(entry.name for entry in folder.iterdir())
