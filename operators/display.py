@@ -127,5 +127,7 @@ def write_png(path: Path, image: NDArray[Any], reserve: StorageReserve | None = 
     """
     coded, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
     if not coded:
-        raise OutputError(f"{path}: an image {list(image.shape)} of {image.dtype} cannot be coded as PNG; give uint8 or uint16")
+        raise OutputError(
+            f"{path}: an image {list(image.shape)} of {image.dtype} cannot be coded as PNG; give uint8 or uint16"
+        )
     write_whole(path, data.tobytes(), reserve)

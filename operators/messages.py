@@ -32,7 +32,9 @@ class Reconstruction:
         if self.steps < 0:
             raise InvalidInput(f"frame {self.frame.seq}: steps is {self.steps}; it must not be negative")
         if not self.trained and self.steps:
-            raise InvalidInput(f"frame {self.frame.seq}: a held-out frame had {self.steps} training steps; it must have none")
+            raise InvalidInput(
+                f"frame {self.frame.seq}: a held-out frame had {self.steps} training steps; it must have none"
+            )
 
 
 @dataclass(frozen=True)

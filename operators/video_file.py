@@ -18,7 +18,9 @@ CODEC = "mp4v"
 class VideoFile:
     """Writes RGB frames of one size to an MP4; use as a context manager or call `close()`, which finishes the file's index."""
 
-    def __init__(self, path: Path, width_px: int, height_px: int, fps: float, reserve: StorageReserve | None = None) -> None:
+    def __init__(
+        self, path: Path, width_px: int, height_px: int, fps: float, reserve: StorageReserve | None = None
+    ) -> None:
         self.path = path
         # A run that fails must not have destroyed the video of the run before; the container is chosen by the suffix.
         self._partial = path.with_name(f".{path.stem}.part{path.suffix}")
@@ -48,7 +50,9 @@ class VideoFile:
         Raises StorageFull before the disk is so full that the file could not be finished.
         """
         if image.shape[:2] != self._size:
-            raise OutputError(f"{self.path}: frame {self.frames} is {list(image.shape[:2])}, the video {list(self._size)}; they must be equal")
+            raise OutputError(
+                f"{self.path}: frame {self.frames} is {list(image.shape[:2])}, the video {list(self._size)}; they must be equal"
+            )
         self._reserve.require(self._frame_bytes)
         bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
         if self._even != self._size:

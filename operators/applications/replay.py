@@ -12,41 +12,33 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from itertools import islice
 from pathlib import Path
-from time import perf_counter
 from typing import Any, get_args
 
-import torch
-
-from gsplat_core.errors import CoreError, InvalidInput
+from gsplat_core.errors import InvalidInput
 from gsplat_core.frames import Frame
-from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.recordings import Recording, is_heldout, open_recording
-from gsplat_core.training.baselines import Baselines, measure_baselines
 from gsplat_core.training.config import FieldChoice, ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device
+from operators.applications.execution import Execution
 from operators.applications.progress import Progress, ProgressCallback
-from operators.applications.result import RunOutcome, peak_memory_bytes
+from operators.applications.result import RunOutcome
 from operators.deform import DeformOp
 from operators.display import CallbackSinkOp, VideoSinkOp
-from operators.errors import OperatorsError, RunFailed
-from operators.graph import Application, Engine, GreedyScheduler, ManualClock, run
+from operators.graph import Application, Engine, GreedyScheduler, ManualClock
 from operators.ingest import SourceOp
 from operators.keyframes import KeyframesOp
 from operators.metrics import MetricsOp, ScoredFrame
-from operators.output_folder import claim_output_folder
+from operators.output_folder import check_output_folder, claim_output_folder
 from operators.rasterize import RasterizeOp
 from operators.reconstruct import ReconstructOp
-from operators.storage import StorageReserve, storage_errors
+from operators.storage import StorageReserve
 from operators.tool_mask import RecordedToolMaskOp
 
 REPORT_RESERVE_BYTES = 8 * 2**20
 """Room on the disk that stays free for the video's index and the report."""
 KEYFRAMES = 5
-PERCENTILES = tuple(k / 100 for k in range(101))
 
 
 @dataclass(frozen=True)
@@ -90,13 +82,15 @@ class ReplayApplication(Application):
         reserve_bytes: int = REPORT_RESERVE_BYTES,
         progress: ProgressCallback | None = None,
         stop_requested: Callable[[], bool] = lambda: False,
-        make_reconstructor: Callable[[], Reconstructor] | None = None,
+        make_reconstructor: Callable[[], Any] | None = None,
+        stage: str = "replay",
     ) -> None:
         super().__init__(name="replay", track=True)
         self.scheduler(GreedyScheduler(self, clock=ManualClock()))
         self.recording = recording
         self.settings = settings
         self.video_path = video
+        self.stage = stage
         self._progress = progress
         self._stop_requested = stop_requested
         self._make_reconstructor = make_reconstructor or self._new_reconstructor
@@ -145,7 +139,10 @@ class ReplayApplication(Application):
         if self._progress is not None:
             self._progress(
                 Progress(
-                    "replay", len(self.metrics.series), self.recording.frame_count, psnr_tissue_db=scored.quality.psnr_tissue_db
+                    self.stage,
+                    len(self.metrics.series),
+                    self.recording.frame_count,
+                    psnr_tissue_db=scored.quality.psnr_tissue_db,
                 )
             )
 
@@ -163,127 +160,24 @@ def replay(
         RecordingError, InvalidInput, DeviceMissing, OutputFolderInUse, StorageFull: before anything was written.
         RunFailed: the run ended early; what it had reached is saved, and the error carries the outcome.
     """
+    recording, notes = prepare(settings, "replay")
+    app = ReplayApplication(
+        recording, settings, video=settings.out / "reconstruction.mp4", progress=progress, stop_requested=stop_requested
+    )
+    return Execution(app, notes, stop_requested).execute()
+
+
+def prepare(settings: ReplaySettings, made_by: str) -> tuple[Recording, list[str]]:
+    """Check everything that can be checked before the first frame, then claim the output folder; the recording and its notes.
+
+    Raises as `replay` does before anything is written.
+    """
     check_device(settings.device)
     settings.reconstructor_config()
+    check_output_folder(settings.out)
     recording = open_recording(settings.recording, scale=settings.scale, max_frames=settings.max_frames)
     notes = list(recording.notes)
-    if claim_output_folder(settings.out, "replay"):
-        notes.append("the output folder held an earlier run, whose files were replaced")
+    if claim_output_folder(settings.out, made_by):
+        notes.append("the output folder held an earlier run; this one replaces its files")
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
-    return _Run(recording, settings, notes, progress, stop_requested).execute()
-
-
-class _Run:
-    """One replay from start to outcome."""
-
-    def __init__(
-        self,
-        recording: Recording,
-        settings: ReplaySettings,
-        notes: list[str],
-        progress: ProgressCallback | None,
-        stop_requested: Callable[[], bool],
-    ) -> None:
-        self.recording, self.settings, self.notes = recording, settings, notes
-        self.stop_requested = stop_requested
-        self.outputs: dict[str, Path] = {}
-        self.failure: Exception | None = None
-        self.app = ReplayApplication(
-            recording,
-            settings,
-            video=settings.out / "reconstruction.mp4",
-            progress=progress,
-            stop_requested=stop_requested,
-        )
-
-    def execute(self) -> RunOutcome:
-        started_at, began_s = datetime.now(UTC), perf_counter()
-        # The caller's random numbers are not ours to move.
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.settings.seed)
-            self._attempt(lambda: run(self.app, self.settings.engine))
-        wall_s = perf_counter() - began_s
-        if self.app.video.displayed and self.app.video_path.exists():
-            self.outputs["video"] = self.app.video_path
-        self._attempt(self._save_model)
-        baselines = self._attempt(self._baselines)
-        outcome = self._outcome(started_at, wall_s, baselines)
-        if self.failure is not None:
-            raise RunFailed(f"the replay ended early: {outcome.stop_reason}", outcome) from self.failure
-        return outcome
-
-    def _attempt(self, action: Callable[[], Any]) -> Any:
-        """Do one part of the run; its error is kept for the end, so that the other parts are still saved."""
-        try:
-            return action()
-        except (CoreError, OperatorsError, OSError) as error:
-            self.failure = self.failure or error
-            self.notes.append(str(error))
-            return None
-
-    def _save_model(self) -> None:
-        model = self.app.reconstruct.model
-        if model is not None:
-            folder = self.settings.out / "model"
-            with storage_errors(self.settings.out):
-                save_bundle(model, folder)
-            self.outputs["model"] = folder
-
-    def _baselines(self) -> Baselines | None:
-        shown = len(self.app.metrics.series)
-        if self.stop_requested() or self.failure is not None:
-            self.notes.append("the run ended early: baselines that need a second reading of the recording were left out")
-            return None
-        return measure_baselines(_Beginning(self.recording, shown))
-
-    def _outcome(self, started_at: datetime, wall_s: float, baselines: Baselines | None) -> RunOutcome:
-        app, settings = self.app, self.settings
-        metrics = app.metrics
-        interrupted = self.stop_requested() and app.source.emitted < self.recording.frame_count
-        reason = "interrupted" if interrupted else "end of recording"
-        if self.failure is not None:
-            reason = str(self.failure)
-        tracker = app.track()
-        dropped = sum(sum(edge.dropped.values()) for edge in app.edge_stats())
-        return RunOutcome(
-            command="replay",
-            recording=self.recording,
-            device=settings.device,
-            engine=settings.engine,
-            field=settings.reconstructor_config().chosen_field,
-            seed=settings.seed,
-            scale=settings.scale,
-            steps_per_frame=settings.reconstructor_config().steps_per_frame,
-            started_at=started_at,
-            wall_s=wall_s,
-            stop_reason=reason,
-            interrupted=interrupted,
-            ingested=app.source.emitted,
-            displayed=app.video.displayed,
-            dropped=dropped,
-            latency=tracker.latency(),
-            latency_quantiles_ms=tracker.latency_quantiles_ms(PERCENTILES),
-            operators=tracker.compute(),
-            live=metrics.live,
-            held_out=metrics.held_out if settings.heldout else None,
-            baselines=baselines,
-            series=tuple(metrics.series),
-            keyframes=tuple(app.keyframes.keyframes),
-            worst_seq=app.keyframes.worst_seq,
-            model=app.reconstruct.model,
-            frames_sha256=metrics.frames_sha256,
-            notes=(*self.notes, *app.tool_mask.notes),
-            outputs=self.outputs,
-            peak_memory_bytes=peak_memory_bytes(),
-        )
-
-
-@dataclass(frozen=True)
-class _Beginning:
-    """The first frames of a recording; can be read more than once."""
-
-    recording: Recording
-    count: int
-
-    def __iter__(self) -> Any:
-        return islice(iter(self.recording), self.count)
+    return recording, notes

@@ -44,7 +44,11 @@ class RunOutcome:
     latency_quantiles_ms: dict[str, list[float]]
     operators: dict[str, DurationSummary]
     live: QualityTracker | None
+    """Frames right after their own training steps; None offline."""
     held_out: QualityTracker | None
+    """Frames that were never trained on; None when none were kept back."""
+    training: QualityTracker | None
+    """Training frames after all of the training; None online."""
     baselines: Baselines | None
     series: tuple[dict[str, float | int | bool | None], ...]
     keyframes: tuple[ScoredFrame, ...]

@@ -21,8 +21,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-RecordingArgument = Annotated[Path, typer.Argument(help="A video, or a folder with video.mp4, images/ or cameras.json.", show_default=False)]
-OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results: new, empty, or left by an earlier run.", show_default=False)]
+RecordingArgument = Annotated[
+    Path, typer.Argument(help="A video, or a folder with video.mp4, images/ or cameras.json.", show_default=False)
+]
+OutOption = Annotated[
+    Path,
+    typer.Option("--out", help="Folder for the results: new, empty, or left by an earlier run.", show_default=False),
+]
 DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
 FieldOption = Annotated[str, typer.Option(help="Deformation field: auto, basis or hexplane.")]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
@@ -56,7 +61,9 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def _common(
-    version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
 ) -> None:
     pass
 
@@ -69,18 +76,36 @@ def replay(
     engine: Annotated[str, typer.Option(help="Graph engine: embedded or holoscan.")] = "embedded",
     field: FieldOption = "auto",
     seed: SeedOption = 0,
-    steps_per_frame: Annotated[int | None, typer.Option(help="Optimiser steps per frame.", show_default="the field's")] = None,
+    steps_per_frame: Annotated[
+        int | None, typer.Option(help="Optimiser steps per frame.", show_default="the field's")
+    ] = None,
     max_frames: MaxFramesOption = None,
     scale: ScaleOption = 1.0,
-    heldout: Annotated[bool, typer.Option("--heldout/--no-heldout", help="Show frames 1, 9, 17, ... without training on them, and score them apart.")] = False,
+    heldout: Annotated[
+        bool,
+        typer.Option(
+            "--heldout/--no-heldout", help="Show frames 1, 9, 17, ... without training on them, and score them apart."
+        ),
+    ] = False,
     json: JsonOption = False,
 ) -> int:
     """Reconstruct a recording as if it were live: train on each frame as it comes, show it, measure it."""
+    from operators.applications.replay import ReplaySettings
     from services.cli.replay import replay_command
 
-    return replay_command(
-        recording, out, device, engine, field, seed, steps_per_frame, max_frames, scale, heldout, as_json=json
+    settings = ReplaySettings(
+        recording=recording,
+        out=out,
+        device=device,
+        engine=engine,  # type: ignore[arg-type]
+        field=field,  # type: ignore[arg-type]
+        seed=seed,
+        steps_per_frame=steps_per_frame,
+        max_frames=max_frames,
+        scale=scale,
+        heldout=heldout,
     )
+    return replay_command(settings, as_json=json)
 
 
 @app.command()
@@ -90,15 +115,25 @@ def reconstruct(
     device: DeviceOption = "cpu",
     field: FieldOption = "auto",
     seed: SeedOption = 0,
-    steps: Annotated[int, typer.Option(help="Optimiser steps over all training frames.")] = 3000,
+    steps: Annotated[int, typer.Option(help="Optimiser steps over all training frames.")] = 2000,
     max_frames: MaxFramesOption = None,
     scale: ScaleOption = 1.0,
     json: JsonOption = False,
 ) -> int:
     """Reconstruct offline: train on all training frames, then evaluate the held-out ones."""
+    from operators.applications.replay import ReplaySettings
     from services.cli.reconstruct import reconstruct_command
 
-    return reconstruct_command(recording, out, device, field, seed, steps, max_frames, scale, as_json=json)
+    settings = ReplaySettings(
+        recording=recording,
+        out=out,
+        device=device,
+        field=field,  # type: ignore[arg-type]
+        seed=seed,
+        max_frames=max_frames,
+        scale=scale,
+    )
+    return reconstruct_command(settings, steps, as_json=json)
 
 
 @app.command()

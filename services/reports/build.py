@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from pathlib import Path
 
 import torch
 
-from gsplat_core.ops.native import instruction_set
 from gsplat_core.training.metrics import QualityTracker
 from operators.applications.result import RunOutcome
 from services.reports.html import write_html
+from services.reports.machine import machine_facts
 from services.reports.pictures import keyframe_pictures
 from services.reports.schema import (
     BaselineQuality,
@@ -63,11 +61,13 @@ def build_report(outcome: RunOutcome) -> RunReport:
             path: Latency(p50=t.p50_ms, p95=t.p95_ms, p99=t.p99_ms, max=t.max_ms) for path, t in outcome.latency.items()
         },
         operators={
-            name: OperatorTimes(calls=t.count, p50_ms=t.p50_ms, p99_ms=t.p99_ms) for name, t in outcome.operators.items()
+            name: OperatorTimes(calls=t.count, p50_ms=t.p50_ms, p99_ms=t.p99_ms)
+            for name, t in outcome.operators.items()
         },
         quality=QualityReport(
             live=_quality(outcome.live),
             heldout=_quality(outcome.held_out),
+            training=_quality(outcome.training),
             baselines=BaselineQuality(
                 previous_frame_db=baselines.previous_frame_db if baselines else None,
                 train_mean_db=baselines.heldout_train_mean_db if baselines else None,
@@ -96,32 +96,10 @@ def write_reports(outcome: RunOutcome, folder: Path) -> RunReport:
     report = build_report(outcome)
     report = report.model_copy(update={"outputs": {**report.outputs, "report": "report.json", "page": "report.html"}})
     report.write(folder / "report.json")
-    write_html(report, [keyframe_pictures(frame) for frame in outcome.keyframes], folder / "report.html", outcome.worst_seq)
+    write_html(
+        report, [keyframe_pictures(frame) for frame in outcome.keyframes], folder / "report.html", outcome.worst_seq
+    )
     return report
-
-
-def machine_facts() -> dict[str, str]:
-    """What the figures were measured on."""
-    return {
-        "Processor": processor_name(),
-        "Cores": str(os.cpu_count()),
-        "Instruction set": instruction_set(),
-        "System": f"{platform.system()} {platform.release()}",
-        "Python": platform.python_version(),
-        "torch": torch.__version__,
-    }
-
-
-def processor_name() -> str:
-    """The processor's marketing name where the system tells it."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as lines:
-            for line in lines:
-                if line.startswith("model name"):
-                    return line.split(":", 1)[1].strip()
-    except FileNotFoundError:
-        pass
-    return platform.processor() or platform.machine()
 
 
 def _quality(tracker: QualityTracker | None) -> Quality | None:

@@ -60,10 +60,14 @@ class Chart:
             parts.append(f'<text x="{LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{_number(tick)}</text>')
         for tick in x_axis.ticks:
             x = x_of(tick)
-            parts.append(f'<line class="tick" x1="{x:.1f}" y1="{HEIGHT - BOTTOM}" x2="{x:.1f}" y2="{HEIGHT - BOTTOM + 5}"/>')
+            parts.append(
+                f'<line class="tick" x1="{x:.1f}" y1="{HEIGHT - BOTTOM}" x2="{x:.1f}" y2="{HEIGHT - BOTTOM + 5}"/>'
+            )
             parts.append(f'<text x="{x:.1f}" y="{HEIGHT - BOTTOM + 19}" text-anchor="middle">{_number(tick)}</text>')
         middle = LEFT + (self.width - LEFT - RIGHT) / 2
-        parts.append(f'<text class="axis" x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(self.x_label)}</text>')
+        parts.append(
+            f'<text class="axis" x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(self.x_label)}</text>'
+        )
         height = TOP + (HEIGHT - TOP - BOTTOM) / 2
         parts.append(
             f'<text class="axis" x="13" y="{height}" text-anchor="middle" transform="rotate(-90 13 {height})">'
@@ -93,7 +97,9 @@ class Chart:
             runs[-1].append((px, py))
             label = f"{line.name}: {_number(y)}{self.y_unit} at {_number(x)}{self.x_unit}"
             radius, style = (3.5, f"mark {line.style}") if line.marks else (5, "hover")
-            hover.append(f'<circle class="{style}" cx="{px:.1f}" cy="{py:.1f}" r="{radius}"><title>{escape(label)}</title></circle>')
+            hover.append(
+                f'<circle class="{style}" cx="{px:.1f}" cy="{py:.1f}" r="{radius}"><title>{escape(label)}</title></circle>'
+            )
         parts = []
         for run in runs:
             if len(run) > 1 and not line.marks:

@@ -17,7 +17,9 @@ from services.reports.schema import Quality, RunReport
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
-def write_html(report: RunReport, keyframes: Sequence[KeyframePictures], path: Path, worst_seq: int | None = None) -> None:
+def write_html(
+    report: RunReport, keyframes: Sequence[KeyframePictures], path: Path, worst_seq: int | None = None
+) -> None:
     """Write the page; the file is whole or not there."""
     write_whole(path, render_html(report, keyframes, worst_seq).encode())
 
@@ -100,10 +102,24 @@ def _tiles(report: RunReport) -> str:
     if report.latency_ms:
         path = _display_path(report)
         latency = report.latency_ms[path]
-        tiles.append(_tile("Latency to display", f"{latency.p50:,.0f}", "ms", f"p95 {latency.p95:,.0f} ms, max {latency.max:,.0f} ms"))
+        tiles.append(
+            _tile(
+                "Latency to display",
+                f"{latency.p50:,.0f}",
+                "ms",
+                f"p95 {latency.p95:,.0f} ms, max {latency.max:,.0f} ms",
+            )
+        )
     tiles.append(_tile("Run time", f"{wall:,.1f}", "s", f"{rate:.2f} frames a second"))
     if report.model:
-        tiles.append(_tile("Gaussians", f"{report.model.gaussians:,}", "", f"{report.model.parameters:,} parameters, {escape(report.run.field)} field"))
+        tiles.append(
+            _tile(
+                "Gaussians",
+                f"{report.model.gaussians:,}",
+                "",
+                f"{report.model.parameters:,} parameters, {escape(report.run.field)} field",
+            )
+        )
     return f'<ul class="tiles">{"".join(tiles)}</ul>'
 
 
@@ -128,7 +144,12 @@ def _pictures(keyframes: Sequence[KeyframePictures], worst_seq: int | None, repo
             f'<div class="row"><b>Frame {seq}</b><span>{rendered.frame.time_s:.2f} s</span><span>model {rendered.model_version}</span>'
             f"<span>{_finite(quality.psnr_tissue_db)} dB tissue</span><span>SSIM {_finite(quality.ssim, 4)}</span><span>{depth}</span>{tags}</div>"
         )
-        for name, uri in (("raw", pictures.raw), ("reconstruction", pictures.reconstruction), ("error", pictures.error), ("depth", pictures.depth)):
+        for name, uri in (
+            ("raw", pictures.raw),
+            ("reconstruction", pictures.reconstruction),
+            ("error", pictures.error),
+            ("depth", pictures.depth),
+        ):
             cells.append(f'<img src="{uri}" alt="frame {seq}, {name}" loading="lazy">')
     return (
         "<section><h2>Frames</h2>"
@@ -148,14 +169,26 @@ def _quality_over_time(report: RunReport) -> str:
     if not report.series:
         return ""
     lines = []
-    if trained and report.quality.live is not None:
-        lines.append(Line("Reconstruction, live", [e.time_s for e in trained], [e.psnr_tissue_db for e in trained], "main"))
+    if trained:
+        name = "Reconstruction, training frames" if report.quality.live is None else "Reconstruction, live"
+        lines.append(Line(name, [e.time_s for e in trained], [e.psnr_tissue_db for e in trained], "main"))
     lines.append(
-        Line("Previous frame shown instead", [e.time_s for e in report.series], [e.previous_frame_db for e in report.series], "base")
+        Line(
+            "Previous frame shown instead",
+            [e.time_s for e in report.series],
+            [e.previous_frame_db for e in report.series],
+            "base",
+        )
     )
     if held_out:
         lines.append(
-            Line("Reconstruction, held-out frames", [e.time_s for e in held_out], [e.psnr_tissue_db for e in held_out], "second", marks=True)
+            Line(
+                "Reconstruction, held-out frames",
+                [e.time_s for e in held_out],
+                [e.psnr_tissue_db for e in held_out],
+                "second",
+                marks=True,
+            )
         )
     chart = Chart(
         title="Tissue PSNR over time",
@@ -177,6 +210,10 @@ def _baselines(report: RunReport) -> str:
             (f"IntraSplat, live, {quality.live.frames} frames", quality.live.psnr_tissue_db, True),
             ("Previous frame shown instead", baselines.previous_frame_db, False),
         ]
+    if quality.training is not None:
+        rows.append(
+            (f"IntraSplat, training frames, {quality.training.frames} frames", quality.training.psnr_tissue_db, True)
+        )
     if quality.heldout is not None:
         rows.append((f"IntraSplat, held out, {quality.heldout.frames} frames", quality.heldout.psnr_tissue_db, True))
     rows += [
@@ -196,7 +233,7 @@ def _baselines(report: RunReport) -> str:
             f'<td class="track"><span class="rail"><span class="dot" style="left:{share:.1f}%"></span></span></td></tr>'
         )
     extra = ""
-    for name, part in (("Live", quality.live), ("Held out", quality.heldout)):
+    for name, part in (("Live", quality.live), ("Held out", quality.heldout), ("Training", quality.training)):
         if part is not None:
             ssim = "–" if part.ssim is None else f"{part.ssim:.4f}"
             extra += f"{name}: whole-frame PSNR {_decibels(part.psnr_frame_db)} dB, SSIM {ssim}. "
@@ -268,7 +305,9 @@ def _facts(report: RunReport) -> str:
     }
     digests = {"Recording": recording.digest, "Model": model.sha256 if model else None, "Frames": report.frames_sha256}
     rows = "".join(f'<tr><th scope="row">{escape(k)}</th><td>{escape(v)}</td></tr>' for k, v in facts.items())
-    rows += "".join(f'<tr><th scope="row">{k} SHA-256</th><td><code>{v}</code></td></tr>' for k, v in digests.items() if v)
+    rows += "".join(
+        f'<tr><th scope="row">{k} SHA-256</th><td><code>{v}</code></td></tr>' for k, v in digests.items() if v
+    )
     return f"<section><h2>Run</h2><table><tbody>{rows}</tbody></table></section>"
 
 

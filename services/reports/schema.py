@@ -108,6 +108,8 @@ class QualityReport(_Part):
     heldout: Quality | None
     """Frames that were never trained on; null without `--heldout`."""
     baselines: BaselineQuality
+    training: Quality | None = None
+    """Training frames after all of the training; null for a replay."""
 
 
 class ModelFacts(_Part):

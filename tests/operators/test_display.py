@@ -28,7 +28,7 @@ def test_the_video_shows_raw_and_reconstruction_side_by_side(tmp_path, rendered,
     operator.stop()
     frames = frames_of(tmp_path / "out.mp4")
     assert len(frames) == 4 == operator.displayed
-    height, width = frames[0].shape[:2]
+    _height, width = frames[0].shape[:2]
     assert width == 2 * 14 * 24, "small frames are enlarged by a whole factor"
     raw, reconstruction = frames[0][40:, : width // 2 - 8], frames[0][40:, width // 2 + 8 :]
     assert 20 < float(reconstruction.mean()) - float(raw.mean()) < 40
@@ -57,7 +57,7 @@ def test_a_failed_run_keeps_the_video_of_the_run_before(tmp_path, rendered, comp
     path.write_bytes(b"earlier")
     operator = VideoSinkOp(None, path=path, fps=25.0, reserve=StorageReserve(tmp_path, lambda: 1 << 60))
     operator.start()
-    with pytest.raises(StorageFull, match="the disk of .* is full"):
+    with pytest.raises(StorageFull, match=r"the disk of .* is full"):
         compute(operator, rendered=rendered())
     operator.stop()
     assert path.read_bytes() == b"earlier" and len(list(tmp_path.iterdir())) == 1
@@ -65,7 +65,9 @@ def test_a_failed_run_keeps_the_video_of_the_run_before(tmp_path, rendered, comp
 
 def test_a_full_disk_stops_the_video_while_it_can_still_be_finished(tmp_path, rendered, compute):
     reserve_bytes = 0
-    operator = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0, reserve=StorageReserve(tmp_path, lambda: reserve_bytes))
+    operator = VideoSinkOp(
+        None, path=tmp_path / "out.mp4", fps=25.0, reserve=StorageReserve(tmp_path, lambda: reserve_bytes)
+    )
     operator.start()
     compute(operator, rendered=rendered(0))
     compute(operator, rendered=rendered(1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
 from operators.keyframes import KeyframesOp
@@ -27,7 +29,7 @@ def test_first_last_and_evenly_between(length, rendered, compute):
     assert seqs == sorted(set(seqs)) and len(seqs) == min(5, length)
     assert seqs[0] == 0 and seqs[-1] == length - 1
     assert held <= 10, "memory is bounded"
-    gaps = [b - a for a, b in zip(seqs, seqs[1:], strict=False)]
+    gaps = [b - a for a, b in itertools.pairwise(seqs)]
     assert max(gaps, default=0) <= max(1, length / 2)
 
 
