@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from types import ModuleType
 from typing import Any, cast
 
 import torch
@@ -18,6 +19,7 @@ from gsplat_core.deformation import regularisers
 from gsplat_core.deformation.field import DeformationField, checked_window
 from gsplat_core.errors import InvalidInput
 from gsplat_core.gaussians import Gaussians
+from gsplat_core.ops.hexplane import hexplane as compiled
 from gsplat_core.reference import deformation as reference
 from gsplat_core.reference.deformation import PLANE_AXES
 
@@ -94,14 +96,16 @@ class HexPlaneField(DeformationField):
 
     def features(self, means: Tensor, time_s: float) -> Tensor:
         """[N, levels * channels]: product over the planes, levels side by side."""
-        coordinates = self.coordinates(means, time_s)
-        return torch.cat(
-            [reference.hexplane_features(coordinates, *level) for level in self._levels(PLANE_NAMES)], dim=1
-        )
+        return torch.cat(self._features(self.coordinates(means, time_s)), dim=1)
 
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`; outside the window the state of its nearest end."""
-        return self._displaced(gaussians, self._decode(self.features(gaussians.means, time_s)))
+        coordinates = self.coordinates(gaussians.means, time_s)
+        # With a graph, torch's own layers: they keep what their gradients need.
+        ops = reference if torch.is_grad_enabled() else self._ops
+        return self._displaced(
+            gaussians, ops.hexplane_decode(self._features(coordinates), coordinates, [], *self._network())
+        )
 
     def cached(self, gaussians: Gaussians) -> Callable[[float], Gaussians]:
         """Factorised inference: the product of the space planes is kept per Gaussian, and at a new time the time planes
@@ -109,15 +113,13 @@ class HexPlaneField(DeformationField):
         gaussians = gaussians.detach()
         with torch.no_grad():
             coordinates = self.coordinates(gaussians.means, self.time_window_s[0])
-            spaces = [reference.hexplane_space(coordinates, *level) for level in self._levels(SPACE_PLANES)]
+            spaces = [self._ops.hexplane_space(coordinates, *level) for level in self._levels(SPACE_PLANES)]
 
         def at(time_s: float) -> Gaussians:
             with torch.no_grad():
-                features = [
-                    reference.hexplane_modulate(space, coordinates, *self._lines(planes, time_s))
-                    for space, planes in zip(spaces, self._levels(TIME_PLANES), strict=True)
-                ]
-                return self._displaced(gaussians, self._decode(torch.cat(features, dim=1)))
+                lines = [line for level in self._levels(TIME_PLANES) for line in self._lines(level, time_s)]
+                deltas = self._ops.hexplane_decode(spaces, coordinates, lines, *self._network())
+                return self._displaced(gaussians, deltas)
 
         return at
 
@@ -190,6 +192,12 @@ class HexPlaneField(DeformationField):
             planes[name] = torch.nn.Parameter(plane if name in TIME_PLANES else plane.uniform_(0.1, 0.5))
         return planes
 
+    @property
+    def _ops(self) -> ModuleType:
+        """The compiled ops where they exist, plain torch for other dtypes and devices."""
+        is_native = self.box.dtype == torch.float32 and self.box.device.type == "cpu"
+        return compiled if is_native else reference
+
     def _named(self, names: Sequence[str]) -> list[Tensor]:
         return [plane for level in self._levels(names) for plane in level]
 
@@ -205,10 +213,13 @@ class HexPlaneField(DeformationField):
         row = min(int(at), rows - 2)
         return [torch.lerp(plane[row], plane[row + 1], at - row) for plane in planes]
 
-    def _decode(self, features: Tensor) -> Tensor:
-        for layer in self.trunk:
-            features = torch.relu(layer(features))
-        return cast(Tensor, self.head(features))
+    def _features(self, coordinates: Tensor) -> list[Tensor]:
+        return [self._ops.hexplane_features(coordinates, *level) for level in self._levels(PLANE_NAMES)]
+
+    def _network(self) -> tuple[list[Tensor], list[Tensor]]:
+        """Weights and biases of the trunk and the head, layer by layer."""
+        layers = [cast(torch.nn.Linear, layer) for layer in (*self.trunk, self.head)]
+        return [layer.weight for layer in layers], [layer.bias for layer in layers]
 
     def _displaced(self, gaussians: Gaussians, deltas: Tensor) -> Gaussians:
         position, log_scale, rotation, opacity = torch.split(deltas, list(HEAD_CHANNELS), dim=1)

@@ -121,3 +121,27 @@ def hexplane_modulate(space: Tensor, coordinates: Tensor, xt: Tensor, yt: Tensor
         u = coordinates[:, axis]
         product = product * sample_plane(line[None], u, torch.zeros_like(u))
     return product
+
+
+def hexplane_decode(
+    spaces: Sequence[Tensor],
+    coordinates: Tensor,
+    lines: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+) -> Tensor:
+    """Features through an MLP with ReLU between its layers: [N, outputs].
+
+    The features of a level are its `spaces` [N, C], times its three `lines` [U, C] when these are given; the levels are put
+    side by side. `weights` [outputs, inputs] and `biases` [outputs] are those of `torch.nn.Linear`, layer by layer.
+    """
+    levels = list(spaces)
+    if lines:
+        levels = [
+            hexplane_modulate(space, coordinates, *lines[3 * level : 3 * level + 3])
+            for level, space in enumerate(levels)
+        ]
+    values = torch.cat(levels, dim=1)
+    for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        values = torch.nn.functional.linear(torch.relu(values) if layer else values, weight, bias)
+    return values

@@ -56,7 +56,7 @@ class TrainingStep:
         """Add Gaussians, which start still."""
         self.gaussians = self.gaussians.append(added)
         self.field.append(added)
-        self._adam.append(self.gaussians.tensors())
+        self._adam.append(added.count)
 
     def _basis_step(self, field: BasisField, observation: Observation, rate_scale: float) -> float:
         deformed = self.at(observation.time_s)
@@ -103,6 +103,7 @@ class TrainingStep:
     def _update_gaussians(self, gradients: dict[str, Tensor], rate_scale: float) -> None:
         rates = self._config.rates
         self._adam.step(
+            self.gaussians.tensors(),
             gradients,
             {
                 "means": rates.means_px * self._pixel_mm * rate_scale,

@@ -15,7 +15,7 @@ from gsplat_core.cameras import Camera
 from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM, SurfacePoints, Tissue, Tug
 from gsplat_core.io.recordings.synthetic.tool import RING, SHAFT, Part, distance, trace
 
-Array = NDArray[np.float32]
+Array = NDArray[np.floating]
 
 NEWTON_STEPS = 6
 LIGHTS_MM = ((-3.2, -2.2, 0.0), (3.2, -2.2, 0.0))
@@ -137,9 +137,7 @@ def _shade_tissue(
     along_v = np.stack(points.along_v, axis=-1) @ turn
     # The sheet lies across the view, u to the right and v down: u x v points away from the scope.
     smooth = _unit(np.cross(along_v, along_u))
-    bumpy = _unit(
-        np.cross(along_v - slope[..., 1:] * -smooth, along_u - slope[..., :1] * -smooth).astype(np.float32)
-    )
+    bumpy = _unit(np.cross(along_v - slope[..., 1:] * -smooth, along_u - slope[..., :1] * -smooth).astype(np.float32))
     light_diffuse = np.zeros(u.shape, np.float32)
     light_wet = np.zeros(u.shape, np.float32)
     for offset in LIGHTS_MM:
@@ -152,7 +150,7 @@ def _shade_tissue(
         half = _unit(to_light - rays)
         shine = np.clip(np.einsum("hwi,hwi->hw", bumpy, half), 0, 1)
         light_diffuse += power * np.clip((facing + np.float32(0.12)) / np.float32(1.12), 0, 1)
-        light_wet += power * (np.float32(7.0) * shine ** np.float32(420) + np.float32(0.22) * shine ** np.float32(36))
+        light_wet += power * (np.float32(9.0) * shine ** np.float32(900) + np.float32(0.20) * shine ** np.float32(40))
     shade = _tool_shade(parts, camera, local)
     diffuse = (light_diffuse * shade)[..., None]
     # Light that has wandered through tissue comes out red: lift red where little arrives directly.
@@ -191,10 +189,10 @@ def _upsample(coarse: Array, rows: int, columns: int, step: int) -> Array:
 def _shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8]) -> Array:
     """Linear radiance [N, 3] of the tool: dark polymer shaft, brushed steel that mirrors the pink surroundings."""
     metal = (material != SHAFT)[:, None]
-    base = np.where(metal, np.array([0.34, 0.34, 0.36], np.float32), np.array([0.050, 0.052, 0.058], np.float32))
-    base = np.where((material == RING)[:, None], np.array([0.16, 0.165, 0.18], np.float32), base)
-    gloss = np.where(metal[:, 0], np.float32(46), np.float32(18))
-    glint = np.where(metal[:, 0], np.float32(1.9), np.float32(0.30))
+    base = np.where(metal, np.array([0.26, 0.265, 0.28], np.float32), np.array([0.085, 0.093, 0.108], np.float32))
+    base = np.where((material == RING)[:, None], np.array([0.10, 0.105, 0.12], np.float32), base)
+    gloss = np.where(metal[:, 0], np.float32(64), np.float32(14))
+    glint = np.where(metal[:, 0], np.float32(2.6), np.float32(0.16))
     total = np.zeros((len(at), 3), np.float32)
     for offset in LIGHTS_MM:
         to_light = np.array(offset, np.float32) - at
@@ -205,10 +203,10 @@ def _shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8
         shine = np.clip(np.einsum("ni,ni->n", normal, _unit(to_light - rays)), 0, 1)
         total += (power * facing)[:, None] * base + (power * glint * shine**gloss)[:, None]
     mirrored = rays - 2 * np.einsum("ni,ni->n", rays, normal)[:, None] * normal
-    tissue_seen = np.clip(0.5 + 0.5 * mirrored[:, 2], 0, 1)[:, None]
+    tissue_seen = (np.clip(0.45 + 0.65 * mirrored[:, 2], 0, 1) ** 2)[:, None]
     fresnel = (1 - np.clip(-np.einsum("ni,ni->n", rays, normal), 0, 1))[:, None] ** 3
-    reflected = np.where(metal, 0.55 + 0.45 * fresnel, 0.03 + 0.5 * fresnel)
-    surroundings = np.array([0.230, 0.085, 0.070], np.float32)
+    reflected = np.where(metal, 0.60 + 0.40 * fresnel, 0.05 + 0.45 * fresnel)
+    surroundings = np.array([0.250, 0.130, 0.110], np.float32)
     return np.asarray(total + reflected * tissue_seen * surroundings, np.float32)
 
 
