@@ -21,6 +21,8 @@ class KeyframesOp(Operator):
         count: how many frames `keyframes` returns at most, the worst one among them.
     """
 
+    count: int
+
     def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
         self._kept: list[ScoredFrame] = []
         self._worst: ScoredFrame | None = None

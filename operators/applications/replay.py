@@ -11,7 +11,7 @@ recording, settings and device give the same `frames_sha256`, on either engine.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -66,8 +66,8 @@ class ReplaySettings:
 
     def reconstructor_config(self) -> ReconstructorConfig:
         """The reconstructor's settings. Raises InvalidInput."""
-        steps = {} if self.steps_per_frame is None else {"steps_per_frame": self.steps_per_frame}
-        return ReconstructorConfig(field=self.field, **steps)
+        config = ReconstructorConfig(field=self.field)
+        return config if self.steps_per_frame is None else replace(config, steps_per_frame=self.steps_per_frame)
 
 
 class ReplayApplication(Application):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 
 # Wrong options and their like. Where the class lives has changed between releases of typer; what derives from it has not.
-_USAGE_ERRORS = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
+_USAGE_ERRORS: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
 
 app = typer.Typer(
     name="intrasplat",
@@ -44,7 +44,7 @@ def run(arguments: list[str]) -> int:
     except typer.Abort:
         return INTERRUPTED
     except _USAGE_ERRORS as error:
-        error.show()  # type: ignore[attr-defined]
+        error.show()
         return BAD_INPUT
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the one place where errors become exit codes
         return exit_code_of(error)

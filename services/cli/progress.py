@@ -8,6 +8,9 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+    from rich.progress import TaskID
+
     from operators.applications.progress import Progress
 
 PLAIN_PERIOD_S = 5.0
@@ -21,8 +24,8 @@ class ProgressPrinter:
         self._terminal = not quiet and sys.stderr.isatty()
         self._stage = ""
         self._began_s = self._printed_s = 0.0
-        self._bar = None
-        self._task = None
+        self._bar: Bar | None = None
+        self._task: TaskID | None = None
 
     def __enter__(self) -> ProgressPrinter:
         if self._terminal:

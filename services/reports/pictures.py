@@ -48,7 +48,8 @@ def data_uri(image: NDArray[np.uint8]) -> str:
     """An RGB image as a JPEG `data:` URI."""
     height, width = image.shape[:2]
     if width > WIDTH_PX:
-        image = cv2.resize(image, (WIDTH_PX, max(1, round(height * WIDTH_PX / width))), interpolation=cv2.INTER_AREA)
+        size = (WIDTH_PX, max(1, round(height * WIDTH_PX / width)))
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     elif width * 2 <= WIDTH_PX:
         zoom = WIDTH_PX // width
         image = image.repeat(zoom, axis=0).repeat(zoom, axis=1)
