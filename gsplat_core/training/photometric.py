@@ -41,7 +41,7 @@ def loss_and_gradients(
     scales, opacities = gaussians.scales, gaussians.opacities
     use_depth = weights.depth > 0 and observation.depth is not None
 
-    radii, means2d, depths, conics, _ = ops.project_gaussians(
+    means2d, depths, conics, _, radii = ops.project_gaussians(
         means, None, quats, scales[None], opacities[None], viewmat, intrinsics,
         width, height, EPS2D_PX2, NEAR_MM, FAR_MM, 0.0, False, model,
     )  # fmt: skip

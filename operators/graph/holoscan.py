@@ -11,6 +11,7 @@ Hazards of the SDK (4.6) and what is done about them:
 - The greedy scheduler sleeps through events until the next appointed time: appointments are kept short.
 - Its schedulers give up before they have seen what a check or a thread just changed: they wait half a second first.
 - An exception in compute can end a run silently: none ever reaches the SDK.
+- It takes over SIGINT and SIGTERM, for good: the handlers are put back once it runs.
 - It drops without counting: edges keep the policy themselves, and the SDK's queues never overflow.
 """
 
@@ -26,7 +27,7 @@ from operators.graph.graph import Graph, Scheduler
 from operators.graph.greedy import GreedyScheduler
 from operators.graph.multithread import MultiThreadScheduler
 from operators.graph.queues import CarriedEdge
-from operators.graph.sdk import load_sdk
+from operators.graph.sdk import keep_signals, load_sdk
 from operators.graph.spec import QueuePolicy
 from operators.graph.task import OperatorTask
 
@@ -52,7 +53,9 @@ class Gate(_Condition):
 
     def check(self, timestamp: int) -> tuple[Any, int | None]:
         """May the operator compute, as far as the SDK cannot tell from its queues?"""
-        self.checked = True
+        if not self.checked:
+            self.checked = True
+            self.scheduler.restore_signals()
         task, now_ns = self.task, self.scheduler.now_ns(timestamp)
         status, due_ns = task.consent(now_ns)
         if task.finished or task.graph.stopping:
@@ -117,8 +120,10 @@ class HoloscanScheduler:
             raise EngineUnsupported(f"the holoscan engine has no scheduler like {type(scheduler).__name__}")
         self.clock = scheduler.clock
         self.error: BaseException | None = None
+        self.restore_signals = keep_signals()
         self._threads = isinstance(scheduler, MultiThreadScheduler)
         self._lock = threading.RLock()
+        self._over = threading.Event()
         self._gates: list[Gate] = []
         self._edge_count = 0
 
@@ -146,11 +151,11 @@ class HoloscanScheduler:
         thread = threading.Thread(target=self._run, args=(self._application(graph),), name="holoscan", daemon=True)
         thread.start()
         try:
-            thread.join()
+            self._over.wait()  # not join: interrupted, it takes the thread for ended (Python 3.11)
         finally:
             stopped = graph.stopping
             graph.stop()
-            thread.join()
+            self._over.wait()
         if self.error is not None:
             raise self.error
         now_ns = self.clock.timestamp()
@@ -167,6 +172,7 @@ class HoloscanScheduler:
             self.error = self.error or error
         finally:
             self._gates = []
+            self._over.set()
 
     def _application(self, graph: Graph) -> Any:
         """The graph as an application of the SDK."""

@@ -6,7 +6,7 @@ import faulthandler
 import itertools
 import os
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -218,8 +218,14 @@ def require_sdk() -> None:
         pytest.skip(str(error))
 
 
+@pytest.fixture
+def sdk() -> None:
+    """The Holoscan SDK can be loaded."""
+    require_sdk()
+
+
 @pytest.fixture(params=ENGINES)
-def runner(request: pytest.FixtureRequest) -> Iterable[Runner]:
+def runner(request: pytest.FixtureRequest) -> Runner:
     """Every engine with every scheduler."""
     engine, scheduler = request.param
     if engine == "holoscan":
@@ -228,7 +234,7 @@ def runner(request: pytest.FixtureRequest) -> Iterable[Runner]:
 
 
 @pytest.fixture(params=[ENGINES[0], ENGINES[2]])
-def greedy_runner(request: pytest.FixtureRequest) -> Iterable[Runner]:
+def greedy_runner(request: pytest.FixtureRequest) -> Runner:
     """Every engine with the greedy scheduler."""
     engine, scheduler = request.param
     if engine == "holoscan":
