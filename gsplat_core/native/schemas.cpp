@@ -38,8 +38,10 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
 
   // Tiles: which splats each tile has, in depth order. `images` counts batch x cameras; image_ids is for packed splats.
   m.def(
-      "isect_tiles(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
-      "int tile_size, int tile_width, int tile_height, bool sort) -> (Tensor tiles_per_gauss, Tensor isect_ids, Tensor flatten_ids)");
+      "isect_tiles(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int "
+      "images, "
+      "int tile_size, int tile_width, int tile_height, bool sort) -> (Tensor tiles_per_gauss, Tensor isect_ids, Tensor "
+      "flatten_ids)");
   m.def(
       "bin_splats(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
       "int tile_size, int tile_width, int tile_height) -> (Tensor tiles_per_gauss, Tensor flatten_ids, Tensor isect_offsets)");

@@ -58,6 +58,7 @@ def make_scene() -> Callable[..., Scene]:
             return torch.randn(*batch, *shape, generator=g, dtype=torch.float64).float().double()
 
         means = normal(count, 3) * torch.tensor([1.5, 1.2, 2.0]) + torch.tensor([0.0, 0.0, 6.0])
+        means[..., :1, :] = torch.tensor([0.1, 0.2, 5.0])  # one at least is seen
         viewmats = torch.eye(4, dtype=torch.float64).repeat(*batch, cameras, 1, 1)
         viewmats[..., :3, :] += 0.05 * normal(cameras, 3, 4)
         focal = 8.0 if model == "ortho" else 45.0
