@@ -94,7 +94,7 @@ def test_new_bumps_hold_the_last_motion_when_asked():
             field.weights[:] = 1.0
             field.centers[:] = torch.arange(float(field.bumps))
             field.log_widths[:] = 0.0
-    held.extend((0.0, 8.0), hold=True)
+    held.extend((0.0, 8.0), hold_at_s=2.0)
     still.extend((0.0, 8.0))
     middle = held.deltas(2.0).detach()
     torch.testing.assert_close(held.deltas(7.0).detach(), middle, rtol=1e-3, atol=1e-3)
