@@ -17,7 +17,7 @@ OperatorsError
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 
 class OperatorsError(Exception):
@@ -58,7 +58,11 @@ class OperatorFailed(GraphError):
 
 
 class OperatorStuck(GraphError):
-    """An operator did not return from compute within the scheduler's stop timeout."""
+    """Operators, named in `operators`, did not return from compute in time; they are not stopped."""
+
+    def __init__(self, operators: Iterable[str], timeout_s: float) -> None:
+        self.operators = tuple(operators)
+        super().__init__(f"still in compute {timeout_s:g} s after the graph stopped: {', '.join(self.operators)}")
 
 
 class GraphDeadlock(GraphError):

@@ -31,7 +31,7 @@ def new_field(
     if kind in ("auto", "basis"):
         return BasisField(gaussians.count, time_window_s, **architecture)
     if kind == "hexplane":
-        return HexPlaneField.around(gaussians, time_window_s, **architecture)
+        return HexPlaneField(gaussians, time_window_s, **architecture)
     raise InvalidInput(f"unknown deformation field {kind!r}; known are {', '.join(FIELD_KINDS)}")
 
 

@@ -11,10 +11,10 @@ starts with centre b and width 1.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -106,7 +106,7 @@ class BasisField(DeformationField):
 
     def deltas(self, time_s: float) -> Tensor:
         """What the field adds at `time_s`: [N, 13] position, rotation, log-scale, colour. Differentiable."""
-        return self._ops.basis_field(self.centers, self.log_widths, self.weights, self.tau(time_s))
+        return cast(Tensor, self._ops.basis_field(self.centers, self.log_widths, self.weights, self.tau(time_s)))
 
     def displaced(self, gaussians: Gaussians, deltas: Tensor) -> Gaussians:
         """The Gaussians with `deltas` [N, 13] added; differentiable in both."""
@@ -115,7 +115,7 @@ class BasisField(DeformationField):
                 f"the field holds bumps for {deltas.shape[0]} Gaussians, got {gaussians.count}; keep them in step with"
                 " select and append"
             )
-        position, rotation, log_scale, colour = deltas.split(CHANNEL_GROUPS, dim=1)
+        position, rotation, log_scale, colour = torch.split(deltas, list(CHANNEL_GROUPS), dim=1)
         sh = gaussians.sh
         base = sh[:, :1] + colour[:, None]
         return Gaussians(
@@ -169,7 +169,7 @@ class BasisField(DeformationField):
 
         def at(time_s: float) -> Gaussians:
             with torch.no_grad():
-                return self(gaussians, time_s)
+                return self.forward(gaussians, time_s)
 
         return at
 
@@ -242,6 +242,9 @@ class BasisField(DeformationField):
         if not (math.isfinite(field._origin_s) and math.isfinite(field._spacing_s) and field._spacing_s > 0):
             raise InvalidInput(f"spacing_s must be positive and origin_s finite, got {config}")
         return field
+
+    def _training_state(self) -> Sequence[object]:
+        return (self._moments,)
 
     def _append_columns(self, added: int, hold: bool) -> None:
         centers, log_widths, weights = (p.data for p in self._parameters_in_order())

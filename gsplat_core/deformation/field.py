@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Callable
-from typing import Any, ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -53,6 +54,18 @@ class DeformationField(torch.nn.Module):
     def config(self) -> dict[str, Any]:
         """All that `field_from_config` needs to rebuild the architecture, as JSON-able values."""
         raise NotImplementedError
+
+    def detached_copy(self) -> Self:
+        """A copy for publishing: own memory, no gradients, no state of training."""
+        copied = copy.deepcopy(self, {id(state): None for state in self._training_state()})
+        return copied.requires_grad_(False)
+
+    def check_state(self) -> None:
+        """InvalidInput when loaded tensors, finite and of the right shapes, still make no field."""
+
+    def _training_state(self) -> Sequence[object]:
+        """Attributes that belong to training and become None in a `detached_copy`."""
+        return ()
 
     def select(self, index: Tensor) -> None:
         """Keep the per-Gaussian state of the Gaussians in `index` (int64 positions or a bool mask), in that order."""

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
+from types import ModuleType
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from gsplat_core.deformation import regularisers
-from gsplat_core.deformation.field import DeformationField
+from gsplat_core.deformation.field import DeformationField, checked_window
 from gsplat_core.errors import InvalidInput
 from gsplat_core.gaussians import Gaussians
+from gsplat_core.ops.hexplane import hexplane as compiled
 from gsplat_core.reference import deformation as reference
 from gsplat_core.reference.deformation import PLANE_AXES
 
@@ -28,6 +30,20 @@ PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")
 SPACE_PLANES, TIME_PLANES = PLANE_NAMES[:3], PLANE_NAMES[3:]
 BOX_MARGIN = 0.05
 """Share of the box's longest side added on every side, so that Gaussians can move a little and stay inside."""
+
+
+def box_around(means: Tensor) -> Tensor:
+    """[2, 3]: corners of the finite positions with a margin; the unit box around the origin when there are none."""
+    box = torch.tensor([[-1.0] * 3, [1.0] * 3])
+    if means.is_meta:  # only the shape is wanted
+        return box
+    finite = means.detach().to(torch.float32)
+    finite = finite[finite.isfinite().all(dim=1)]
+    if finite.shape[0] == 0:
+        return box
+    low, high = finite.amin(dim=0), finite.amax(dim=0)
+    margin = max(float((high - low).max()) * BOX_MARGIN, 1e-3)
+    return torch.stack([low - margin, high + margin])
 
 
 class HexPlaneField(DeformationField):
@@ -43,7 +59,7 @@ class HexPlaneField(DeformationField):
 
     def __init__(
         self,
-        box: Tensor,
+        gaussians: Gaussians,
         time_window_s: tuple[float, float],
         *,
         channels: int = 32,
@@ -59,29 +75,16 @@ class HexPlaneField(DeformationField):
             raise InvalidInput(
                 f"levels, channels, width and depth must be at least 1, got {list(levels)}, {channels}, {width}, {depth}"
             )
-        if box.shape != (2, 3) or not bool((box[1] > box[0]).all()):
-            raise InvalidInput(f"box must be [2, 3], lower corner before upper, got {box.tolist()}")
         self.channels, self.resolution, self.levels = channels, tuple(resolution), tuple(levels)
         self.width, self.depth = width, depth
         self.box: Tensor
-        self.register_buffer("box", box.detach().clone().to(torch.float32))
+        self.register_buffer("box", box_around(gaussians.means))
         self.planes = torch.nn.ModuleList(self._new_planes(level) for level in self.levels)
         sizes = [channels * len(self.levels)] + [width] * depth
         self.trunk = torch.nn.ModuleList(torch.nn.Linear(a, b) for a, b in pairwise(sizes))
         self.head = torch.nn.Linear(width, sum(HEAD_CHANNELS))
         torch.nn.init.zeros_(self.head.weight)
         torch.nn.init.zeros_(self.head.bias)
-
-    @classmethod
-    def around(cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any) -> HexPlaneField:
-        """A field whose box holds the Gaussians with a margin; the unit box around the origin when there are none."""
-        means = gaussians.means.detach().to(torch.float32)
-        means = means[means.isfinite().all(dim=1)]
-        if means.shape[0] == 0:
-            return cls(torch.tensor([[-1.0] * 3, [1.0] * 3]), time_window_s, **architecture)
-        low, high = means.amin(dim=0), means.amax(dim=0)
-        margin = max(float((high - low).max()) * BOX_MARGIN, 1e-3)
-        return cls(torch.stack([low - margin, high + margin]), time_window_s, **architecture)
 
     def coordinates(self, means: Tensor, time_s: float) -> Tensor:
         """[N, 4] in [-1, 1]: the one place where space and time are normalised. Outside the box or window: clamped."""
@@ -93,15 +96,16 @@ class HexPlaneField(DeformationField):
 
     def features(self, means: Tensor, time_s: float) -> Tensor:
         """[N, levels * channels]: product over the planes, levels side by side."""
-        coordinates = self.coordinates(means, time_s)
-        return torch.cat(
-            [reference.hexplane_features(coordinates, *(planes[n] for n in PLANE_NAMES)) for planes in self.planes],
-            dim=1,
-        )
+        return torch.cat(self._features(self.coordinates(means, time_s)), dim=1)
 
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`; outside the window the state of its nearest end."""
-        return self._displaced(gaussians, self._decode(self.features(gaussians.means, time_s)))
+        coordinates = self.coordinates(gaussians.means, time_s)
+        # With a graph, torch's own layers: they keep what their gradients need.
+        ops = reference if torch.is_grad_enabled() else self._ops
+        return self._displaced(
+            gaussians, ops.hexplane_decode(self._features(coordinates), coordinates, [], *self._network())
+        )
 
     def cached(self, gaussians: Gaussians) -> Callable[[float], Gaussians]:
         """Factorised inference: the product of the space planes is kept per Gaussian, and at a new time the time planes
@@ -109,15 +113,13 @@ class HexPlaneField(DeformationField):
         gaussians = gaussians.detach()
         with torch.no_grad():
             coordinates = self.coordinates(gaussians.means, self.time_window_s[0])
-            spaces = [reference.hexplane_space(coordinates, *(p[n] for n in SPACE_PLANES)) for p in self.planes]
+            spaces = [self._ops.hexplane_space(coordinates, *level) for level in self._levels(SPACE_PLANES)]
 
         def at(time_s: float) -> Gaussians:
             with torch.no_grad():
-                features = [
-                    reference.hexplane_modulate(space, coordinates, *self._lines(planes, time_s))
-                    for space, planes in zip(spaces, self.planes, strict=True)
-                ]
-                return self._displaced(gaussians, self._decode(torch.cat(features, dim=1)))
+                lines = [line for level in self._levels(TIME_PLANES) for line in self._lines(level, time_s)]
+                deltas = self._ops.hexplane_decode(spaces, coordinates, lines, *self._network())
+                return self._displaced(gaussians, deltas)
 
         return at
 
@@ -132,6 +134,23 @@ class HexPlaneField(DeformationField):
     def time_sparsity(self) -> Tensor:
         """Scalar: distance of the time planes from 1, their value without motion."""
         return regularisers.mean_over_planes(regularisers.distance_from_one, self._named(TIME_PLANES))
+
+    def extend(self, time_window_s: tuple[float, float]) -> None:
+        """Cover another window with the same number of time rows: what was learned keeps its place in time.
+
+        The rows are interpolated linearly, so a longer window has coarser rows; beyond the old window they hold the nearest
+        end. Parameters are changed in place, so that an optimiser can go on with them.
+        """
+        start, end = checked_window(time_window_s)
+        old_start, old_end = self.time_window_s
+        rows = self.resolution[3]
+        times = torch.linspace(start, end, rows, dtype=torch.float64)
+        at = ((times - old_start) / ((old_end - old_start) or 1.0)).clamp(0, 1) * (rows - 1)
+        row = at.long().clamp(max=rows - 2)
+        share = (at - row).to(torch.float32)[:, None, None]
+        for plane in self._named(TIME_PLANES):
+            plane.data.copy_(torch.lerp(plane.data[row], plane.data[row + 1], share))
+        self._time_window_s = (start, end)
 
     def select(self, index: Tensor) -> None:
         """The field holds no state per Gaussian; nothing to do."""
@@ -156,7 +175,14 @@ class HexPlaneField(DeformationField):
         """An untrained field of the architecture that `config` describes."""
         start, end = config["time_window_s"]
         names = ("channels", "resolution", "levels", "width", "depth")
-        return cls.around(gaussians, (start, end), **{name: config[name] for name in names})
+        return cls(gaussians, (start, end), **{name: config[name] for name in names})
+
+    def check_state(self) -> None:
+        """InvalidInput when the box is not one: its lower corner must be below its upper one."""
+        if not bool((self.box[1] > self.box[0]).all()):
+            raise InvalidInput(
+                f"the field's box must have its lower corner before its upper one, got {self.box.tolist()}"
+            )
 
     def _new_planes(self, level: int) -> torch.nn.ParameterDict:
         sizes = [size * level for size in self.resolution[:3]] + [self.resolution[3]]
@@ -166,24 +192,37 @@ class HexPlaneField(DeformationField):
             planes[name] = torch.nn.Parameter(plane if name in TIME_PLANES else plane.uniform_(0.1, 0.5))
         return planes
 
-    def _named(self, names: Sequence[str]) -> list[Tensor]:
-        return [planes[name] for planes in self.planes for name in names]
+    @property
+    def _ops(self) -> ModuleType:
+        """The compiled ops where they exist, plain torch for other dtypes and devices."""
+        is_native = self.box.dtype == torch.float32 and self.box.device.type == "cpu"
+        return compiled if is_native else reference
 
-    def _lines(self, planes: torch.nn.ParameterDict, time_s: float) -> list[Tensor]:
+    def _named(self, names: Sequence[str]) -> list[Tensor]:
+        return [plane for level in self._levels(names) for plane in level]
+
+    def _levels(self, names: Sequence[str]) -> list[list[Tensor]]:
+        """The planes of these names, level by level."""
+        return [[cast(torch.nn.ParameterDict, planes)[name] for name in names] for planes in self.planes]
+
+    def _lines(self, planes: Sequence[Tensor], time_s: float) -> list[Tensor]:
         """The time planes of one level interpolated at `time_s`: three lines [U, C]."""
         rows = self.resolution[3]
         t = self.coordinates(self.box[:1], time_s)[0, 3]
         at = float((t + 1) / 2 * (rows - 1))
         row = min(int(at), rows - 2)
-        return [torch.lerp(planes[name][row], planes[name][row + 1], at - row) for name in TIME_PLANES]
+        return [torch.lerp(plane[row], plane[row + 1], at - row) for plane in planes]
 
-    def _decode(self, features: Tensor) -> Tensor:
-        for layer in self.trunk:
-            features = torch.relu(layer(features))
-        return self.head(features)
+    def _features(self, coordinates: Tensor) -> list[Tensor]:
+        return [self._ops.hexplane_features(coordinates, *level) for level in self._levels(PLANE_NAMES)]
+
+    def _network(self) -> tuple[list[Tensor], list[Tensor]]:
+        """Weights and biases of the trunk and the head, layer by layer."""
+        layers = [cast(torch.nn.Linear, layer) for layer in (*self.trunk, self.head)]
+        return [layer.weight for layer in layers], [layer.bias for layer in layers]
 
     def _displaced(self, gaussians: Gaussians, deltas: Tensor) -> Gaussians:
-        position, log_scale, rotation, opacity = deltas.split(HEAD_CHANNELS, dim=1)
+        position, log_scale, rotation, opacity = torch.split(deltas, list(HEAD_CHANNELS), dim=1)
         return Gaussians(
             means=gaussians.means + position,
             quats=gaussians.quats + rotation,

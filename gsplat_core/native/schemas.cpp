@@ -5,10 +5,11 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // The instruction set in use: 0 baseline, 1 AVX2, 2 AVX-512.
   m.def("active_isa() -> int");
 
-  // Adam over one dense tensor, in place; `step` counts from 1.
+  // Adam over one dense tensor, in place; `step` counts from 1. Rows of row_size values whose gradient is not finite are left
+  // alone and counted in the result (int64 scalar).
   m.def(
       "adam_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, int step, "
-      "float learning_rate, float beta1, float beta2, float epsilon) -> ()");
+      "float learning_rate, float beta1, float beta2, float epsilon, int row_size) -> Tensor");
 
   // Projection to the image: B batches, C cameras, N Gaussians. Covariances as [B, N, 6], or quats and scales.
   m.def(
@@ -34,10 +35,13 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "quat_scale_to_covar_preci_backward(Tensor quats, Tensor scales, Tensor? v_covars, Tensor? v_precis, bool triu) -> "
       "(Tensor v_quats, Tensor v_scales)");
+
   // Tiles: which splats each tile has, in depth order. `images` counts batch x cameras; image_ids is for packed splats.
   m.def(
-      "isect_tiles(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
-      "int tile_size, int tile_width, int tile_height, bool sort) -> (Tensor tiles_per_gauss, Tensor isect_ids, Tensor flatten_ids)");
+      "isect_tiles(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int "
+      "images, "
+      "int tile_size, int tile_width, int tile_height, bool sort) -> (Tensor tiles_per_gauss, Tensor isect_ids, Tensor "
+      "flatten_ids)");
   m.def(
       "bin_splats(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
       "int tile_size, int tile_width, int tile_height) -> (Tensor tiles_per_gauss, Tensor flatten_ids, Tensor isect_offsets)");
@@ -54,6 +58,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor flatten_ids, Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size, Tensor alphas, Tensor last, "
       "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
       "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
+
   // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
   m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, float tau) -> Tensor");
   m.def(
@@ -64,4 +69,22 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor(d!) m_centers, Tensor(e!) m_log_widths, Tensor(f!) m_weights, Tensor(g!) v_centers, Tensor(h!) v_log_widths, "
       "Tensor(i!) v_weights, Tensor(j!) steps, float position_rate, float rotation_rate, float scale_rate, float colour_rate, "
       "float center_rate, float width_rate, float beta1, float beta2, float epsilon) -> ()");
+
+  // Structural similarity of each pixel and channel of [H, W, C] images.
+  m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
+  m.def("ssim_map_backward(Tensor gradient, Tensor image, Tensor target) -> Tensor");
+
+  // Loss over tissue and its gradients in one go: (loss, [l1, 1 - ssim, inverse-depth l1], dL/dimage, dL/ddepth or empty).
+  m.def(
+      "image_loss(Tensor image, Tensor target, Tensor? mask, Tensor? depth, Tensor? target_depth, float ssim_weight, "
+      "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
+
+  // HexPlane features of one level: the product of six plane samples [N, C], its gradients, and the parts used for inference.
+  m.def("hexplane_features(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
+  m.def(
+      "hexplane_features_backward(Tensor gradient, Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, "
+      "Tensor zt) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+  m.def("hexplane_space(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz) -> Tensor");
+  m.def("hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
+  m.def("hexplane_decode(Tensor[] spaces, Tensor coordinates, Tensor[] lines, Tensor[] weights, Tensor[] biases) -> Tensor");
 }

@@ -68,8 +68,8 @@ def basis_field_backward_adam_(
         count = steps.clamp(min=1).to(centers.dtype)
         bias1, bias2 = 1 - beta1**count, 1 - beta2**count
         groups = torch.tensor(CHANNEL_GROUPS)
-        channel_rates = torch.tensor(learning_rates[:4], dtype=centers.dtype).repeat_interleave(groups)
-        rates = (learning_rates[4], learning_rates[5], channel_rates)
+        channel_rates = centers.new_tensor(learning_rates[:4]).repeat_interleave(groups)
+        rates = (centers.new_tensor(learning_rates[4]), centers.new_tensor(learning_rates[5]), channel_rates)
         for parameter, g, m, v, rate in zip(
             (centers, log_widths, weights), gradients, first_moments, second_moments, rates, strict=True
         ):
@@ -121,3 +121,27 @@ def hexplane_modulate(space: Tensor, coordinates: Tensor, xt: Tensor, yt: Tensor
         u = coordinates[:, axis]
         product = product * sample_plane(line[None], u, torch.zeros_like(u))
     return product
+
+
+def hexplane_decode(
+    spaces: Sequence[Tensor],
+    coordinates: Tensor,
+    lines: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+) -> Tensor:
+    """Features through an MLP with ReLU between its layers: [N, outputs].
+
+    The features of a level are its `spaces` [N, C], times its three `lines` [U, C] when these are given; the levels are put
+    side by side. `weights` [outputs, inputs] and `biases` [outputs] are those of `torch.nn.Linear`, layer by layer.
+    """
+    levels = list(spaces)
+    if lines:
+        levels = [
+            hexplane_modulate(space, coordinates, *lines[3 * level : 3 * level + 3])
+            for level, space in enumerate(levels)
+        ]
+    values = torch.cat(levels, dim=1)
+    for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        values = torch.nn.functional.linear(torch.relu(values) if layer else values, weight, bias)
+    return values

@@ -14,18 +14,22 @@ C1 = 0.01**2
 C2 = 0.03**2
 
 
-def gaussian_window(dtype: torch.dtype = torch.float64) -> Tensor:
-    """The 11 taps of the separable window; they sum to 1."""
+def gaussian_window() -> Tensor:
+    """The 11 taps of the separable window, float64; they sum to 1."""
     offsets = torch.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1, dtype=torch.float64)
     taps = torch.exp(-0.5 * (offsets / WINDOW_SIGMA_PX) ** 2)
-    return (taps / taps.sum()).to(dtype)
+    return taps / taps.sum()
 
 
 def _blur(planes: Tensor) -> Tensor:
     """[P, H, W] filtered by the window, zero outside of the image."""
-    taps = gaussian_window(planes.dtype).to(planes.device)
-    rows = torch.nn.functional.conv2d(planes[:, None], taps.view(1, 1, -1, 1), padding=(WINDOW_RADIUS_PX, 0))
-    return torch.nn.functional.conv2d(rows, taps.view(1, 1, 1, -1), padding=(0, WINDOW_RADIUS_PX))[:, 0]
+    height, width = planes.shape[1:]
+    taps = gaussian_window().tolist()
+    padded = torch.nn.functional.pad(planes, (WINDOW_RADIUS_PX,) * 4)
+    rows = sum(
+        (tap * padded[:, k : k + height] for k, tap in enumerate(taps)), start=torch.zeros_like(padded[:, :height])
+    )
+    return sum((tap * rows[:, :, k : k + width] for k, tap in enumerate(taps)), start=torch.zeros_like(planes))
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from operators.graph.graph import Graph
 
 READY, WAIT_TIME, WAIT, WAIT_EVENT, NEVER = SchedulingStatus
+_READY, _WAIT, _NEVER = (READY, 0), (WAIT, 0), (NEVER, 0)
 
 
 class InputContext:
@@ -174,45 +175,65 @@ class OperatorTask:
         self._durations = None if self.tracker is None else self.tracker.operator(self.name)
 
     def gates(self, edge: Edge) -> int:
-        """How many messages this edge must hold before compute (0: any), as its consumer."""
+        """How many messages this input edge must hold before compute; 0 for any."""
         return next((need for _, gating, need in self._needs if gating is edge), 0)
 
-    def ports_ready(self) -> bool:
-        """Whether every input that gates has its messages and every output that gates has room."""
-        for queue, _, need in self._needs:
+    def leaves_room(self, edge: Edge) -> int:
+        """How many messages must fit into this output edge before compute; 0 for any."""
+        return next((edge.capacity - most for _, gating, most in self._rooms if gating is edge), 0)
+
+    def has_messages(self) -> bool:
+        """Whether every input that gates has its messages."""
+        for queue, _, need in self._needs:  # noqa: SIM110 - all() of a generator costs more than the rest of a poll
             if len(queue) < need:
                 return False
-        for queue, edge, most in self._rooms:  # noqa: SIM110 - all() of a generator costs more than the rest of a poll
+        return True
+
+    def has_room(self) -> bool:
+        """Whether every output that gates has room."""
+        for queue, edge, most in self._rooms:  # noqa: SIM110
             if len(queue) > most and not edge.closed:
                 return False
         return True
 
-    def poll(self, now_ns: int) -> tuple[SchedulingStatus, int]:
-        """May the operator compute now? With WAIT_TIME, when."""
+    def consent(self, now_ns: int) -> tuple[SchedulingStatus, int]:
+        """What the operator's own conditions say together; with WAIT_TIME, until when."""
         status, due_ns = READY, 0
         for condition in self.conditions:
             verdict, at_ns = condition.check(now_ns)
-            if verdict is WAIT_TIME:
-                due_ns = max(due_ns, at_ns)
+            if verdict is WAIT_TIME and at_ns > due_ns:
+                due_ns = at_ns
             if verdict > status:
                 status = verdict
+        return status, due_ns
+
+    def poll(self, now_ns: int) -> tuple[SchedulingStatus, int]:
+        """May the operator compute now? With WAIT_TIME, when."""
+        status, due_ns = self.consent(now_ns) if self.conditions else _READY
         if status is NEVER or self.exhausted():
-            return NEVER, 0
-        if not self.ports_ready() and status < WAIT:
-            return WAIT, 0
+            return _NEVER
+        if status < WAIT and not (self.has_messages() and self.has_room()):
+            return _WAIT
         return status, due_ns
 
     def exhausted(self) -> bool:
         """Whether the operator can do nothing more: told to stop, starved for good, or with nobody listening."""
         if self.operator._finish:
             return True
-        for _, edge, need in self._needs:
-            if edge.ended and len(edge) < need:
+        for queue, edge, need in self._needs:
+            if edge.ended and len(queue) < need:
                 return True
-        ins, outs = self.in_edges, self.out_edges
-        if ins and all(edge.ended and not len(edge) for edge in ins):
-            return True
-        return bool(outs) and all(edge.closed for edge in outs)
+        if self.in_edges and not self._needs:
+            # Inputs that do not gate: done when all of them have run dry.
+            for edge in self.in_edges:
+                if not edge.ended or edge.queue:
+                    break
+            else:
+                return True
+        for edge in self.out_edges:
+            if not edge.closed:
+                return False
+        return bool(self.out_edges)
 
     def finish(self) -> None:
         """Be done: tell the neighbours through the edges."""

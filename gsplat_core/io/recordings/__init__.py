@@ -3,6 +3,7 @@
 from gsplat_core.io.recordings.findings import Finding, ValidationReport
 from gsplat_core.io.recordings.recording import FileRecording, Recording, open_recording, validate_recording
 from gsplat_core.io.recordings.split import is_heldout
+from gsplat_core.io.recordings.synthetic.synthesize import synthesize
 
 __all__ = [
     "FileRecording",
@@ -11,5 +12,6 @@ __all__ = [
     "ValidationReport",
     "is_heldout",
     "open_recording",
+    "synthesize",
     "validate_recording",
 ]

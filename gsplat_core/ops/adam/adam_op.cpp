@@ -1,3 +1,4 @@
+#include <atomic>
 #include <cmath>
 
 #include "adam.h"
@@ -5,20 +6,30 @@
 
 static int64_t active_isa_op() { return int64_t(active_isa()); }
 
-static void adam_(Tensor parameter, Tensor gradient, Tensor first_moment, Tensor second_moment, int64_t step,
-                  double learning_rate, double beta1, double beta2, double epsilon) {
+static Tensor adam_(Tensor parameter, Tensor gradient, Tensor first_moment, Tensor second_moment, int64_t step,
+                    double learning_rate, double beta1, double beta2, double epsilon, int64_t row_size) {
   const Tensor g = floats(gradient, "gradient");
   for (const Tensor* t : {&parameter, &first_moment, &second_moment})
-    STD_TORCH_CHECK(t->is_contiguous() && t->numel() == g.numel(),
-                    "adam_ updates contiguous tensors of the gradient's size in place");
-  const float rate = float(learning_rate / (1 - std::pow(beta1, double(step))));
-  const float inv_bias2 = float(1 / std::sqrt(1 - std::pow(beta2, double(step))));
+    STD_TORCH_CHECK(t->is_cpu() && t->scalar_type() == ScalarType::Float && t->is_contiguous() && t->numel() == g.numel(),
+                    "adam_ updates contiguous float32 CPU tensors of the gradient's size in place");
+  STD_TORCH_CHECK(row_size >= 1 && g.numel() % row_size == 0, "row_size must divide the number of values");
+  const AdamStep options{float(learning_rate / (1 - std::pow(beta1, double(step)))),
+                         float(1 / std::sqrt(1 - std::pow(beta2, double(step)))),
+                         float(1 - beta1),
+                         float(1 - beta2),
+                         float(epsilon),
+                         row_size};
   float *p = mutable_data(parameter), *m = mutable_data(first_moment), *v = mutable_data(second_moment);
   const float* gp = data(g);
-  torch::stable::parallel_for(0, g.numel(), 1 << 14, [&](int64_t begin, int64_t end) {
-    adam_kernels().step(p + begin, gp + begin, m + begin, v + begin, end - begin, rate, inv_bias2, float(beta1), float(beta2),
-                        float(epsilon));
+  std::atomic<int64_t> skipped{0};
+  const int64_t grain = 1 + (1 << 14) / row_size;
+  torch::stable::parallel_for(0, g.numel() / row_size, grain, [&](int64_t begin, int64_t end) {
+    const int64_t at = begin * row_size;
+    skipped += adam_kernels().step(p + at, gp + at, m + at, v + at, end - begin, options);
   });
+  Tensor result = torch::stable::empty({}, ScalarType::Long);
+  *result.mutable_data_ptr<int64_t>() = skipped;
+  return result;
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CompositeExplicitAutograd, m) { m.impl("active_isa", TORCH_BOX(&active_isa_op)); }

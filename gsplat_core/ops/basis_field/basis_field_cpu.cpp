@@ -3,6 +3,7 @@
 #include "simd_partial.h"
 
 namespace GSPLAT_ISA {
+namespace {
 
 constexpr int kRowVectors = 16 / kLanes;
 constexpr float kReach = 4.0f;  // widths; a bump further away is left out (BUMP_REACH of the reference)
@@ -57,7 +58,7 @@ GSPLAT_INLINE Bumps bumps_at(const float* centers, const float* log_widths, int6
 
 GSPLAT_INLINE int64_t lanes_left(int64_t from, int64_t bumps) { return bumps - from < kLanes ? bumps - from : kLanes; }
 
-static void forward(const BasisBumps& field, float* deltas, int64_t begin, int64_t end) {
+void forward(const BasisBumps& field, float* deltas, int64_t begin, int64_t end) {
   for (int64_t n = begin; n < end; ++n) {
     Row total = {};
     const int64_t first = n * field.bumps;
@@ -76,8 +77,8 @@ static void forward(const BasisBumps& field, float* deltas, int64_t begin, int64
   }
 }
 
-static void backward(const BasisBumps& field, const float* gradient, float* centers, float* log_widths, float* weights,
-                     int64_t begin, int64_t end) {
+void backward(const BasisBumps& field, const float* gradient, float* centers, float* log_widths, float* weights, int64_t begin,
+              int64_t end) {
   for (int64_t n = begin; n < end; ++n) {
     const Row g = load_row(gradient + n * kBasisChannels);
     const int64_t first = n * field.bumps;
@@ -120,7 +121,7 @@ GSPLAT_INLINE void adam_update_active(float* p, float* m, float* v, vfloat g, vi
   store_first(v, select(active, v1, v0), count);
 }
 
-static void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t end) {
+void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t end) {
   Row rates;
   for (int i = 0; i < kRowVectors; ++i) rates.v[i] = load(field.channel_rates + i * kLanes);
   for (int64_t n = begin; n < end; ++n) {
@@ -155,6 +156,8 @@ static void adam(const BasisAdam& field, const float* gradient, int64_t begin, i
     }
   }
 }
+
+}  // namespace
 
 extern const BasisFieldKernels basis_field_kernels = {forward, backward, adam};
 

@@ -1,0 +1,192 @@
+"""A model on disk: a folder with `model.safetensors` (every tensor) and `manifest.json` (everything else).
+
+Nothing in a bundle is executed when it is read: no pickle. A bundle may come from anyone, so each value is checked against
+the architecture that the manifest states before memory is taken for it.
+
+Saving is atomic. Both files are first written in full beside the old ones (a full disk is noticed here), then renamed,
+tensors before manifest. Should the machine stop between the two renames, the new manifest still lies there as
+`manifest.next.json`, and loading takes it because its digest is the tensors'.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from pathlib import Path
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
+from gsplat_core.gaussians import Gaussians
+from gsplat_core.io.atomic_files import replace_durably, write_durably
+from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, Manifest, manifest_bytes, parse_manifest
+from gsplat_core.model import Model
+
+TENSORS, NEXT_TENSORS = "model.safetensors", "model.next.safetensors"
+MANIFEST, NEXT_MANIFEST = "manifest.json", "manifest.next.json"
+MAX_HEADER_BYTES = 25_000_000
+
+
+def save_bundle(model: Model, folder: str | Path) -> None:
+    """Write `model` into `folder` (made when missing), replacing the bundle there in one step.
+
+    Raises BundleCorrupt when a tensor holds NaN or infinity, BundleError when the files cannot be written (a full disk, a
+    missing right); the bundle that was there before is then still whole.
+    """
+    folder = Path(folder)
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.tensors().items()}
+    for name, tensor in tensors.items():
+        if tensor.dtype != torch.float32:
+            raise InvalidInput(f"a bundle holds float32, but {name} is {tensor.dtype}; convert the model first")
+    _check_finite(tensors, f"the model was not saved to {folder}")
+    payload = safetensors.torch.save(tensors)
+    digest = hashlib.sha256(payload).hexdigest()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_durably(folder / NEXT_TENSORS, [payload])
+        write_durably(folder / NEXT_MANIFEST, [manifest_bytes(model, len(payload), digest)])
+        replace_durably(folder / NEXT_TENSORS, folder / TENSORS)
+        replace_durably(folder / NEXT_MANIFEST, folder / MANIFEST)
+    except OSError as error:
+        raise BundleError(
+            f"cannot write the model to {folder}: {error.strerror or error}; free space or choose another folder. What was"
+            " there before is unchanged"
+        ) from error
+
+
+def load_bundle(folder: str | Path) -> Model:
+    """Read a model and check all of it.
+
+    Raises UnknownFormatVersion (a later format), BundleCorrupt (digest, truncation, wrong tensors, NaN or infinity) or
+    BundleError (not there, not readable); each names the file and what to do.
+    """
+    folder = Path(folder)
+    try:
+        with open(folder / TENSORS, "rb") as file:
+            size = file.seek(0, 2)
+            file.seek(0)
+            manifest = _manifest_for(folder, size)
+            _check_header(folder / TENSORS, file.read(8), size)
+            file.seek(0)
+            payload = file.read(size)
+    except FileNotFoundError as error:
+        raise BundleError(f"{error.filename} is missing; a bundle is a folder with {TENSORS} and {MANIFEST}") from error
+    except OSError as error:
+        raise BundleError(f"cannot read the model in {folder}: {error.strerror or error}") from error
+    digest = hashlib.sha256(payload).hexdigest()
+    if digest != manifest.tensors_sha256:
+        manifest = _interrupted_save(folder, size, digest) or _raise_digest(folder, digest, manifest)
+    return _model(folder / TENSORS, payload, manifest)
+
+
+def _manifest_for(folder: Path, size: int) -> Manifest:
+    """The manifest, or the next one when only that fits the tensors (see the module's text)."""
+    if not (folder / MANIFEST).exists() and (folder / NEXT_MANIFEST).exists():
+        return _read_manifest(folder / NEXT_MANIFEST)
+    manifest = _read_manifest(folder / MANIFEST)
+    if manifest.tensors_bytes == size:
+        return manifest
+    if (folder / NEXT_MANIFEST).exists():
+        following = _read_manifest(folder / NEXT_MANIFEST)
+        if following.tensors_bytes == size:
+            return following
+    raise BundleCorrupt(
+        f"{folder / TENSORS} has {size} bytes, its manifest says {manifest.tensors_bytes}; copy the bundle again"
+    )
+
+
+def _interrupted_save(folder: Path, size: int, digest: str) -> Manifest | None:
+    if not (folder / NEXT_MANIFEST).exists():
+        return None
+    following = _read_manifest(folder / NEXT_MANIFEST)
+    return following if (following.tensors_bytes, following.tensors_sha256) == (size, digest) else None
+
+
+def _raise_digest(folder: Path, digest: str, manifest: Manifest) -> Manifest:
+    raise BundleCorrupt(
+        f"{folder / TENSORS} has SHA-256 {digest}, its manifest says {manifest.tensors_sha256}; it was changed or damaged,"
+        " copy the bundle again"
+    )
+
+
+def _read_manifest(path: Path) -> Manifest:
+    with open(path, "rb") as file:
+        text = file.read(MAX_MANIFEST_BYTES + 1)
+    if len(text) > MAX_MANIFEST_BYTES:
+        raise BundleCorrupt(f"{path} is larger than {MAX_MANIFEST_BYTES} bytes; it is not a manifest")
+    return parse_manifest(text, str(path))
+
+
+def _check_header(path: Path, start: bytes, size: int) -> None:
+    """safetensors: eight bytes of header length, the header as JSON, the data."""
+    if len(start) < 8:
+        raise BundleCorrupt(f"{path} has only {size} bytes; copy the bundle again")
+    (header,) = struct.unpack("<Q", start)
+    if header > min(size - 8, MAX_HEADER_BYTES):
+        raise BundleCorrupt(
+            f"{path} states a header of {header} bytes; the file has {size}, and at most {MAX_HEADER_BYTES} are allowed"
+        )
+
+
+def _model(path: Path, payload: bytes, manifest: Manifest) -> Model:
+    try:
+        gaussians, field = manifest.skeleton()
+    except InvalidInput as error:
+        raise BundleCorrupt(f"the manifest of {path} describes no valid model: {error}") from error
+    expected = {f"gaussians.{name}": tensor for name, tensor in gaussians.tensors().items()}
+    if field is not None:
+        expected |= {f"field.{name}": tensor for name, tensor in field.state_dict().items()}
+    _check_size(path, expected, len(payload))
+    try:
+        tensors = safetensors.torch.load(payload)
+    except (safetensors.SafetensorError, ValueError, KeyError) as error:
+        raise BundleCorrupt(f"{path} is not a safetensors file ({error}); copy the bundle again") from error
+    _check_tensors(path, tensors, expected)
+    _check_finite(tensors, f"{path} cannot be used")
+    loaded = Gaussians(**{name: tensors[f"gaussians.{name}"] for name in gaussians.tensors()})
+    if field is not None:
+        field.load_state_dict(
+            {name.removeprefix("field."): t for name, t in tensors.items() if name.startswith("field.")}, assign=True
+        )
+        field.requires_grad_(False)
+        try:
+            field.check_state()
+        except InvalidInput as error:
+            raise BundleCorrupt(f"{path} cannot be used: {error}") from error
+    return Model(manifest.version, loaded, field, manifest.camera, manifest.time_window_s, manifest.training_digest)
+
+
+def _check_size(path: Path, expected: dict[str, Tensor], size: int) -> None:
+    """Before anything is parsed: the file can hold the tensors that the manifest describes, and little more."""
+    needed = 4 * sum(tensor.numel() for tensor in expected.values())
+    if not needed + 8 <= size <= needed + 8 + MAX_HEADER_BYTES:
+        raise BundleCorrupt(f"{path} has {size} bytes, but the manifest describes {needed} bytes of tensors")
+
+
+def _check_tensors(path: Path, tensors: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    missing, unknown = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
+    if missing or unknown:
+        raise BundleCorrupt(
+            f"{path} does not match its manifest: missing {', '.join(missing[:5]) or 'nothing'}, unknown"
+            f" {', '.join(name[:80] for name in unknown[:5]) or 'nothing'}"
+        )
+    for name, tensor in tensors.items():
+        if tensor.dtype != torch.float32 or tensor.shape != expected[name].shape:
+            raise BundleCorrupt(
+                f"{path}: {name} must be float32 {list(expected[name].shape)}, got {tensor.dtype} {list(tensor.shape)}"
+            )
+
+
+def _check_finite(tensors: dict[str, Tensor], consequence: str) -> None:
+    for name, tensor in tensors.items():
+        # A sum is finite only when all terms are, unless it overflows: then the terms are counted.
+        if not bool(torch.isfinite(tensor.sum())):
+            bad = int((~torch.isfinite(tensor)).sum())
+            if bad:
+                raise BundleCorrupt(
+                    f"{consequence}: {name} holds {bad} of {tensor.numel()} values that are NaN or infinite; go back to an"
+                    " earlier version of the model"
+                )

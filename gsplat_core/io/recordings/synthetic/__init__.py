@@ -1,0 +1,1 @@
+"""A deforming surgical scene with exact ground truth, rendered by ray casting."""

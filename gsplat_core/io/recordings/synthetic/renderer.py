@@ -1,0 +1,221 @@
+"""Ray casting of tissue and tool, lit from the scope's tip: image, depth and tool mask of one eye.
+
+Each pixel's ray is cut with the deformed sheet by Newton's method on the material coordinates (u, v), so depth is that
+of the surface itself, not of a mesh. A pixel (column i, row j) has its centre at (i + 0.5, j + 0.5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.cameras import Camera
+from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM, SurfacePoints, Tissue, Tug
+from gsplat_core.io.recordings.synthetic.tool import RING, SHAFT, Part, distance, trace
+
+Array = NDArray[np.floating]
+
+NEWTON_STEPS = 6
+LIGHTS_MM = ((-3.2, -2.2, 0.0), (3.2, -2.2, 0.0))
+"""Two light fibres beside the lens, in the camera's axes."""
+REFERENCE_MM = 66.0
+"""A white surface facing the scope at this distance is exposed as 1."""
+
+
+@dataclass(frozen=True)
+class Eye:
+    """What one eye sees, and the material point behind each pixel."""
+
+    image: NDArray[np.uint8]
+    """sRGB [H, W, 3]."""
+    depth: Array
+    """z of the first surface on the ray through the pixel's centre, tool or tissue, in mm [H, W]."""
+    tool: NDArray[np.bool_]
+    """[H, W]; every pixel that the tool covers in part."""
+    tissue_depth: Array
+    """z of the tissue, also behind the tool [H, W]."""
+    u: Array
+    v: Array
+
+
+def render_eye(tissue: Tissue, tug: Tug, parts: list[Part], camera: Camera, time_s: float) -> Eye:
+    """One eye's view of the scene at a time."""
+    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    ray_x, ray_y = pixel_rays(camera)
+    u, v, points = cast_tissue(tissue, tug, camera, ray_x, ray_y, time_s)
+    position = np.stack(points.position, axis=-1)
+    local = position @ rotation.T.astype(np.float32) + translation.astype(np.float32)
+    tissue_depth = np.ascontiguousarray(local[..., 2])
+
+    length = np.sqrt(ray_x * ray_x + ray_y * ray_y + 1)
+    rays = np.stack([ray_x / length, ray_y / length, 1 / length], axis=-1)
+    world_rays = (rays @ rotation.astype(np.float32)).reshape(-1, 3)
+    hits = trace(parts, camera.position, world_rays, (tissue_depth * length).ravel(), 1 / float(camera.K[0, 0]))
+    shape = tissue_depth.shape
+    tool_depth = hits.distance_mm.reshape(shape) / length
+    cover = hits.cover.reshape(shape)
+
+    radiance = _shade_tissue(tissue, u, v, points, local, rays, rotation, parts, camera)
+    touched = cover > 0
+    if touched.any():
+        normal = hits.normal.reshape(*shape, 3)[touched] @ rotation.T.astype(np.float32)
+        reach = np.where(np.isfinite(tool_depth), tool_depth, tissue_depth * np.float32(0.9))[touched]
+        at = rays[touched] * (reach * length[touched])[:, None]
+        steel = _shade_tool(at, normal, rays[touched], hits.material.reshape(shape)[touched])
+        share = cover[touched][:, None]
+        radiance[touched] = (1 - share) * radiance[touched] + share * steel
+    return Eye(
+        image=_develop(radiance),
+        depth=np.minimum(tissue_depth, tool_depth).astype(np.float32),
+        tool=touched,
+        tissue_depth=tissue_depth,
+        u=u,
+        v=v,
+    )
+
+
+def pixel_rays(camera: Camera) -> tuple[Array, Array]:
+    """x/z and y/z of the rays through the pixel centres, [H, W] each."""
+    column = (np.arange(camera.width_px) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
+    row = (np.arange(camera.height_px) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
+    ray_x, ray_y = np.meshgrid(column.astype(np.float32), row.astype(np.float32))
+    return ray_x, ray_y
+
+
+def cast_tissue(
+    tissue: Tissue, tug: Tug, camera: Camera, ray_x: Array, ray_y: Array, time_s: float
+) -> tuple[Array, Array, SurfacePoints]:
+    """The material point (u, v) that each ray meets: Newton's method on X - ray_x Z = 0, Y - ray_y Z = 0."""
+    r = camera.world_to_camera[:3, :3].astype(np.float32)
+    t = camera.world_to_camera[:3, 3].astype(np.float32)
+    # Start on the plane at the mean distance.
+    directions = np.stack([ray_x, ray_y, np.ones_like(ray_x)], axis=-1) @ r
+    origin = camera.position.astype(np.float32)
+    s = (np.float32(TISSUE_DISTANCE_MM) - origin[2]) / directions[..., 2]
+    u, v = origin[0] + s * directions[..., 0], origin[1] + s * directions[..., 1]
+    for _ in range(NEWTON_STEPS):
+        points = tissue.points(u, v, time_s, tug)
+        # Rows of the camera's rotation minus the ray: what a displacement does to the two residuals.
+        residual_x, residual_y, xu, xv, yu, yv = (
+            _dot(r[axis], vector) - ray * _dot(r[2], vector)
+            for vector_axis in (
+                ((points.position, 0, ray_x), (points.position, 1, ray_y)),
+                ((points.along_u, 0, ray_x), (points.along_v, 0, ray_x)),
+                ((points.along_u, 1, ray_y), (points.along_v, 1, ray_y)),
+            )
+            for vector, axis, ray in vector_axis
+        )
+        residual_x = residual_x + t[0] - ray_x * t[2]
+        residual_y = residual_y + t[1] - ray_y * t[2]
+        determinant = xu * yv - xv * yu
+        u = u - (residual_x * yv - residual_y * xv) / determinant
+        v = v - (residual_y * xu - residual_x * yu) / determinant
+    return u, v, tissue.points(u, v, time_s, tug)
+
+
+def _dot(row: Array, vector: tuple[Array, Array, Array]) -> Array:
+    return np.asarray(row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2])
+
+
+def _shade_tissue(
+    tissue: Tissue,
+    u: Array,
+    v: Array,
+    points: SurfacePoints,
+    local: Array,
+    rays: Array,
+    rotation: NDArray[np.float64],
+    parts: list[Part],
+    camera: Camera,
+) -> Array:
+    """Linear radiance [H, W, 3] of the tissue: scattering that bleeds red, and a wet film over a fine relief."""
+    reflectance, slope = tissue.texture.sample(u, v)
+    turn = rotation.T.astype(np.float32)
+    along_u = np.stack(points.along_u, axis=-1) @ turn
+    along_v = np.stack(points.along_v, axis=-1) @ turn
+    # The sheet lies across the view, u to the right and v down: u x v points away from the scope.
+    smooth = _unit(np.cross(along_v, along_u))
+    bumpy = _unit(np.cross(along_v - slope[..., 1:] * -smooth, along_u - slope[..., :1] * -smooth).astype(np.float32))
+    light_diffuse = np.zeros(u.shape, np.float32)
+    light_wet = np.zeros(u.shape, np.float32)
+    for offset in LIGHTS_MM:
+        to_light = np.array(offset, np.float32) - local
+        distance2 = np.einsum("hwi,hwi->hw", to_light, to_light)
+        to_light /= np.sqrt(distance2)[..., None]
+        # Fibres shine in a cone about the view axis.
+        power = np.float32(0.5 * REFERENCE_MM**2) / distance2 * np.clip(-to_light[..., 2], 0, 1) ** 2
+        facing = np.einsum("hwi,hwi->hw", bumpy, to_light)
+        half = _unit(to_light - rays)
+        shine = np.clip(np.einsum("hwi,hwi->hw", bumpy, half), 0, 1)
+        light_diffuse += power * np.clip((facing + np.float32(0.12)) / np.float32(1.12), 0, 1)
+        light_wet += power * (np.float32(9.0) * shine ** np.float32(900) + np.float32(0.20) * shine ** np.float32(40))
+    shade = _tool_shade(parts, camera, local)
+    diffuse = (light_diffuse * shade)[..., None]
+    # Light that has wandered through tissue comes out red: lift red where little arrives directly.
+    bleed = np.array([0.060, 0.014, 0.010], np.float32) * np.sqrt(np.maximum(diffuse, 0))
+    wet = (light_wet * shade * reflectance[..., 3])[..., None] * np.array([1.0, 0.97, 0.93], np.float32)
+    return np.asarray(reflectance[..., :3] * diffuse + bleed + wet, np.float32)
+
+
+def _tool_shade(parts: list[Part], camera: Camera, local: Array) -> Array:
+    """How much light reaches the tissue past the tool: sampled on a coarse grid, along the way to the scope."""
+    step = 3
+    rotation = camera.world_to_camera[:3, :3].astype(np.float32)
+    coarse = local[::step, ::step].reshape(-1, 3)
+    # The lights sit above the lens, so that the tool throws its shadow downwards.
+    to_light = np.array([0.0, -9.0, 0.0], np.float32) - coarse
+    shade = np.ones(len(coarse), np.float32)
+    for reach in (0.015, 0.05, 0.10, 0.17, 0.26, 0.37):
+        at = (coarse + np.float32(reach) * to_light) @ rotation + camera.position.astype(np.float32)
+        gap, _ = distance(parts, at)
+        blur = np.float32(1.0 + 22 * reach)
+        shade = np.minimum(shade, np.clip(0.5 + gap / blur, 0, 1))
+    rows, columns = local[::step, ::step].shape[:2]
+    return _upsample(0.30 + 0.70 * shade.reshape(rows, columns), local.shape[0], local.shape[1], step)
+
+
+def _upsample(coarse: Array, rows: int, columns: int, step: int) -> Array:
+    row, column = np.arange(rows) / step, np.arange(columns) / step
+    known_rows, known_columns = np.arange(coarse.shape[0]), np.arange(coarse.shape[1])
+    wide = np.stack([np.interp(column, known_columns, line) for line in coarse])
+    low = np.minimum(row.astype(int), len(known_rows) - 1)
+    high = np.minimum(low + 1, len(known_rows) - 1)
+    weight = (row - low)[:, None]
+    return np.asarray((1 - weight) * wide[low] + weight * wide[high], np.float32)
+
+
+def _shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8]) -> Array:
+    """Linear radiance [N, 3] of the tool: dark polymer shaft, brushed steel that mirrors the pink surroundings."""
+    metal = (material != SHAFT)[:, None]
+    base = np.where(metal, np.array([0.26, 0.265, 0.28], np.float32), np.array([0.085, 0.093, 0.108], np.float32))
+    base = np.where((material == RING)[:, None], np.array([0.10, 0.105, 0.12], np.float32), base)
+    gloss = np.where(metal[:, 0], np.float32(64), np.float32(14))
+    glint = np.where(metal[:, 0], np.float32(2.6), np.float32(0.16))
+    total = np.zeros((len(at), 3), np.float32)
+    for offset in LIGHTS_MM:
+        to_light = np.array(offset, np.float32) - at
+        distance2 = np.einsum("ni,ni->n", to_light, to_light)
+        to_light /= np.sqrt(distance2)[:, None]
+        power = np.float32(0.5 * REFERENCE_MM**2) / np.maximum(distance2, 400) * np.clip(-to_light[:, 2], 0, 1) ** 2
+        facing = np.clip(np.einsum("ni,ni->n", normal, to_light), 0, 1)
+        shine = np.clip(np.einsum("ni,ni->n", normal, _unit(to_light - rays)), 0, 1)
+        total += (power * facing)[:, None] * base + (power * glint * shine**gloss)[:, None]
+    mirrored = rays - 2 * np.einsum("ni,ni->n", rays, normal)[:, None] * normal
+    tissue_seen = (np.clip(0.45 + 0.65 * mirrored[:, 2], 0, 1) ** 2)[:, None]
+    fresnel = (1 - np.clip(-np.einsum("ni,ni->n", rays, normal), 0, 1))[:, None] ** 3
+    reflected = np.where(metal, 0.60 + 0.40 * fresnel, 0.05 + 0.45 * fresnel)
+    surroundings = np.array([0.250, 0.130, 0.110], np.float32)
+    return np.asarray(total + reflected * tissue_seen * surroundings, np.float32)
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.sqrt(np.einsum("...i,...i->...", vector, vector))[..., None], np.float32)
+
+
+def _develop(radiance: Array) -> NDArray[np.uint8]:
+    """Exposure with a soft shoulder, then the sRGB curve (IEC 61966-2-1)."""
+    exposed = 1 - np.exp(np.float32(-1.45) * radiance)
+    curve = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * np.maximum(exposed, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.asarray(np.clip(np.round(255 * curve), 0, 255), np.uint8)

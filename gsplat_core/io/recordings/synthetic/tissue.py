@@ -1,0 +1,106 @@
+"""Deforming tissue: a smooth sheet of material points (u, v), where they are at time t, and what colour they have.
+
+Texture is looked up by (u, v), the point's place on the undeformed sheet, so it moves with the tissue.
+Lengths in millimetres, time in seconds, world axes as the camera's at rest (x right, y down, z away).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.io.recordings.synthetic.texture import TissueTexture
+
+Array = NDArray[np.floating]
+
+TISSUE_DISTANCE_MM = 74.0
+BREATH_PERIOD_S = 3.4
+PULSE_PERIOD_S = 0.9
+TUG_RADIUS_MM = 12.0
+
+
+@dataclass(frozen=True)
+class Tug:
+    """The tissue's local displacement by a tool: `pull` at the material point `grasp`, fading like a Gaussian."""
+
+    grasp: tuple[float, float]
+    pull: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Positions and tangents of material points: each a tuple of x, y and z arrays."""
+
+    position: tuple[Array, Array, Array]
+    along_u: tuple[Array, Array, Array]
+    along_v: tuple[Array, Array, Array]
+
+
+class Tissue:
+    """One patient's sheet of tissue: shape, breathing and pulse, colour. Deterministic by the generator it is given."""
+
+    def __init__(self, rng: np.random.Generator, texel_mm: float) -> None:
+        wavelengths = np.array([74.0, 58.0, 43.0, 33.0, 26.0, 21.0])
+        slopes = np.array([0.16, 0.17, 0.15, 0.14, 0.10, 0.07])
+        angles = rng.uniform(0, 2 * np.pi) + np.arange(6) * 2.4 + rng.uniform(-0.4, 0.4, 6)
+        wave_numbers = 2 * np.pi / wavelengths
+        self._relief = [
+            (float(k * np.cos(angle)), float(k * np.sin(angle)), float(phase), float(slope / k))
+            for k, angle, phase, slope in zip(wave_numbers, angles, rng.uniform(0, 2 * np.pi, 6), slopes, strict=True)
+        ]
+        self._tilt = rng.uniform(-0.10, 0.10, 2)
+        self._breath_phase = float(rng.uniform(0, 2 * np.pi))
+        self._breath_angle = float(rng.uniform(0, 2 * np.pi))
+        self.texture = TissueTexture(rng, texel_mm)
+
+    def points(self, u: Array, v: Array, time_s: float, tug: Tug) -> SurfacePoints:
+        """Where the material points (u, v) are at a time, and the derivatives by u and v."""
+        one, zero = np.ones_like(u), np.zeros_like(u)
+        bowl = np.float32(-0.0022)
+        tilt_u, tilt_v = (np.float32(tilt) for tilt in self._tilt)
+        z = np.float32(TISSUE_DISTANCE_MM) + tilt_u * u + tilt_v * v + bowl * (u * u + v * v)
+        z_u, z_v = tilt_u + 2 * bowl * u, tilt_v + 2 * bowl * v
+        for k_u, k_v, phase, amplitude in self._relief:
+            angle = np.float32(k_u) * u + np.float32(k_v) * v + np.float32(phase)
+            z = z + np.float32(amplitude) * np.sin(angle)
+            slope = np.float32(amplitude) * np.cos(angle)
+            z_u, z_v = z_u + np.float32(k_u) * slope, z_v + np.float32(k_v) * slope
+        x, y, x_u, y_v = u, v, one, one
+        x_v, y_u = zero, zero
+
+        # Breathing: a long wave that lifts and shears; pulse: a short one that runs across.
+        breath = 2 * np.pi * time_s / BREATH_PERIOD_S + self._breath_phase
+        pulse = 2 * np.pi * time_s / PULSE_PERIOD_S
+        direction = (np.cos(self._breath_angle), np.sin(self._breath_angle))
+        for wavelength_mm, phase, lift_mm, shear_mm in ((130.0, breath, 2.4, 1.6), (55.0, -pulse, 0.35, 0.25)):
+            wave_u, wave_v = (np.float32(2 * np.pi / wavelength_mm * component) for component in direction)
+            angle = wave_u * u + wave_v * v + np.float32(phase)
+            sine, cosine = np.sin(angle), np.cos(angle)
+            lift, shear = np.float32(lift_mm), np.float32(shear_mm)
+            z, z_u, z_v = z + lift * sine, z_u + lift * wave_u * cosine, z_v + lift * wave_v * cosine
+            for axis, component in enumerate(direction):
+                part = shear * np.float32(component)
+                if axis == 0:
+                    x, x_u, x_v = x + part * cosine, x_u - part * wave_u * sine, x_v - part * wave_v * sine
+                else:
+                    y, y_u, y_v = y + part * cosine, y_u - part * wave_u * sine, y_v - part * wave_v * sine
+
+        # The tug.
+        inverse = np.float32(1 / TUG_RADIUS_MM**2)
+        d_u, d_v = u - np.float32(tug.grasp[0]), v - np.float32(tug.grasp[1])
+        weight = np.exp(np.float32(-0.5) * inverse * (d_u * d_u + d_v * d_v))
+        w_u, w_v = -inverse * d_u * weight, -inverse * d_v * weight
+        p_x, p_y, p_z = (np.float32(component) for component in tug.pull)
+        return SurfacePoints(
+            (x + p_x * weight, y + p_y * weight, z + p_z * weight),
+            (x_u + p_x * w_u, y_u + p_y * w_u, z_u + p_z * w_u),
+            (x_v + p_x * w_v, y_v + p_y * w_v, z_v + p_z * w_v),
+        )
+
+    def position(self, point: tuple[float, float], time_s: float, tug: Tug) -> NDArray[np.float64]:
+        """Where one material point (u, v) is [3]."""
+        u, v = point
+        points = self.points(np.array([u], np.float32), np.array([v], np.float32), time_s, tug)
+        return np.array([float(component[0]) for component in points.position])

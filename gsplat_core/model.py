@@ -1,0 +1,123 @@
+"""A published model: Gaussians, how they deform, and the camera and time they were seen with."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsplat_core.cameras import Camera
+from gsplat_core.deformation import BasisField, DeformationField
+from gsplat_core.deformation.field import checked_window
+from gsplat_core.errors import InvalidInput
+from gsplat_core.gaussians import Gaussians
+from gsplat_core.rendering import RenderOutput, render
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """One immutable version of a reconstruction; may be read by several threads.
+
+    The publisher hands over tensors of their own (detached copies) and never changes them afterwards. Raises InvalidInput when
+    a tensor still requires a gradient, or when the field was made for another number of Gaussians.
+    """
+
+    version: int
+    """Counts up with every snapshot, from 1."""
+    gaussians: Gaussians
+    """The canonical Gaussians."""
+    field: DeformationField | None
+    """How they deform; None for a scene that does not move."""
+    camera: Camera
+    """The camera of the recording's first frame."""
+    time_window_s: tuple[float, float]
+    """First and last time that the model has seen; other times show the nearest of these."""
+    training_digest: str | None = None
+    """SHA-256 of the recording that it was trained on, where known."""
+
+    _deform: Callable[[float], Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
+    _last: tuple[float, Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "time_window_s", checked_window(self.time_window_s))
+        if self.version < 1:
+            raise InvalidInput(f"a model's version counts from 1, got {self.version}")
+        learning = [name for name, tensor in self.tensors().items() if tensor.requires_grad]
+        if learning:
+            raise InvalidInput(
+                f"a model is published with detached copies, but {', '.join(learning)} require gradients"
+            )
+        if isinstance(self.field, BasisField) and self.field.count != self.gaussians.count:
+            raise InvalidInput(f"the field deforms {self.field.count} Gaussians, the model has {self.gaussians.count}")
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Every tensor of the model by name: `gaussians.*`, then `field.*` in the field's order."""
+        named = {f"gaussians.{name}": tensor for name, tensor in self.gaussians.tensors().items()}
+        if self.field is not None:
+            named |= {f"field.{name}": tensor for name, tensor in self.field.state_dict(keep_vars=True).items()}
+        return named
+
+    @property
+    def parameter_count(self) -> int:
+        """Numbers in all tensors."""
+        return sum(tensor.numel() for tensor in self.tensors().values())
+
+    def at(self, time_s: float) -> Gaussians:
+        """The Gaussians at `time_s`, clamped to the window. The last answer is remembered, so asking again is free."""
+        if self.field is None:
+            return self.gaussians
+        start, end = self.time_window_s
+        time_s = min(max(time_s, start), end) if time_s == time_s else time_s  # NaN: the field refuses it
+        last = self._last
+        if last is not None and last[0] == time_s:
+            return last[1]
+        deform = self._deform
+        if deform is None:
+            deform = self.field.cached(self.gaussians)
+            object.__setattr__(self, "_deform", deform)
+        deformed = deform(time_s)
+        object.__setattr__(self, "_last", (time_s, deformed))
+        return deformed
+
+    def render(
+        self, time_s: float, camera: Camera | None = None, background: Tensor | None = None, depth: bool = True
+    ) -> RenderOutput:
+        """The scene at `time_s` from `camera` (the recording's own when None), without an autograd graph."""
+        with torch.no_grad():
+            return render(self.at(time_s), camera or self.camera, background, depth)
+
+    def description(self) -> dict[str, Any]:
+        """All of the model but its tensors and version, as JSON-able values."""
+        return {
+            "gaussians": {"count": self.gaussians.count, "sh_degree": self.gaussians.sh_degree},
+            "field": None if self.field is None else self.field.config(),
+            "camera": {
+                "K": self.camera.K.tolist(),
+                "width_px": self.camera.width_px,
+                "height_px": self.camera.height_px,
+                "world_to_camera": self.camera.world_to_camera.tolist(),
+                "model": self.camera.model,
+            },
+            "time_window_s": list(self.time_window_s),
+            "training_digest": self.training_digest,
+        }
+
+    def sha256(self) -> str:
+        """Digest of the description and of every tensor's name, type, shape and bytes; the version is not part of it."""
+        digest = hashlib.sha256()
+        for piece in self._canonical_bytes():
+            digest.update(piece)
+        return digest.hexdigest()
+
+    def _canonical_bytes(self) -> Iterator[bytes | memoryview]:
+        yield json.dumps(self.description(), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+        for name, tensor in sorted(self.tensors().items()):
+            yield f"\n{name} {tensor.dtype} {list(tensor.shape)}\n".encode()
+            if tensor.numel():
+                yield tensor.detach().cpu().contiguous().numpy().data.cast("B")

@@ -1,0 +1,109 @@
+"""The training loss of one frame and its gradients in one fused op: masked L1, SSIM and inverse-depth L1 over tissue."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops import native  # noqa: F401  registers the compiled op
+from gsplat_core.ops.ssim.ssim import MAX_CHANNELS
+from gsplat_core.reference.image_loss import ImageLoss
+
+
+def image_loss(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    depth: Tensor | None = None,
+    target_depth: Tensor | None = None,
+    ssim_weight: float = 0.0,
+    depth_weight: float = 0.0,
+) -> ImageLoss:
+    """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM) + depth_weight |1/depth - 1/target_depth|, each a mean over tissue.
+
+    SSIM is that of the masked images (Wang et al. 2004; 11x11 Gaussian of sigma 1.5, zero padding) averaged over tissue pixels. The depth
+    term averages over tissue pixels where both depths are known (> 0). A term over no pixel is 0 with zero gradient.
+
+    A training step takes `grad_image` and `grad_depth` as they are and needs no autograd graph; `loss.backward()` gives the same ones.
+
+    Args:
+        image: [H, W, C] float32 in 0..1.
+        target: [H, W, C], uint8 (value / 255) or float32.
+        mask: [H, W], non-zero = tissue, any type; None = all tissue. Values elsewhere are not seen, not even NaN.
+        depth: [H, W] float32 in mm, 0 = unknown.
+        target_depth: [H, W] float32 in mm, 0 = unknown; needed with depth.
+        ssim_weight: 0..1. With 0 the SSIM is not computed at all.
+        depth_weight: at least 0.
+
+    Raises:
+        InvalidInput: shapes, types or weights are not as said; `gsplat_core.reference.image_loss` takes float64.
+    """
+    if image.ndim != 3 or image.shape != target.shape or not 1 <= image.shape[2] <= MAX_CHANNELS:
+        raise InvalidInput(
+            f"image and target must both be [H, W, C] with 1 to {MAX_CHANNELS} channels,"
+            f" got {list(image.shape)} and {list(target.shape)}"
+        )
+    if target.dtype not in (torch.uint8, torch.float32):
+        raise InvalidInput(
+            f"target must be uint8 or float32, got {target.dtype}; gsplat_core.reference takes other types"
+        )
+    if (depth is None) != (target_depth is None):
+        raise InvalidInput("depth and target_depth go together: pass both or neither")
+    for name, tensor in (("mask", mask), ("depth", depth), ("target_depth", target_depth)):
+        if tensor is not None and tensor.shape != image.shape[:2]:
+            raise InvalidInput(f"{name} must be [H, W] = {list(image.shape[:2])}, got {list(tensor.shape)}")
+    for name, tensor in (("image", image), ("depth", depth), ("target_depth", target_depth)):
+        if tensor is not None and tensor.dtype != torch.float32:
+            raise InvalidInput(f"{name} must be float32, got {tensor.dtype}; gsplat_core.reference takes other types")
+    if not 0 <= ssim_weight <= 1 or not 0 <= depth_weight < float("inf"):
+        raise InvalidInput(
+            f"ssim_weight must be in 0..1 and depth_weight at least 0, got {ssim_weight} and {depth_weight}"
+        )
+    if mask is not None and mask.dtype != torch.uint8:
+        mask = (mask != 0).view(torch.uint8)
+    loss, terms, grad_image, grad_depth = torch.ops.gsplat_core.image_loss(
+        image, target, mask, depth, target_depth, ssim_weight, depth_weight
+    )
+    return ImageLoss(loss, terms, grad_image, None if depth is None else grad_depth)
+
+
+@torch.library.register_fake("gsplat_core::image_loss")
+def _(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    depth: Tensor | None,
+    target_depth: Tensor | None,
+    ssim_weight: float,
+    depth_weight: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    grad_depth = image.new_empty(0 if depth is None else depth.shape)
+    return image.new_empty(()), image.new_empty(3), image.new_empty(image.shape), grad_depth
+
+
+def _save(
+    ctx: torch.autograd.function.FunctionCtx, inputs: tuple, output: tuple[Tensor, Tensor, Tensor, Tensor]
+) -> None:
+    _, terms, grad_image, grad_depth = output
+    ctx.has_depth = inputs[3] is not None  # type: ignore[attr-defined]
+    ctx.mark_non_differentiable(terms, grad_image, grad_depth)
+    ctx.save_for_backward(grad_image, grad_depth)
+
+
+def _backward(
+    ctx: torch.autograd.function.FunctionCtx, grad_loss: Tensor, *_: Tensor
+) -> tuple[Tensor | None, None, None, Tensor | None, None, None, None]:
+    grad_image, grad_depth = ctx.saved_tensors  # type: ignore[attr-defined]
+    return (
+        grad_loss * grad_image,
+        None,
+        None,
+        grad_loss * grad_depth if ctx.has_depth else None,  # type: ignore[attr-defined]
+        None,
+        None,
+        None,
+    )
+
+
+torch.library.register_autograd("gsplat_core::image_loss", _backward, setup_context=_save)

@@ -1,0 +1,123 @@
+"""The image loss and its terms in plain torch: any floating type, differentiable by autograd.
+
+A term over nothing (no tissue, no valid depth) is 0 with zero gradient, never NaN.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.reference.ssim import ssim_map
+
+
+class ImageLoss(NamedTuple):
+    """A loss with its gradients, ready to be fed to the renderer's backward op."""
+
+    loss: Tensor
+    """Scalar; differentiable in image and depth."""
+    terms: Tensor
+    """[3]: L1, 1 - SSIM (0 when its weight is 0) and inverse-depth L1, each before its weight. Not differentiable."""
+    grad_image: Tensor
+    """dL/dimage [H, W, C]. Not differentiable."""
+    grad_depth: Tensor | None
+    """dL/ddepth [H, W]; None without depth. Not differentiable."""
+
+
+def _mean_where(values: Tensor, keep: Tensor) -> Tensor:
+    """Mean of the kept values; 0 when none is kept. What is not kept may be NaN: neither value nor gradient sees it."""
+    return torch.where(keep, values, torch.zeros_like(values)).sum() / keep.sum().clamp(min=1)
+
+
+def _tissue(mask: Tensor | None, like: Tensor) -> Tensor:
+    """The mask as booleans [H, W, C]."""
+    if mask is None:
+        return torch.ones_like(like, dtype=torch.bool)
+    if mask.shape != like.shape[:2]:
+        raise InvalidInput(f"mask must be [H, W] = {list(like.shape[:2])}, got {list(mask.shape)}")
+    return (mask != 0)[..., None].expand_as(like)
+
+
+def _same_shape(a: Tensor, b: Tensor, names: str) -> None:
+    if a.shape != b.shape:
+        raise InvalidInput(f"{names} must have one shape, got {list(a.shape)} and {list(b.shape)}")
+
+
+def masked_l1(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean absolute error over tissue pixels and channels.
+
+    Args:
+        image: [H, W, C].
+        target: [H, W, C].
+        mask: [H, W], non-zero = tissue; None = all.
+    """
+    _same_shape(image, target, "image and target")
+    keep = _tissue(mask, image)
+    # The difference is formed of masked images: a NaN under the tool would reach the gradient through abs.
+    zero = torch.zeros_like(image)
+    return _mean_where((torch.where(keep, image, zero) - torch.where(keep, target, zero)).abs(), keep)
+
+
+def masked_ssim_loss(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """1 - mean structural similarity of the masked images over tissue pixels; arguments as in `masked_l1`."""
+    _same_shape(image, target, "image and target")
+    keep = _tissue(mask, image)
+    zero = torch.zeros_like(image)
+    return _mean_where(1 - ssim_map(torch.where(keep, image, zero), torch.where(keep, target, zero)), keep)
+
+
+def valid_depth(depth: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    """Where both depths are known (> 0) and the mask is tissue: booleans [H, W]."""
+    _same_shape(depth, target, "depth and target depth")
+    valid = (depth > 0) & (target > 0)
+    if mask is not None:
+        _same_shape(depth, mask, "depth and mask")
+        valid = valid & (mask != 0)
+    return valid
+
+
+def inverse_depth_l1(depth: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean |1/depth - 1/target| over pixels where both are known (> 0) and the mask is tissue.
+
+    Inverse depth weighs by what a stereo pair can see: its error is disparity's.
+
+    Args:
+        depth: [H, W] in mm, 0 = unknown.
+        target: [H, W] in mm, 0 = unknown.
+        mask: [H, W], non-zero = tissue; None = all.
+    """
+    valid = valid_depth(depth, target, mask)
+    one = torch.ones_like(depth)
+    return _mean_where((1 / torch.where(valid, depth, one) - 1 / torch.where(valid, target, one)).abs(), valid)
+
+
+def image_loss(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    depth: Tensor | None = None,
+    target_depth: Tensor | None = None,
+    ssim_weight: float = 0.0,
+    depth_weight: float = 0.0,
+) -> ImageLoss:
+    """As `gsplat_core.ops.image_loss.image_loss`, which documents it; here image and depth may be of any floating type."""
+    if target.dtype == torch.uint8:
+        target = target.to(image.dtype) / 255
+    with torch.enable_grad():
+        x = image if image.requires_grad else image.detach().requires_grad_()
+        z = depth if depth is None or depth.requires_grad else depth.detach().requires_grad_()
+        zero = image.new_zeros(())
+        l1 = masked_l1(x, target, mask)
+        ssim = masked_ssim_loss(x, target, mask) if ssim_weight else zero
+        inverse_depth = inverse_depth_l1(z, target_depth, mask) if z is not None and target_depth is not None else zero
+        loss = (1 - ssim_weight) * l1 + ssim_weight * ssim + depth_weight * inverse_depth
+        wanted = [x] if z is None else [x, z]
+        gradients = torch.autograd.grad(loss, wanted, retain_graph=True, materialize_grads=True)
+    terms = torch.stack([l1, ssim, inverse_depth]).detach()
+    differentiable = image.requires_grad or (depth is not None and depth.requires_grad)
+    return ImageLoss(
+        loss if differentiable else loss.detach(), terms, gradients[0], gradients[1] if z is not None else None
+    )

@@ -1,0 +1,152 @@
+"""Adam over the Gaussians' tensors, whose number of rows changes as they are added and pruned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.adam.adam import adam_step
+
+
+class FusedAdam:
+    """Adam (Kingma and Ba 2015) over named tensors, with a learning rate each, as torch.optim.Adam computes it.
+
+    It holds the moments and not the parameters: those are passed to every step, so they may be replaced between steps as long as
+    their rows keep step with the moments (`select`, `append`).
+
+    A NaN or infinite gradient never reaches a parameter or a moment. With `rows=True` (Gaussians: dimension 0 counts them) it
+    leaves its whole row of that tensor as it was, with `rows=False` (planes, weights) just its element; `skipped` counts them.
+
+    Args:
+        parameters: the tensors to be updated, float32 on the CPU; only their shapes are kept.
+        learning_rates: one per name, which `step` can replace at any time; None: the first step brings them.
+        betas: decay of the first and second moment.
+        epsilon: added to the denominator.
+        rows: whether dimension 0 of every tensor counts Gaussians.
+
+    Raises:
+        InvalidInput: rates and tensors differ in their names, or tensors in their number of rows.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Tensor],
+        learning_rates: Mapping[str, float] | None = None,
+        *,
+        betas: tuple[float, float] = (0.9, 0.999),
+        epsilon: float = 1e-8,
+        rows: bool = True,
+    ) -> None:
+        self.betas = betas
+        self.epsilon = epsilon
+        self.rows = rows
+        self.steps = 0
+        """Steps taken."""
+        self.skipped = 0
+        """Rows (or elements) left alone so far because their gradient was not finite."""
+        self.first_moments = {name: _zeros(tensor) for name, tensor in parameters.items()}
+        self.second_moments = {name: _zeros(tensor) for name, tensor in parameters.items()}
+        self.learning_rates = self._checked_rates(learning_rates) if learning_rates is not None else {}
+        counts = {name: tensor.shape[0] for name, tensor in parameters.items() if tensor.ndim} if rows else {}
+        if rows and (len(counts) < len(parameters) or len(set(counts.values())) > 1):
+            raise InvalidInput(
+                f"every tensor needs one row per Gaussian, got {counts}; pass rows=False for planes and weights"
+            )
+
+    def _checked_rates(self, learning_rates: Mapping[str, float]) -> dict[str, float]:
+        if set(learning_rates) != set(self.first_moments):
+            raise InvalidInput(
+                f"learning rates for {sorted(learning_rates)}, tensors {sorted(self.first_moments)}: they must match"
+            )
+        return dict(learning_rates)
+
+    def step(
+        self,
+        parameters: Mapping[str, Tensor],
+        gradients: Mapping[str, Tensor | None] | None = None,
+        learning_rates: Mapping[str, float] | None = None,
+    ) -> int:
+        """Update the parameters in place.
+
+        Args:
+            parameters: every named tensor, contiguous, of the moments' shapes.
+            gradients: by name; one that is None or missing leaves its tensor and moments alone. None: each tensor's `.grad`.
+            learning_rates: replace those in use, from this step on; some names or all.
+
+        Returns:
+            Rows (or elements) left alone in this step because their gradient was not finite.
+
+        Raises:
+            InvalidInput: a tensor or its rate is missing, or its shape is not that of its moments.
+        """
+        self.learning_rates = self._checked_rates({**self.learning_rates, **(learning_rates or {})})
+        for name, moment in self.first_moments.items():
+            if name not in parameters or parameters[name].shape != moment.shape:
+                shape = list(parameters[name].shape) if name in parameters else "nothing"
+                raise InvalidInput(
+                    f"{name} must be {list(moment.shape)}, got {shape}; call select or append when Gaussians are removed or added"
+                )
+        self.steps += 1
+        skipped = 0
+        for name, first in self.first_moments.items():
+            parameter = parameters[name]
+            gradient = parameter.grad if gradients is None else gradients.get(name)
+            if gradient is None or first.numel() == 0:
+                continue
+            row_size = first.numel() // first.shape[0] if self.rows else 1
+            skipped += adam_step(
+                parameter.detach(),
+                gradient,
+                first,
+                self.second_moments[name],
+                self.steps,
+                self.learning_rates[name],
+                *self.betas,
+                self.epsilon,
+                row_size,
+            )
+        self.skipped += skipped
+        return skipped
+
+    @property
+    def count(self) -> int:
+        """Number of rows (Gaussians)."""
+        self._need_rows()
+        return next(iter(self.first_moments.values())).shape[0] if self.first_moments else 0
+
+    def select(self, index: Tensor) -> None:
+        """Keep the moments of some rows, as `Gaussians.select(index)` does: booleans [N] or indices, in their order."""
+        self._need_rows()
+        for moments in (self.first_moments, self.second_moments):
+            for name, moment in moments.items():
+                moments[name] = moment[index].contiguous()
+
+    def append(self, count: int) -> None:
+        """Add rows with zero moments at the end; they share the step count, so their first steps are up to 3 times the usual."""
+        self._need_rows()
+        if count < 0:
+            raise InvalidInput(f"cannot append {count} rows")
+        for moments in (self.first_moments, self.second_moments):
+            for name, moment in moments.items():
+                moments[name] = torch.cat([moment, moment.new_zeros((count, *moment.shape[1:]))])
+
+    def reset(self, name: str, index: Tensor | None = None) -> None:
+        """Forget the moments of one tensor, or of some of its rows: after its values were set by hand (opacity reset, relocation)."""
+        for moments in (self.first_moments, self.second_moments):
+            if index is None:
+                moments[name].zero_()
+            else:
+                moments[name][index] = 0
+
+    def _need_rows(self) -> None:
+        if not self.rows:
+            raise InvalidInput(
+                "these tensors have no rows of Gaussians (rows=False); only Gaussians are selected and appended"
+            )
+
+
+def _zeros(tensor: Tensor) -> Tensor:
+    return torch.zeros_like(tensor, requires_grad=False, memory_format=torch.contiguous_format)

@@ -1,0 +1,69 @@
+"""Loading the Holoscan SDK from pip, without LD_LIBRARY_PATH."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import importlib.util
+import os
+import signal
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from operators.errors import EngineMissing
+
+_CUDART = "libcudart.so.13"
+_ADVICE = "install it with: pip install 'intrasplat[holoscan]'"
+
+
+def load_sdk() -> Any:
+    """The SDK's modules `core`, `schedulers` and `resources`. Raises EngineMissing, which says what is not there."""
+    if importlib.util.find_spec("holoscan") is None:
+        raise EngineMissing(f"the Holoscan SDK is not installed; {_ADVICE}")
+    _preload_cudart()
+    try:
+        with warnings.catch_warnings():
+            # It asks for a 32 MB stack, which nothing here needs.
+            warnings.filterwarnings("ignore", message="Current stack size", category=RuntimeWarning)
+            core, schedulers, resources, logger = (
+                importlib.import_module(f"holoscan.{name}") for name in ("core", "schedulers", "resources", "logger")
+            )
+    except (ImportError, OSError) as error:
+        raise EngineMissing(f"the Holoscan SDK is installed but cannot be loaded ({error}); {_ADVICE}") from error
+    if "HOLOSCAN_LOG_LEVEL" not in os.environ:
+        logger.set_log_level(logger.LogLevel.ERROR)
+    return SimpleNamespace(core=core, schedulers=schedulers, resources=resources)
+
+
+def keep_signals() -> Callable[[], None]:
+    """Note the handlers of SIGINT and SIGTERM; the function returned puts them back, from any thread.
+
+    A run of the SDK installs its own and leaves them: from then on the process ignores SIGTERM.
+    """
+    get, put = ctypes.pythonapi.PyOS_getsig, ctypes.pythonapi.PyOS_setsig
+    get.restype = put.restype = ctypes.c_void_p
+    put.argtypes = [ctypes.c_int, ctypes.c_void_p]
+    kept = {number: get(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def restore() -> None:
+        for number, handler in kept.items():
+            put(number, handler)
+
+    return restore
+
+
+def _preload_cudart() -> None:
+    """Load the CUDA runtime for all libraries of the process; the SDK is linked against it even on the CPU."""
+    try:
+        ctypes.CDLL(_CUDART, ctypes.RTLD_GLOBAL)
+        return
+    except OSError:
+        spec = importlib.util.find_spec("nvidia")
+    for site in (spec.submodule_search_locations or []) if spec is not None else []:
+        for library in sorted(Path(site).glob(f"*/lib/{_CUDART}")):
+            ctypes.CDLL(str(library), ctypes.RTLD_GLOBAL)
+            return
+    raise EngineMissing(f"the Holoscan SDK needs {_CUDART} of the package nvidia-cuda-runtime >= 13; {_ADVICE}")

@@ -1,0 +1,97 @@
+"""The Adam op against torch.optim.Adam and the reference; gradients that are not finite; threads."""
+
+import math
+
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.adam.adam import adam_step
+from gsplat_core.reference.adam import adam_step as reference_adam_step
+
+
+def state(*shape, seed=0, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(seed)
+    parameter = torch.randn(shape, generator=generator, dtype=dtype)
+    return parameter, torch.zeros_like(parameter), torch.zeros_like(parameter)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (0, 3), (7, 3), (1000, 16, 3), (70001,)])
+def test_equals_torchs_adam(shape):
+    parameter, first, second = state(*shape)
+    other = parameter.clone().requires_grad_()
+    optimiser = torch.optim.Adam([other], lr=0.02, betas=(0.9, 0.999), eps=1e-10)
+    generator = torch.Generator().manual_seed(1)
+    for step in range(1, 6):
+        gradient = torch.randn(shape, generator=generator)
+        assert adam_step(parameter, gradient, first, second, step, 0.02, 0.9, 0.999, 1e-10) == 0
+        other.grad = gradient.clone()
+        optimiser.step()
+        torch.testing.assert_close(parameter, other.detach(), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("row_size", [1, 3, 48])
+def test_equals_the_reference_where_gradients_are_not_finite(row_size):
+    ours = state(2000, 48)
+    expected = [t.double() for t in ours]
+    generator = torch.Generator().manual_seed(2)
+    for step in range(1, 4):
+        gradient = torch.randn(2000, 48, generator=generator)
+        gradient[::7, 5] = torch.nan
+        gradient[3, 3] = -torch.inf
+        gradient[1999, 47] = 1e30  # finite, but its square is not
+        parameter, first, second = ours
+        skipped = adam_step(parameter, gradient, first, second, step, 0.1, row_size=row_size)
+        usable = gradient.masked_fill(gradient.abs() > 1e20, torch.nan).double()
+        assert skipped == reference_adam_step(expected[0], usable, *expected[1:], step, 0.1, row_size=row_size)
+        assert skipped == math.ceil(2000 / 7) + 2
+        for a, b in zip(ours, expected, strict=True):
+            torch.testing.assert_close(a.double(), b, rtol=1e-5, atol=2e-6)
+
+
+def test_a_skipped_row_keeps_its_bits():
+    parameter, first, second = state(5, 3)
+    adam_step(parameter, torch.ones(5, 3), first, second, 1, 0.1)
+    before = [t.clone() for t in (parameter, first, second)]
+    gradient = torch.ones(5, 3)
+    gradient[2, 1] = torch.inf
+    assert adam_step(parameter, gradient, first, second, 2, 0.1, row_size=3) == 1
+    for now, then in zip((parameter, first, second), before, strict=True):
+        assert torch.equal(now[2], then[2])
+        assert (now[[0, 1, 3, 4]] != then[[0, 1, 3, 4]]).all()
+
+
+def test_the_number_of_threads_does_not_change_a_bit():
+    gradient = torch.randn(100_003, generator=torch.Generator().manual_seed(3))
+    gradient[::101] = torch.nan
+    before = torch.get_num_threads()
+    results = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        tensors = state(100_003)
+        results.append((*tensors, torch.tensor(adam_step(tensors[0], gradient, *tensors[1:], 1, 0.1))))
+    torch.set_num_threads(before)
+    for a, b in zip(*results, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_opcheck():
+    parameter, first, second = state(10, 3)
+    torch.library.opcheck(
+        torch.ops.gsplat_core.adam_, (parameter, torch.ones(10, 3), first, second, 1, 0.1, 0.9, 0.999, 1e-8, 3)
+    )
+
+
+def test_what_it_cannot_take_is_refused():
+    parameter, first, second = state(4, 3)
+    gradient = torch.ones(4, 3)
+    with pytest.raises(InvalidInput, match=r"gsplat_core\.reference"):
+        adam_step(parameter.double(), gradient.double(), first.double(), second.double(), 1, 0.1)
+    with pytest.raises(InvalidInput, match="contiguous"):
+        adam_step(state(3, 4)[0].T, gradient, first, second, 1, 0.1)
+    with pytest.raises(InvalidInput, match="first_moment"):
+        adam_step(parameter, gradient, first[:2], second, 1, 0.1)
+    with pytest.raises(InvalidInput, match="row_size"):
+        adam_step(parameter, gradient, first, second, 1, 0.1, row_size=5)
+    with pytest.raises(InvalidInput, match="step 0"):
+        adam_step(parameter, gradient, first, second, 0, 0.1)

@@ -1,0 +1,107 @@
+"""The C++ HexPlane ops against their definition in plain torch."""
+
+import pytest
+import torch
+
+from gsplat_core import reference
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.hexplane.hexplane import hexplane_features, hexplane_modulate, hexplane_space
+
+
+def level(channels=32, sizes=(9, 7, 8, 5), dtype=torch.float32, seed=0):
+    random = torch.Generator().manual_seed(seed)
+    axes = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
+    return [(0.5 + torch.rand(sizes[v], sizes[u], channels, generator=random)).to(dtype) for u, v in axes]
+
+
+def points(n, dtype=torch.float32, reach=1.2, seed=1):
+    random = torch.Generator().manual_seed(seed)
+    return (reach * (2 * torch.rand(n, 4, generator=random) - 1)).to(dtype)
+
+
+@pytest.mark.parametrize("n", [0, 1, 1300])
+@pytest.mark.parametrize("channels", [1, 5, 16, 32, 40])
+def test_features_and_gradients_equal_the_reference(n, channels):
+    seen = [t.requires_grad_() for t in (points(n), *level(channels))]
+    wanted = [t.detach().clone().requires_grad_() for t in seen]
+    ours, theirs = hexplane_features(*seen), reference.hexplane_features(*wanted)
+    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-5)
+    gradient = torch.randn(n, channels, generator=torch.Generator().manual_seed(2))
+    ours.backward(gradient)
+    theirs.backward(gradient)
+    for s, w in zip(seen, wanted, strict=True):
+        scale = 1.0 if w.grad.numel() == 0 else max(1.0, float(w.grad.abs().max()))
+        torch.testing.assert_close(s.grad / scale, w.grad / scale, rtol=1e-4, atol=1e-5)
+
+
+def test_points_on_and_beyond_the_border_read_the_border():
+    planes = level(4)
+    for corner in (-1.0, 1.0):
+        inside = torch.full((1, 4), corner)
+        torch.testing.assert_close(hexplane_features(inside, *planes), hexplane_features(3 * inside, *planes))
+        value = torch.ones(4)
+        for plane in planes:
+            value = value * (plane[0, 0] if corner < 0 else plane[-1, -1])
+        torch.testing.assert_close(hexplane_features(inside, *planes)[0], value)
+
+
+def test_the_reference_is_differentiable():
+    inputs = [points(3, torch.float64, reach=0.9), *level(2, (3, 4, 3, 2), torch.float64)]
+    assert torch.autograd.gradcheck(reference.hexplane_features, [t.requires_grad_() for t in inputs])
+
+
+@pytest.mark.parametrize("n", [0, 1, 700])
+def test_the_two_halves_equal_the_whole(n):
+    planes, time = level(), 0.37
+    x = points(n)
+    x[:, 3] = time
+    row = (time + 1) / 2 * (planes[3].shape[0] - 1)
+    lines = [torch.lerp(plane[int(row)], plane[int(row) + 1], row - int(row)) for plane in planes[3:]]
+    space = hexplane_space(x, *planes[:3])
+    torch.testing.assert_close(space, reference.hexplane_space(x, *planes[:3]), rtol=1e-5, atol=1e-6)
+    seen = hexplane_modulate(space, x, *lines)
+    torch.testing.assert_close(seen, reference.hexplane_modulate(space, x, *lines), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(seen, hexplane_features(x, *planes), rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_do_not_depend_on_the_number_of_threads():
+    inputs = (points(4000), *level())
+    gradient = torch.randn(4000, 32, generator=torch.Generator().manual_seed(3))
+    results = []
+    old = torch.get_num_threads()
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        results.append(torch.ops.gsplat_core.hexplane_features_backward(gradient, *inputs))
+    torch.set_num_threads(old)
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_a_position_that_is_not_a_number_shows_and_reads_nothing_outside():
+    x = points(5)
+    x[2, 0], x[3, 1] = float("nan"), float("inf")
+    features = hexplane_features(x, *level())
+    assert features[2].isnan().all()
+    assert features[[0, 1, 3, 4]].isfinite().all()
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
+def test_ops_pass_opcheck():
+    ops, planes = torch.ops.gsplat_core, level(3)
+    inputs = [t.requires_grad_() for t in (points(4), *level(3))]
+    torch.library.opcheck(ops.hexplane_features.default, inputs)
+    torch.library.opcheck(ops.hexplane_features_backward.default, (torch.rand(4, 3), points(4), *planes))
+    torch.library.opcheck(ops.hexplane_space.default, (points(4), *planes[:3]))
+    lines = [plane[0] for plane in planes[3:]]
+    torch.library.opcheck(ops.hexplane_modulate.default, (torch.rand(4, 3), points(4), *lines))
+
+
+def test_wrong_input_is_refused_with_its_value():
+    planes = level(4)
+    with pytest.raises(InvalidInput, match=r"\[6, 3\]"):
+        hexplane_features(points(6)[:, :3], *planes)
+    with pytest.raises(InvalidInput, match=r"float64.*gsplat_core\.reference"):
+        hexplane_features(points(6, torch.float64), *planes)
+    with pytest.raises(InvalidInput, match=r"one C"):
+        hexplane_features(points(6), *planes[:5], planes[5][..., :2])
+    with pytest.raises(InvalidInput, match=r"\[6, 4\], got \[5, 4\]"):
+        hexplane_modulate(torch.rand(5, 4), points(6), *(plane[0] for plane in planes[3:]))

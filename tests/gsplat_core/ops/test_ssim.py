@@ -1,0 +1,121 @@
+"""The fused SSIM against the reference in float64: values, gradients, sizes around every block and strip, threads."""
+
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.ssim.ssim import ssim_map
+from gsplat_core.reference.ssim import gaussian_window
+from gsplat_core.reference.ssim import ssim_map as reference_ssim_map
+
+# 700 x 3 is wider than one strip; 49 and 100 rows end inside a band.
+SHAPES = [
+    (1, 1, 3),
+    (1, 700, 3),
+    (13, 1, 1),
+    (3, 4, 3),
+    (11, 11, 3),
+    (49, 31, 2),
+    (100, 17, 4),
+    (20, 700, 3),
+    (9, 50, 32),
+]
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def images(shape, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.rand(shape, generator=generator)
+    return (target + 0.2 * torch.randn(shape, generator=generator)), target
+
+
+def test_the_window_is_a_normalised_gaussian():
+    window = gaussian_window()
+    assert window.sum().item() == pytest.approx(1)
+    assert (window[5] / window[6]).log().item() == pytest.approx(0.5 / 1.5**2)
+
+
+def test_the_reference_by_hand_on_one_pixel():
+    # One pixel in zeros: each moment is the centre weight times the pixel's.
+    weight = gaussian_window()[5].item() ** 2
+    x, y = 0.5, 0.8
+    means = (2 * weight**2 * x * y + 1e-4) / (weight**2 * (x * x + y * y) + 1e-4)
+    shape = weight - weight**2
+    expected = means * (2 * shape * x * y + 9e-4) / (shape * (x * x + y * y) + 9e-4)
+    one = torch.ones(1, 1, 1, dtype=torch.float64)
+    assert reference_ssim_map(x * one, y * one).item() == pytest.approx(expected)
+
+
+def test_gradcheck_of_the_reference():
+    image, target = (t.double().requires_grad_() for t in images((6, 7, 2)))
+    assert torch.autograd.gradcheck(reference_ssim_map, (image, target))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_values_and_gradients_equal_the_reference(shape):
+    image, target = images(shape)
+    weights = torch.randn(shape, generator=torch.Generator().manual_seed(5))
+    results = []
+    for function, dtype in ((ssim_map, torch.float32), (reference_ssim_map, torch.float64)):
+        x, y = image.to(dtype, copy=True).requires_grad_(), target.to(dtype, copy=True).requires_grad_()
+        similarity = function(x, y)
+        (similarity * weights).sum().backward()
+        results.append((similarity.detach(), x.grad, y.grad))
+    for ours, expected in zip(*results, strict=True):
+        scale = expected.abs().max().clamp(min=1)
+        torch.testing.assert_close(ours.double() / scale, expected / scale, rtol=0, atol=1e-4)
+
+
+def test_smooth_dark_images_where_variances_cancel():
+    ramp = torch.linspace(0.02, 0.05, 40 * 60).reshape(40, 60, 1).expand(-1, -1, 3).contiguous()
+    other = ramp + 0.001
+    torch.testing.assert_close(
+        ssim_map(other, ramp).double(), reference_ssim_map(other.double(), ramp.double()), rtol=0, atol=1e-5
+    )
+
+
+def test_inputs_need_not_be_contiguous():
+    image, target = images((3, 40, 52))
+    x, y = image.permute(1, 2, 0), target.permute(1, 2, 0)
+    assert torch.equal(ssim_map(x, y), ssim_map(x.contiguous(), y.contiguous()))
+
+
+def test_the_number_of_threads_does_not_change_a_bit(two_threads):
+    image, target = images((200, 90, 3))
+
+    def run():
+        x = image.clone().requires_grad_()
+        similarity = ssim_map(x, target)
+        similarity.square().sum().backward()
+        return similarity.detach(), x.grad
+
+    two = run()
+    torch.set_num_threads(1)
+    for a, b in zip(two, run(), strict=True):
+        assert torch.equal(a, b)
+
+
+# opcheck itself reads .grad of tensors that are not leaves.
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+@pytest.mark.parametrize("differentiable", [False, True])
+def test_opcheck(differentiable):
+    image, target = images((12, 9, 3))
+    torch.library.opcheck(torch.ops.gsplat_core.ssim_map, (image.requires_grad_(differentiable), target))
+    torch.library.opcheck(torch.ops.gsplat_core.ssim_map_backward, (target, image.detach(), target))
+
+
+def test_what_it_cannot_take_is_refused():
+    image, target = images((4, 5, 3))
+    with pytest.raises(InvalidInput, match=r"gsplat_core\.reference"):
+        ssim_map(image.double(), target.double())
+    with pytest.raises(InvalidInput, match=r"\[4, 5, 3\] and \[4, 4, 3\]"):
+        ssim_map(image, target[:, :4])
+    with pytest.raises(InvalidInput, match="32 channels"):
+        ssim_map(torch.zeros(2, 2, 33), torch.zeros(2, 2, 33))

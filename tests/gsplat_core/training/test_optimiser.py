@@ -1,0 +1,127 @@
+"""FusedAdam: torch's Adam over named tensors, whose rows come and go."""
+
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.training.optimiser import FusedAdam
+
+RATES = {"means": 0.01, "sh": 0.002, "logit_opacities": 0.05}
+
+
+def tensors(count, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.randn(count, *shape, generator=generator)
+    return {"means": draw(3), "sh": draw(4, 3), "logit_opacities": draw()}
+
+
+def test_equals_torchs_adam_with_rates_that_change():
+    ours = {name: tensor.requires_grad_() for name, tensor in tensors(50).items()}
+    theirs = {name: tensor.detach().clone().requires_grad_() for name, tensor in ours.items()}
+    optimiser = FusedAdam(ours, RATES)
+    expected = torch.optim.Adam([{"params": [theirs[name]], "lr": rate} for name, rate in RATES.items()], eps=1e-8)
+    for step in range(6):
+        gradients = tensors(50, seed=10 + step)
+        for name in RATES:
+            ours[name].grad, theirs[name].grad = gradients[name], gradients[name].clone()
+        rate = 0.01 / (step + 1)
+        expected.param_groups[0]["lr"] = rate
+        assert optimiser.step(ours, learning_rates={"means": rate}) == 0
+        expected.step()
+        for name in RATES:
+            torch.testing.assert_close(ours[name], theirs[name], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("index", [torch.tensor([7, 2, 2, 0]), torch.arange(10) % 3 == 0])
+def test_moments_follow_their_rows(index):
+    whole, gradients = tensors(10), tensors(10, seed=1)
+    optimiser = FusedAdam(whole, RATES)
+    optimiser.step(whole, gradients)
+    part = {name: tensor[index].clone() for name, tensor in whole.items()}
+    optimiser.step(whole, gradients)
+
+    other = tensors(10)
+    selecting = FusedAdam(other, RATES)
+    selecting.step(other, gradients)
+    selecting.select(index)
+    assert selecting.count == len(part["means"])
+    selecting.step(part, {name: gradient[index] for name, gradient in gradients.items()})
+    for name in RATES:
+        assert torch.equal(part[name], whole[name][index])
+
+
+def test_appended_rows_start_without_moments_and_leave_the_others_alone():
+    whole, gradients = tensors(6), tensors(6, seed=1)
+    optimiser = FusedAdam(whole, RATES)
+    optimiser.step(whole, gradients)
+    before = {name: moment.clone() for name, moment in optimiser.first_moments.items()}
+    optimiser.append(2)
+    assert optimiser.count == 8
+    for name in RATES:
+        assert torch.equal(optimiser.first_moments[name][:6], before[name])
+        assert not optimiser.second_moments[name][6:].any()
+    with pytest.raises(InvalidInput, match="select or append"):
+        optimiser.step(whole, gradients)
+
+
+def test_rows_with_gradients_that_are_not_finite_are_counted_and_kept():
+    values, gradients = tensors(6), tensors(6, seed=1)
+    before = {name: tensor.clone() for name, tensor in values.items()}
+    gradients["means"][1, 2] = torch.nan
+    gradients["sh"][1, 0, 0] = gradients["sh"][4, 3, 2] = torch.inf
+    optimiser = FusedAdam(values)
+    assert optimiser.step(values, gradients, RATES) == 3
+    assert optimiser.skipped == 3
+    assert torch.equal(values["means"][1], before["means"][1])
+    assert torch.equal(values["sh"][[1, 4]], before["sh"][[1, 4]])
+    assert (values["logit_opacities"] != before["logit_opacities"]).all()
+    assert all(torch.isfinite(moment).all() for moment in optimiser.second_moments.values())
+
+
+def test_a_missing_gradient_leaves_its_tensor_alone():
+    values = tensors(3)
+    before = values["sh"].clone()
+    FusedAdam(values, RATES).step(values, {"means": torch.ones(3, 3), "sh": None})
+    assert torch.equal(values["sh"], before)
+
+
+def test_reset_forgets_some_rows():
+    values = tensors(4)
+    optimiser = FusedAdam(values, RATES)
+    optimiser.step(values, tensors(4, seed=1))
+    optimiser.reset("sh", torch.tensor([2]))
+    assert not optimiser.first_moments["sh"][2].any()
+    assert optimiser.first_moments["sh"][3].any()
+    optimiser.reset("sh")
+    assert not optimiser.second_moments["sh"].any()
+
+
+def test_dense_tensors_skip_single_elements():
+    plane = {"plane": torch.zeros(2, 5)}
+    optimiser = FusedAdam(plane, {"plane": 0.1}, rows=False)
+    gradient = torch.ones(2, 5)
+    gradient[0, 3] = torch.nan
+    assert optimiser.step(plane, {"plane": gradient}) == 1
+    assert (plane["plane"] == 0).sum() == 1
+    with pytest.raises(InvalidInput, match="rows=False"):
+        optimiser.append(1)
+
+
+def test_no_gaussians_at_all():
+    values = tensors(0)
+    optimiser = FusedAdam(values, RATES)
+    assert optimiser.step(values, tensors(0)) == 0
+    optimiser.append(3)
+    assert optimiser.count == 3
+
+
+def test_what_does_not_match_is_refused():
+    values = tensors(4)
+    with pytest.raises(InvalidInput, match="must match"):
+        FusedAdam(values, {"means": 0.1})
+    with pytest.raises(InvalidInput, match="must match"):
+        FusedAdam(values).step(values, tensors(4), {"means": 0.1})
+    with pytest.raises(InvalidInput, match="one row per Gaussian"):
+        FusedAdam({"a": torch.zeros(2), "b": torch.zeros(3)}, {"a": 1.0, "b": 1.0})
+    with pytest.raises(InvalidInput, match="sh"):
+        FusedAdam(values, RATES).step({"means": values["means"]}, {})
