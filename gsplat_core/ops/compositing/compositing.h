@@ -52,7 +52,7 @@ struct CompositingGradients {
   bool absgrad;
   // Where the gradient of every instance goes: position of flatten_ids -> row of `rows`, so that a splat's rows are neighbours.
   const int32_t* slots;
-  float* rows;           // [instances, row_size]: moments, colours, then |dL/dx|, |dL/dy| with absgrad; on cache lines
+  float* rows;  // [instances, row_size]: moments, colours, then |dL/dx|, |dL/dy| with absgrad; on cache lines
   int64_t row_size;
   float* v_backgrounds;  // [tiles, channels] partial sums, or null
 };

@@ -140,10 +140,15 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
   const int64_t lines_per_row = (kMoments + channels + (absgrad ? 2 : 0) + 15) / 16;
   const auto rows = uninitialised<Line>(instances * lines_per_row);
   std::vector<float> background_parts(backgrounds ? size_t(call.tiles * channels) : 0, 0.0f);
-  const CompositingGradients gradients = {data(alphas_),   last_.const_data_ptr<int32_t>(),
-                                          data(v_colors_), data(v_alphas_),
-                                          absgrad,         slots.get(),
-                                          rows[0].floats, lines_per_row * 16, backgrounds ? background_parts.data() : nullptr};
+  const CompositingGradients gradients = {data(alphas_),
+                                          last_.const_data_ptr<int32_t>(),
+                                          data(v_colors_),
+                                          data(v_alphas_),
+                                          absgrad,
+                                          slots.get(),
+                                          rows[0].floats,
+                                          lines_per_row * 16,
+                                          backgrounds ? background_parts.data() : nullptr};
   call.for_tiles([&](int64_t tile, float* scratch) { compositing_kernels().tile_backward(call.in, tile, gradients, scratch); });
 
   Tensor v_means2d = empty_floats({count, 2}), v_conics = empty_floats({count, 3}),

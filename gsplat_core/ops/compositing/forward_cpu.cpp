@@ -116,7 +116,8 @@ void blend_window(const Compositing& in, const Tile& tile, int x0, int y0, const
       float* const to = out.colors + pixel * channels;
       const float* const from = w.colors + at;
       if constexpr (D == 4) {
-        quad a = load_quad(from), b = load_quad(from + kPixels), c = load_quad(from + 2 * kPixels), d = load_quad(from + 3 * kPixels);
+        quad a = load_quad(from), b = load_quad(from + kPixels), c = load_quad(from + 2 * kPixels),
+             d = load_quad(from + 3 * kPixels);
         transpose(a, b, c, d);
         store_quad(to, a), store_quad(to + 4, b), store_quad(to + 8, c), store_quad(to + 12, d);
       } else {
