@@ -14,11 +14,12 @@ if TYPE_CHECKING:
     from gsplat_core.errors import CoreError, InvalidInput
     from gsplat_core.frames import Frame, FrameStatus
     from gsplat_core.gaussians import Gaussians
+    from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
     from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
     from gsplat_core.ops.projection.projection import fully_fused_projection
     from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
     from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
-    from gsplat_core.rendering import RenderOutput, rasterization, rasterize_to_pixels, render
+    from gsplat_core.rendering import RenderOutput, rasterization, render
 
 __all__ = [
     "Camera",
@@ -51,7 +52,7 @@ _HOME = {
     "isect_tiles": "ops.tiles.tiles",
     "quat_scale_to_covar_preci": "ops.covariance.covariance",
     "rasterization": "rendering",
-    "rasterize_to_pixels": "rendering",
+    "rasterize_to_pixels": "ops.compositing.compositing",
     "render": "rendering",
     "spherical_harmonics": "ops.spherical_harmonics.spherical_harmonics",
 }

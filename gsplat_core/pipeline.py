@@ -12,10 +12,11 @@ from torch import Tensor
 
 from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
+from gsplat_core.meta import Deferred, Meta
 from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, pack
 from gsplat_core.render_settings import RasterizeMode, RenderMode, RenderSettings, refuse_unsupported
 
-Rasterized = tuple[Tensor, Tensor, dict[str, Any]]
+Rasterized = tuple[Tensor, Tensor, Meta]
 """Colours [..., C, H, W, X], alphas [..., C, H, W, 1] and what was computed on the way."""
 
 
@@ -26,7 +27,7 @@ class Operations:
     fully_fused_projection: Callable[..., Any]
     spherical_harmonics: Callable[..., Tensor]
     isect_tiles: Callable[..., tuple[Tensor, Tensor, Tensor]]
-    isect_offset_encode: Callable[..., Tensor]
+    bin_splats: Callable[..., tuple[Tensor, Tensor, Tensor]]
     rasterize_to_pixels: Callable[..., tuple[Tensor, Tensor]]
 
     def rasterization(
@@ -156,7 +157,7 @@ def _rasterize(
         ids = {name: getattr(rows, name) for name in ids}
         image_ids = rows.batch_ids * n_cameras + rows.camera_ids
         n_images = math.prod(batch_dims) * n_cameras
-        tiling = {"packed": True, "n_images": n_images, "image_ids": image_ids, "gaussian_ids": rows.gaussian_ids}
+        tiling = {"packed": True, "n_images": n_images, "image_ids": image_ids}
         picked = image_ids * n_gaussians + rows.gaussian_ids
         opacities = opacities.reshape(-1)[picked]
         channels = None if channels is None else channels.reshape(-1, channels.shape[-1])[picked]
@@ -172,12 +173,10 @@ def _rasterize(
 
     tile_size = settings.tile_size
     tile_width, tile_height = -(-width // tile_size), -(-height // tile_size)
-    tiles_per_gauss, isect_ids, flatten_ids = ops.isect_tiles(
-        rows.means2d, rows.radii, rows.depths, tile_size, tile_width, tile_height,
-        conics=rows.conics, opacities=opacities, **tiling,
-    )  # fmt: skip
-    n_images = math.prod(batch_dims) * n_cameras
-    isect_offsets = ops.isect_offset_encode(isect_ids, n_images, tile_width, tile_height)
+    grid = (tile_size, tile_width, tile_height)
+    splats = (rows.means2d, rows.radii, rows.depths)
+    exact = {"conics": rows.conics, "opacities": opacities}
+    tiles_per_gauss, flatten_ids, isect_offsets = ops.bin_splats(*splats, *grid, **exact, **tiling)
     isect_offsets = isect_offsets.reshape(*batch_dims, n_cameras, tile_height, tile_width)
     render_colors, render_alphas = ops.rasterize_to_pixels(
         rows.means2d, rows.conics, channels, opacities, width, height, tile_size, isect_offsets, flatten_ids,
@@ -186,25 +185,25 @@ def _rasterize(
     if settings.render_mode.endswith("ED"):
         expected = render_colors[..., -1:] / render_alphas.clamp(min=1e-10)
         render_colors = torch.cat([render_colors[..., :-1], expected], -1) if settings.has_colors else expected
-    meta = {
+    meta = Meta(
         **ids,
-        "radii": rows.radii,
-        "means2d": rows.means2d,
-        "depths": rows.depths,
-        "conics": rows.conics,
-        "opacities": opacities,
-        "tile_width": tile_width,
-        "tile_height": tile_height,
-        "tiles_per_gauss": tiles_per_gauss,
-        "isect_ids": isect_ids,
-        "flatten_ids": flatten_ids,
-        "isect_offsets": isect_offsets,
-        "width": width,
-        "height": height,
-        "tile_size": tile_size,
-        "n_batches": math.prod(batch_dims),
-        "n_cameras": n_cameras,
-    }
+        radii=rows.radii,
+        means2d=rows.means2d,
+        depths=rows.depths,
+        conics=rows.conics,
+        opacities=opacities,
+        tile_width=tile_width,
+        tile_height=tile_height,
+        tiles_per_gauss=tiles_per_gauss,
+        isect_ids=Deferred(lambda: ops.isect_tiles(*splats, *grid, **exact, **tiling)[1]),
+        flatten_ids=flatten_ids,
+        isect_offsets=isect_offsets,
+        width=width,
+        height=height,
+        tile_size=tile_size,
+        n_batches=math.prod(batch_dims),
+        n_cameras=n_cameras,
+    )
     return render_colors, render_alphas, meta
 
 

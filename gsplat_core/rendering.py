@@ -10,11 +10,11 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_shape
 from gsplat_core.cameras import Camera
 from gsplat_core.gaussians import Gaussians
+from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
-from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
+from gsplat_core.ops.tiles.tiles import bin_splats, isect_tiles
 from gsplat_core.pipeline import Operations
-from gsplat_core.reference.compositing import rasterize_to_pixels
 
 __all__ = ["RenderOutput", "rasterization", "render"]
 
@@ -22,7 +22,7 @@ rasterization = Operations(
     fully_fused_projection=fully_fused_projection,
     spherical_harmonics=spherical_harmonics,
     isect_tiles=isect_tiles,
-    isect_offset_encode=isect_offset_encode,
+    bin_splats=bin_splats,
     rasterize_to_pixels=rasterize_to_pixels,
 ).rasterization
 

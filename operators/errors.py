@@ -10,14 +10,20 @@ OperatorsError
 │   ├── OperatorStuck                      an operator did not return from compute when the graph stopped
 │   ├── GraphDeadlock                      nothing can go on although not everything is done; says who waits on what
 │   └── GraphBusy                          run() while the application already runs
-└── EngineError
-    ├── EngineMissing                      the engine's package is not installed or cannot be loaded
-    └── EngineUnsupported                  the engine cannot run this graph faithfully
+├── EngineError
+│   ├── EngineMissing                      the engine's package is not installed or cannot be loaded
+│   └── EngineUnsupported                  the engine cannot run this graph faithfully
+├── OutputError                            what a run writes cannot be written
+│   ├── OutputFolderInUse                  the folder holds something that is not ours
+│   └── StorageFull                        the disk has no room left
+└── RunError
+    ├── DeviceMissing                      the device asked for is not there or not supported
+    └── RunFailed                          a run ended early; carries what it had reached
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 
 class OperatorsError(Exception):
@@ -58,7 +64,11 @@ class OperatorFailed(GraphError):
 
 
 class OperatorStuck(GraphError):
-    """An operator did not return from compute within the scheduler's stop timeout."""
+    """Operators, named in `operators`, did not return from compute in time; they are not stopped."""
+
+    def __init__(self, operators: Iterable[str], timeout_s: float) -> None:
+        self.operators = tuple(operators)
+        super().__init__(f"still in compute {timeout_s:g} s after the graph stopped: {', '.join(self.operators)}")
 
 
 class GraphDeadlock(GraphError):
@@ -84,3 +94,31 @@ class EngineMissing(EngineError):
 
 class EngineUnsupported(EngineError):
     """The engine cannot run this graph faithfully."""
+
+
+class OutputError(OperatorsError):
+    """What a run writes cannot be written."""
+
+
+class OutputFolderInUse(OutputError):
+    """The folder holds something that is not ours."""
+
+
+class StorageFull(OutputError):
+    """The disk has no room left."""
+
+
+class RunError(OperatorsError):
+    """An application cannot run, or ended early."""
+
+
+class DeviceMissing(RunError):
+    """The device asked for is not there, or this version cannot use it."""
+
+
+class RunFailed(RunError):
+    """A run ended early; the `__cause__` says why. `result` is what it had reached, already saved."""
+
+    def __init__(self, what: str, result: object) -> None:
+        super().__init__(what)
+        self.result = result

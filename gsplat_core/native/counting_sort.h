@@ -28,8 +28,7 @@ int64_t counting_sort(int64_t items, int64_t buckets, int32_t* starts, const Cou
   std::vector<int32_t> counters(size_t(chunks * buckets), 0);
   const auto for_chunks = [&](const auto& work) {
     torch::stable::parallel_for(0, chunks, 1, [&](int64_t first, int64_t last) {
-      for (int64_t c = first; c < last; ++c)
-        work(items * c / chunks, items * (c + 1) / chunks, counters.data() + c * buckets);
+      for (int64_t c = first; c < last; ++c) work(items * c / chunks, items * (c + 1) / chunks, counters.data() + c * buckets);
     });
   };
   for_chunks(count);

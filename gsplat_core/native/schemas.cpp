@@ -15,7 +15,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "project_gaussians(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
       "Tensor Ks, int width, int height, float eps2d, float near_plane, float far_plane, float radius_clip, bool compensate, "
-      "int camera_model) -> (Tensor radii, Tensor means2d, Tensor depths, Tensor conics, Tensor compensations)");
+      "int camera_model) -> (Tensor means2d, Tensor depths, Tensor conics, Tensor compensations, Tensor radii)");
   m.def(
       "project_gaussians_backward(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor viewmats, Tensor Ks, "
       "Tensor radii, Tensor? v_means2d, Tensor? v_depths, Tensor? v_conics, Tensor? v_compensations, int width, int height, "
@@ -70,15 +70,6 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor(i!) v_weights, Tensor(j!) steps, float position_rate, float rotation_rate, float scale_rate, float colour_rate, "
       "float center_rate, float width_rate, float beta1, float beta2, float epsilon) -> ()");
 
-  // HexPlane features of one level: the product of six plane samples [N, C], its gradients, and the parts used for inference.
-  m.def("hexplane_features(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
-  m.def(
-      "hexplane_features_backward(Tensor gradient, Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, "
-      "Tensor zt) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
-  m.def("hexplane_space(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz) -> Tensor");
-  m.def("hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
-  m.def("hexplane_decode(Tensor[] spaces, Tensor coordinates, Tensor[] lines, Tensor[] weights, Tensor[] biases) -> Tensor");
-
   // Structural similarity of each pixel and channel of [H, W, C] images.
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
   m.def("ssim_map_backward(Tensor gradient, Tensor image, Tensor target) -> Tensor");
@@ -87,4 +78,13 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "image_loss(Tensor image, Tensor target, Tensor? mask, Tensor? depth, Tensor? target_depth, float ssim_weight, "
       "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
+
+  // HexPlane features of one level: the product of six plane samples [N, C], its gradients, and the parts used for inference.
+  m.def("hexplane_features(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
+  m.def(
+      "hexplane_features_backward(Tensor gradient, Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, "
+      "Tensor zt) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+  m.def("hexplane_space(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz) -> Tensor");
+  m.def("hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
+  m.def("hexplane_decode(Tensor[] spaces, Tensor coordinates, Tensor[] lines, Tensor[] weights, Tensor[] biases) -> Tensor");
 }

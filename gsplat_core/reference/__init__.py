@@ -1,5 +1,6 @@
 """Every operation in plain torch, for any floating-point dtype and device: the oracle of the tests."""
 
+from gsplat_core.reference.adam import adam_step
 from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.covariance import quat_scale_to_covar_preci
 from gsplat_core.reference.deformation import (
@@ -11,6 +12,7 @@ from gsplat_core.reference.deformation import (
     hexplane_modulate,
     hexplane_space,
 )
+from gsplat_core.reference.image_loss import image_loss
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
@@ -18,6 +20,7 @@ from gsplat_core.reference.ssim import ssim_map
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 
 __all__ = [
+    "adam_step",
     "basis_field",
     "basis_field_backward",
     "basis_field_backward_adam_",
@@ -26,6 +29,7 @@ __all__ = [
     "hexplane_features",
     "hexplane_modulate",
     "hexplane_space",
+    "image_loss",
     "isect_offset_encode",
     "isect_tiles",
     "quat_scale_to_covar_preci",

@@ -37,11 +37,10 @@ def rasterize_to_pixels(
     image_dims = isect_offsets.shape[:-2]
     tile_height, tile_width = isect_offsets.shape[-2:]
     channels = colors.shape[-1]
-    splats = _Splats(means2d, conics, colors, opacities, absgrad)
-    starts = [*isect_offsets.flatten().tolist(), flatten_ids.numel()]
     images = image_dims.numel()
     background = None if backgrounds is None else backgrounds.reshape(images, channels)
-    shown = None if masks is None else masks.reshape(-1).tolist()
+    starts = torch.cat([isect_offsets.flatten(), isect_offsets.new_tensor([flatten_ids.numel()])])
+    instances = _Instances(means2d, conics, colors, opacities, starts, flatten_ids, masks, absgrad)
     all_colors, all_alphas = [], []
     for image in range(images):
         rows = []
@@ -49,14 +48,10 @@ def rasterize_to_pixels(
             row = []
             for tile_x in range(tile_width):
                 tile = (image * tile_height + tile_y) * tile_width + tile_x
-                ids = flatten_ids[starts[tile] : starts[tile + 1]].long()
-                if shown is not None and not shown[tile]:
-                    ids = ids[:0]
-                ids = ids[splats.usable[ids]]
                 x = torch.arange(tile_x * tile_size, min((tile_x + 1) * tile_size, image_width), device=means2d.device)
                 y = torch.arange(tile_y * tile_size, min((tile_y + 1) * tile_size, image_height), device=means2d.device)
                 grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2).to(means2d.dtype) + 0.5
-                tile_colors, through = splats.blend(ids, grid)
+                tile_colors, through = instances.blend(tile, grid)
                 if background is not None:
                     tile_colors = tile_colors + through[:, None] * background[image]
                 row.append(torch.cat([tile_colors, (1 - through)[:, None]], -1).reshape(len(y), len(x), channels + 1))
@@ -70,51 +65,67 @@ def rasterize_to_pixels(
     return torch.stack(all_colors).reshape(*shape, channels), torch.stack(all_alphas).reshape(*shape, 1)
 
 
-class _Splats:
-    """The splats of all images in one row, and how some of them blend over some pixels."""
+class _Instances:
+    """The splats in the order of the tiles' lists, and how a tile's splats blend over its pixels."""
 
-    def __init__(self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, absgrad: bool) -> None:
-        self.means2d = means2d.reshape(-1, 2)
-        self.conics = conics.reshape(-1, 3)
-        self.colors = colors.reshape(-1, colors.shape[-1])
-        self.opacities = opacities.reshape(-1)
+    def __init__(
+        self,
+        means2d: Tensor,
+        conics: Tensor,
+        colors: Tensor,
+        opacities: Tensor,
+        starts: Tensor,
+        flatten_ids: Tensor,
+        masks: Tensor | None,
+        absgrad: bool,
+    ) -> None:
+        values = torch.cat(
+            [
+                means2d.reshape(-1, 2),
+                conics.reshape(-1, 3),
+                opacities.reshape(-1, 1),
+                colors.reshape(-1, colors.shape[-1]),
+            ],
+            -1,
+        )
+        sizes = starts.diff().long()
         with torch.no_grad():
-            values = torch.cat([self.means2d, self.conics, self.colors, self.opacities[:, None]], -1)
-            self.usable = values.isfinite().all(-1)
+            tile = torch.repeat_interleave(torch.arange(len(sizes), device=starts.device), sizes)
+            used = values.isfinite().all(-1)[flatten_ids.long()]
+            if masks is not None:
+                used &= masks.reshape(-1)[tile]
+            ids = flatten_ids.long()[used]
+            counts = torch.bincount(tile[used], minlength=len(sizes)).tolist()
+        # Gathered and split once: indexing tile by tile would cost a gradient of all splats per tile.
+        self.ids = ids.split(counts)
+        self.values = values[ids].split(counts)
         self.absolute: Tensor | None = None
         if absgrad:
             absolute = torch.zeros_like(means2d)
             means2d.absgrad = absolute  # type: ignore[attr-defined]
             self.absolute = absolute.view(-1, 2)
 
-    def blend(self, ids: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours [P, D] and transmittance [P] behind the splats `ids` at the pixel centres [P, 2]."""
-        colors = pixels.new_zeros(len(pixels), self.colors.shape[-1])
+    def blend(self, tile: int, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Colours [P, D] and transmittance [P] behind the tile's splats at the pixel centres [P, 2]."""
+        colors = pixels.new_zeros(len(pixels), self.values[tile].shape[-1] - 6)
         product = through = pixels.new_ones(len(pixels))
-        for part in ids.split(SPLATS_AT_A_TIME) if len(ids) else ():
-            if not bool((product > TRANSMITTANCE_STOP).any()):
+        parts = zip(self.ids[tile].split(SPLATS_AT_A_TIME), self.values[tile].split(SPLATS_AT_A_TIME), strict=True)
+        for ids, values in parts:
+            if not len(ids) or not bool((product > TRANSMITTANCE_STOP).any()):
                 break
-            inputs = (self.means2d[part], self.conics[part], self.colors[part], self.opacities[part])
-            if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-                result = checkpoint(self._blend_part, part, pixels, *inputs, product, through, use_reentrant=False)
+            if torch.is_grad_enabled() and values.requires_grad:
+                result = checkpoint(self._blend_part, ids, values, pixels, product, through, use_reentrant=False)
             else:
-                result = self._blend_part(part, pixels, *inputs, product, through)
+                result = self._blend_part(ids, values, pixels, product, through)
             more, product, through = result
             colors = colors + more
         return colors, through
 
     def _blend_part(
-        self,
-        ids: Tensor,
-        pixels: Tensor,
-        means2d: Tensor,
-        conics: Tensor,
-        colors: Tensor,
-        opacities: Tensor,
-        product: Tensor,
-        through: Tensor,
+        self, ids: Tensor, values: Tensor, pixels: Tensor, product: Tensor, through: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One part of the list. `product` is the transmittance had no pixel stopped, `through` the one that is left."""
+        means2d, conics, opacities, colors = values[:, :2], values[:, 2:5], values[:, 5], values[:, 6:]
         means = means2d[None].expand(len(pixels), -1, -1)
         if self.absolute is not None and means.requires_grad:
             absolute = self.absolute
@@ -126,12 +137,16 @@ class _Splats:
         dx, dy = (means - pixels[:, None]).unbind(-1)
         a, b, c = conics.unbind(-1)
         sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-        alpha = (opacities * torch.exp(-sigma.clamp(min=0))).clamp(max=ALPHA_MAX)
+        # Not clamp: its gradient is zero at the bound, which sigma reaches where the mean is on a pixel's centre.
+        falloff = torch.exp(-torch.where(sigma >= 0, sigma, 0))
+        alpha = (opacities * falloff).clamp(max=ALPHA_MAX)
         alpha = torch.where((sigma >= 0) & (alpha >= ALPHA_MIN), alpha, 0)
-        after = product[:, None] * torch.cumprod(1 - alpha, 1)
+        # The product of (1 - alpha) by its logarithm, whose gradient is cheaper.
+        after = product[:, None] * torch.exp(torch.cumsum(torch.log1p(-alpha), 1))
         before = torch.cat([product[:, None], after[:, :-1]], 1)
-        # The product only falls, so a pixel that has stopped stays stopped.
+        # The product only falls, so a pixel that has stopped stays stopped: what is blended is the start of the list.
         blended = after > TRANSMITTANCE_STOP
         weights = torch.where(blended, alpha * before, 0)
-        left = through * torch.where(blended, 1 - alpha, 1).prod(1)
+        length = blended.sum(1, keepdim=True)
+        left = torch.where(length[:, 0] > 0, after.gather(1, (length - 1).clamp(min=0))[:, 0], through)
         return weights @ colors, after[:, -1], left

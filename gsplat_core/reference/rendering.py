@@ -2,16 +2,45 @@
 
 from __future__ import annotations
 
+import math
+
+from torch import Tensor
+
 from gsplat_core.pipeline import Operations
 from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 
+
+def bin_splats(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    packed: bool = False,
+    n_images: int | None = None,
+    image_ids: Tensor | None = None,
+    *,
+    conics: Tensor | None = None,
+    opacities: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`isect_tiles` (sorted) and `isect_offset_encode` in one."""
+    tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
+        means2d, radii, depths, tile_size, tile_width, tile_height, packed=packed, n_images=n_images,
+        image_ids=image_ids, conics=conics, opacities=opacities,
+    )  # fmt: skip
+    images = math.prod(depths.shape[:-1]) if n_images is None else n_images
+    offsets = isect_offset_encode(isect_ids, images, tile_width, tile_height)
+    return tiles_per_gauss, flatten_ids, offsets
+
+
 rasterization = Operations(
     fully_fused_projection=fully_fused_projection,
     spherical_harmonics=spherical_harmonics,
     isect_tiles=isect_tiles,
-    isect_offset_encode=isect_offset_encode,
+    bin_splats=bin_splats,
     rasterize_to_pixels=rasterize_to_pixels,
 ).rasterization

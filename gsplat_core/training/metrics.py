@@ -1,9 +1,10 @@
 """Image quality in the field's measures: PSNR over tissue, PSNR over the frame, SSIM of masked images.
 
-Two facts that a table of such figures needs:
+Three facts that a table of such figures needs:
 
 * Equal images have no finite PSNR; it is capped at `PSNR_CAP_DB`, so that reports stay valid JSON.
 * A frame without one tissue pixel has no quality: the functions return NaN, and `QualityTracker` leaves it out of its means.
+* A pixel that is not finite counts as black: a broken picture scores badly, and is not left out.
 """
 
 from __future__ import annotations
@@ -37,26 +38,39 @@ def _unit_image(image: ImageLike, name: str) -> Tensor:
         return tensor.to(torch.float32) / 255
     if not tensor.is_floating_point():
         raise InvalidInput(f"{name} must be uint8 (0..255) or floating point (0..1), got {tensor.dtype}")
-    return tensor.to(torch.float32)
+    return tensor.to(torch.float32).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _prepare(image: ImageLike, target: ImageLike, mask: ImageLike | None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Both images as floats, and the tissue mask as booleans [H, W]."""
+def _masked_pair(image: ImageLike, target: ImageLike, mask: ImageLike | None) -> tuple[Tensor, Tensor, int]:
+    """Both images as floats, 0 where there is no tissue, and the number of tissue pixels."""
     x, y = _unit_image(image, "image"), _unit_image(target, "target")
     if x.shape != y.shape:
         raise InvalidInput(f"image {list(x.shape)} and target {list(y.shape)} must have one size")
     if mask is None:
-        return x, y, None
-    tissue = mask.detach().cpu() if isinstance(mask, Tensor) else torch.from_numpy(np.ascontiguousarray(mask))
-    if tissue.shape != x.shape[:2]:
-        raise InvalidInput(f"mask must be [H, W] = {list(x.shape[:2])}, got {list(tissue.shape)}")
-    return x, y, tissue != 0
+        return x, y, x.shape[0] * x.shape[1]
+    values = mask.detach().cpu() if isinstance(mask, Tensor) else torch.from_numpy(np.ascontiguousarray(mask))
+    if values.shape != x.shape[:2]:
+        raise InvalidInput(f"mask must be [H, W] = {list(x.shape[:2])}, got {list(values.shape)}")
+    tissue = values != 0
+    black = torch.zeros(())
+    return (
+        torch.where(tissue[..., None], x, black),
+        torch.where(tissue[..., None], y, black),
+        int(torch.count_nonzero(tissue)),
+    )
 
 
-def _squared_error(x: Tensor, y: Tensor, tissue: Tensor | None) -> tuple[float, int]:
-    """Squared error summed over tissue (in float64: a frame has a million terms), and the number of tissue pixels."""
-    error = x - y if tissue is None else (x - y)[tissue]
-    return float((error * error).sum(dtype=torch.float64)), error.numel() // 3
+def _psnr_db(x: Tensor, y: Tensor, pixels: int) -> float:
+    """PSNR of the squared error shared out over `pixels`; NaN over none."""
+    if not pixels:
+        return math.nan
+    error = x - y
+    # Summed in float64: a frame has a million terms.
+    return _decibels(float((error * error).sum(dtype=torch.float64)) / (3 * pixels))
+
+
+def _mean_ssim(x: Tensor, y: Tensor) -> float:
+    return float(ssim_map(x, y).mean(dtype=torch.float64))
 
 
 def _decibels(mean_squared_error: float) -> float:
@@ -74,10 +88,9 @@ def psnr_tissue_db(image: ImageLike, target: ImageLike, mask: ImageLike | None =
         mask: [H, W], non-zero = tissue; None = all of it.
 
     Returns:
-        At most PSNR_CAP_DB; NaN when the mask has no tissue or a value is NaN.
+        At most PSNR_CAP_DB; NaN when the mask has no tissue.
     """
-    error, pixels = _squared_error(*_prepare(image, target, mask))
-    return _decibels(error / (3 * pixels)) if pixels else math.nan
+    return _psnr_db(*_masked_pair(image, target, mask))
 
 
 def psnr_frame_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
@@ -86,9 +99,8 @@ def psnr_frame_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = 
     The variant that most papers print; it rises with the tool's size, so it stands beside `psnr_tissue_db`, never alone.
     Arguments and return as there.
     """
-    x, y, tissue = _prepare(image, target, mask)
-    error, pixels = _squared_error(x, y, tissue)
-    return _decibels(error / x.numel()) if pixels else math.nan
+    x, y, pixels = _masked_pair(image, target, mask)
+    return _psnr_db(x, y, x.shape[0] * x.shape[1] if pixels else 0)
 
 
 def ssim(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
@@ -97,12 +109,8 @@ def ssim(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> 
     11x11 Gaussian of sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, range 1: the convention of the field's tables. The masked-out
     part counts as equal. Arguments as in `psnr_tissue_db`; NaN when the mask has no tissue.
     """
-    x, y, tissue = _prepare(image, target, mask)
-    if x.numel() == 0 or (tissue is not None and not bool(tissue.any())):
-        return math.nan
-    if tissue is not None:
-        x, y = (torch.where(tissue[..., None], plane, torch.zeros(())) for plane in (x, y))
-    return float(ssim_map(x, y).mean(dtype=torch.float64))
+    x, y, pixels = _masked_pair(image, target, mask)
+    return _mean_ssim(x, y) if pixels else math.nan
 
 
 @dataclass(frozen=True)
@@ -126,8 +134,12 @@ class QualityTracker:
 
     def observe(self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> FrameQuality:
         """Score one frame and keep the result; arguments as in `psnr_tissue_db`."""
+        x, y, pixels = _masked_pair(image, target, mask)
         quality = FrameQuality(
-            seq, psnr_tissue_db(image, target, mask), psnr_frame_db(image, target, mask), ssim(image, target, mask)
+            seq,
+            psnr_tissue_db=_psnr_db(x, y, pixels),
+            psnr_frame_db=_psnr_db(x, y, x.shape[0] * x.shape[1] if pixels else 0),
+            ssim=_mean_ssim(x, y) if pixels else math.nan,
         )
         self.frames.append(quality)
         return quality

@@ -22,19 +22,19 @@ class FusedAdam:
 
     Args:
         parameters: the tensors to be updated, float32 on the CPU; only their shapes are kept.
-        learning_rates: one per name; `step` can replace them at any time.
+        learning_rates: one per name, which `step` can replace at any time; None: the first step brings them.
         betas: decay of the first and second moment.
         epsilon: added to the denominator.
         rows: whether dimension 0 of every tensor counts Gaussians.
 
     Raises:
-        InvalidInput: a name without a rate, a rate without a tensor, or tensors with different numbers of rows.
+        InvalidInput: rates and tensors differ in their names, or tensors in their number of rows.
     """
 
     def __init__(
         self,
         parameters: Mapping[str, Tensor],
-        learning_rates: Mapping[str, float],
+        learning_rates: Mapping[str, float] | None = None,
         *,
         betas: tuple[float, float] = (0.9, 0.999),
         epsilon: float = 1e-8,
@@ -49,7 +49,7 @@ class FusedAdam:
         """Rows (or elements) left alone so far because their gradient was not finite."""
         self.first_moments = {name: _zeros(tensor) for name, tensor in parameters.items()}
         self.second_moments = {name: _zeros(tensor) for name, tensor in parameters.items()}
-        self.learning_rates = self._checked_rates(learning_rates)
+        self.learning_rates = self._checked_rates(learning_rates) if learning_rates is not None else {}
         counts = {name: tensor.shape[0] for name, tensor in parameters.items() if tensor.ndim} if rows else {}
         if rows and (len(counts) < len(parameters) or len(set(counts.values())) > 1):
             raise InvalidInput(
@@ -80,10 +80,9 @@ class FusedAdam:
             Rows (or elements) left alone in this step because their gradient was not finite.
 
         Raises:
-            InvalidInput: a tensor is missing or its shape is not that of its moments.
+            InvalidInput: a tensor or its rate is missing, or its shape is not that of its moments.
         """
-        if learning_rates is not None:
-            self.learning_rates = self._checked_rates({**self.learning_rates, **learning_rates})
+        self.learning_rates = self._checked_rates({**self.learning_rates, **(learning_rates or {})})
         for name, moment in self.first_moments.items():
             if name not in parameters or parameters[name].shape != moment.shape:
                 shape = list(parameters[name].shape) if name in parameters else "nothing"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -29,13 +31,14 @@ class TrainingStep:
         self._config = config
         self._weights = LossWeights(config.ssim_weight, config.depth_weight)
         # World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres.
-        centre = torch.from_numpy(camera.world_to_camera).float()
+        centre = camera.viewmat
         distance = (
             (gaussians.means @ centre[2, :3] + centre[2, 3]).abs().median() if gaussians.count else torch.ones(())
         )
         self._pixel_mm = float(distance) / float(camera.K[0, 0])
         self._adam = FusedAdam(gaussians.tensors())
-        self._network_adam = self._new_network_adam()
+        network = {} if isinstance(field, BasisField) else dict(field.named_parameters())
+        self._network_adam = FusedAdam(network, rows=False)
 
     def __call__(self, observation: Observation, rate_scale: float = 1.0) -> float:
         """Train on one observation; returns its loss before the update."""
@@ -56,7 +59,7 @@ class TrainingStep:
         """Add Gaussians, which start still."""
         self.gaussians = self.gaussians.append(added)
         self.field.append(added)
-        self._adam.append(self.gaussians.tensors())
+        self._adam.append(added.count)
 
     def _basis_step(self, field: BasisField, observation: Observation, rate_scale: float) -> float:
         deformed = self.at(observation.time_s)
@@ -85,24 +88,27 @@ class TrainingStep:
         with torch.enable_grad():
             deformed = self.field(canonical, observation.time_s)
         loss, gradients = loss_and_gradients(deformed.detach(), observation, self._weights)
-        pairs = [(t, gradients[name]) for name, t in deformed.tensors().items() if t.requires_grad]
-        torch.autograd.backward([t for t, _ in pairs], [g for _, g in pairs])
-        assert self._network_adam is not None
-        self._network_adam.zero_missing()
-        for group in self._network_adam.param_groups:
-            group["lr"] = group["rate"] * rate_scale
-        self._network_adam.step()
-        self._network_adam.zero_grad(set_to_none=True)
-        own = {name: t.grad for name, t in canonical.tensors().items()}
-        self._update_gaussians(
-            {name: g if g is not None else torch.zeros_like(getattr(canonical, name)) for name, g in own.items()},
-            rate_scale,
+        pairs = [(tensor, gradients[name]) for name, tensor in deformed.tensors().items() if tensor.requires_grad]
+        torch.autograd.backward([tensor for tensor, _ in pairs], [gradient for _, gradient in pairs])
+        parameters = dict(self.field.named_parameters())
+        rates = self._config.rates
+        self._network_adam.step(
+            parameters,
+            learning_rates={
+                name: (rates.hexplane_planes if name.startswith("planes") else rates.hexplane_network) * rate_scale
+                for name in parameters
+            },
         )
+        for parameter in parameters.values():
+            parameter.grad = None
+        own = {name: tensor.grad for name, tensor in canonical.tensors().items()}
+        self._update_gaussians(own, rate_scale)
         return loss
 
-    def _update_gaussians(self, gradients: dict[str, Tensor], rate_scale: float) -> None:
+    def _update_gaussians(self, gradients: Mapping[str, Tensor | None], rate_scale: float) -> None:
         rates = self._config.rates
         self._adam.step(
+            self.gaussians.tensors(),
             gradients,
             {
                 "means": rates.means_px * self._pixel_mm * rate_scale,

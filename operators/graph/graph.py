@@ -11,7 +11,7 @@ from enum import Enum
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Protocol, Union, get_args, get_origin
 
-from operators.errors import GraphDeadlock, GraphInvalid, OperatorFailed
+from operators.errors import GraphDeadlock, GraphInvalid, OperatorFailed, OperatorStuck
 from operators.graph.clock import Clock
 from operators.graph.conditions import SchedulingStatus
 from operators.graph.faults import Fault, FaultAction
@@ -141,8 +141,11 @@ class Graph:
         except BaseException as error:  # noqa: BLE001 - raised again once every operator is stopped
             interrupt = error
         self.stopping = True
+        # Not while it still computes: an operator is never entered by two threads.
+        stuck = interrupt.operators if isinstance(interrupt, OperatorStuck) else ()
         for task in reversed(self.tasks):
-            task.stop()
+            if task.name not in stuck:
+                task.stop()
         return self._conclude(perf_counter() - began, interrupt)
 
     def _start(self) -> None:
@@ -157,6 +160,8 @@ class Graph:
 
     def _conclude(self, wall_s: float, interrupt: BaseException | None) -> RunResult:
         error: BaseException | None = interrupt or self.failure or self.deadlock
+        if isinstance(interrupt, OperatorStuck) and self.failure is not None:
+            interrupt.__cause__ = self.failure
         if isinstance(error, OperatorFailed):
             reason = StopReason.FAILED
         elif isinstance(error, GraphDeadlock):

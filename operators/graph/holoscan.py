@@ -1,31 +1,33 @@
 """The same graph on the Holoscan SDK: its schedulers decide who computes, its connections carry the messages.
 
 Each operator becomes a bridge, each edge a pair of ports of its own, so that the edges of a fan-out keep their own
-capacity and policy. A message travels as the opaque `Message`, which the SDK never converts. Everything else, the
-fault policy, stop reasons, counts and tracking, is `OperatorTask` and `Graph`, as on the embedded engine.
+capacity and policy. A message travels as the opaque `Message`, which the SDK never converts. The rest (faults, stop
+reasons, counts, tracking) is `OperatorTask` and `Graph`, as on the embedded engine.
 
 Hazards of the SDK (4.6) and what is done about them:
-- Its MultiThreadScheduler stops early at random: threads map to the EventBasedScheduler, and a run that ends while
-  an operator could compute raises EngineError.
+- Its MultiThreadScheduler stops early at random: our threads map to its EventBasedScheduler, and a run that ends
+  while an operator could go on raises EngineError.
 - `stop_execution` does not wake a graph that waits for an event: stopping goes through the gates.
+- The greedy scheduler sleeps through events until the next appointed time: appointments are kept short.
+- Its schedulers give up before they have seen what a check or a thread just changed: they wait half a second first.
 - An exception in compute can end a run silently: none ever reaches the SDK.
+- It takes over SIGINT and SIGTERM, for good: the handlers are put back once it runs.
 - It drops without counting: edges keep the policy themselves, and the SDK's queues never overflow.
-- ManualClock hangs with threads: our MultiThreadScheduler refuses it already.
 """
 
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import Any, cast
 
 from operators.errors import EngineError, EngineUnsupported
-from operators.graph.clock import Clock, ManualClock
+from operators.graph.clock import ManualClock
 from operators.graph.conditions import SchedulingStatus
 from operators.graph.graph import Graph, Scheduler
 from operators.graph.greedy import GreedyScheduler
 from operators.graph.multithread import MultiThreadScheduler
-from operators.graph.queues import LockedEdge, Message
-from operators.graph.sdk import load_sdk
+from operators.graph.queues import CarriedEdge
+from operators.graph.sdk import keep_signals, load_sdk
 from operators.graph.spec import QueuePolicy
 from operators.graph.task import OperatorTask
 
@@ -33,45 +35,15 @@ _sdk = load_sdk()
 _Operator: Any = _sdk.core.Operator
 _Condition: Any = _sdk.core.Condition
 _Application: Any = _sdk.core.Application
-_port_condition = _sdk.core.ConditionType
+_PortCondition = _sdk.core.ConditionType
+_QUEUE = _sdk.core.IOSpec.ConnectorType.DOUBLE_BUFFER
 _STATUS = {status: getattr(_sdk.core.SchedulingStatusType, status.name) for status in SchedulingStatus}
-
-
-class HoloscanEdge(LockedEdge):
-    """An edge whose messages travel through the SDK.
-
-    The queue here mirrors the SDK's: it counts, and applies the policy. When `drop_oldest` makes room, no further
-    message is sent: the one under way delivers what is then the oldest.
-    """
-
-    def __init__(self, name: str, capacity: int, policy: QueuePolicy, lock: Any, port: str) -> None:
-        super().__init__(name, capacity, policy, lock)
-        self.port = port
-        self.sender: Any = None
-        self.receiver: Any = None
-
-    def push(self, message: Message) -> None:
-        """As Edge.push."""
-        with self._lock:
-            length = len(self.queue)
-            super().push(message)
-            grown = len(self.queue) > length
-        if grown:
-            self.sender.emit(message, self.port)
-
-    def pop(self) -> Message | None:
-        """As Edge.pop."""
-        carried = self.receiver.receive(self.port)
-        if carried is None:
-            return None
-        message = super().pop()
-        if self.policy is QueuePolicy.BLOCK and message is not carried:
-            raise EngineError(f"the SDK delivered another message on {self.name} than was due")
-        return message
+_APPOINTMENT_NS = 10_000_000
+_GIVE_UP_MS = 500
 
 
 class Gate(_Condition):
-    """All that the operator's own conditions and its outputs say, as one condition of the SDK."""
+    """What the operator's conditions and outputs say, as one condition of the SDK."""
 
     def __init__(self, fragment: Any, task: OperatorTask, scheduler: HoloscanScheduler) -> None:
         self.task, self.scheduler = task, scheduler
@@ -79,30 +51,26 @@ class Gate(_Condition):
         self.checked = False
         super().__init__(fragment, name=f"{task.name}_gate")
 
-    def setup(self, spec: Any) -> None:
-        """No parameters."""
-
-    def update_state(self, timestamp: int) -> None:
-        """The state is the task's."""
-
-    def on_execute(self, timestamp: int) -> None:
-        """OperatorTask.tick has told the conditions."""
-
     def check(self, timestamp: int) -> tuple[Any, int | None]:
-        """May the operator compute, as far as the SDK cannot tell from its ports?"""
-        self.checked = True
+        """May the operator compute, as far as the SDK cannot tell from its queues?"""
+        if not self.checked:
+            self.checked = True
+            self.scheduler.restore_signals()
         task, now_ns = self.task, self.scheduler.now_ns(timestamp)
-        if task.finished or task.graph.stopping:
-            return _STATUS[SchedulingStatus.NEVER], None
         status, due_ns = task.consent(now_ns)
-        if status is SchedulingStatus.NEVER or task.exhausted():
+        if task.finished or task.graph.stopping:
+            status = SchedulingStatus.NEVER
+        elif status is SchedulingStatus.NEVER or task.exhausted():
             task.finish()
             self.scheduler.wake()
-            return _STATUS[SchedulingStatus.NEVER], None
-        if not task.has_room():
-            return _STATUS[SchedulingStatus.WAIT], None
+            status = SchedulingStatus.NEVER
+        elif not task.has_room():
+            status = SchedulingStatus.WAIT
+        elif status is SchedulingStatus.WAIT_TIME:
+            manual = isinstance(self.scheduler.clock, ManualClock)
+            return _STATUS[status], timestamp + (due_ns - now_ns if manual else min(due_ns - now_ns, _APPOINTMENT_NS))
         self.ready_at_ns = now_ns
-        return _STATUS[status], timestamp + due_ns - now_ns if status is SchedulingStatus.WAIT_TIME else None
+        return _STATUS[status], None
 
 
 class Bridge(_Operator):
@@ -110,131 +78,121 @@ class Bridge(_Operator):
 
     def __init__(self, fragment: Any, task: OperatorTask, gate: Gate) -> None:
         self.task, self.gate = task, gate
+        self.in_edges = cast("list[CarriedEdge]", task.in_edges)
+        self.out_edges = cast("list[CarriedEdge]", task.out_edges)
         super().__init__(fragment, gate, name=task.name)
 
     def setup(self, spec: Any) -> None:
         """One port per edge. min_size is always given: the SDK's default would batch."""
-        for edge in self.task.in_edges:
-            port = spec.input(edge.port)
-            port.connector(_sdk.core.IOSpec.ConnectorType.DOUBLE_BUFFER, capacity=edge.capacity)
+        kind = _PortCondition.MESSAGE_AVAILABLE
+        for edge in self.in_edges:
+            port = spec.input(edge.port).connector(_QUEUE, capacity=edge.capacity)
             need = self.task.gates(edge)
-            if need:
-                port.condition(_port_condition.MESSAGE_AVAILABLE, min_size=need)
-            else:
-                port.condition(_port_condition.NONE)
-        outs = self.task.out_edges
-        for edge in outs:
-            port = spec.output(edge.port, size=edge.capacity)
-            room = self.task.leaves_room(edge)
-            # Among several edges one may close while its queue is full; the SDK would wait for it for ever, the
-            # gate does not.
-            if room and len(outs) == 1:
-                port.condition(_port_condition.DOWNSTREAM_MESSAGE_AFFORDABLE, min_size=room)
-            else:
-                port.condition(_port_condition.NONE)
+            _ = port.condition(kind, min_size=need) if need else port.condition(_PortCondition.NONE)
+        kind = _PortCondition.DOWNSTREAM_MESSAGE_AFFORDABLE
+        for edge in self.out_edges:
+            port = spec.output(edge.port).connector(_QUEUE, capacity=edge.capacity)
+            # One of several edges may close while it is full; the SDK would wait for it for ever, the gate does not.
+            room = self.task.leaves_room(edge) if len(self.out_edges) == 1 else 0
+            _ = port.condition(kind, min_size=room) if room else port.condition(_PortCondition.NONE)
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         """Execute the task; nothing is raised into the SDK."""
         task = self.task
         if task.finished or task.graph.stopping:
             return
-        for edge in task.in_edges:
-            edge.receiver = op_input  # type: ignore[attr-defined]
-        for edge in task.out_edges:
-            edge.sender = op_output  # type: ignore[attr-defined]
+        for edge in self.in_edges:
+            edge.receiver = op_input
+        for edge in self.out_edges:
+            edge.sender = op_output
         try:
             task.tick(self.gate.ready_at_ns)
         except BaseException as error:  # noqa: BLE001 - raised again by HoloscanScheduler.execute
-            self.gate.scheduler.interrupt(error)
+            self.gate.scheduler.error = error
             task.graph.stop()
 
 
 class HoloscanScheduler:
-    """Runs a graph on the SDK scheduler that answers to one of ours."""
+    """Runs a graph on the SDK's scheduler that answers to one of ours."""
 
     def __init__(self, scheduler: Scheduler) -> None:
         if not isinstance(scheduler, GreedyScheduler | MultiThreadScheduler):
-            raise EngineUnsupported(f"the holoscan engine cannot stand in for a {type(scheduler).__name__}")
-        self.clock: Clock = scheduler.clock
+            raise EngineUnsupported(f"the holoscan engine has no scheduler like {type(scheduler).__name__}")
+        self.clock = scheduler.clock
+        self.error: BaseException | None = None
+        self.restore_signals = keep_signals()
         self._threads = isinstance(scheduler, MultiThreadScheduler)
         self._lock = threading.RLock()
-        self._edges = 0
+        self._over = threading.Event()
         self._gates: list[Gate] = []
-        self._interrupt: BaseException | None = None
+        self._edge_count = 0
 
-    def make_edge(self, name: str, capacity: int, policy: QueuePolicy) -> HoloscanEdge:
+    def make_edge(self, name: str, capacity: int, policy: QueuePolicy) -> CarriedEdge:
         """An edge with a port name of its own."""
-        self._edges += 1
-        return HoloscanEdge(name, capacity, policy, self._lock, f"edge{self._edges}")
+        edge = CarriedEdge(name, capacity, policy, self._lock)
+        self._edge_count += 1
+        edge.port = f"edge{self._edge_count}"
+        return edge
 
     def wake(self) -> None:
         """Have the SDK check every operator again; from any thread."""
         for gate in self._gates:
-            if gate.checked:  # before that the SDK does not know it
+            if gate.checked:  # before, the SDK does not know it
                 gate.notify_scheduler()
 
     def now_ns(self, timestamp: int) -> int:
-        """Our time at an SDK timestamp; a manual clock follows the SDK's."""
+        """Our time at a time of the SDK; a manual clock follows the SDK's."""
         if isinstance(self.clock, ManualClock):
             self.clock.advance_to(timestamp)
         return self.clock.timestamp()
 
-    def interrupt(self, error: BaseException) -> None:
-        """Keep what execute raises."""
-        self._interrupt = self._interrupt or error
-
     def execute(self, graph: Graph) -> None:
         """Run the SDK in a thread of its own, so that Ctrl-C reaches the thread that waits here."""
-        app = self._application(graph)
-        over = threading.Event()
-
-        def work() -> None:
-            try:
-                app.run()
-            except BaseException as error:  # noqa: BLE001 - raised again below
-                self.interrupt(error)
-            finally:
-                self._gates = []
-                over.set()
-
-        thread = threading.Thread(target=work, name="holoscan", daemon=True)
+        thread = threading.Thread(target=self._run, args=(self._application(graph),), name="holoscan", daemon=True)
         thread.start()
         try:
-            over.wait()
+            self._over.wait()  # not join: interrupted, it takes the thread for ended (Python 3.11)
         finally:
             stopped = graph.stopping
             graph.stop()
-            thread.join()
-        if self._interrupt is not None:
-            raise self._interrupt
+            self._over.wait()
+        if self.error is not None:
+            raise self.error
         now_ns = self.clock.timestamp()
         if not stopped and not graph.settle(now_ns):
-            ready = [task.name for task in graph.tasks if not task.finished and task.poll(now_ns)[0] < 2]
-            if ready:
-                raise EngineError(f"the Holoscan SDK ended the run while {', '.join(ready)} could go on")
+            able = [task.name for task in graph.tasks if task.poll(now_ns)[0] < SchedulingStatus.WAIT]
+            if able:
+                raise EngineError(f"the Holoscan SDK ended the run while {', '.join(able)} could go on; run it again")
             graph.declare_deadlock(now_ns)
+
+    def _run(self, app: Any) -> None:
+        try:
+            app.run()
+        except Exception as error:  # noqa: BLE001 - raised by execute
+            self.error = self.error or error
+        finally:
+            self._gates = []
+            self._over.set()
 
     def _application(self, graph: Graph) -> Any:
         """The graph as an application of the SDK."""
-        scheduler = self
+        outer, tasks = self, graph.tasks
 
         class Composed(_Application):
             def compose(self) -> None:
-                bridges = {}
-                for task in graph.tasks:
-                    gate = Gate(self, task, scheduler)
-                    scheduler._gates.append(gate)
-                    bridges[task] = Bridge(self, task, gate)
-                    self.add_operator(bridges[task])
+                outer._gates = [Gate(self, task, outer) for task in tasks]
+                bridges = {gate.task: Bridge(self, gate.task, gate) for gate in outer._gates}
+                for bridge in bridges.values():
+                    self.add_operator(bridge)
                 for producer, edge, consumer in graph.ends:
-                    self.add_flow(bridges[producer], bridges[consumer], {(edge.port, edge.port)})
+                    port = cast("CarriedEdge", edge).port
+                    self.add_flow(bridges[producer], bridges[consumer], {(port, port)})
 
         app = Composed()
         app.enable_metadata(False)
+        kind, options = _sdk.schedulers.GreedyScheduler, {}
         if self._threads:
-            workers = len(graph.tasks)
-            app.scheduler(_sdk.schedulers.EventBasedScheduler(app, worker_thread_number=workers, name="scheduler"))
-        else:
-            clock = _sdk.resources.ManualClock if isinstance(self.clock, ManualClock) else _sdk.resources.RealtimeClock
-            app.scheduler(_sdk.schedulers.GreedyScheduler(app, clock=clock(app, name="clock"), name="scheduler"))
+            kind, options = _sdk.schedulers.EventBasedScheduler, {"worker_thread_number": len(tasks)}
+        clock = _sdk.resources.ManualClock if isinstance(self.clock, ManualClock) else _sdk.resources.RealtimeClock
+        app.scheduler(kind(app, clock=clock(app, name="clock"), stop_on_deadlock_timeout=_GIVE_UP_MS, **options))
         return app

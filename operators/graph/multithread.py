@@ -131,4 +131,4 @@ class MultiThreadScheduler:
             thread.join(max(0, deadline_ns - self.clock.timestamp()) * 1e-9)
         stuck = [thread.name for thread in threads if thread.is_alive()]
         if stuck:
-            raise OperatorStuck(f"still in compute {self.stop_timeout_s} s after the graph stopped: {', '.join(stuck)}")
+            raise OperatorStuck(stuck, self.stop_timeout_s)

@@ -94,8 +94,9 @@ class Operator:
 
     def _take_params(self, given: dict[str, Any]) -> None:
         params = self.spec.params
-        for name in params.keys() & self._reserved:
-            raise GraphInvalid(f"operator {self.name!r}: parameter {name!r} would hide an attribute of Operator")
+        for name in params:
+            if name in self._reserved or hasattr(Operator, name):
+                raise GraphInvalid(f"operator {self.name!r}: parameter {name!r} would hide an attribute of Operator")
         if unknown := sorted(given.keys() - params.keys()):
             raise GraphInvalid(f"operator {self.name!r} has no parameter {unknown[0]!r}; it has {sorted(params)}")
         for name, default in params.items():

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from operators.errors import QueueFull
+from operators.errors import EngineError, QueueFull
 from operators.graph.spec import QueuePolicy
 from operators.graph.tracking import Trail
 
@@ -121,6 +121,38 @@ class LockedEdge(Edge):
             message = super().pop()
             self.wake_producer()
             return message
+
+
+class CarriedEdge(LockedEdge):
+    """An edge whose messages another engine carries, between `sender.emit` and `receiver.receive` of one compute.
+
+    The queue here mirrors the engine's, counts and applies the policy. When `drop_oldest` makes room, no further
+    message is sent: the one under way stands for what is then the oldest. So the engine's queue never overflows.
+    """
+
+    port = ""
+    """Name of the engine's port at both ends."""
+    sender: Any = None
+    receiver: Any = None
+
+    def push(self, message: Message) -> None:
+        """As Edge.push."""
+        with self._lock:
+            length = len(self.queue)
+            super().push(message)
+            grown = len(self.queue) > length
+        if grown:
+            self.sender.emit(message, self.port)
+
+    def pop(self) -> Message | None:
+        """As Edge.pop. Raises EngineError when the engine delivers out of order."""
+        carried = self.receiver.receive(self.port)
+        if carried is None:
+            return None
+        message = super().pop()
+        if self.policy is QueuePolicy.BLOCK and message is not carried:
+            raise EngineError(f"the engine delivered another message on {self.name} than was due")
+        return message
 
 
 def _nobody() -> None:

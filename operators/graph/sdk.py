@@ -6,7 +6,9 @@ import ctypes
 import importlib
 import importlib.util
 import os
+import signal
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -34,6 +36,23 @@ def load_sdk() -> Any:
     if "HOLOSCAN_LOG_LEVEL" not in os.environ:
         logger.set_log_level(logger.LogLevel.ERROR)
     return SimpleNamespace(core=core, schedulers=schedulers, resources=resources)
+
+
+def keep_signals() -> Callable[[], None]:
+    """Note the handlers of SIGINT and SIGTERM; the function returned puts them back, from any thread.
+
+    A run of the SDK installs its own and leaves them: from then on the process ignores SIGTERM.
+    """
+    get, put = ctypes.pythonapi.PyOS_getsig, ctypes.pythonapi.PyOS_setsig
+    get.restype = put.restype = ctypes.c_void_p
+    put.argtypes = [ctypes.c_int, ctypes.c_void_p]
+    kept = {number: get(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def restore() -> None:
+        for number, handler in kept.items():
+            put(number, handler)
+
+    return restore
 
 
 def _preload_cudart() -> None:

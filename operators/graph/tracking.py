@@ -7,6 +7,7 @@ Each histogram has one writer (an operator computes in one thread at a time), so
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter_ns
 
@@ -44,21 +45,21 @@ class Histogram:
 
     def summary(self) -> DurationSummary:
         """The percentiles so far; from any thread."""
+        p50_ms, p95_ms, p99_ms = self.quantiles_ms((0.50, 0.95, 0.99))
+        return DurationSummary(sum(self._counts), p50_ms, p95_ms, p99_ms, self._max_ns * 1e-6)
+
+    def quantiles_ms(self, fractions: Sequence[float]) -> list[float]:
+        """The durations that these shares (ascending, 0..1) of all do not exceed, in milliseconds; from any thread."""
         max_ns = self._max_ns
         counts = self._counts.copy()
         total = sum(counts)
-        percentiles: list[float] = []
-        for fraction in (0.50, 0.95, 0.99):
-            remaining = math.ceil(fraction * total)
-            value = 0
-            for bucket, count in enumerate(counts):
-                remaining -= count
-                if count and remaining <= 0:
-                    value = min(_bucket_end(bucket), max_ns)
-                    break
-            percentiles.append(value * 1e-6)
-        p50_ms, p95_ms, p99_ms = percentiles
-        return DurationSummary(total, p50_ms, p95_ms, p99_ms, max_ns * 1e-6)
+        values: list[float] = []
+        reached = 0
+        for bucket, count in enumerate(counts):
+            reached += count
+            while count and len(values) < len(fractions) and reached >= math.ceil(fractions[len(values)] * total):
+                values.append(min(_bucket_end(bucket), max_ns) * 1e-6)
+        return values + [0.0] * (len(fractions) - len(values))
 
 
 def _bucket(value: int) -> int:
@@ -112,6 +113,10 @@ class FlowTracker:
     def latency(self) -> dict[str, DurationSummary]:
         """Per path, named `source,depth,display`; from any thread."""
         return {path: histogram.summary() for path, histogram in self._paths.copy().items()}
+
+    def latency_quantiles_ms(self, fractions: Sequence[float]) -> dict[str, list[float]]:
+        """Per path, the latencies at these shares (ascending, 0..1): the distribution as a curve; from any thread."""
+        return {path: histogram.quantiles_ms(fractions) for path, histogram in self._paths.copy().items()}
 
     def compute(self) -> dict[str, DurationSummary]:
         """Per operator, by name; from any thread."""

@@ -1,11 +1,101 @@
-"""Scenes shared by the tests of the core."""
+"""Random scenes that a camera sees, and comparison of a float32 result with the float64 oracle."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from gsplat_core.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Float64 inputs of `rasterization`; `to(float32)` rounds them for the compiled ops."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+
+    def to(self, dtype: torch.dtype) -> Scene:
+        """The same scene in another dtype, as new leaves."""
+        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("width", "height")}
+        return replace(self, **{name: tensor.detach().to(dtype).clone() for name, tensor in tensors.items()})
+
+    def leaves(self) -> list[Tensor]:
+        """Means, quats, scales, opacities, sh and viewmats, asked for gradients."""
+        return [
+            tensor.requires_grad_()
+            for tensor in (self.means, self.quats, self.scales, self.opacities, self.sh, self.viewmats)
+        ]
+
+
+@pytest.fixture
+def make_scene() -> Callable[..., Scene]:
+    """`make_scene(count, batch, cameras, model, degree, seed)`: some Gaussians outside of the view, most in it."""
+
+    def make(
+        count: int = 60,
+        batch: tuple[int, ...] = (),
+        cameras: int = 1,
+        model: str = "pinhole",
+        degree: int = 3,
+        seed: int = 0,
+        width: int = 52,
+        height: int = 37,
+    ) -> Scene:
+        g = torch.Generator().manual_seed(seed)
+
+        def normal(*shape: int) -> Tensor:
+            # Rounded to float32, so that both precisions start from the same numbers.
+            return torch.randn(*batch, *shape, generator=g, dtype=torch.float64).float().double()
+
+        means = normal(count, 3) * torch.tensor([1.5, 1.2, 2.0]) + torch.tensor([0.0, 0.0, 6.0])
+        means[..., :1, :] = torch.tensor([0.1, 0.2, 5.0])  # one at least is seen
+        viewmats = torch.eye(4, dtype=torch.float64).repeat(*batch, cameras, 1, 1)
+        viewmats[..., :3, :] += 0.05 * normal(cameras, 3, 4)
+        focal = 8.0 if model == "ortho" else 45.0
+        K = torch.tensor([[focal, 0, width / 2 + 1], [0, focal * 1.1, height / 2 - 2], [0, 0, 1]], dtype=torch.float64)
+        return Scene(
+            means=means.float().double(),
+            quats=normal(count, 4),
+            scales=(normal(count, 3) * 0.5 - 1.5).exp().float().double(),
+            opacities=(normal(count) * 1.5 + 1.0).sigmoid().float().double(),
+            sh=normal(count, (degree + 1) ** 2, 3) * 0.3,
+            viewmats=viewmats.float().double(),
+            Ks=K.repeat(*batch, cameras, 1, 1).float().double(),
+            width=width,
+            height=height,
+        )
+
+    return make
+
+
+@pytest.fixture
+def assert_near() -> Callable[..., None]:
+    """Assert that float32 `actual` is `expected` up to rounding: relative, and relative to the largest element."""
+
+    def check(actual: Tensor | None, expected: Tensor | None, relative: float = 2e-3, of_largest: float = 2e-5) -> None:
+        if expected is None or actual is None:
+            assert actual is expected
+            return
+        assert actual.shape == expected.shape
+        if expected.numel():
+            absolute = of_largest * float(expected.detach().abs().max())
+            torch.testing.assert_close(
+                actual.detach().double(), expected.detach().double(), rtol=relative, atol=absolute
+            )
+
+    return check
 
 
 @pytest.fixture

@@ -95,6 +95,9 @@ def read_poses_bounds(
 
 def read_json(path: Path, findings: Findings) -> dict[str, Any] | None:
     """A JSON object from a file of bounded size."""
+    if not path.is_file():
+        findings.problem(path, "it is not a plain file", "Give a JSON file")
+        return None
     try:
         if path.stat().st_size > MAX_JSON_BYTES:
             findings.problem(path, f"{path.stat().st_size} bytes, more than the bound of {MAX_JSON_BYTES}", "Split it")
@@ -132,11 +135,9 @@ def read_pinhole(path: Path, content: dict[str, Any], findings: Findings) -> Cam
 def invert_poses(camera_to_world: NDArray[np.float64], path: Path, findings: Findings) -> NDArray[np.float64] | None:
     """World-to-camera [N, 4, 4] from camera-to-world [N, 3, 4]; each must be a rotation and a translation."""
     rotation, translation = camera_to_world[:, :, :3], camera_to_world[:, :, 3]
-    if np.abs(rotation).max() > 2:  # also keeps the products below finite
-        skew = np.abs(rotation).max(axis=(1, 2))
-    else:
-        skew = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        skew = np.maximum(skew, np.abs(np.linalg.det(rotation) - 1))
+    bounded = np.clip(rotation, -2, 2)  # keeps the products finite, and what it changes is no rotation either way
+    skew = np.abs(bounded @ bounded.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    skew = np.maximum(skew, np.abs(np.linalg.det(bounded) - 1))
     if skew.max() > _ROTATION_TOLERANCE:
         index = int(np.argmax(skew > _ROTATION_TOLERANCE))
         findings.problem(

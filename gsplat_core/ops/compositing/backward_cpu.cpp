@@ -30,12 +30,12 @@ GSPLAT_INLINE void splat_backward(const Compositing& in, int32_t id, int64_t pos
   const int channels = D > 0 ? D : in.channels;
   for (; blocks != 0; blocks &= blocks - 1) {
     const int block = __builtin_ctzll(blocks), at = block * kLanes;
-    const Falloff f = falloff(record, block_x + float(block % kColumns * kBlockWidth),
-                              block_y + float(block / kColumns * kBlockHeight));
+    const Falloff f =
+        falloff(record, block_x + float(block % kColumns * kBlockWidth), block_y + float(block / kColumns * kBlockHeight));
     vint last;
     __builtin_memcpy(&last, w.last + at, sizeof(last));
-    const vmask valid = at_least(f.power, splat(kFaintest)) & at_least(splat(record.cap), f.power) &
-                        at_least(last, splat_int(int32_t(position)));
+    const vmask valid =
+        at_least(f.power, splat(kFaintest)) & at_least(splat(record.cap), f.power) & at_least(last, splat_int(int32_t(position)));
     const vfloat alpha = zero_unless(valid, exp2(smaller(f.power, splat(kOpaque))));
     const vfloat widen = reciprocal(1.0f - alpha);
     const vfloat through = load(w.through + at) * widen, weight = alpha * through;
@@ -172,7 +172,8 @@ void tile_backward(const Compositing& in, int64_t index, const CompositingGradie
   const Tile tile = tile_of(in, index);
   bool add = false;
   for (int y = tile.y; y < tile.bottom; y += kWindow)
-    for (int x = tile.x; x < tile.right; x += kWindow, add = true) window_backward<D, kAbs>(in, tile, x, y, index, add, out, scratch);
+    for (int x = tile.x; x < tile.right; x += kWindow, add = true)
+      window_backward<D, kAbs>(in, tile, x, y, index, add, out, scratch);
   if (!add) {  // a tile outside of the image: its instances reach no pixel
     const int64_t row_size = kMoments + in.channels + (kAbs ? 2 : 0);
     for (int64_t position = tile.begin; position < tile.end; ++position)

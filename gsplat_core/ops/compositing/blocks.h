@@ -14,9 +14,9 @@ constexpr int kRows = kWindow / kBlockHeight;
 constexpr int kBlocks = kColumns * kRows;
 constexpr int kPixels = kWindow * kWindow;
 
-constexpr float kFaintest = -7.99435344f;   // log2(1/255): a splat fainter than this at a pixel is skipped there
-constexpr float kOpaque = -0.01449957f;     // log2(0.99): the most opaque that a splat can be
-constexpr float kStop = 1e-4f;              // a splat that would leave less transmittance ends the pixel, unblended
+constexpr float kFaintest = -7.99435344f;  // log2(1/255): a splat fainter than this at a pixel is skipped there
+constexpr float kOpaque = -0.01449957f;    // log2(0.99): the most opaque that a splat can be
+constexpr float kStop = 1e-4f;             // a splat that would leave less transmittance ends the pixel, unblended
 
 // Where pixel (x, y) of a window is in its block-wise arrays.
 GSPLAT_INLINE int place(int x, int y) {
@@ -55,7 +55,8 @@ GSPLAT_INLINE Falloff falloff(const SplatRecord& splat_, vfloat x, vfloat y) {
 // The part of an ellipse in a strip of pixel rows reaches in x from the left to the right solution of
 // a dx^2 + 2 b dx dy + c dy^2 = k at the dy of the strip that is nearest to the outermost point.
 template <class OnBlock>
-GSPLAT_INLINE void test_blocks(const SplatRecord* records, const int32_t* ids, int count, float x, float y, const OnBlock& on_block) {
+GSPLAT_INLINE void test_blocks(const SplatRecord* records, const int32_t* ids, int count, float x, float y,
+                               const OnBlock& on_block) {
   alignas(64) float fields[6][kLanes];
   for (int i = 0; i < kLanes; ++i) {
     const SplatRecord& record = records[ids[i < count ? i : 0]];

@@ -8,8 +8,8 @@
 
 #include "isa.h"
 
-// One splat, ready to blend, on one cache line. log2(alpha) = a dx^2 + b dx dy + c dy^2 + l with dx, dy from the mean to the pixel.
-// A splat with a value that is not finite has l = -infinity, so that it reaches no pixel.
+// One splat, ready to blend, on one cache line. log2(alpha) = a dx^2 + b dx dy + c dy^2 + l with dx, dy from the mean to the
+// pixel. A splat with a value that is not finite has l = -infinity, so that it reaches no pixel.
 struct SplatRecord {
   float x, y, a, b, c, l;
   // log2(alpha) beyond this is skipped: l where the conic is indefinite (sigma would be negative), else infinity.
@@ -18,13 +18,13 @@ struct SplatRecord {
   float colors[8];  // where there are at most 8 channels
 };
 
-constexpr int kWindow = 16;           // pixels on a side
-constexpr int kMostRecorded = 8;      // channels that a record has room for
-constexpr int kMoments = 6;           // sum over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
+constexpr int kWindow = 16;       // pixels on a side
+constexpr int kMostRecorded = 8;  // channels that a record has room for
+constexpr int kMoments = 6;       // sum over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
 
 struct Compositing {
   const SplatRecord* records;
-  const float* colors;  // [count, channels]
+  const float* colors;     // [count, channels]
   const float* means2d;    // [count, 2]
   const float* conics;     // [count, 3]
   const float* opacities;  // [count]

@@ -95,7 +95,9 @@ def _check(
     for name, tensor, last in (("means2d", means2d, 2), ("conics", conics, 3), ("colors", colors, None)):
         if tuple(tensor.shape[:-1]) != shape or (last is not None and tensor.shape[-1] != last):
             expected = (*shape, "D" if last is None else last)
-            raise InvalidInput(f"{name} must have shape {expected} to go with opacities {shape}, got {tuple(tensor.shape)}")
+            raise InvalidInput(
+                f"{name} must have shape {expected} to go with opacities {shape}, got {tuple(tensor.shape)}"
+            )
     if backgrounds is not None and tuple(backgrounds.shape) != (*image_dims, colors.shape[-1]):
         raise InvalidInput(
             f"backgrounds must have shape {(*image_dims, colors.shape[-1])}, one colour per image, got {tuple(backgrounds.shape)}"
@@ -117,7 +119,9 @@ def _check(
             )
     for name, value in {"isect_offsets": isect_offsets, "flatten_ids": flatten_ids}.items():
         if value.dtype != torch.int32:
-            raise InvalidInput(f"{name} must be int32 as isect_tiles and isect_offset_encode return it, got {value.dtype}")
+            raise InvalidInput(
+                f"{name} must be int32 as isect_tiles and isect_offset_encode return it, got {value.dtype}"
+            )
     if flatten_ids.ndim != 1:
         raise InvalidInput(f"flatten_ids must have shape [M], got {tuple(flatten_ids.shape)}")
 

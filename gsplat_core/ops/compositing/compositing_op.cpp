@@ -1,10 +1,9 @@
-#include "compositing.h"
-
 #include <atomic>
 #include <new>
 #include <optional>
 #include <tuple>
 
+#include "compositing.h"
 #include "counting_sort.h"
 #include "tensor_checks.h"
 
@@ -63,9 +62,8 @@ struct Call {
           int32_t(tile_height),
           backgrounds ? data(*backgrounds) : nullptr,
           masks ? masks->const_data_ptr<bool>() : nullptr};
-    torch::stable::parallel_for(0, count, 2048, [&](int64_t begin, int64_t end) {
-      compositing_kernels().records(in, begin, end, records.get());
-    });
+    torch::stable::parallel_for(
+        0, count, 2048, [&](int64_t begin, int64_t end) { compositing_kernels().records(in, begin, end, records.get()); });
   }
 
   // The lists come from the caller, and a wrong index would read foreign memory.
@@ -99,7 +97,8 @@ struct Call {
 
 std::tuple<Tensor, Tensor, Tensor> composite(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor offsets,
                                              Tensor flatten_ids, std::optional<Tensor> backgrounds, std::optional<Tensor> masks,
-                                             std::optional<Tensor> absgrad_probe, int64_t width, int64_t height, int64_t tile_size) {
+                                             std::optional<Tensor> absgrad_probe, int64_t width, int64_t height,
+                                             int64_t tile_size) {
   const Call call(means2d, conics, colors, opacities, offsets, flatten_ids, backgrounds, masks, width, height, tile_size);
   const int64_t images = call.in.images;
   Tensor out_colors = empty_floats({images, height, width, call.in.channels});
@@ -112,8 +111,8 @@ std::tuple<Tensor, Tensor, Tensor> composite(Tensor means2d, Tensor conics, Tens
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
     Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor offsets, Tensor flatten_ids,
-    std::optional<Tensor> backgrounds, std::optional<Tensor> masks, int64_t width, int64_t height, int64_t tile_size, Tensor alphas,
-    Tensor last, Tensor v_colors, Tensor v_alphas, bool absgrad) {
+    std::optional<Tensor> backgrounds, std::optional<Tensor> masks, int64_t width, int64_t height, int64_t tile_size,
+    Tensor alphas, Tensor last, Tensor v_colors, Tensor v_alphas, bool absgrad) {
   const Call call(means2d, conics, colors, opacities, offsets, flatten_ids, backgrounds, masks, width, height, tile_size);
   const int64_t count = call.count, instances = call.in.instances, channels = call.in.channels, images = call.in.images;
   const int64_t pixels = images * height * width;
@@ -140,10 +139,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
                                           data(v_colors_), data(v_alphas_),
                                           absgrad,         slots.get(),
                                           rows.get(),      backgrounds ? background_parts.data() : nullptr};
-  call.for_tiles(
-      [&](int64_t tile, float* scratch) { compositing_kernels().tile_backward(call.in, tile, gradients, scratch); });
+  call.for_tiles([&](int64_t tile, float* scratch) { compositing_kernels().tile_backward(call.in, tile, gradients, scratch); });
 
-  Tensor v_means2d = empty_floats({count, 2}), v_conics = empty_floats({count, 3}), v_splat_colors = empty_floats({count, channels});
+  Tensor v_means2d = empty_floats({count, 2}), v_conics = empty_floats({count, 3}),
+         v_splat_colors = empty_floats({count, channels});
   Tensor v_opacities = empty_floats({count}), v_absolute = empty_floats({absgrad ? count : 0, 2});
   torch::stable::parallel_for(0, count, 2048, [&](int64_t begin, int64_t end) {
     compositing_kernels().gather(call.in, gradients, first.get(), begin, end, mutable_data(v_means2d), mutable_data(v_conics),

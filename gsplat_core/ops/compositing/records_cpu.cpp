@@ -71,6 +71,7 @@ void gather(const Compositing& in, const CompositingGradients& from, const int32
 
 }  // namespace
 
-extern const CompositingKernels compositing_kernels = {make_records, scratch_floats, composite_tile, composite_tile_backward, gather};
+extern const CompositingKernels compositing_kernels = {make_records, scratch_floats, composite_tile, composite_tile_backward,
+                                                       gather};
 
 }  // namespace GSPLAT_ISA

@@ -71,7 +71,7 @@ def fully_fused_projection(
     def flat(tensor: Tensor | None, *trailing: int) -> Tensor | None:
         return None if tensor is None else tensor.reshape(math.prod(batch_dims), *trailing)
 
-    radii, means2d, depths, conics, compensations = torch.ops.gsplat_core.project_gaussians(
+    means2d, depths, conics, compensations, radii = torch.ops.gsplat_core.project_gaussians(
         flat(means, n, 3), flat(covars, n, 6), flat(quats, n, 4), flat(scales, n, 3),
         None if opacities is None else flat(opacities.detach(), n), flat(viewmats, c, 4, 4), flat(Ks.detach(), c, 3, 3),
         width, height, eps2d, near_plane, far_plane, radius_clip, calc_compensations, CAMERA_MODELS.index(camera_model),
@@ -95,11 +95,11 @@ def _fake(
     b, n, _ = means.shape
     c = viewmats.shape[1]
     return (
-        means.new_empty((b, c, n, 2), dtype=torch.int32),
         means.new_empty((b, c, n, 2)),
         means.new_empty((b, c, n)),
         means.new_empty((b, c, n, 3)),
         means.new_empty((b, c, n) if compensate else (0,)),
+        means.new_empty((b, c, n, 2), dtype=torch.int32),
     )
 
 
@@ -122,17 +122,17 @@ def _fake_backward(
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
     means, covars, quats, scales, _, viewmats, Ks = inputs[:7]
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(means, covars, quats, scales, viewmats, Ks, output[0])
+    ctx.save_for_backward(means, covars, quats, scales, viewmats, Ks, output[4])
     ctx.width, ctx.height, ctx.eps2d, ctx.compensate, ctx.camera_model = *inputs[7:10], inputs[13], inputs[14]
 
 
 def _backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
     means, covars, quats, scales, viewmats, Ks, radii = ctx.saved_tensors
     needs = ctx.needs_input_grad
-    v_compensations = v[4] if ctx.compensate else None
+    v_means2d, v_depths, v_conics, v_compensations, _ = v
     v_means, v_covars, v_quats, v_scales, v_viewmats = torch.ops.gsplat_core.project_gaussians_backward(
-        means, covars, quats, scales, viewmats, Ks, radii, v[1], v[2], v[3], v_compensations,
-        ctx.width, ctx.height, ctx.eps2d, ctx.camera_model, needs[5],
+        means, covars, quats, scales, viewmats, Ks, radii, v_means2d, v_depths, v_conics,
+        v_compensations if ctx.compensate else None, ctx.width, ctx.height, ctx.eps2d, ctx.camera_model, needs[5],
     )  # fmt: skip
     return (
         v_means if needs[0] else None,

@@ -93,7 +93,7 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians(
       projection_kernels().forward(scene.view(image / C, image % C), o, begin, end);
     }
   });
-  return {radii, means2d, depths, conics, compensations};
+  return {means2d, depths, conics, compensations, radii};
 }
 
 static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians_backward(

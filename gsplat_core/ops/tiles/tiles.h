@@ -27,7 +27,8 @@ struct TilesKernels {
   // Spans and tile counts of splats [begin, end).
   void (*spans)(const SplatBoxes& in, int64_t begin, int64_t end, TileSpan* spans, int32_t* tile_counts);
   // Adds one to the counter of every tile that the splats order[begin..end) touch.
-  void (*count)(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, int64_t begin, int64_t end, int32_t* counters);
+  void (*count)(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, int64_t begin, int64_t end,
+                int32_t* counters);
   // Writes each of those splats at its tile's cursor, which moves on. With `keys`, also image|tile|depth (gsplat's isect_ids).
   void (*emit)(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, int64_t begin, int64_t end, int32_t* cursors,
                int32_t* flatten_ids, int64_t* keys);

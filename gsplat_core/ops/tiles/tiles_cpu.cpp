@@ -3,9 +3,8 @@
 // A splat reaches the pixels where o exp(-sigma) >= 1/255: an ellipse. Its part inside a row of tiles is convex, so it touches a
 // contiguous run of tiles, given by its extent in x over the row's pixel centres (Gaussian splat extents after StopThePop,
 // Radl et al. 2024, and AccuTile; the extent in a strip is our own derivation, below).
-#include "tiles.h"
-
 #include "simd.h"
+#include "tiles.h"
 
 namespace GSPLAT_ISA {
 namespace {
@@ -60,9 +59,7 @@ GSPLAT_INLINE Run run_of_row(const Ellipse& e, int row, int tile_size, Run box) 
 GSPLAT_INLINE bool finite(float v) { return v - v == 0; }
 
 // The contour: sigma <= k / 2, a little outside of alpha = 1/255.
-GSPLAT_INLINE float contour(float opacity) {
-  return opacity > 0 ? 1.3862944f * log2(splat(255.0f * opacity))[0] + 1e-3f : -1.0f;
-}
+GSPLAT_INLINE float contour(float opacity) { return opacity > 0 ? 1.3862944f * log2(splat(255.0f * opacity))[0] + 1e-3f : -1.0f; }
 
 TileSpan span_of(const SplatBoxes& in, int64_t splat, float k) {
   const TileSpan nothing = {0, 0, 0, 0, 0};
@@ -130,9 +127,9 @@ void spans(const SplatBoxes& in, int64_t begin, int64_t end, TileSpan* spans, in
     if (in.conics != nullptr) {
       for (int i = 0; i < n; ++i) contours[i] = in.opacities[first + i];
       const vfloat o = load(contours);
-      // 2 ln(255 o); what is not positive has no contour.
+      // 2 ln(255 o); what is not positive and finite has no contour.
       const vfloat k = fma(log2(o * 255.0f), splat(1.3862944f), splat(1e-3f));
-      store(contours, where(above(o, vfloat{}), k, splat(-1.0f)));
+      store(contours, where(above(o, vfloat{}) & at_least(splat(3e38f), o), k, splat(-1.0f)));
     }
     for (int i = 0; i < n; ++i) {
       const TileSpan span = span_of(in, first + i, contours[i]);
@@ -171,7 +168,7 @@ struct Key {
 };
 
 void emit(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, int64_t begin, int64_t end, int32_t* cursors,
-                 int32_t* flatten_ids, int64_t* keys) {
+          int32_t* flatten_ids, int64_t* keys) {
   for (int64_t i = begin; i < end; ++i) {
     const int64_t splat = order[i];
     int32_t* const mine = cursors + first_tile(in, splat);

@@ -1,10 +1,9 @@
-#include "tiles.h"
-
 #include <optional>
 #include <tuple>
 
 #include "counting_sort.h"
 #include "tensor_checks.h"
+#include "tiles.h"
 
 namespace {
 
@@ -52,9 +51,8 @@ struct Binning {
     tile_counts = empty_ints({count});
     spans = uninitialised<TileSpan>(count);
     int32_t* const counts = tile_counts.mutable_data_ptr<int32_t>();
-    torch::stable::parallel_for(0, count, 2048, [&](int64_t begin, int64_t end) {
-      tiles_kernels().spans(boxes, begin, end, spans.get(), counts);
-    });
+    torch::stable::parallel_for(
+        0, count, 2048, [&](int64_t begin, int64_t end) { tiles_kernels().spans(boxes, begin, end, spans.get(), counts); });
     for (int64_t i = 0; i < count; ++i) total += counts[i];
     STD_TORCH_CHECK(total <= kMostInts, "the splats touch ", total,
                     " tiles in all, more than 2^31 - 1; render fewer images at a time or with a larger tile_size");

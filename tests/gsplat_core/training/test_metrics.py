@@ -90,6 +90,18 @@ def test_a_nan_under_the_tool_is_not_seen(pair):
         assert measure(floats, target, mask) == pytest.approx(measure(image, target, mask), abs=1e-5)
 
 
+def test_a_broken_picture_scores_as_a_black_one_and_stays_in_the_means(pair):
+    image, target, mask = pair
+    broken = np.full(image.shape, np.nan, np.float32)
+    broken[0] = np.inf
+    tracker = QualityTracker()
+    tracker.observe(0, broken, target, mask)
+    tracker.observe(1, np.zeros_like(image), target, mask)
+    first, second = tracker.series()
+    assert first | {"seq": 1} == second
+    assert tracker.means()["psnr_tissue_db"] == first["psnr_tissue_db"] < 10
+
+
 def test_wrong_shapes_and_types_are_refused(pair):
     image, target, mask = pair
     with pytest.raises(InvalidInput, match="one size"):

@@ -69,8 +69,8 @@ def test_rows_with_gradients_that_are_not_finite_are_counted_and_kept():
     before = {name: tensor.clone() for name, tensor in values.items()}
     gradients["means"][1, 2] = torch.nan
     gradients["sh"][1, 0, 0] = gradients["sh"][4, 3, 2] = torch.inf
-    optimiser = FusedAdam(values, RATES)
-    assert optimiser.step(values, gradients) == 3
+    optimiser = FusedAdam(values)
+    assert optimiser.step(values, gradients, RATES) == 3
     assert optimiser.skipped == 3
     assert torch.equal(values["means"][1], before["means"][1])
     assert torch.equal(values["sh"][[1, 4]], before["sh"][[1, 4]])
@@ -119,6 +119,8 @@ def test_what_does_not_match_is_refused():
     values = tensors(4)
     with pytest.raises(InvalidInput, match="must match"):
         FusedAdam(values, {"means": 0.1})
+    with pytest.raises(InvalidInput, match="must match"):
+        FusedAdam(values).step(values, tensors(4), {"means": 0.1})
     with pytest.raises(InvalidInput, match="one row per Gaussian"):
         FusedAdam({"a": torch.zeros(2), "b": torch.zeros(3)}, {"a": 1.0, "b": 1.0})
     with pytest.raises(InvalidInput, match="sh"):

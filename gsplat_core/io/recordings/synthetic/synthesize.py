@@ -1,12 +1,12 @@
 """Writing a synthetic recording: the EndoNeRF layout, `recording.json`, and exact ground truth.
 
-    images/frame-000000.color.png        left eye
-    images_right/frame-000000.color.png  right eye of the rectified pair, rendered, not warped
-    masks/frame-000000.mask.png          255 = tool
-    depth/frame-000000.depth.png         16 bit, units of 0.01 mm: the first surface on the ray, tool or tissue
-    poses_bounds.npy                     camera-to-world, size, focal length, nearest and farthest depth
-    tracks.npy                           float32 [frames, points, 3]: material points of the tissue in the world, in mm
-    recording.json                       frame rate, camera, units, seed, and what the files mean
+images/frame-000000.color.png        left eye
+images_right/frame-000000.color.png  right eye of the rectified pair, rendered, not warped
+masks/frame-000000.mask.png          255 = tool
+depth/frame-000000.depth.png         16 bit, units of 0.01 mm: the first surface on the ray, tool or tissue
+poses_bounds.npy                     camera-to-world, size, focal length, nearest and farthest depth
+tracks.npy                           float32 [frames, points, 3]: material points of the tissue in the world, in mm
+recording.json                       frame rate, camera, units, seed, and what the files mean
 """
 
 from __future__ import annotations
@@ -73,13 +73,13 @@ class SyntheticScene:
 
     def render(self, time_s: float, eye: Literal["left", "right"] = "left") -> Eye:
         """What an eye sees at a time."""
-        camera = self.camera_at(time_s)
+        camera, scope_x_mm = self.camera_at(time_s), BASELINE_MM / 2
         if eye == "right":
             pose = camera.world_to_camera.copy()
             pose[0, 3] -= BASELINE_MM
-            camera = camera.with_pose(pose)
+            camera, scope_x_mm = camera.with_pose(pose), -BASELINE_MM / 2
         parts = self.motion.parts(self.tissue, time_s)
-        return render_eye(self.tissue, self.motion.tug(time_s), parts, camera, time_s)
+        return render_eye(self.tissue, self.motion.tug(time_s), parts, camera, time_s, scope_x_mm)
 
     def track(self, time_s: float) -> NDArray[np.float32]:
         """A grid of material points in the world [63, 3], mm."""
@@ -145,7 +145,9 @@ def _check_target(target: Path) -> None:
     names = {entry.name for entry in target.iterdir()}
     ours = "recording.json" in names and GENERATOR in (target / "recording.json").read_text(errors="replace")
     if names and not (ours and names <= set(_WRITTEN)):
-        raise InvalidInput(f"{target} holds other files ({', '.join(sorted(names)[:5])}); give a new or an empty folder")
+        raise InvalidInput(
+            f"{target} holds other files ({', '.join(sorted(names)[:5])}); give a new or an empty folder"
+        )
 
 
 def _write(
@@ -178,12 +180,15 @@ def _write(
 
     rows, tracks = [], []
     # A frame depends on its index alone, so the order in which threads finish does not matter.
-    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+    pool = ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1))
+    try:
         for done, (row, track) in enumerate(pool.map(write_frame, range(frames)), start=1):
             rows.append(row)
             tracks.append(track)
             if progress is not None:
                 progress(done, frames)
+    finally:
+        pool.shutdown(cancel_futures=True)  # after Ctrl-C or a full disk the frames not begun are not rendered
     np.save(folder / "poses_bounds.npy", np.stack(rows))
     np.save(folder / "tracks.npy", np.stack(tracks).astype(np.float32))
 

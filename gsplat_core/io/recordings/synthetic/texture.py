@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
+Array = NDArray[np.floating]
 
 HALF_EXTENT_MM = 84.0
 # Linear RGB reflectances.
-_PINK = np.array([0.60, 0.185, 0.140], np.float32)
-_PALE = np.array([0.74, 0.345, 0.255], np.float32)
+_PINK = np.array([0.62, 0.175, 0.115], np.float32)
+_PALE = np.array([0.76, 0.315, 0.215], np.float32)
 _DEEP = np.array([0.40, 0.072, 0.055], np.float32)
-_FAT = np.array([0.80, 0.520, 0.200], np.float32)
+_FAT = np.array([0.86, 0.420, 0.150], np.float32)
 _VEIN = np.array([0.130, 0.022, 0.040], np.float32)
 _ARTERY = np.array([0.300, 0.014, 0.012], np.float32)
 
@@ -30,25 +30,25 @@ class TissueTexture:
         cloud = self._noise(rng, (46.0, 21.0, 9.0, 4.2, 2.0, 0.9), 0.62)
         grain = self._noise(rng, (3.4, 1.7, 0.85, 0.45), 0.75)
         fat_cloud = self._noise(rng, (38.0, 17.0, 7.0, 3.0), 0.5)
-        folds = 1 - np.abs(self._noise(rng, (19.0, 9.5, 4.8, 2.4), 0.55))  # ridged: thin creases
+        folds = 1 - np.abs(self._noise(rng, (23.0, 11.0), 0.45))  # ridged: long soft creases
         lobules = np.abs(self._noise(rng, (4.6, 2.3), 0.5))
 
         colour = _mix(_PINK, _PALE, _smoothstep(0.1, 1.3, cloud))
         colour = _mix(colour, _DEEP, _smoothstep(0.0, 1.5, -cloud))
         fat = _smoothstep(0.75, 1.25, fat_cloud)
         colour = _mix(colour, _FAT * (0.86 + 0.14 * _smoothstep(0.0, 0.5, lobules))[..., None], 0.85 * fat)
-        crease = _smoothstep(0.93, 1.0, folds) * (1 - fat)
-        colour *= (1 - 0.30 * crease)[..., None]
+        crease = _smoothstep(0.72, 1.0, folds) * (1 - fat)
+        colour *= (1 - 0.20 * crease)[..., None]
         veins, vein_relief = self._vessels(rng, count=7, width_mm=2.1, blur_mm=0.42)
         arteries, artery_relief = self._vessels(rng, count=16, width_mm=0.85, blur_mm=0.12)
         colour = _mix(colour, _VEIN, 0.66 * veins * (1 - 0.5 * fat))
         colour = _mix(colour, _ARTERY, 0.80 * arteries)
         colour *= (1 + 0.10 * grain)[..., None]
 
-        relief_mm = 0.055 * grain + 0.24 * cloud - 0.16 * crease + 0.34 * fat * lobules + 0.25 * fat
+        relief_mm = 0.040 * grain + 0.22 * cloud - 0.20 * crease + 0.34 * fat * lobules + 0.25 * fat
         relief_mm += 0.30 * vein_relief + 0.14 * artery_relief
         relief_mm = cv2.GaussianBlur(relief_mm.astype(np.float32), (0, 0), 0.22 / self.texel_mm)
-        wetness = 0.35 + 0.65 * _smoothstep(-0.8, 0.9, self._noise(rng, (16.0, 6.0, 2.5), 0.6))
+        wetness = 0.12 + 0.88 * _smoothstep(-0.3, 1.2, self._noise(rng, (16.0, 6.0, 2.5), 0.6))
         self.reflectance = np.ascontiguousarray(np.clip(np.dstack([colour, wetness]), 0.004, 0.95), np.float32)
         """[S, S, 4]: linear RGB, wetness."""
         slope_v, slope_u = np.gradient(relief_mm, np.float32(self.texel_mm))
@@ -101,7 +101,9 @@ class TissueTexture:
             if depth < 4 and width > 0.2:
                 for side in (-1, 1):
                     if rng.random() < 0.88:
-                        stack.append((point, heading + side * rng.uniform(0.25, 0.8), width * rng.uniform(0.55, 0.85), depth + 1))
+                        stack.append(
+                            (point, heading + side * rng.uniform(0.25, 0.8), width * rng.uniform(0.55, 0.85), depth + 1)
+                        )
         cover = canvas.astype(np.float32) / 255
         soft = cv2.GaussianBlur(cover, (0, 0), blur_mm / self.texel_mm)
         raised = cv2.GaussianBlur(cover, (0, 0), (blur_mm + 0.3) / self.texel_mm)

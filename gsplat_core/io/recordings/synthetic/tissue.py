@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.io.recordings.synthetic.texture import TissueTexture
 
-Array = NDArray[np.float32]
+Array = NDArray[np.floating]
 
 TISSUE_DISTANCE_MM = 74.0
 BREATH_PERIOD_S = 3.4
@@ -48,9 +48,7 @@ class Tissue:
         wave_numbers = 2 * np.pi / wavelengths
         self._relief = [
             (float(k * np.cos(angle)), float(k * np.sin(angle)), float(phase), float(slope / k))
-            for k, angle, phase, slope in zip(
-                wave_numbers, angles, rng.uniform(0, 2 * np.pi, 6), slopes, strict=True
-            )
+            for k, angle, phase, slope in zip(wave_numbers, angles, rng.uniform(0, 2 * np.pi, 6), slopes, strict=True)
         ]
         self._tilt = rng.uniform(-0.10, 0.10, 2)
         self._breath_phase = float(rng.uniform(0, 2 * np.pi))
@@ -77,17 +75,17 @@ class Tissue:
         pulse = 2 * np.pi * time_s / PULSE_PERIOD_S
         direction = (np.cos(self._breath_angle), np.sin(self._breath_angle))
         for wavelength_mm, phase, lift_mm, shear_mm in ((130.0, breath, 2.4, 1.6), (55.0, -pulse, 0.35, 0.25)):
-            k_u, k_v = (np.float32(2 * np.pi / wavelength_mm * component) for component in direction)
-            angle = k_u * u + k_v * v + np.float32(phase)
+            wave_u, wave_v = (np.float32(2 * np.pi / wavelength_mm * component) for component in direction)
+            angle = wave_u * u + wave_v * v + np.float32(phase)
             sine, cosine = np.sin(angle), np.cos(angle)
             lift, shear = np.float32(lift_mm), np.float32(shear_mm)
-            z, z_u, z_v = z + lift * sine, z_u + lift * k_u * cosine, z_v + lift * k_v * cosine
+            z, z_u, z_v = z + lift * sine, z_u + lift * wave_u * cosine, z_v + lift * wave_v * cosine
             for axis, component in enumerate(direction):
                 part = shear * np.float32(component)
                 if axis == 0:
-                    x, x_u, x_v = x + part * cosine, x_u - part * k_u * sine, x_v - part * k_v * sine
+                    x, x_u, x_v = x + part * cosine, x_u - part * wave_u * sine, x_v - part * wave_v * sine
                 else:
-                    y, y_u, y_v = y + part * cosine, y_u - part * k_u * sine, y_v - part * k_v * sine
+                    y, y_u, y_v = y + part * cosine, y_u - part * wave_u * sine, y_v - part * wave_v * sine
 
         # The tug.
         inverse = np.float32(1 / TUG_RADIUS_MM**2)
@@ -101,7 +99,8 @@ class Tissue:
             (x_v + p_x * w_v, y_v + p_y * w_v, z_v + p_z * w_v),
         )
 
-    def position(self, u: float, v: float, time_s: float, tug: Tug) -> NDArray[np.float64]:
-        """One material point [3]."""
+    def position(self, point: tuple[float, float], time_s: float, tug: Tug) -> NDArray[np.float64]:
+        """Where one material point (u, v) is [3]."""
+        u, v = point
         points = self.points(np.array([u], np.float32), np.array([v], np.float32), time_s, tug)
         return np.array([float(component[0]) for component in points.position])

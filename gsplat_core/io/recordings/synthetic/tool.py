@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 
-Array = NDArray[np.float32]
+Array = NDArray[np.floating]
 
 PORT_MM = np.array([58.0, 44.0, 8.0])
 """Where the shaft enters: to the lower right, beside the scope."""
@@ -20,6 +20,9 @@ CYCLE_S = 2.4
 HOVER_MM = 13.0
 TRACE_STEPS = 56
 HIT_MM = 2e-3
+NEAREST_MM = 4.0
+HULL_RADIUS_MM = 7.0
+"""Around the shaft's axis: the open jaws, and a margin so that what only grazes a pixel is measured too."""
 
 
 @dataclass(frozen=True)
@@ -65,18 +68,17 @@ class ToolMotion:
         cycle, phase = self._phase(time_s)
         strength = np.sin(np.pi * np.clip((phase - 0.25) / 0.5, 0, 1)) ** 2
         pull = self._pulls[cycle] * strength
-        grasp = self._grasps[cycle]
-        return Tug((float(grasp[0]), float(grasp[1])), (float(pull[0]), float(pull[1]), float(pull[2])))
+        return Tug(self._grasp(cycle), (float(pull[0]), float(pull[1]), float(pull[2])))
 
     def parts(self, tissue: Tissue, time_s: float) -> list[Part]:
         """The tool's parts in world millimetres. While it tugs, its tip holds the grasped material point."""
         cycle, phase = self._phase(time_s)
         tug = self.tug(time_s)
-        held = tissue.position(*tug.grasp, time_s, tug)
+        held = tissue.position(tug.grasp, time_s, tug)
         away = _smooth(1 - phase / 0.25) if phase < 0.25 else _smooth((phase - 0.75) / 0.25)
         if phase > 0.75:  # on the way to the next grasp
-            after = self._grasps[cycle + 1]
-            held = held + _smooth((phase - 0.75) / 0.25) * (tissue.position(*after, time_s, tug) - held)
+            after = tissue.position(self._grasp(cycle + 1), time_s, tug)
+            held = held + _smooth((phase - 0.75) / 0.25) * (after - held)
         back = PORT_MM - held
         back /= np.linalg.norm(back)
         tip = held + back * HOVER_MM * away + np.array([0, 0, -0.4])
@@ -102,6 +104,9 @@ class ToolMotion:
             Part(collar, PORT_MM + 20 * axis, 4.0, 4.0, SHAFT),
         ]
 
+    def _grasp(self, cycle: int) -> tuple[float, float]:
+        return float(self._grasps[cycle, 0]), float(self._grasps[cycle, 1])
+
     def _phase(self, time_s: float) -> tuple[int, float]:
         cycle = int(time_s // CYCLE_S)
         return cycle, time_s / CYCLE_S - cycle
@@ -113,20 +118,22 @@ def _smooth(x: float) -> float:
 
 
 def distance(parts: list[Part], points: Array) -> tuple[Array, NDArray[np.int8]]:
-    """Distance of points [N, 3] to the tool (never more than the true one), and the nearest part."""
+    """Distance of points [N, 3] to the tool (a little less than the true one where a part tapers), and the nearest part."""
+    x, y, z = np.ascontiguousarray(points.T)
     nearest = np.full(len(points), np.inf, np.float32)
     which = np.zeros(len(points), np.int8)
     for index, part in enumerate(parts):
-        along = (part.b - part.a).astype(np.float32)
-        offset = points - part.a.astype(np.float32)
-        length2 = float(along @ along)
-        h = np.clip(offset @ (along / np.float32(length2)), 0, 1)
-        taper = part.radius_b_mm - part.radius_a_mm
-        squared = np.einsum("ni,ni->n", offset, offset) - 2 * h * (offset @ along) + h * h * np.float32(length2)
-        gap = np.sqrt(np.maximum(squared, 0)) - np.float32(part.radius_a_mm) - np.float32(taper) * h
-        closer = gap < nearest
-        nearest[closer] = gap[closer]
-        which[closer] = index
+        a_x, a_y, a_z = part.a.astype(np.float32)
+        b_x, b_y, b_z = (part.b - part.a).astype(np.float32)
+        length2 = b_x * b_x + b_y * b_y + b_z * b_z
+        p_x, p_y, p_z = x - a_x, y - a_y, z - a_z
+        dot = p_x * b_x + p_y * b_y + p_z * b_z
+        h = np.clip(dot / length2, 0, 1)
+        squared = p_x * p_x + p_y * p_y + p_z * p_z - h * (2 * dot - h * length2)
+        taper = np.float32(part.radius_b_mm - part.radius_a_mm)
+        gap = np.sqrt(np.maximum(squared, 0)) - np.float32(part.radius_a_mm) - taper * h
+        which[gap < nearest] = index
+        nearest = np.minimum(nearest, gap)
     return nearest, which
 
 
@@ -139,28 +146,29 @@ def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm:
     start = origin.astype(np.float32)
     travelled = np.full(count, np.inf, np.float32)
     closest = np.full(count, np.inf, np.float32)
-    hit = np.zeros(count, bool)
-    material = np.zeros(count, np.int8)
-    active = np.arange(count)
-    s = np.full(count, 4.0, np.float32)
+    reach = np.zeros(count, np.float32)
+    active = may_meet(parts, start, rays)
+    s = np.full(len(active), NEAREST_MM, np.float32)
     for _ in range(TRACE_STEPS):
         gap, _ = distance(parts, start + rays[active] * s[:, None])
-        closest[active] = np.minimum(closest[active], gap / (s * np.float32(pixel_rad)))
+        passing = gap / (s * np.float32(pixel_rad))
+        closer = passing < closest[active]
+        closest[active[closer]], reach[active[closer]] = passing[closer], s[closer]
         touched = gap < HIT_MM
-        hit[active[touched]] = True
         travelled[active[touched]] = s[touched]
         s = s + np.float32(0.97) * gap
         alive = ~touched & (s < limit_mm[active])
         active, s = active[alive], s[alive]
         if not active.size:
             break
+    hit = np.isfinite(travelled)
     cover = np.where(hit, np.float32(1), np.clip(np.float32(0.75) - closest, 0, 1)).astype(np.float32)
     touching = np.flatnonzero(cover > 0)
     normal = np.zeros((count, 3), np.float32)
+    material = np.zeros(count, np.int8)
     if touching.size:
-        # A ray that only grazes is shaded where it comes closest, near enough to the silhouette of a hit beside it.
-        reach = np.where(hit[touching], travelled[touching], _closest_approach(parts, start, rays[touching]))
-        at = start + rays[touching] * reach[:, None]
+        # A ray that only grazes is shaded where it comes closest.
+        at = start + rays[touching] * reach[touching][:, None]
         which = distance(parts, at)[1]
         material[touching] = np.array([part.material for part in parts], np.int8)[which]
         for index, part in enumerate(parts):
@@ -173,16 +181,16 @@ def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm:
     return ToolHits(travelled, cover, normal, material)
 
 
-def _closest_approach(parts: list[Part], start: Array, rays: Array) -> Array:
-    """Distance along each ray at which it comes closest to the axis of the part that it passes nearest."""
-    best = np.full(len(rays), np.inf, np.float32)
-    reach = np.full(len(rays), 10.0, np.float32)
-    for part in parts:
-        for weight in np.linspace(0, 1, 24):
-            radius = part.radius_a_mm + weight * (part.radius_b_mm - part.radius_a_mm)
-            point = (part.a + weight * (part.b - part.a)).astype(np.float32) - start
-            s = np.maximum(rays @ point, np.float32(4.0))
-            gap = np.linalg.norm(point - rays * s[:, None], axis=1) - np.float32(radius)
-            closer = gap < best
-            best[closer], reach[closer] = gap[closer], s[closer]
-    return reach
+def may_meet(parts: list[Part], start: Array, rays: Array) -> NDArray[np.intp]:
+    """The rays that pass near the tool: those that meet one of a chain of spheres around it."""
+    shaft = parts[-1]
+    axis = (shaft.a - shaft.b) / np.linalg.norm(shaft.a - shaft.b)
+    tip = max(float((part.b - shaft.a) @ axis) for part in parts)
+    count = 32
+    spacing = (np.linalg.norm(shaft.a - shaft.b) + tip) / (count - 1)
+    centres = shaft.b + np.linspace(0, (count - 1) * spacing, count)[:, None] * axis - start
+    radius = float(np.hypot(HULL_RADIUS_MM, spacing / 2))
+    away = np.linalg.norm(centres, axis=1)
+    cosine = np.where(away > radius, np.sqrt(np.maximum(1 - (radius / away) ** 2, 0)), -1)
+    towards = (centres / away[:, None]).astype(np.float32)
+    return np.flatnonzero((rays @ towards.T > cosine.astype(np.float32)).any(axis=1))

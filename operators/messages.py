@@ -1,0 +1,81 @@
+"""What travels on the edges of the graph besides `Frame`: each step keeps the frame it belongs to and adds its own result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.cameras import Camera
+from gsplat_core.errors import InvalidInput
+from gsplat_core.frames import Frame
+from gsplat_core.gaussians import Gaussians
+from gsplat_core.model import Model
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A frame and the model as it stands right after that frame's own training steps."""
+
+    frame: Frame
+    model: Model
+    """Immutable; later steps publish later versions and never change this one."""
+    trained: bool
+    """False for a held-out frame: it is shown and scored, and no step has seen it."""
+    steps: int = 0
+    """Optimiser steps that the frame was given."""
+    loss: float | None = None
+    """Loss of the last of these steps; None when there was none."""
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise InvalidInput(f"frame {self.frame.seq}: steps is {self.steps}; it must not be negative")
+        if not self.trained and self.steps:
+            raise InvalidInput(
+                f"frame {self.frame.seq}: a held-out frame had {self.steps} training steps; it must have none"
+            )
+
+
+@dataclass(frozen=True)
+class DeformedScene:
+    """The Gaussians at a frame's time, and the camera that saw the frame."""
+
+    frame: Frame
+    gaussians: Gaussians
+    camera: Camera
+    model_version: int
+    trained: bool
+
+    def __post_init__(self) -> None:
+        if (self.camera.width_px, self.camera.height_px) != (self.frame.width_px, self.frame.height_px):
+            raise InvalidInput(
+                f"frame {self.frame.seq} is {self.frame.width_px}x{self.frame.height_px} px, its camera "
+                f"{self.camera.width_px}x{self.camera.height_px}; scale the camera with Camera.scaled"
+            )
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """A frame beside its reconstruction, ready to be shown."""
+
+    frame: Frame
+    image: NDArray[np.uint8]
+    """RGB uint8 [H, W, 3], as displayed."""
+    depth: NDArray[np.float32]
+    """z in millimetres (or the recording's unit) [H, W]; 0 = nothing there."""
+    alpha: NDArray[np.float32]
+    """Opacity 0..1 [H, W]."""
+    model_version: int
+    trained: bool
+
+    def __post_init__(self) -> None:
+        size = self.frame.image.shape
+        if self.image.shape != size or self.image.dtype != np.uint8:
+            raise InvalidInput(
+                f"frame {self.frame.seq}: the reconstruction must be RGB uint8 {list(size)}, "
+                f"got {self.image.dtype} {list(self.image.shape)}"
+            )
+        for name, plane in (("depth", self.depth), ("alpha", self.alpha)):
+            if plane.shape != size[:2]:
+                raise InvalidInput(f"frame {self.frame.seq}: {name} is {list(plane.shape)}, the image {list(size[:2])}")

@@ -1,0 +1,93 @@
+"""How good each displayed frame is, and which bytes were displayed."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from gsplat_core.frames import Frame
+from gsplat_core.training.metrics import FrameQuality, QualityTracker, psnr_tissue_db
+from operators.graph import Operator, OperatorSpec
+from operators.messages import RenderedFrame
+
+
+@dataclass(frozen=True)
+class ScoredFrame:
+    """A displayed frame and its quality."""
+
+    rendered: RenderedFrame
+    quality: FrameQuality
+    previous_frame_db: float
+    """Tissue PSNR of showing the raw frame before it instead: what doing nothing scores. NaN for the first frame."""
+
+    def as_json(self) -> dict[str, float | int | bool | None]:
+        """One entry of the report's series; null where a measure does not exist."""
+        frame = self.rendered.frame
+        measures = {
+            "psnr_tissue_db": self.quality.psnr_tissue_db,
+            "psnr_frame_db": self.quality.psnr_frame_db,
+            "ssim": self.quality.ssim,
+            "previous_frame_db": self.previous_frame_db,
+        }
+        return {
+            "seq": frame.seq,
+            "time_s": frame.time_s,
+            "trained": self.rendered.trained,
+            "model_version": self.rendered.model_version,
+            **{name: value if math.isfinite(value) else None for name, value in measures.items()},
+        }
+
+
+class MetricsOp(Operator):
+    """Scores each displayed frame against its raw frame, over tissue, and takes a digest of the bytes that were displayed.
+
+    The digest is SHA-256 over, for each frame in order, the line `seq width height\\n` and the RGB bytes of the reconstruction.
+
+    Inputs:
+        rendered: `RenderedFrame`.
+
+    Outputs:
+        scored: `ScoredFrame`.
+    """
+
+    def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
+        self.live = QualityTracker()
+        """Frames that were trained on before they were shown."""
+        self.held_out = QualityTracker()
+        """Frames that were shown and never trained on."""
+        self.series: list[dict[str, float | int | bool | None]] = []
+        """One entry per displayed frame, in order."""
+        self._digest = hashlib.sha256()
+        self._previous: Frame | None = None
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("rendered", type=RenderedFrame)
+        spec.output("scored", type=ScoredFrame)
+
+    def start(self) -> None:
+        self.live, self.held_out = QualityTracker(), QualityTracker()
+        self.series = []
+        self._digest = hashlib.sha256()
+        self._previous = None
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        rendered: RenderedFrame = op_input.receive("rendered")
+        frame, previous = rendered.frame, self._previous
+        self._digest.update(f"{frame.seq} {frame.width_px} {frame.height_px}\n".encode())
+        self._digest.update(rendered.image.tobytes())
+        tracker = self.live if rendered.trained else self.held_out
+        quality = tracker.observe(frame.seq, rendered.image, frame.image, frame.mask)
+        comparable = previous is not None and previous.image.shape == frame.image.shape
+        before_db = psnr_tissue_db(previous.image, frame.image, frame.mask) if comparable and previous else math.nan
+        scored = ScoredFrame(rendered, quality, before_db)
+        self.series.append(scored.as_json())
+        self._previous = frame
+        op_output.emit(scored, "scored")
+
+    @property
+    def frames_sha256(self) -> str:
+        """The digest so far, in hex."""
+        return self._digest.hexdigest()

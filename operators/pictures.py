@@ -1,0 +1,80 @@
+"""Pictures for people: a frame beside its reconstruction, the error between them, depth as colour."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.messages import RenderedFrame
+
+MINIMUM_PANE_WIDTH_PX = 320
+"""A smaller recording is enlarged by a whole factor, so that its caption fits."""
+CAPTION_HEIGHT_PX = 26
+ERROR_FULL_SCALE = 32
+"""Mean absolute difference of RGB, of 255, that is drawn at the bright end of the error colours."""
+
+_BACKGROUND = (17, 20, 24)
+_TEXT = (232, 236, 240)
+_HELD_OUT = (255, 196, 87)
+
+
+def side_by_side(rendered: RenderedFrame) -> NDArray[np.uint8]:
+    """Raw | reconstruction, RGB uint8, with frame number, time and model version in a caption above, never on the tissue."""
+    frame = rendered.frame
+    zoom = -(-MINIMUM_PANE_WIDTH_PX // frame.width_px) if frame.width_px < MINIMUM_PANE_WIDTH_PX else 1
+    panes = np.concatenate([frame.image, rendered.image], axis=1)
+    if zoom > 1:
+        panes = panes.repeat(zoom, axis=0).repeat(zoom, axis=1)
+    canvas = np.empty((CAPTION_HEIGHT_PX + panes.shape[0], panes.shape[1], 3), np.uint8)
+    canvas[:CAPTION_HEIGHT_PX] = _BACKGROUND
+    canvas[CAPTION_HEIGHT_PX:] = panes
+    middle = panes.shape[1] // 2
+    _caption(canvas, 8, f"{frame.status.value}  frame {frame.seq}  {frame.time_s:.2f} s")
+    right = f"reconstruction  model {rendered.model_version}"
+    if not rendered.trained:
+        right += "  held out"
+    _caption(canvas, middle + 8, right, _TEXT if rendered.trained else _HELD_OUT)
+    canvas[:, middle - 1 : middle + 1] = _BACKGROUND
+    return canvas
+
+
+def _caption(canvas: NDArray[np.uint8], x: int, text: str, colour: tuple[int, int, int] = _TEXT) -> None:
+    cv2.putText(canvas, text, (x, CAPTION_HEIGHT_PX - 9), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+
+
+def error_map(rendered: RenderedFrame) -> NDArray[np.uint8]:
+    """Absolute difference to the raw frame as colour (dark = equal), RGB uint8 [H, W, 3]; tool pixels, which do not count, are grey."""
+    difference = np.abs(rendered.image.astype(np.int16) - rendered.frame.image).mean(axis=2)
+    level = np.clip(difference * (255 / ERROR_FULL_SCALE), 0, 255).astype(np.uint8)
+    colours = _coloured(level, cv2.COLORMAP_INFERNO)
+    if rendered.frame.mask is not None:
+        colours[rendered.frame.mask == 0] = (70, 74, 80)
+    return colours
+
+
+def depth_map(rendered: RenderedFrame) -> NDArray[np.uint8]:
+    """Depth as colour (bright = near) between its 2nd and 98th percentile, RGB uint8 [H, W, 3]; unknown is grey."""
+    depth = rendered.depth
+    known = (depth > 0) & np.isfinite(depth) & (rendered.alpha > 0.5)
+    colours = np.full((*depth.shape, 3), (70, 74, 80), np.uint8)
+    if known.any():
+        near, far = np.percentile(depth[known], (2, 98))
+        # A flat scene has no range of its own: without this floor its rounding noise would be drawn as relief.
+        span = max(float(far - near), 1e-3 * float(far))
+        level = np.clip(0.5 + ((near + far) / 2 - np.where(known, depth, far)) / span, 0, 1)
+        colours[known] = _coloured((level * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[known]
+    return colours
+
+
+def depth_range(rendered: RenderedFrame) -> tuple[float, float] | None:
+    """The depths that `depth_map` draws brightest and darkest; None where nothing is known."""
+    known = rendered.depth[(rendered.depth > 0) & np.isfinite(rendered.depth) & (rendered.alpha > 0.5)]
+    if known.size == 0:
+        return None
+    near, far = np.percentile(known, (2, 98))
+    return float(near), float(far)
+
+
+def _coloured(level: NDArray[np.uint8], colour_map: int) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(cv2.applyColorMap(level, colour_map)[..., ::-1])

@@ -1,0 +1,49 @@
+"""From Gaussians to a picture at the frame's camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsplat_core.rendering import render
+from operators.graph import Operator, OperatorSpec
+from operators.messages import DeformedScene, RenderedFrame
+
+
+def displayed(image: torch.Tensor) -> NDArray[np.uint8]:
+    """A float image [H, W, 3] in 0..1 as it is displayed: RGB uint8, clipped and rounded to nearest."""
+    return (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+class RasterizeOp(Operator):
+    """Renders colour, depth and opacity.
+
+    Inputs:
+        scene: `DeformedScene`.
+
+    Outputs:
+        rendered: `RenderedFrame`.
+    """
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("scene", type=DeformedScene)
+        spec.output("rendered", type=RenderedFrame)
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        scene: DeformedScene = op_input.receive("scene")
+        with torch.inference_mode():
+            output = render(scene.gaussians, scene.camera)
+        op_output.emit(
+            RenderedFrame(
+                frame=scene.frame,
+                image=displayed(output.image),
+                depth=output.depth.cpu().numpy(),
+                alpha=output.alpha.cpu().numpy(),
+                model_version=scene.model_version,
+                trained=scene.trained,
+            ),
+            "rendered",
+        )

@@ -1,0 +1,72 @@
+"""Online reconstruction: the operator that owns the model and trains it as frames arrive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from gsplat_core.frames import Frame
+from gsplat_core.model import Model
+from gsplat_core.training.reconstructor import Reconstructor
+from operators.graph import Operator, OperatorSpec
+from operators.messages import Reconstruction
+
+
+def never_held_out(frame: Frame) -> bool:
+    """Every frame is trained on."""
+    return False
+
+
+class ReconstructOp(Operator):
+    """Trains on each frame and publishes the model right after, so that what is shown has seen the frame it shows.
+
+    Inputs:
+        frame: `Frame`.
+
+    Outputs:
+        reconstruction: `Reconstruction` with an immutable snapshot.
+
+    Params:
+        make_reconstructor: called in `start()`; what it returns is owned by this operator alone.
+        held_out: frames for which it answers True are passed on with the newest model and never trained on.
+    """
+
+    def __init__(
+        self,
+        fragment: Any,
+        *args: Any,
+        make_reconstructor: Callable[[], Reconstructor],
+        held_out: Callable[[Frame], bool] = never_held_out,
+        **kwargs: Any,
+    ) -> None:
+        self.make_reconstructor = make_reconstructor
+        self.held_out = held_out
+        self.model: Model | None = None
+        """The newest published snapshot."""
+        self._reconstructor: Reconstructor | None = None
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("frame", type=Frame)
+        spec.output("reconstruction", type=Reconstruction)
+
+    def start(self) -> None:
+        self._reconstructor = self.make_reconstructor()
+        self.model = None
+
+    def stop(self) -> None:
+        # The optimiser's state goes; the last snapshot stays for whoever saves it.
+        self._reconstructor = None
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        assert self._reconstructor is not None
+        frame = op_input.receive("frame")
+        # Without a first frame there is no model that a held-out one could be shown with.
+        train = self.model is None or not self.held_out(frame)
+        report = self._reconstructor.observe(frame, train=train)
+        # A held-out frame changes no parameter, but the model's time window now reaches it.
+        self.model = self._reconstructor.snapshot()
+        op_output.emit(
+            Reconstruction(frame, self.model, trained=train, steps=report.steps, loss=report.loss),
+            "reconstruction",
+        )

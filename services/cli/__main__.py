@@ -1,0 +1,5 @@
+"""`python -m services.cli` is the `intrasplat` command."""
+
+from services.cli import main
+
+main()

@@ -1,0 +1,183 @@
+"""The commands of `intrasplat` and their options. What a command needs is imported when it runs."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
+
+# Wrong options and their like. Where the class lives has changed between releases of typer; what derives from it has not.
+_USAGE_ERRORS: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
+
+app = typer.Typer(
+    name="intrasplat",
+    help="Live, deforming 3D reconstruction from endoscopic video. Research use only, not a medical device.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+RecordingArgument = Annotated[
+    Path, typer.Argument(help="A video, or a folder with video.mp4, images/ or cameras.json.", show_default=False)
+]
+OutOption = Annotated[
+    Path,
+    typer.Option("--out", help="Folder for the results: new, empty, or left by an earlier run.", show_default=False),
+]
+DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
+FieldOption = Annotated[str, typer.Option(help="Deformation field: auto, basis or hexplane.")]
+SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
+ScaleOption = Annotated[float, typer.Option(help="Resize the frames by this factor.")]
+MaxFramesOption = Annotated[int | None, typer.Option(help="Stop after this many frames.", show_default=False)]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout, and nothing else.")]
+
+
+def run(arguments: list[str]) -> int:
+    """Run a command line; returns the exit code. Every error ends here."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        code = typer.main.get_command(app).main(arguments, prog_name="intrasplat", standalone_mode=False)
+    except typer.Abort:
+        return INTERRUPTED
+    except _USAGE_ERRORS as error:
+        error.show()
+        return BAD_INPUT
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the one place where errors become exit codes
+        return exit_code_of(error)
+    return code if isinstance(code, int) else OK
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from services.version import product_version
+
+        typer.echo(f"intrasplat {product_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def replay(
+    recording: RecordingArgument,
+    out: OutOption,
+    device: DeviceOption = "cpu",
+    engine: Annotated[str, typer.Option(help="Graph engine: embedded or holoscan.")] = "embedded",
+    field: FieldOption = "auto",
+    seed: SeedOption = 0,
+    steps_per_frame: Annotated[
+        int | None, typer.Option(help="Optimiser steps per frame.", show_default="the field's")
+    ] = None,
+    max_frames: MaxFramesOption = None,
+    scale: ScaleOption = 1.0,
+    heldout: Annotated[
+        bool,
+        typer.Option(
+            "--heldout/--no-heldout", help="Show frames 1, 9, 17, ... without training on them, and score them apart."
+        ),
+    ] = False,
+    json: JsonOption = False,
+) -> int:
+    """Reconstruct a recording as if it were live: train on each frame as it comes, show it, measure it."""
+    from operators.applications.replay import ReplaySettings
+    from services.cli.replay import replay_command
+
+    settings = ReplaySettings(
+        recording=recording,
+        out=out,
+        device=device,
+        engine=engine,  # type: ignore[arg-type]
+        field=field,  # type: ignore[arg-type]
+        seed=seed,
+        steps_per_frame=steps_per_frame,
+        max_frames=max_frames,
+        scale=scale,
+        heldout=heldout,
+    )
+    return replay_command(settings, as_json=json)
+
+
+@app.command()
+def reconstruct(
+    recording: RecordingArgument,
+    out: OutOption,
+    device: DeviceOption = "cpu",
+    field: FieldOption = "auto",
+    seed: SeedOption = 0,
+    steps: Annotated[int, typer.Option(help="Optimiser steps over all training frames.")] = 2000,
+    max_frames: MaxFramesOption = None,
+    scale: ScaleOption = 1.0,
+    json: JsonOption = False,
+) -> int:
+    """Reconstruct offline: train on all training frames, then evaluate the held-out ones."""
+    from operators.applications.replay import ReplaySettings
+    from services.cli.reconstruct import reconstruct_command
+
+    settings = ReplaySettings(
+        recording=recording,
+        out=out,
+        device=device,
+        field=field,  # type: ignore[arg-type]
+        seed=seed,
+        max_frames=max_frames,
+        scale=scale,
+    )
+    return reconstruct_command(settings, steps, as_json=json)
+
+
+@app.command()
+def render(
+    model: Annotated[Path, typer.Argument(help="A model folder that replay or reconstruct wrote.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="A video (name.mp4) or a folder of images.", show_default=False)],
+    fps: Annotated[float, typer.Option(help="Frames per second of the model's time.")] = 30.0,
+    scale: ScaleOption = 1.0,
+    json: JsonOption = False,
+) -> int:
+    """Render a model over its time window to a video or to images."""
+    from services.cli.render import render_command
+
+    return render_command(model, out, fps, scale, as_json=json)
+
+
+@app.command()
+def synthesize(
+    out: OutOption,
+    frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
+    width: Annotated[int, typer.Option(help="Width in pixels.")] = 320,
+    height: Annotated[int, typer.Option(help="Height in pixels.")] = 256,
+    fps: Annotated[float, typer.Option(help="Frames per second.")] = 30.0,
+    seed: SeedOption = 0,
+    moving_camera: Annotated[bool, typer.Option("--moving-camera/--fixed-camera", help="Let the scope move.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Make a recording with exact ground truth: tissue, tool, stereo, depth, masks, poses."""
+    from services.cli.synthesize import synthesize_command
+
+    return synthesize_command(out, frames, width, height, fps, seed, moving_camera, as_json=json)
+
+
+@app.command()
+def validate(recording: RecordingArgument, json: JsonOption = False) -> int:
+    """Read a recording from the first frame to the last and say what is wrong with it."""
+    from services.cli.validate import validate_command
+
+    return validate_command(recording, as_json=json)
+
+
+@app.command()
+def doctor(json: JsonOption = False) -> int:
+    """Say what this machine has, what is missing, and what to do about it."""
+    from services.cli.doctor import doctor_command
+
+    return doctor_command(as_json=json)

@@ -1,0 +1,170 @@
+"""`intrasplat doctor`: what this machine has, what is missing, what to do about it."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import platform
+import sys
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+
+import typer
+
+from services.cli.exit_codes import BAD_INPUT, OK
+from services.version import product_version
+
+PACKAGES = (
+    "torch",
+    "numpy",
+    "opencv-contrib-python-headless",
+    "safetensors",
+    "typer",
+    "rich",
+    "pydantic",
+    "pyzmq",
+    "fastapi",
+)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at."""
+
+    name: str
+    value: str
+    ok: bool = True
+    advice: str = ""
+    """What to do when it is not ok, or what would be better."""
+    needed: bool = True
+    """Whether the program works without it."""
+
+
+def doctor_command(*, as_json: bool) -> int:
+    """Print all checks; 2 when something that is needed is missing."""
+    checks = [*_versions(), *_processor(), *_core(), *_graphics(), *_video(), *_holoscan()]
+    broken = [check for check in checks if check.needed and not check.ok]
+    if as_json:
+        typer.echo(json.dumps({"ok": not broken, "checks": [asdict(check) for check in checks]}, indent=2))
+        return BAD_INPUT if broken else OK
+    width = max(len(check.name) for check in checks)
+    for check in checks:
+        mark = "ok" if check.ok else "MISSING" if check.needed else "-"
+        typer.echo(f"{mark:8}{check.name:{width}}  {check.value}")
+        if check.advice:
+            typer.echo(f"{'':{8 + width}}  -> {check.advice}")
+    typer.echo("everything that is needed is here" if not broken else f"{len(broken)} things are missing")
+    return BAD_INPUT if broken else OK
+
+
+def _versions() -> list[Check]:
+    checks = [
+        Check("intrasplat", product_version()),
+        Check(
+            "Python",
+            f"{platform.python_version()} ({sys.executable})",
+            sys.version_info >= (3, 11),
+            "" if sys.version_info >= (3, 11) else "install Python 3.11 or later",
+        ),
+        Check("system", f"{platform.system()} {platform.release()} {platform.machine()}"),
+    ]
+    for name in PACKAGES:
+        try:
+            checks.append(Check(name, version(name)))
+        except PackageNotFoundError:
+            checks.append(Check(name, "not installed", False, f"pip install {name}"))
+    return checks
+
+
+def _processor() -> list[Check]:
+    import torch
+
+    from services.reports.machine import processor_name, usable_cores
+
+    threads, cores = torch.get_num_threads(), usable_cores()
+    advice = "" if threads <= cores else f"set OMP_NUM_THREADS={cores}: more threads than cores slow each other down"
+    return [
+        Check("processor", f"{processor_name()}, {cores} usable cores"),
+        Check("vectors of the processor", torch.backends.cpu.get_cpu_capability()),
+        Check("threads", f"{threads} (OMP_NUM_THREADS={os.environ.get('OMP_NUM_THREADS', 'not set')})", advice=advice),
+    ]
+
+
+def _core() -> list[Check]:
+    import torch
+
+    from gsplat_core.errors import NativeLibraryMissing
+
+    try:
+        from gsplat_core.ops.native import LIBRARY_PATH, instruction_set
+    except NativeLibraryMissing as error:
+        return [Check("compiled core", "missing", False, str(error))]
+    names = sorted(
+        name.removeprefix("gsplat_core::")
+        for name in torch._C._dispatch_get_all_op_names()
+        if name.startswith("gsplat_core::")
+    )
+    where: dict[str, list[str]] = {"CPU": [], "CUDA": []}
+    for name in names:
+        for key, found in where.items():
+            if torch._C._dispatch_has_kernel_for_dispatch_key(f"gsplat_core::{name}", key):
+                found.append(name)
+    return [
+        Check("compiled core", str(LIBRARY_PATH)),
+        Check("instruction set in use", instruction_set()),
+        Check("ops on the CPU", f"{len(where['CPU'])}: {', '.join(where['CPU'])}"),
+        Check(
+            "ops on the GPU",
+            ", ".join(where["CUDA"]) or "none in this version",
+            bool(where["CUDA"]),
+            "" if where["CUDA"] else "everything runs on the CPU; use --device cpu",
+            needed=False,
+        ),
+    ]
+
+
+def _graphics() -> list[Check]:
+    import torch
+
+    if torch.cuda.is_available():
+        names = ", ".join(torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count()))
+        return [Check("GPU", names, needed=False)]
+    built = f"torch was built for CUDA {torch.version.cuda}" if torch.version.cuda else "this torch has no CUDA"
+    return [
+        Check(
+            "GPU",
+            f"none seen ({built})",
+            False,
+            "not needed; to use one: an NVIDIA driver on this machine, and in a container `--gpus all`",
+            needed=False,
+        )
+    ]
+
+
+def _video() -> list[Check]:
+    import tempfile
+    from pathlib import Path
+
+    import cv2
+    import numpy as np
+
+    from operators.errors import OutputError
+    from operators.video_file import CODEC, VideoFile
+
+    try:
+        with tempfile.TemporaryDirectory() as folder, VideoFile(Path(folder) / "probe.mp4", 64, 48, 30.0) as video:
+            video.write(np.zeros((48, 64, 3), np.uint8))
+    except OutputError as error:
+        return [Check("video", "cannot be written", False, str(error))]
+    return [Check("video", f"OpenCV {cv2.__version__} writes {CODEC}")]
+
+
+def _holoscan() -> list[Check]:
+    if importlib.util.find_spec("holoscan") is None:
+        return [
+            Check(
+                "Holoscan engine", "not installed", False, "optional: pip install 'intrasplat[holoscan]'", needed=False
+            )
+        ]
+    return [Check("Holoscan engine", version("holoscan-cu13"), needed=False)]

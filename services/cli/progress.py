@@ -1,0 +1,91 @@
+"""Progress of a run: a live bar on a terminal, plain lines anywhere else; always on stderr, so that stdout is the result's alone."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+    from rich.progress import TaskID
+
+    from operators.applications.progress import Progress
+
+PLAIN_PERIOD_S = 5.0
+
+
+class ProgressPrinter:
+    """Shows `Progress` events; use as a context manager."""
+
+    def __init__(self, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._terminal = not quiet and sys.stderr.isatty()
+        self._stage = ""
+        self._began_s = self._printed_s = 0.0
+        self._bar: Bar | None = None
+        self._task: TaskID | None = None
+
+    def __enter__(self) -> ProgressPrinter:
+        if self._terminal:
+            from rich.console import Console
+            from rich.progress import (
+                BarColumn,
+                MofNCompleteColumn,
+                Progress,
+                TextColumn,
+                TimeElapsedColumn,
+                TimeRemainingColumn,
+            )
+
+            self._bar = Progress(
+                TextColumn("[bold]{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[rate]}"),
+                TextColumn("[cyan]{task.fields[quality]}"),
+                TimeElapsedColumn(),
+                TextColumn("eta"),
+                TimeRemainingColumn(),
+                console=Console(stderr=True),
+            )
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, progress: Progress) -> None:
+        """Take one event."""
+        if self._quiet:
+            return
+        now_s = time.monotonic()
+        first = progress.stage != self._stage
+        if first:
+            self._stage, self._began_s, self._printed_s = progress.stage, now_s, now_s
+        elapsed_s = now_s - self._began_s
+        rate = progress.done / elapsed_s if elapsed_s > 0 else 0.0
+        quality = "" if progress.psnr_tissue_db is None else f"{progress.psnr_tissue_db:.2f} dB"
+        rate_text = f"{rate:.1f} {progress.unit}/s" if rate else ""
+        if self._bar is not None:
+            if first:
+                self._task = self._bar.add_task(progress.stage, total=progress.total, rate="", quality="")
+            assert self._task is not None
+            self._bar.update(self._task, completed=progress.done, rate=rate_text, quality=quality)
+            return
+        finished = progress.done == progress.total
+        if not (first or finished or now_s - self._printed_s >= PLAIN_PERIOD_S):
+            return
+        self._printed_s = now_s
+        parts = [f"{progress.stage} {progress.done}/{progress.total}"]
+        if rate and not first:
+            parts.append(rate_text)
+            if not finished:
+                parts.append(f"eta {(progress.total - progress.done) / rate:.0f} s")
+        if quality:
+            parts.append(quality)
+        print("  ".join(parts), file=sys.stderr, flush=True)  # noqa: T201

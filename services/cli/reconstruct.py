@@ -1,0 +1,14 @@
+"""`intrasplat reconstruct`."""
+
+from __future__ import annotations
+
+from operators.applications.reconstruct import reconstruct
+from operators.applications.replay import ReplaySettings
+from services.cli.runs import report_run
+
+
+def reconstruct_command(settings: ReplaySettings, steps: int, *, as_json: bool) -> int:
+    """Reconstruct offline, write the reports, print where they are; returns the exit code."""
+    return report_run(
+        lambda progress, stop: reconstruct(settings, steps, progress, stop), settings.out, as_json=as_json
+    )

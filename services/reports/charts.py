@@ -1,0 +1,159 @@
+"""Charts as inline SVG, without a library: lines over time and distribution curves. Colours come from the page's CSS classes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+HEIGHT = 290
+WIDE, NARROW = 1068, 500
+"""Widths in CSS pixels of the places that a chart may have, so that its text is as large as the page's."""
+LEFT, RIGHT, TOP, BOTTOM = 56, 16, 14, 44
+
+
+@dataclass(frozen=True)
+class Line:
+    """One curve. A None in `y` is a gap."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float | None]
+    style: str
+    """CSS class: `main`, `base`, `second`, `third`."""
+    marks: bool = False
+    """Draw the points alone, without a line between them."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A titled chart with its lines and axes."""
+
+    title: str
+    description: str
+    """What a reader who cannot see the chart should know."""
+    x_label: str
+    y_label: str
+    lines: tuple[Line, ...]
+    x_unit: str = ""
+    y_unit: str = ""
+    y_range: tuple[float, float] | None = None
+    x_log: bool = False
+    width: int = WIDE
+
+    def svg(self) -> str:
+        """The chart as one `<svg>` element with a text alternative."""
+        x_low, x_high = self._extent([v for line in self.lines for v in line.x])
+        values = [v for line in self.lines for v in line.y if v is not None]
+        x_axis = _log_axis(x_low, x_high) if self.x_log else _axis(x_low, x_high, self.width // 110, tight=True)
+        y_axis = _axis(*(self.y_range or self._extent(values)), 5, tight=self.y_range is not None)
+        x_of = lambda v: LEFT + x_axis.position(v) * (self.width - LEFT - RIGHT)
+        y_of = lambda v: HEIGHT - BOTTOM - y_axis.position(v) * (HEIGHT - TOP - BOTTOM)
+        parts = [
+            f'<svg viewBox="0 0 {self.width} {HEIGHT}" role="img" aria-label="{escape(self.title + ". " + self.description)}">',
+            '<g class="grid">',
+        ]
+        for tick in y_axis.ticks:
+            y = y_of(tick)
+            parts.append(f'<line x1="{LEFT}" y1="{y:.1f}" x2="{self.width - RIGHT}" y2="{y:.1f}"/>')
+            parts.append(f'<text x="{LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{_number(tick)}</text>')
+        for tick in x_axis.ticks:
+            x = x_of(tick)
+            parts.append(
+                f'<line class="tick" x1="{x:.1f}" y1="{HEIGHT - BOTTOM}" x2="{x:.1f}" y2="{HEIGHT - BOTTOM + 5}"/>'
+            )
+            parts.append(f'<text x="{x:.1f}" y="{HEIGHT - BOTTOM + 19}" text-anchor="middle">{_number(tick)}</text>')
+        middle = LEFT + (self.width - LEFT - RIGHT) / 2
+        parts.append(
+            f'<text class="axis" x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(self.x_label)}</text>'
+        )
+        height = TOP + (HEIGHT - TOP - BOTTOM) / 2
+        parts.append(
+            f'<text class="axis" x="13" y="{height}" text-anchor="middle" transform="rotate(-90 13 {height})">'
+            f"{escape(self.y_label)}</text></g>"
+        )
+        for line in self.lines:
+            parts.extend(self._draw(line, x_of, y_of))
+        parts.append("</svg>")
+        return "".join(parts)
+
+    def figure(self) -> str:
+        """The chart with its legend and caption."""
+        keys = "".join(
+            f'<li><span class="key {line.style}{" round" if line.marks else ""}"></span>{escape(line.name)}</li>'
+            for line in self.lines
+        )
+        return f'<figure class="chart"><ul class="legend">{keys}</ul>{self.svg()}<figcaption>{escape(self.description)}</figcaption></figure>'
+
+    def _draw(self, line: Line, x_of, y_of) -> list[str]:  # type: ignore[no-untyped-def]
+        runs: list[list[tuple[float, float]]] = [[]]
+        hover: list[str] = []
+        for x, y in zip(line.x, line.y, strict=True):
+            if y is None:
+                runs.append([])
+                continue
+            px, py = x_of(x), y_of(y)
+            runs[-1].append((px, py))
+            label = f"{line.name}: {_number(y)}{self.y_unit} at {_number(x)}{self.x_unit}"
+            radius, style = (3.5, f"mark {line.style}") if line.marks else (5, "hover")
+            hover.append(
+                f'<circle class="{style}" cx="{px:.1f}" cy="{py:.1f}" r="{radius}"><title>{escape(label)}</title></circle>'
+            )
+        parts = []
+        for run in runs:
+            if len(run) > 1 and not line.marks:
+                points = " ".join(f"{x:.1f},{y:.1f}" for x, y in run)
+                parts.append(f'<polyline class="line {line.style}" points="{points}"/>')
+            elif len(run) == 1 and not line.marks:
+                parts.append(f'<circle class="mark {line.style}" cx="{run[0][0]:.1f}" cy="{run[0][1]:.1f}" r="3"/>')
+        return parts + hover
+
+    @staticmethod
+    def _extent(values: Sequence[float]) -> tuple[float, float]:
+        return (min(values), max(values)) if values else (0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class _Axis:
+    low: float
+    high: float
+    ticks: tuple[float, ...]
+    log: bool = False
+
+    def position(self, value: float) -> float:
+        """Where a value lies on the axis, 0..1."""
+        if self.log:
+            low, high = math.log10(self.low), math.log10(self.high)
+            return (math.log10(max(value, self.low)) - low) / (high - low)
+        return (value - self.low) / (self.high - self.low)
+
+
+def _axis(low: float, high: float, wanted: int, tight: bool) -> _Axis:
+    """Ticks at 1, 2 or 5 times a power of ten; a loose axis ends at a tick, a tight one at the data."""
+    if high - low < 1e-9 * max(1.0, abs(high)):
+        low, high = low - 0.5, high + 0.5
+    rough = (high - low) / max(1, wanted)
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(m * power for m in (1, 2, 5, 10) if m * power >= rough * (1 - 1e-9))
+    if not tight:
+        low, high = math.floor(low / step + 1e-9) * step, math.ceil(high / step - 1e-9) * step
+    first = math.ceil(low / step - 1e-9)
+    last = math.floor(high / step + 1e-9)
+    return _Axis(low, high, tuple(k * step for k in range(first, last + 1)))
+
+
+def _log_axis(low: float, high: float) -> _Axis:
+    low = max(low, 1e-3)
+    low, high = low / 1.05, max(high, low * 2) * 1.05
+    ticks = [m * 10.0**e for e in range(-4, 8) for m in (1, 2, 5)]
+    return _Axis(low, high, tuple(t for t in ticks if low <= t <= high), log=True)
+
+
+def _number(value: float) -> str:
+    """At most four significant digits, without an exponent."""
+    if value == 0:
+        return "0"
+    digits = max(0, 3 - math.floor(math.log10(abs(value))))
+    text = f"{value:,.{min(digits, 4)}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text

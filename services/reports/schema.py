@@ -1,0 +1,165 @@
+"""The shape of `report.json`: one model that writes it, reads it back and gives its JSON schema.
+
+Fields are added, never renamed or removed, as long as `format_version` stays. A measure that does not exist is null, never NaN.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from operators.storage import write_whole
+
+NOTICE = "Research use only, not a medical device."
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Count = Annotated[int, Field(ge=0)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class RecordingFacts(_Part):
+    """The recording as it was read: after `--scale` and `--max-frames`."""
+
+    name: str
+    frames: Count
+    width_px: Annotated[int, Field(ge=1)]
+    height_px: Annotated[int, Field(ge=1)]
+    fps: Annotated[float, Field(gt=0)]
+    digest: str | None = None
+    """SHA-256 over the recording's files."""
+
+
+class RunFacts(_Part):
+    """How the run was made, and how it ended."""
+
+    device: str
+    engine: str
+    seed: int
+    version: str
+    threads: Annotated[int, Field(ge=1)]
+    wall_s: Annotated[float, Field(ge=0)]
+    command: Literal["replay", "reconstruct"] = "replay"
+    field: str
+    """Deformation field in use: `basis` or `hexplane`, never `auto`."""
+    steps_per_frame: int | None = None
+    scale: float = 1.0
+    started_at: str
+    """UTC, ISO 8601."""
+    stop_reason: str
+    """Why the run ended: `end of recording`, `interrupted`, or what failed."""
+    interrupted: bool = False
+    peak_memory_bytes: Count | None = None
+    machine: dict[str, str] = {}
+    """Processor, instruction set, versions of Python and torch."""
+
+
+class FrameCounts(_Part):
+    ingested: Count
+    displayed: Count
+    dropped: Count
+
+
+class Latency(_Part):
+    """Milliseconds from a root operator's emission to the end of a leaf operator's work on it."""
+
+    p50: float
+    p95: float
+    p99: float
+    max: float
+
+
+class OperatorTimes(_Part):
+    """How often an operator ran and how long a run of it took."""
+
+    calls: Count
+    p50_ms: float
+    p99_ms: float
+
+
+class Quality(_Part):
+    """Means over frames; PSNR is averaged in decibels."""
+
+    psnr_tissue_db: float | None
+    psnr_frame_db: float | None
+    ssim: float | None
+    frames: Count
+
+
+class BaselineQuality(_Part):
+    """Tissue PSNR of doing nothing, on the same recording."""
+
+    previous_frame_db: float | None
+    """The raw frame before, shown for every frame from the second on."""
+    train_mean_db: float | None
+    """The mean of all training frames, shown for every held-out frame."""
+    heldout_previous_frame_db: float | None = None
+    heldout_neighbour_mean_db: float | None = None
+    """Mean of the frames before and after; it sees the future."""
+
+
+class QualityReport(_Part):
+    live: Quality | None
+    """Each displayed frame right after its own training steps; null for an offline reconstruction."""
+    heldout: Quality | None
+    """Frames that were never trained on; null without `--heldout`."""
+    baselines: BaselineQuality
+    training: Quality | None = None
+    """Training frames after all of the training; null for a replay."""
+
+
+class ModelFacts(_Part):
+    gaussians: Count
+    parameters: Count
+    sha256: Sha256
+    version: Count
+
+
+class FrameEntry(_Part):
+    """One displayed frame."""
+
+    seq: Count
+    time_s: float
+    trained: bool
+    model_version: Count
+    psnr_tissue_db: float | None
+    psnr_frame_db: float | None
+    ssim: float | None
+    previous_frame_db: float | None
+
+
+class RunReport(_Part):
+    """Everything `report.json` holds."""
+
+    format_version: Literal[1] = 1
+    notice: str = NOTICE
+    recording: RecordingFacts
+    run: RunFacts
+    frames: FrameCounts
+    latency_ms: dict[str, Latency]
+    operators: dict[str, OperatorTimes]
+    quality: QualityReport
+    model: ModelFacts | None
+    """Null when the run ended before the first snapshot."""
+    frames_sha256: Sha256
+    notes: list[str] = []
+    """Stated fallbacks and what went wrong, in sentences."""
+    outputs: dict[str, str] = {}
+    """What was written, as paths relative to the report."""
+    latency_quantiles_ms: dict[str, list[float]] = {}
+    """Per path, the latency distribution at 101 equally spaced quantiles, 0 to 1."""
+    series: list[FrameEntry] = []
+
+    def write(self, path: Path) -> None:
+        """Write JSON; the file is whole or not there."""
+        text = json.dumps(self.model_dump(mode="json"), indent=2, allow_nan=False)
+        write_whole(path, (text + "\n").encode())
+
+    @classmethod
+    def read(cls, path: Path) -> RunReport:
+        """Read a report back; raises pydantic.ValidationError where it does not fit."""
+        return cls.model_validate_json(path.read_text(encoding="utf-8"))

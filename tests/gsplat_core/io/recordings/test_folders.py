@@ -1,0 +1,175 @@
+"""Image folders: the EndoNeRF layout, `cameras.json`, and images alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.errors import RecordingInvalid, RecordingMissing
+from gsplat_core.io.recordings import open_recording, validate_recording
+
+Refused = Callable[..., str]
+
+
+def test_endonerf(endonerf_folder: Path, make: SimpleNamespace) -> None:
+    recording = open_recording(endonerf_folder)
+    assert recording.fields == {"mask", "pose", "depth", "right_image"}
+    assert recording.camera.K[0, 0] == 50
+    for index, frame in enumerate(recording):
+        assert np.array_equal(frame.image, make.frame_image(index))
+        assert frame.right_image is not None and np.array_equal(frame.right_image, frame.image)
+        assert frame.depth is not None and frame.depth.dtype == np.float32
+        assert frame.depth[0, 0] == 0 and frame.depth[1, 1] == 40 + index
+        assert frame.mask is not None and frame.mask.dtype == np.uint8
+        assert frame.mask[:, :12].max() == 0 and frame.mask[:, 12:].min() == 1
+    assert index == 5
+    assert any("unit of depth" in note for note in recording.notes)
+    assert any("30 frames/s" in note for note in recording.notes)
+
+
+def test_validation_report_of_a_good_recording(endonerf_folder: Path) -> None:
+    report = validate_recording(endonerf_folder)
+    assert report.ok and not report.problems
+    facts = report.facts
+    assert (facts["frames"], facts["frames_decoded"], facts["width_px"], facts["height_px"]) == (6, 6, 48, 40)
+    assert facts["layout"] == "endonerf" and facts["calibration"] == "poses_bounds.npy"
+    assert facts["fields"] == ["depth", "mask", "pose", "right_image"]
+    assert facts["tool_share"] == pytest.approx(0.25) and facts["tissue_share"] == pytest.approx(0.75)
+    assert facts["camera_moves"] is False
+    json.dumps(facts)
+
+
+def test_cameras_json(cameras_folder: Path, make: SimpleNamespace) -> None:
+    recording = open_recording(cameras_folder)
+    assert recording.frame_count == 5 and recording.fps == 20
+    assert recording.camera.K.tolist() == [[50, 0, 23], [0, 51, 21], [0, 0, 1]]
+    for index, frame in enumerate(recording):
+        assert np.array_equal(frame.image, make.frame_image(index))
+        # The camera is at +2 i, so the world moves by -2 i in its eyes.
+        assert frame.pose is not None and frame.pose[:3, 3].tolist() == [-2 * index, 0, 0]
+        assert recording.camera_at(index).position.tolist() == [2 * index, 0, 0]
+        assert frame.mask is not None and frame.mask.sum() == (make.width - 10) * (make.height - 10)
+        assert frame.mask[0, 0] == 0  # outside the scope's circle is not tissue
+    assert validate_recording(cameras_folder).facts["camera_moves"] is True
+
+
+def test_cameras_json_order_wins_over_names(cameras_folder: Path, make: SimpleNamespace) -> None:
+    path = cameras_folder / "cameras.json"
+    content = json.loads(path.read_text())
+    content["frames"].reverse()
+    path.write_text(json.dumps(content))
+    assert np.array_equal(next(iter(open_recording(cameras_folder))).image, make.frame_image(4))
+
+
+def test_valid_mask_is_joined_with_tool_masks(cameras_folder: Path, make: SimpleNamespace) -> None:
+    make.masks(cameras_folder / "masks", 5)
+    mask = next(iter(open_recording(cameras_folder))).mask
+    assert mask is not None
+    assert mask.sum() == (make.width - 12 - 5) * (make.height - 10)
+
+
+def test_images_alone_sort_by_number(tmp_path: Path, make: SimpleNamespace) -> None:
+    make.images(tmp_path, 12, "{}.png")
+    (tmp_path / ".hidden.png").write_text("not an image")
+    recording = open_recording(tmp_path)
+    assert recording.frame_count == 12
+    assert [int(frame.image[0, 0, 0]) for frame in recording] == [20 * index + 10 for index in range(12)]
+    assert any("no calibration" in note for note in recording.notes)
+
+
+def test_grey_and_transparent_images_become_rgb(tmp_path: Path, make: SimpleNamespace) -> None:
+    make.image(tmp_path / "0.png", np.full((make.height, make.width), 77, np.uint8))
+    rgba = np.dstack([make.frame_image(1)[..., ::-1], np.full((make.height, make.width), 9, np.uint8)])
+    cv2.imwrite(str(tmp_path / "1.png"), rgba)
+    frames = list(open_recording(tmp_path))
+    assert (frames[0].image == 77).all()
+    assert np.array_equal(frames[1].image, make.frame_image(1))
+
+
+def test_scale_keeps_masks_binary_and_depth_unmixed(endonerf_folder: Path) -> None:
+    frame = next(iter(open_recording(endonerf_folder, scale=0.4)))
+    assert frame.image.shape == (16, 19, 3)
+    assert frame.mask is not None and set(np.unique(frame.mask)) == {0, 1}
+    assert frame.depth is not None and set(np.unique(frame.depth)) <= {0.0, 40.0}
+
+
+def test_one_unreadable_image_is_named(endonerf_folder: Path, refused: Refused) -> None:
+    path = endonerf_folder / "images" / "frame-000003.color.png"
+    path.write_bytes(path.read_bytes()[:-40])
+    refused(endonerf_folder, RecordingInvalid, path.name, "ends too early")
+
+
+def test_truncated_jpeg_is_not_read_as_grey(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
+    rng = np.random.default_rng(0)
+    make.image(tmp_path / "0.jpg", rng.integers(0, 255, (64, 64, 3), dtype=np.uint8))
+    data = (tmp_path / "0.jpg").read_bytes()
+    (tmp_path / "0.jpg").write_bytes(data[: len(data) // 2])
+    refused(tmp_path, RecordingInvalid, "0.jpg", "ends too early")
+
+
+def test_damaged_png(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
+    make.images(tmp_path, 2)
+    data = bytearray((tmp_path / "000001.png").read_bytes())
+    data[60:80] = bytes(20)
+    (tmp_path / "000001.png").write_bytes(data)
+    refused(tmp_path, RecordingInvalid, "000001.png", "damaged")
+
+
+def test_images_of_two_sizes(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
+    make.images(tmp_path, 4)
+    make.image(tmp_path / "000002.png", make.frame_image(2, 30, 20))
+    refused(tmp_path, RecordingInvalid, "000002.png", "30x20", "48x40")
+
+
+def test_right_eye_of_another_size_or_count(endonerf_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
+    make.image(endonerf_folder / "images_right" / "frame-000001.color.png", make.frame_image(1, 24, 20))
+    refused(endonerf_folder, RecordingInvalid, "images_right", "24x20")
+    (endonerf_folder / "images_right" / "frame-000005.color.png").unlink()
+    refused(endonerf_folder, RecordingInvalid, "images_right", "5 right images for 6 frames")
+
+
+@pytest.mark.parametrize(
+    ("change", "fragments"),
+    [
+        ({"fx": None}, ["fx"]),
+        ({"fx": -5}, ["fx = -5"]),
+        ({"width": 47}, ["48x40", "47x40"]),
+        ({"cx": float("nan")}, ["cx"]),
+        ({"frames": []}, ["frames is []"]),
+        ({"frames": [{"file": "images/000000.png"}]}, ["camera_to_world of frame 0 is None"]),
+        ({"frames": [{"file": "images/000000.png", "camera_to_world": [[1, 2], [3, 4]]}]}, ["frame 0", "[[1, 2]"]),
+        ({"frames": [{"file": "images/000000.png", "camera_to_world": (2 * np.eye(4)).tolist()}]}, ["frame 0"]),
+        ({"frames": ["images/000000.png"]}, ["file of frame 0 is None"]),
+        ({"fps_assumed": "fast"}, ["frame rate", "fast"]),
+    ],
+)
+def test_wrong_cameras_json(cameras_folder: Path, refused: Refused, change: dict, fragments: list[str]) -> None:
+    path = cameras_folder / "cameras.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    refused(cameras_folder, RecordingInvalid, *fragments)
+
+
+def test_cameras_json_key_or_file_missing(cameras_folder: Path, refused: Refused) -> None:
+    path = cameras_folder / "cameras.json"
+    content = json.loads(path.read_text())
+    (cameras_folder / "images" / "000003.png").unlink()
+    refused(cameras_folder, RecordingMissing, "000003.png", "frame 3")
+    del content["fy"]
+    path.write_text(json.dumps(content))
+    refused(cameras_folder, RecordingInvalid, "cameras.json", "no fy")
+    path.write_text("{ not json")
+    refused(cameras_folder, RecordingInvalid, "cameras.json", "not JSON")
+
+
+def test_mirrored_pose_is_not_a_rotation(cameras_folder: Path, refused: Refused) -> None:
+    path = cameras_folder / "cameras.json"
+    content = json.loads(path.read_text())
+    content["frames"][2]["camera_to_world"] = np.diag([1.0, 1, -1, 1]).tolist()
+    path.write_text(json.dumps(content))
+    refused(cameras_folder, RecordingInvalid, "frame 2 is not a rotation")

@@ -1,0 +1,180 @@
+"""Video files and what lies beside them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import RecordingInvalid, RecordingMissing
+from gsplat_core.frames import FrameStatus
+from gsplat_core.io.recordings import Recording, open_recording, validate_recording
+
+Refused = Callable[..., str]
+
+
+def test_reads_frames_masks_and_poses(video_folder: Path, make: SimpleNamespace) -> None:
+    recording = open_recording(video_folder)
+    assert isinstance(recording, Recording)
+    assert (recording.name, recording.frame_count, recording.width_px, recording.height_px) == ("rec", 8, 48, 40)
+    assert recording.fps == 25
+    assert recording.fields == {"mask", "pose"}
+    assert recording.notes == ()
+    assert recording.camera.K.tolist() == [[50, 0, 24], [0, 50, 20], [0, 0, 1]]
+    frames = list(recording)
+    assert [frame.seq for frame in frames] == list(range(8))
+    assert [frame.pts_ns for frame in frames] == [index * 40_000_000 for index in range(8)]
+    for index, frame in enumerate(frames):
+        # Lossy, but the frames' red differs by 20.
+        assert abs(float(frame.image[..., 0].mean()) - (20 * index + 10)) < 8
+        assert np.abs(frame.image.astype(int) - make.frame_image(index)).mean() < 8
+        assert frame.mask is not None and frame.mask[:, :12].max() == 0 and frame.mask[:, 12:].min() == 1
+        assert frame.pose is not None and np.array_equal(frame.pose, np.eye(4))
+        assert frame.status is FrameStatus.REPLAY
+
+
+def test_iterates_again_and_in_parallel(video_folder: Path) -> None:
+    recording = open_recording(video_folder)
+    first, second = iter(recording), iter(recording)
+    for a in first:
+        b = next(second)
+        assert a.seq == b.seq and np.array_equal(a.image, b.image)
+    assert len(list(recording)) == 8
+
+
+def test_bare_video_gets_a_stated_default_camera(video_folder: Path) -> None:
+    recording = open_recording(video_folder / "video.mp4")
+    assert recording.name == "video.mp4"
+    assert recording.fields == frozenset()
+    assert recording.camera.K[0, 0] == pytest.approx(0.9 * 48)
+    assert "no calibration" in recording.notes[0] and "43.2 px" in recording.notes[0]
+    frame = next(iter(recording))
+    assert frame.pose is None and frame.mask is None
+    assert recording.camera_at(7) == recording.camera
+
+
+def test_a_single_video_of_any_name_is_found(video_folder: Path, refused: Refused, make: SimpleNamespace) -> None:
+    (video_folder / "video.mp4").rename(video_folder / "left eye.mp4")
+    assert open_recording(video_folder).frame_count == 8
+    make.video(video_folder / "right eye.mp4", 8)
+    refused(video_folder, RecordingInvalid, "2 videos", "left eye.mp4", "video.mp4")
+
+
+@pytest.mark.parametrize(("codec", "suffix"), [("MJPG", ".avi"), ("VP80", ".webm")])
+def test_containers_without_exact_frame_count(tmp_path: Path, make: SimpleNamespace, codec: str, suffix: str) -> None:
+    make.video(tmp_path / f"v{suffix}", 7, codec=codec)
+    recording = open_recording(tmp_path / f"v{suffix}")
+    assert recording.frame_count == 7 == len(list(recording))
+
+
+def test_max_frames_and_scale(video_folder: Path) -> None:
+    recording = open_recording(video_folder, scale=0.5, max_frames=3)
+    frames = list(recording)
+    assert len(frames) == recording.frame_count == 3
+    assert frames[0].image.shape == (20, 24, 3)
+    assert frames[0].mask is not None and set(np.unique(frames[0].mask)) == {0, 1}
+    assert recording.camera.K.tolist() == [[25, 0, 12], [0, 25, 10], [0, 0, 1]]
+    assert (recording.camera.width_px, recording.camera.height_px) == (24, 20)
+    full = next(iter(open_recording(video_folder)))
+    means = full.image.reshape(20, 2, 24, 2, 3).mean(axis=(1, 3))
+    assert np.abs(frames[0].image - means).max() <= 1  # the area filter is the mean of 2 x 2 pixels
+
+
+def test_missing(tmp_path: Path, refused: Refused) -> None:
+    refused(tmp_path / "nowhere", RecordingMissing, "nowhere", "no such file or folder")
+
+
+def test_empty_folder(tmp_path: Path, refused: Refused) -> None:
+    refused(tmp_path, RecordingMissing, str(tmp_path), "the folder is empty")
+
+
+def test_folder_with_something_else(tmp_path: Path, refused: Refused) -> None:
+    (tmp_path / "notes.txt").write_text("hello")
+    refused(tmp_path, RecordingMissing, "notes.txt")
+
+
+def test_text_file_named_mp4(tmp_path: Path, refused: Refused, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "video.mp4").write_text("this is no video\n" * 50)
+    refused(tmp_path, RecordingInvalid, "video.mp4", "is not a video", "this is no v")
+    assert capfd.readouterr().err == ""
+
+
+def test_empty_file_named_mp4(tmp_path: Path, refused: Refused) -> None:
+    (tmp_path / "video.mp4").touch()
+    refused(tmp_path / "video.mp4", RecordingInvalid, "empty (0 bytes)")
+
+
+def test_video_cut_in_half(video_folder: Path, refused: Refused, capfd: pytest.CaptureFixture[str]) -> None:
+    video = video_folder / "video.mp4"
+    size = video.stat().st_size
+    os.truncate(video, size // 2)
+    refused(video_folder, RecordingInvalid, "video.mp4", "cut off", f"ends at byte {size // 2}")
+    assert capfd.readouterr().err == ""
+
+
+def test_video_cut_between_its_parts(video_folder: Path, refused: Refused) -> None:
+    video = video_folder / "video.mp4"
+    os.truncate(video, video.read_bytes().index(b"moov") - 4)
+    refused(video_folder, RecordingInvalid, "cut off", "index", "missing")
+
+
+def test_avi_cut_in_half(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
+    make.video(tmp_path / "v.avi", 7, codec="MJPG")
+    os.truncate(tmp_path / "v.avi", (tmp_path / "v.avi").stat().st_size // 2)
+    refused(tmp_path / "v.avi", RecordingInvalid, "cut off")
+
+
+def test_frames_that_end_early(video_folder: Path) -> None:
+    """The container is complete and announces 8 frames, but its data stops making sense after some."""
+    video = video_folder / "video.mp4"
+    data = bytearray(video.read_bytes())
+    begin, end = data.index(b"mdat") + 4, data.index(b"moov") - 4
+    middle = (begin + end) // 2
+    data[middle:end] = bytes(end - middle)
+    video.write_bytes(data)
+    recording = open_recording(video_folder)
+    seen = []
+    with pytest.raises(RecordingInvalid, match=r"ends early: \d of 8 announced frames") as caught:
+        seen.extend(recording)
+    assert 1 <= len(seen) < 8
+    assert f"{len(seen)} of 8" in str(caught.value) and f"--max-frames {len(seen)}" in str(caught.value)
+    assert str(caught.value) in [str(problem) for problem in validate_recording(video_folder).problems]
+    # The advice holds.
+    assert len(list(open_recording(video_folder, max_frames=len(seen)))) == len(seen)
+
+
+def test_digest_tells_recordings_apart(video_folder: Path, tmp_path: Path) -> None:
+    digest = open_recording(video_folder).digest
+    assert len(digest) == 64
+    shutil.copytree(video_folder, tmp_path / "copy")
+    assert open_recording(tmp_path / "copy", scale=0.5).digest == digest
+    poses = np.load(tmp_path / "copy" / "poses_bounds.npy")
+    poses[3, 16] += 1
+    np.save(tmp_path / "copy" / "poses_bounds.npy", poses)
+    assert open_recording(tmp_path / "copy").digest != digest
+
+
+def test_one_frame_is_accepted_with_a_note(tmp_path: Path, make: SimpleNamespace) -> None:
+    make.video(tmp_path / "one.mp4", 1)
+    recording = open_recording(tmp_path / "one.mp4")
+    assert len(list(recording)) == 1
+    assert any("one frame" in note for note in recording.notes)
+    assert validate_recording(tmp_path / "one.mp4").ok
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"scale": 0}, {"scale": float("nan")}, {"scale": float("inf")}, {"max_frames": 0}]
+)
+def test_bad_arguments(video_folder: Path, arguments: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        open_recording(video_folder, **arguments)
+
+
+def test_camera_of_a_frame_that_is_not_there(video_folder: Path) -> None:
+    with pytest.raises(ValueError, match="frame 8 is not in the recording"):
+        open_recording(video_folder).camera_at(8)

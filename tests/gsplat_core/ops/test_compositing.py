@@ -1,0 +1,354 @@
+"""The compiled compositing, forward and backward, against plain torch in float64."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
+from gsplat_core.ops.native import instruction_set
+from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.reference import compositing as reference
+
+Rasterize = Callable[..., tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Splats of some images, and which of them each tile has."""
+
+    means2d: Tensor
+    conics: Tensor
+    colors: Tensor
+    opacities: Tensor
+    width: int
+    height: int
+    tile_size: int = 16
+    backgrounds: Tensor | None = None
+    masks: Tensor | None = None
+
+    def lists(self) -> tuple[Tensor, Tensor]:
+        """Every splat in every tile that its contour may touch, in the order of its index."""
+        shape = self.opacities.shape
+        covers = torch.full((*shape, 2), 2**30, dtype=torch.int32)
+        grid = math.ceil(self.width / self.tile_size), math.ceil(self.height / self.tile_size)
+        depths = torch.arange(1.0, shape[-1] + 1).expand(shape)
+        # Values that are not finite are listed all the same: compositing must skip them itself.
+        means2d = self.means2d.nan_to_num(posinf=20.0)
+        options = dict(conics=self.conics.nan_to_num(posinf=0.1), opacities=self.opacities.nan_to_num(posinf=0.5))
+        _, flatten_ids, offsets = bin_splats(means2d, covers, depths, self.tile_size, *grid, **options)
+        return offsets, flatten_ids
+
+    def run(self, rasterize: Rasterize, dtype: torch.dtype, absgrad: bool = False) -> dict[str, Tensor]:
+        """Image, alpha and the gradients of a fixed random linear function of them."""
+        inputs = {
+            name: value.to(dtype).clone().requires_grad_()
+            for name in ("means2d", "conics", "colors", "opacities", "backgrounds")
+            if (value := getattr(self, name)) is not None
+        }
+        named = dict(backgrounds=inputs.get("backgrounds"), masks=self.masks, absgrad=absgrad)
+        splats = [inputs[name] for name in ("means2d", "conics", "colors", "opacities")]
+        image, alphas = rasterize(*splats, self.width, self.height, self.tile_size, *self.lists(), **named)
+        random = torch.Generator().manual_seed(11)
+        v_image, v_alphas = (torch.randn(t.shape, generator=random) for t in (image, alphas))
+        ((image * v_image).sum() + (alphas * v_alphas).sum()).backward()
+        results = {"image": image.detach(), "alphas": alphas.detach()}
+        results |= {f"v_{name}": t.grad for name, t in inputs.items() if t.grad is not None}
+        if absgrad:
+            results["absgrad"] = inputs["means2d"].absgrad  # type: ignore[attr-defined]
+        return results
+
+
+def scene(
+    count: int,
+    width: int = 70,
+    height: int = 45,
+    channels: int = 3,
+    image_dims: tuple[int, ...] = (1,),
+    median_px: float = 3.0,
+    seed: int = 0,
+    **options: object,
+) -> Scene:
+    random = torch.Generator().manual_seed(seed)
+    shape = (*image_dims, count)
+    means2d = torch.rand(*shape, 2, generator=random) * torch.tensor([width + 10.0, height + 10.0]) - 5
+    axes = (
+        torch.randn(*shape, 2, 2, generator=random)
+        * median_px
+        * torch.exp(0.5 * torch.randn(*shape, 1, 1, generator=random))
+    )
+    conics = torch.linalg.inv(axes @ axes.mT + 0.3 * torch.eye(2)).flatten(-2)[..., [0, 1, 3]]
+    colors = torch.randn(*shape, channels, generator=random)
+    opacities = torch.sigmoid(1 + 2 * torch.randn(shape, generator=random))
+    return Scene(means2d, conics, colors, opacities, width, height, **options)  # type: ignore[arg-type]
+
+
+def assert_close(s: Scene, absgrad: bool = False) -> dict[str, Tensor]:
+    """Compiled against reference: pixels within 2e-4 of their scale, gradients within 1e-3 of their norm."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the reference's many small tensors gain nothing from more
+    try:
+        wanted = s.run(reference.rasterize_to_pixels, torch.float64, absgrad)
+    finally:
+        torch.set_num_threads(threads)
+    seen = s.run(rasterize_to_pixels, torch.float32, absgrad)
+    assert seen.keys() == wanted.keys()
+    for name, w in wanted.items():
+        assert seen[name].shape == w.shape
+        assert seen[name].isfinite().all(), name
+        error = seen[name].double() - w
+        if name in ("image", "alphas"):
+            scale = max(1.0, float(s.colors.nan_to_num(posinf=0).abs().max())) if s.colors.numel() else 1.0
+            # A splat within rounding of a cut-off may fall on either side of it, in a few pixels.
+            off = (error.abs() > 2e-4 * scale).any(-1)
+            assert off.double().mean() < 2e-4, (name, int(off.sum()))
+        else:
+            assert error.norm() <= 1e-3 * w.norm(), (name, float(error.norm() / w.norm()))
+    return seen
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 7, 8, 9, 32])
+def test_random_scene_for_any_number_of_channels(channels: int) -> None:
+    assert_close(scene(300, channels=channels, backgrounds=torch.rand(1, channels)), absgrad=True)
+
+
+@pytest.mark.parametrize("tile_size", [4, 5, 8, 16, 20, 33, 64])
+@pytest.mark.parametrize("size", [(1, 1), (33, 50)])
+def test_any_tile_and_image_size(tile_size: int, size: tuple[int, int]) -> None:
+    assert_close(scene(120, *size, tile_size=tile_size, backgrounds=torch.rand(1, 3)), absgrad=True)
+
+
+@pytest.mark.parametrize("image_dims", [(), (3,), (2, 2), (0,)])
+def test_leading_dimensions(image_dims: tuple[int, ...]) -> None:
+    s = scene(60, 40, 20, image_dims=image_dims, backgrounds=torch.rand(*image_dims, 3))
+    seen = s.run(rasterize_to_pixels, torch.float32)
+    assert seen["image"].shape == (*image_dims, 20, 40, 3)
+    assert seen["alphas"].shape == (*image_dims, 20, 40, 1)
+    if 0 not in image_dims:
+        assert_close(s)
+
+
+def test_depth_channel_of_large_values_keeps_its_gradient() -> None:
+    s = scene(500, channels=4)
+    s.colors[..., 3] = 60 + 0.1 * s.colors[..., 3]
+    assert_close(s, absgrad=True)
+
+
+def test_opaque_splats_stop_the_pixel_and_pass_no_gradient_at_the_ceiling() -> None:
+    s = scene(400, median_px=6.0)
+    s.opacities[:, ::2] = 1.0
+    assert_close(s, absgrad=True)
+    one = Scene(
+        torch.full((1, 1, 2), 0.5), torch.tensor([[[1e-3, 0, 1e-3]]]), torch.ones(1, 1, 1), torch.ones(1, 1), 1, 1
+    )
+    seen = assert_close_or_zero(one)
+    assert seen["alphas"].item() == pytest.approx(0.99, abs=1e-6)
+
+
+def assert_close_or_zero(s: Scene) -> dict[str, Tensor]:
+    seen = s.run(rasterize_to_pixels, torch.float32)
+    for name in ("v_means2d", "v_conics", "v_opacities"):
+        assert not seen[name].any()
+    return seen
+
+
+def test_a_pixel_ends_before_the_splat_that_would_leave_too_little() -> None:
+    # Three splats of 0.95 leave 1.25e-4; a fourth would leave 6e-6 and is not blended, and nothing after it is.
+    alphas = [0.95, 0.95, 0.95, 0.95, 0.01]
+    s = Scene(
+        torch.full((1, 5, 2), 0.5),
+        torch.tensor([1e-9, 0.0, 1e-9]).expand(1, 5, 3).contiguous(),
+        torch.eye(5)[None],
+        torch.tensor([alphas]),
+        1,
+        1,
+    )
+    seen = s.run(rasterize_to_pixels, torch.float32)
+    wanted = torch.tensor([0.95, 0.95 * 0.05, 0.95 * 0.05**2, 0.0, 0.0])
+    torch.testing.assert_close(seen["image"].flatten(), wanted, rtol=1e-5, atol=1e-7)
+    assert not seen["v_colors"][0, 3:].any()
+
+
+def test_faint_splats_and_negative_sigma_are_skipped() -> None:
+    # Below 1/255 at the centre; indefinite conics, whose sigma is negative along an axis.
+    s = scene(60, median_px=5.0)
+    s.opacities[:, ::3] = 0.9 / 255
+    s.conics[:, 1::3] = torch.tensor([0.05, 0.0, -0.04])
+    s.conics[:, 4::9] = torch.tensor([0.02, 0.05, 0.02])
+    assert_close(s)
+
+
+def test_thin_huge_and_tiny_splats() -> None:
+    s = scene(200, 90, 60, median_px=4.0)
+    direction = torch.tensor([[1.0, 1.0], [-1.0, 1.0]]) / math.sqrt(2)
+    thin = direction.T @ torch.diag(torch.tensor([1 / 80.0**2, 1 / 0.6**2])) @ direction
+    s.conics[:, ::5] = thin.flatten()[[0, 1, 3]]
+    s.conics[:, 1::5] = torch.tensor([1e-8, 0.0, 1e-8])
+    s.conics[:, 2::5] = torch.tensor([3.3, 0.0, 3.3])
+    s.conics[:, 3::25] = 0.0
+    assert_close(s, absgrad=True)
+
+
+def test_values_that_are_not_finite_are_skipped_and_get_no_gradient() -> None:
+    s = scene(200, channels=3)
+    bad = torch.zeros(200, dtype=torch.bool)
+    for row, value in enumerate((math.nan, math.inf, -math.inf)):
+        for column, (tensor, channel) in enumerate(
+            ((s.means2d, 0), (s.means2d, 1), (s.conics, 0), (s.conics, 1), (s.conics, 2), (s.colors, 0), (s.colors, 2))
+        ):
+            tensor[0, 8 * row + column, channel] = value
+        s.opacities[0, 8 * row + 7] = value
+    bad[:24] = True
+    seen = s.run(rasterize_to_pixels, torch.float32, absgrad=True)
+    good = replace(s, **{n: getattr(s, n)[:, ~bad] for n in ("means2d", "conics", "colors", "opacities")})
+    wanted = good.run(rasterize_to_pixels, torch.float32, absgrad=True)
+    assert torch.equal(seen["image"], wanted["image"])
+    for name in ("v_means2d", "v_conics", "v_colors", "v_opacities", "absgrad"):
+        assert not seen[name][:, bad].any()
+        assert torch.equal(seen[name][:, ~bad], wanted[name])
+    assert_close(s)
+
+
+def test_masked_tiles_show_the_background_only() -> None:
+    masks = torch.rand(2, 3, 5, generator=torch.Generator().manual_seed(2)) > 0.4
+    s = scene(150, image_dims=(2,), masks=masks, backgrounds=torch.rand(2, 3))
+    seen = assert_close(s)
+    hidden = ~masks.repeat_interleave(16, 1).repeat_interleave(16, 2)[:, :45, :70]
+    assert not seen["alphas"][..., 0][hidden].any()
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_empty_and_nearly_empty_scenes(count: int) -> None:
+    background = torch.tensor([[0.1, 0.2, 0.3]])
+    seen = scene(count, 33, 17, median_px=0.01, backgrounds=background).run(rasterize_to_pixels, torch.float32)
+    if count == 0:
+        assert torch.equal(seen["image"], background.expand(1, 17, 33, 3))
+        assert not seen["alphas"].any()
+    else:
+        assert 0 < (seen["alphas"] > 0).sum() <= 16
+
+
+def test_very_many_splats_in_one_tile() -> None:
+    s = scene(20_000, 16, 16, median_px=8.0)
+    s.opacities[:] = 0.004  # just visible, so that many are blended before the pixel ends
+    assert_close(s)
+
+
+def test_packed_splats_equal_the_dense_ones() -> None:
+    s = scene(80, image_dims=(2,))
+    offsets, flatten_ids = s.lists()
+    dense = rasterize_to_pixels(s.means2d, s.conics, s.colors, s.opacities, s.width, s.height, 16, offsets, flatten_ids)
+    flat = [t.flatten(0, 1) for t in (s.means2d, s.conics, s.colors, s.opacities)]
+    packed = rasterize_to_pixels(*flat, s.width, s.height, 16, offsets, flatten_ids, packed=True)
+    assert all(torch.equal(d, p) for d, p in zip(dense, packed, strict=True))
+
+
+def test_the_same_bits_for_any_number_of_threads_and_every_time() -> None:
+    s = scene(3000, 300, 200, channels=4, backgrounds=torch.rand(1, 4))
+    threads = torch.get_num_threads()
+    try:
+        runs = []
+        for count in (1, 2, 2, 3):
+            torch.set_num_threads(count)
+            runs.append(s.run(rasterize_to_pixels, torch.float32, absgrad=True))
+    finally:
+        torch.set_num_threads(threads)
+    for other in runs[1:]:
+        assert all(torch.equal(other[name], value) for name, value in runs[0].items())
+
+
+def test_the_reference_gradient_is_the_derivative() -> None:
+    s = scene(6, 5, 4, channels=2, median_px=2.0, seed=4)
+    inputs = [t.double().requires_grad_() for t in (s.means2d, s.conics, s.colors, s.opacities, torch.rand(1, 2))]
+    lists = s.lists()
+    assert torch.autograd.gradcheck(
+        lambda m, q, c, o, b: reference.rasterize_to_pixels(m, q, c, o, 5, 4, 16, *lists, backgrounds=b),
+        inputs,
+        atol=1e-4,
+    )
+
+
+@pytest.mark.parametrize("isa", ["baseline", "avx2"])
+def test_other_instruction_sets_agree(isa: str, tmp_path: Path) -> None:
+    s = scene(300, channels=4, backgrounds=torch.rand(1, 4, generator=torch.Generator().manual_seed(0)))
+    torch.save(s, tmp_path / "scene.pt")
+    here = Path(__file__)
+    code = (
+        "import importlib.util, sys, torch\n"
+        f"spec = importlib.util.spec_from_file_location('scene_of_the_test', {str(here)!r})\n"
+        "module = importlib.util.module_from_spec(spec); sys.modules[spec.name] = module; spec.loader.exec_module(module)\n"
+        "s = module.scene(300, channels=4, backgrounds=torch.rand(1, 4, generator=torch.Generator().manual_seed(0)))\n"
+        "results = s.run(module.rasterize_to_pixels, torch.float32, True)\n"
+        f"torch.save((module.instruction_set(), results), {str(tmp_path / 'results.pt')!r})\n"
+    )
+    environment = os.environ | {"INTRASPLAT_ISA": isa, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment, timeout=120)
+    used, results = torch.load(tmp_path / "results.pt")
+    assert used == isa or instruction_set() == "baseline"
+    here_results = s.run(rasterize_to_pixels, torch.float32, True)
+    for name, value in here_results.items():
+        assert (results[name] - value).norm() <= 1e-4 * value.norm(), name
+
+
+def test_wrong_arguments_are_named() -> None:
+    s = scene(5)
+    offsets, flatten_ids = s.lists()
+    rest = (s.width, s.height, 16, offsets, flatten_ids)
+    with pytest.raises(InvalidInput, match=r"float64; gsplat_core\.reference"):
+        rasterize_to_pixels(s.means2d.double(), s.conics, s.colors, s.opacities, *rest)
+    with pytest.raises(InvalidInput, match=r"conics must have shape \(1, 5, 3\)"):
+        rasterize_to_pixels(s.means2d, s.means2d, s.colors, s.opacities, *rest)
+    with pytest.raises(InvalidInput, match="backgrounds must have shape"):
+        rasterize_to_pixels(s.means2d, s.conics, s.colors, s.opacities, *rest, backgrounds=torch.zeros(3))
+    with pytest.raises(InvalidInput, match="do not cover the image"):
+        rasterize_to_pixels(s.means2d, s.conics, s.colors, s.opacities, 500, 45, 16, offsets, flatten_ids)
+    with pytest.raises(RuntimeError, match="flatten_ids must be in"):
+        rasterize_to_pixels(s.means2d, s.conics, s.colors, s.opacities, *rest[:4], flatten_ids + 5)
+    with pytest.raises(RuntimeError, match="isect_offsets must rise"):
+        rasterize_to_pixels(s.means2d, s.conics, s.colors, s.opacities, *rest[:3], offsets.flip(-1), flatten_ids)
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
+@pytest.mark.parametrize("background", [True, False])
+def test_ops_pass_opcheck(background: bool) -> None:
+    s = scene(30, 20, 18)
+    offsets, flatten_ids = s.lists()
+    splats = [t[0].requires_grad_() for t in (s.means2d, s.conics, s.colors, s.opacities)]
+    behind = torch.rand(1, 3, requires_grad=True) if background else None
+    masks = torch.ones(1, 2, 2, dtype=torch.bool) if background else None
+    probe = torch.zeros(30, 2, requires_grad=True) if background else None
+    ops = torch.ops.gsplat_core
+    torch.library.opcheck(
+        ops.composite.default, (*splats, offsets, flatten_ids, behind, masks, probe, s.width, s.height, 16)
+    )
+    with torch.no_grad():
+        plain = [t.detach() for t in splats]
+        image, alphas, last = ops.composite(*plain, offsets, flatten_ids, behind, masks, None, s.width, s.height, 16)
+        torch.library.opcheck(
+            ops.composite_backward.default,
+            (
+                *plain,
+                offsets,
+                flatten_ids,
+                behind,
+                masks,
+                s.width,
+                s.height,
+                16,
+                alphas,
+                last,
+                image,
+                alphas,
+                background,
+            ),
+        )

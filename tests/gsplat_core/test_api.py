@@ -1,0 +1,257 @@
+"""`rasterization` as gsplat 1.5.3's users know it: modes, shapes, meta, absgrad, and what is refused."""
+
+from __future__ import annotations
+
+import enum
+import math
+
+import pytest
+import torch
+
+import gsplat_core as gsplat
+from gsplat_core import InvalidInput, reference
+
+META = [
+    "batch_ids", "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "opacities", "tile_width",
+    "tile_height", "tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets", "width", "height", "tile_size",
+    "n_batches", "n_cameras",
+]  # fmt: skip
+
+
+def rasterize(scene, module=gsplat, **changes):
+    arguments = dict(
+        means=scene.means, quats=scene.quats, scales=scene.scales, opacities=scene.opacities, colors=scene.sh,
+        viewmats=scene.viewmats, Ks=scene.Ks, width=scene.width, height=scene.height, sh_degree=3,
+    )  # fmt: skip
+    return module.rasterization(**(arguments | changes))
+
+
+@pytest.fixture
+def scene(make_scene):
+    return make_scene(50, cameras=2).to(torch.float32)
+
+
+@pytest.mark.parametrize(("mode", "channels"), [("RGB", 3), ("D", 1), ("ED", 1), ("RGB+D", 4), ("RGB+ED", 4)])
+@pytest.mark.parametrize("packed", [False, True])
+def test_render_modes(scene, mode, channels, packed):
+    image, alpha, _ = rasterize(scene, render_mode=mode, packed=packed)
+    assert image.shape == (2, 37, 52, channels) and alpha.shape == (2, 37, 52, 1)
+    rgb, depth = rasterize(scene, render_mode="RGB")[0], rasterize(scene, render_mode="D")[0]
+    if mode.startswith("RGB"):
+        torch.testing.assert_close(image[..., :3], rgb)
+    if mode.endswith("ED"):
+        depth = depth / alpha.clamp(min=1e-10)
+    if mode.endswith("D"):
+        torch.testing.assert_close(image[..., -1:], depth)
+
+
+@pytest.mark.parametrize("count", [1, 3, 7, 40])
+@pytest.mark.parametrize("per_camera", [False, True])
+def test_plain_colors_with_any_number_of_channels(scene, count, per_camera):
+    g = torch.Generator().manual_seed(1)
+    colors = torch.rand(*((2,) if per_camera else ()), 50, count, generator=g)
+    background = torch.rand(2, count, generator=g)
+    image, alpha, _ = rasterize(scene, colors=colors, sh_degree=None, backgrounds=background)
+    assert image.shape[-1] == count
+    # Each channel by itself is the same picture.
+    one, _, _ = rasterize(scene, colors=colors[..., -1:], sh_degree=None, backgrounds=background[:, -1:])
+    torch.testing.assert_close(image[..., -1:], one)
+    empty = alpha[..., 0] == 0
+    assert empty.any()
+    torch.testing.assert_close(image[empty], background[:, None, None].expand(2, 37, 52, count)[empty])
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_sh_degrees_up_to_what_the_coefficients_hold(make_scene, degree, assert_near):
+    scene = make_scene(30, degree=4)
+    image, _, _ = rasterize(scene.to(torch.float32), sh_degree=degree)
+    exact, _, _ = rasterize(scene.to(torch.float64), reference, sh_degree=degree)
+    assert_near(image, exact, of_largest=1e-4)
+
+
+def test_coefficients_per_camera(scene):
+    shared, _, _ = rasterize(scene)
+    own, _, _ = rasterize(scene, colors=scene.sh.expand(2, -1, -1, -1))
+    torch.testing.assert_close(own, shared, rtol=0, atol=0)
+
+
+def test_covars_give_the_same_image(scene):
+    covars, _ = gsplat.quat_scale_to_covar_preci(scene.quats, scene.scales, compute_preci=False)
+    image, _, _ = rasterize(scene, quats=None, scales=None, covars=covars)
+    torch.testing.assert_close(image, rasterize(scene)[0], rtol=1e-3, atol=1e-4)
+
+
+def test_batches_and_cameras_are_separate_images(make_scene):
+    scene = make_scene(30, (2, 2), 3).to(torch.float32)
+    background = torch.rand(2, 2, 3, 3)
+    together, alpha, meta = rasterize(scene, packed=False, backgrounds=background)
+    assert together.shape == (2, 2, 3, 37, 52, 3) and alpha.shape == (2, 2, 3, 37, 52, 1)
+    assert meta["n_batches"] == 4 and meta["n_cameras"] == 3
+    alone, _, _ = gsplat.rasterization(
+        scene.means[1, 0], scene.quats[1, 0], scene.scales[1, 0], scene.opacities[1, 0], scene.sh[1, 0],
+        scene.viewmats[1, 0, 2:], scene.Ks[1, 0, 2:], 52, 37, sh_degree=3, backgrounds=background[1, 0, 2:],
+    )  # fmt: skip
+    torch.testing.assert_close(together[1, 0, 2], alone[0], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("tile_size", [4, 8, 16, 32, None])
+def test_tile_size_is_honoured_and_changes_nothing(scene, tile_size):
+    image, _, meta = rasterize(scene, tile_size=tile_size, packed=False)
+    size = tile_size or 16
+    assert meta["tile_size"] == size
+    assert meta["isect_offsets"].shape == (2, math.ceil(37 / size), math.ceil(52 / size))
+    torch.testing.assert_close(image, rasterize(scene)[0], rtol=1e-4, atol=1e-5)
+
+
+def test_meta_dense(scene):
+    _, _, meta = rasterize(scene, packed=False)
+    assert list(meta) == META
+    assert all(meta[name] is None for name in META[:3])
+    assert meta["radii"].shape == meta["means2d"].shape == (2, 50, 2) and meta["radii"].dtype == torch.int32
+    assert meta["depths"].shape == meta["opacities"].shape == meta["tiles_per_gauss"].shape == (2, 50)
+    assert meta["conics"].shape == (2, 50, 3)
+    assert (meta["width"], meta["height"], meta["tile_width"], meta["tile_height"]) == (52, 37, 4, 3)
+    again = gsplat.isect_offset_encode(meta["isect_ids"], 2, 4, 3)
+    torch.testing.assert_close(again, meta["isect_offsets"])
+    assert len(meta["isect_ids"]) == len(meta["flatten_ids"]) == meta["tiles_per_gauss"].sum()
+    assert dict(meta)["isect_ids"] is meta["isect_ids"]
+
+
+def test_meta_packed_has_the_visible_rows(scene):
+    dense, packed = rasterize(scene, packed=False)[2], rasterize(scene)[2]
+    seen = dense["radii"][..., 0] > 0
+    assert list(packed) == META
+    rows = (packed["camera_ids"], packed["gaussian_ids"])
+    assert (packed["batch_ids"] == 0).all()
+    for name in ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss"):
+        torch.testing.assert_close(packed[name], dense[name][rows], rtol=0, atol=0)
+        assert packed[name].shape[0] == seen.sum()
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_absgrad(scene, packed):
+    scene.means.requires_grad_()
+    image, _, meta = rasterize(scene, packed=packed, absgrad=True)
+    meta["means2d"].retain_grad()
+    (image * torch.rand(image.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
+    absolute, plain = meta["means2d"].absgrad, meta["means2d"].grad
+    assert absolute.shape == plain.shape == meta["means2d"].shape
+    # Of the same terms: the absolute values sum to at least the absolute value of the sum, mostly to more.
+    assert (absolute >= plain.abs() * (1 - 1e-4) - 1e-6).all() and absolute.sum() > 1.2 * plain.abs().sum()
+
+
+def test_absgrad_matches_the_reference(make_scene, assert_near):
+    def absolute(module, dtype):
+        scene = make_scene(30).to(dtype)
+        scene.means.requires_grad_()
+        image, _, meta = rasterize(scene, module, packed=False, absgrad=True)
+        (image**2).sum().backward()
+        return meta["means2d"].absgrad
+
+    assert_near(absolute(gsplat, torch.float32), absolute(reference, torch.float64), relative=1e-2, of_largest=1e-3)
+
+
+def test_antialiasing_dims_what_is_smaller_than_a_pixel(make_scene):
+    scene = make_scene(20).to(torch.float32)
+    scene.scales.fill_(0.01)
+    classic, aliased = (rasterize(scene, rasterize_mode=mode, packed=False) for mode in ("classic", "antialiased"))
+    assert aliased[1].sum() < 0.2 * classic[1].sum()
+    assert (aliased[2]["opacities"] < scene.opacities).all()
+
+
+@pytest.mark.parametrize(
+    ("what", "value"),
+    [
+        ("means", math.nan),
+        ("scales", math.inf),
+        ("quats", math.nan),
+        ("opacities", math.nan),
+        ("sh", math.nan),
+        ("sh", math.inf),
+    ],
+)
+@pytest.mark.parametrize("module", [gsplat, reference])
+def test_one_bad_gaussian_changes_nothing_but_itself(make_scene, what, value, module):
+    scene = make_scene(30)
+    scene = scene.to(torch.float32)
+    scene.means[3] = torch.tensor([0.0, 0.0, 5.0])
+    without = scene.to(torch.float32)
+    without.opacities[3] = 0
+    getattr(scene, what)[3] = value
+    results = []
+    for it in (scene, without):
+        leaves = it.leaves()
+        image, alpha, meta = rasterize(it, module, render_mode="RGB+ED", packed=False)
+        (image.sum() + alpha.sum()).backward()
+        results.append((image, alpha, [leaf.grad for leaf in leaves], meta["radii"]))
+    assert results[0][3][0, 3].tolist() == [0, 0]
+    for actual, wanted in zip(results[0][:2], results[1][:2], strict=True):
+        torch.testing.assert_close(actual, wanted)
+    for actual, wanted in zip(results[0][2][:5], results[1][2][:5], strict=True):
+        assert (actual[3] == 0).all()
+        torch.testing.assert_close(actual, wanted)
+    assert results[0][2][5].isfinite().all()
+
+
+def test_plain_colors_that_are_not_finite_are_culled(scene):
+    colors = torch.rand(50, 3)
+    colors[4, 1] = math.nan
+    image, _, meta = rasterize(scene, colors=colors, sh_degree=None, packed=False)
+    assert image.isfinite().all() and (meta["radii"][:, 4] == 0).all()
+
+
+class Shutter(enum.Enum):
+    """gsplat's names."""
+
+    ROLLING_TOP_TO_BOTTOM = 0
+    GLOBAL = 4
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [
+        ("distributed", True), ("sparse_grad", True), ("with_ut", True), ("with_eval3d", True),
+        ("radial_coeffs", torch.zeros(2, 6)), ("tangential_coeffs", torch.zeros(2, 2)),
+        ("thin_prism_coeffs", torch.zeros(2, 4)), ("ftheta_coeffs", object()), ("viewmats_rs", torch.zeros(2, 4, 4)),
+        ("rolling_shutter", Shutter.ROLLING_TOP_TO_BOTTOM), ("camera_model", "ftheta"), ("camera_model", "lidar"),
+    ],
+)  # fmt: skip
+def test_what_is_not_supported_says_so(scene, argument, value):
+    shown = r"\[2, " if isinstance(value, torch.Tensor) else str(value).split(" at ")[0].replace("<", "")
+    with pytest.raises(NotImplementedError, match=f"{argument}.*{shown}"):
+        rasterize(scene, **{argument: value})
+
+
+def test_what_changes_no_result_is_accepted(scene):
+    image, _, _ = rasterize(scene, segmented=True, channel_chunk=2, rolling_shutter=Shutter.GLOBAL, with_ut=False)
+    torch.testing.assert_close(image, rasterize(scene)[0], rtol=0, atol=0)
+
+
+def test_wrong_arguments_are_refused(scene):
+    for changes, message in [
+        ({"means": scene.means[:, :2]}, r"means must be \[..., N, 3\], got \[50, 2\]"),
+        ({"quats": scene.quats[:9]}, r"quats .*\[50, 4\], got \[9, 4\]"),
+        ({"scales": None}, "quats and scales"),
+        ({"opacities": scene.opacities[:, None]}, r"opacities .*got \[50, 1\]"),
+        ({"colors": scene.sh[:9]}, r"colors must be .*N = 50.*got \[9, 16, 3\]"),
+        ({"colors": scene.sh, "sh_degree": 4}, r"K >= 25 for degree 4, got"),
+        ({"sh_degree": 5}, "sh_degree .*got 5"),
+        ({"sh_degree": None, "colors": scene.sh[:, :0, 0]}, "at least one channel"),
+        ({"viewmats": scene.viewmats[0, 0]}, r"viewmats must be \[..., C, 4, 4\]"),
+        ({"Ks": scene.Ks[:1]}, r"Ks .*\[2, 3, 3\], got \[1, 3, 3\]"),
+        ({"covars": torch.zeros(50, 6)}, r"covars .*\[50, 3, 3\], got \[50, 6\]"),
+        ({"backgrounds": torch.zeros(3)}, r"backgrounds .*\[2, 3\], got \[3\]"),
+        ({"render_mode": "RGBD"}, r"render_mode 'RGBD'.*RGB\+ED"),
+        ({"rasterize_mode": "smooth"}, "'smooth'"),
+        ({"camera_model": "mirror"}, "'mirror'"),
+        ({"tile_size": 0}, "tile_size .*got 0"),
+        ({"height": 0}, "height=0"),
+        ({"colors": scene.sh.double()}, "colors: torch.float64"),
+        (dict(zip(("colors", "backgrounds"), (scene.sh, torch.zeros(2, 3).double()), strict=True)), "float64"),
+    ]:
+        with pytest.raises(InvalidInput, match=message):
+            rasterize(scene, **changes)
+    with pytest.raises(InvalidInput, match=r"float32, got torch.float64.*gsplat_core\.reference"):
+        rasterize(scene.to(torch.float64))
+    with pytest.raises(TypeError, match="positional"):
+        gsplat.rasterization(*[scene.means] * 15)

@@ -1,0 +1,76 @@
+"""The set of Gaussians: checks, activations, picking and joining."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsplat_core import Gaussians, InvalidInput
+
+
+def gaussians(count=5, bases=4, dtype=torch.float32):
+    g = torch.Generator().manual_seed(count)
+    return Gaussians(*(torch.randn(count, *s, generator=g).to(dtype) for s in ((3,), (4,), (3,), (), (bases, 3))))
+
+
+def test_names_and_activations():
+    it = gaussians()
+    assert list(it.tensors()) == ["means", "quats", "log_scales", "logit_opacities", "sh"]
+    assert it.count == len(it) == 5
+    torch.testing.assert_close(it.scales, it.log_scales.exp())
+    torch.testing.assert_close(it.opacities, 1 / (1 + (-it.logit_opacities).exp()))
+
+
+@pytest.mark.parametrize(("bases", "degree"), [(1, 0), (4, 1), (9, 2), (16, 3), (25, 4)])
+def test_sh_degree(bases, degree):
+    assert gaussians(bases=bases).sh_degree == degree
+
+
+def test_select_by_mask_indices_and_slice():
+    it = gaussians()
+    mask = torch.tensor([True, False, True, False, False])
+    for index in (mask, torch.tensor([0, 2]), slice(0, 3, 2)):
+        picked = it.select(index)
+        assert picked.count == 2
+        for name, tensor in picked.tensors().items():
+            assert torch.equal(tensor, it.tensors()[name][[0, 2]])
+    assert it.select(torch.zeros(5, dtype=torch.bool)).count == 0
+
+
+def test_append_is_the_inverse_of_select():
+    it = gaussians()
+    joined = it.select(slice(0, 2)).append(it.select(slice(2, None)))
+    for name, tensor in joined.tensors().items():
+        assert torch.equal(tensor, it.tensors()[name])
+    with pytest.raises(InvalidInput, match="SH degree 2 to degree 1"):
+        it.append(gaussians(bases=9))
+    with pytest.raises(InvalidInput, match="float64"):
+        it.append(gaussians(dtype=torch.float64))
+
+
+def test_gradients_flow_and_detach_stops_them():
+    it = gaussians().requires_grad_()
+    copy = it.clone()
+    (copy.means.sum() + it.to(dtype=torch.float64).sh.sum()).backward()
+    assert torch.equal(it.means.grad, torch.ones(5, 3)) and torch.equal(it.sh.grad, torch.ones(5, 4, 3))
+    assert copy.means.data_ptr() != it.means.data_ptr()
+    assert not any(tensor.requires_grad for tensor in it.detach().tensors().values())
+    assert it.detach().means.data_ptr() == it.means.data_ptr()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"means": torch.zeros(5, 2)}, r"means must be \[N, 3\] with N = 5, got \[5, 2\]"),
+        ({"quats": torch.zeros(4, 4)}, r"quats must be \[N, 4\] with N = 5, got \[4, 4\]"),
+        ({"logit_opacities": torch.zeros(5, 1)}, r"logit_opacities must be \[N\]"),
+        ({"sh": torch.zeros(5, 3)}, r"sh must be \[N, K, 3\]"),
+        ({"sh": torch.zeros(5, 5, 3)}, r"K one of \[1, 4, 9, 16, 25\], got \[5, 5, 3\]"),
+        ({"quats": torch.zeros(5, 4).double()}, "one floating-point dtype"),
+    ],
+)
+def test_wrong_shapes_are_refused(change, message):
+    with pytest.raises(InvalidInput, match=message):
+        Gaussians(**(gaussians().tensors() | change))
+    with pytest.raises(InvalidInput, match="floating-point"):
+        gaussians().map(lambda tensor: tensor.int())

@@ -1,0 +1,125 @@
+"""When conditions let an operator compute, by the clock."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+import pytest
+
+from operators.graph import (
+    Condition,
+    CountCondition,
+    ManualClock,
+    Operator,
+    PeriodicCondition,
+    PeriodicConditionPolicy,
+    RealtimeClock,
+    SchedulingStatus,
+)
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("policy", "ticks_ms", "due_ms"),
+    [
+        # The examples of Holoscan's documentation, for a period of 100 ms.
+        (PeriodicConditionPolicy.CATCH_UP_MISSED_TICKS, [0, 250, 255], [100, 200, 300]),
+        (PeriodicConditionPolicy.MIN_TIME_BETWEEN_TICKS, [0, 101, 350], [100, 201, 450]),
+        (PeriodicConditionPolicy.NO_CATCH_UP_MISSED_TICKS, [0, 250, 305], [100, 300, 400]),
+    ],
+)
+@pytest.mark.parametrize("period", [100 * MS, timedelta(milliseconds=100)])
+def test_periodic_policies(policy, ticks_ms, due_ms, period):
+    condition = PeriodicCondition(None, period, policy)
+    for tick_ms, due in zip(ticks_ms, due_ms, strict=True):
+        assert condition.check(tick_ms * MS) == (SchedulingStatus.READY, 0)
+        condition.on_execute(tick_ms * MS)
+        assert condition.check(due * MS - 1) == (SchedulingStatus.WAIT_TIME, due * MS)
+        assert condition.check(due * MS)[0] is SchedulingStatus.READY
+
+
+def test_impossible_conditions_are_refused():
+    with pytest.raises(ValueError, match="period must be positive"):
+        PeriodicCondition(None, 0)
+    with pytest.raises(ValueError, match="must not be negative"):
+        CountCondition(None, -1)
+
+
+class Stamp(Operator):
+    """Notes the clock and its name."""
+
+    def setup(self, spec):
+        spec.param("stamps")
+
+    def compute(self, op_input, op_output, context):
+        self.stamps.append((context.clock.timestamp() // MS, self.name))
+
+
+def test_clocks_begin_at_zero_and_tell_seconds():
+    manual, real = ManualClock(), RealtimeClock()
+    manual.advance_to(2_500_000_000)
+    manual.advance_to(1)
+    assert manual.timestamp() == 2_500_000_000 and manual.time() == pytest.approx(2.5)
+    manual.reset()
+    assert manual.timestamp() == 0
+    before = real.timestamp()
+    assert before <= real.time() * 1e9 + 1 and real.timestamp() >= before
+
+
+def test_a_manual_clock_compresses_an_hour(kit, greedy_runner):
+    stamps = []
+
+    def wire(app):
+        for name, period_s, count in (("hourly", 3600, 2), ("half", 1800, 3)):
+            periodic = PeriodicCondition(app, timedelta(seconds=period_s))
+            app.add_operator(Stamp(app, periodic, CountCondition(app, count), name=name, stamps=stamps))
+
+    for _ in range(2):  # the clock begins anew
+        stamps.clear()
+        app = kit.Wired(wire)
+        clock = ManualClock()
+        result = greedy_runner(app, clock=clock)
+        assert sorted(stamps) == [
+            (0, "half"),
+            (0, "hourly"),
+            (1800_000, "half"),
+            (3600_000, "half"),
+            (3600_000, "hourly"),
+        ]
+        assert result.wall_s < 60
+
+
+class Weekdays(Condition):
+    """A condition of one's own: computes at two given times."""
+
+    def __init__(self, fragment, times_ns):
+        super().__init__(fragment)
+        self.times_ns = times_ns
+
+    def check(self, timestamp):
+        if not self.times_ns:
+            return SchedulingStatus.NEVER, 0
+        due = self.times_ns[0]
+        return (SchedulingStatus.READY, 0) if timestamp >= due else (SchedulingStatus.WAIT_TIME, due)
+
+    def on_execute(self, timestamp):
+        self.times_ns.pop(0)
+
+
+def test_a_condition_of_ones_own_runs_on_every_engine(kit, greedy_runner):
+    stamps = []
+    app = kit.Wired(lambda app: app.add_operator(Stamp(app, Weekdays(app, [5 * MS, 9 * MS]), name="s", stamps=stamps)))
+    greedy_runner(app, clock=ManualClock())
+    assert stamps == [(5, "s"), (9, "s")]
+
+
+def test_all_conditions_must_agree(kit, runner):
+    stamps = []
+
+    def wire(app):
+        conditions = CountCondition(app, 3), CountCondition(app, 2)
+        app.add_operator(Stamp(app, *conditions, name="s", stamps=stamps))
+
+    runner(kit.Wired(wire))
+    assert len(stamps) == 2

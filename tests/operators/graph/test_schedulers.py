@@ -1,0 +1,252 @@
+"""What each embedded scheduler promises by itself."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+
+import pytest
+
+from operators.errors import EngineUnsupported, GraphInvalid, OperatorStuck
+from operators.graph import (
+    AsynchronousCondition,
+    AsynchronousEventState,
+    ManualClock,
+    MultiThreadScheduler,
+    Operator,
+    PeriodicCondition,
+    StopReason,
+    run,
+)
+
+
+def test_greedy_order_is_topological_and_the_same_each_time(kit):
+    def trace(compose_backwards):
+        order = []
+
+        def noting(kind):
+            class Noting(kind):
+                def compute(self, op_input, op_output, context):
+                    order.append(self.name)
+                    super().compute(op_input, op_output, context)
+
+            return Noting
+
+        def wire(app):
+            source, join = app.counted(3, noting(kit.Source), name="source"), noting(kit.Join)(app, name="join")
+            left, right = (noting(kit.Apply)(app, name=name) for name in ("left", "right"))
+            sink = noting(kit.Collect)(app, name="sink")
+            if compose_backwards:
+                app.add_operator(sink)
+                app.add_operator(join)
+            app.add_flow(source, left)
+            app.add_flow(source, right)
+            app.add_flow(left, join, {("out", "left")})
+            app.add_flow(right, join, {("out", "right")})
+            app.add_flow(join, sink)
+
+        kit.guarded(kit.Wired(wire).run)
+        return order
+
+    assert trace(False) == ["source", "left", "right", "join", "sink"] * 3
+    assert trace(True) == trace(False)
+
+
+def test_greedy_computes_in_the_calling_thread(kit):
+    threads = set()
+    app = kit.Wired(
+        lambda app: app.chain(
+            app.counted(2, kit.Source), kit.Collect(app, function=lambda value: threads.add(threading.current_thread()))
+        )
+    )
+    app.run()
+    assert threads == {threading.current_thread()}
+
+
+def test_threads_refuse_a_manual_clock():
+    with pytest.raises(GraphInvalid, match="ManualClock needs the GreedyScheduler"):
+        MultiThreadScheduler(clock=ManualClock())
+
+
+def test_threads_compute_side_by_side(kit):
+    """Each of two branches waits until the other computes, which one thread could not do."""
+    meet = threading.Barrier(2, timeout=10)
+
+    def wire(app):
+        source = app.counted(3, kit.Source)
+        for name in ("a", "b"):
+            app.add_flow(source, kit.Collect(app, name=name, function=lambda value: meet.wait()))
+
+    app = kit.Wired(wire)
+    app.scheduler(MultiThreadScheduler(app))
+    assert kit.guarded(app.run).reason is StopReason.FINISHED
+
+
+def test_threads_lose_nothing_under_pressure(kit):
+    def wire(app):
+        source, sink = app.counted(1000, kit.Source, name="source"), kit.Collect(app, name="sink")
+        join, viewer = kit.Join(app, name="join"), kit.Collect(app, name="viewer")
+        left, right = kit.Apply(app, name="left"), kit.Apply(app, name="right")
+        app.add_flow(source, left)
+        app.add_flow(source, right, capacity=3)
+        app.add_flow(left, join, {("out", "left")})
+        app.add_flow(right, join, {("out", "right")})
+        app.add_flow(join, sink)
+        app.add_flow(source, viewer, policy="drop_oldest")
+        return sink, viewer
+
+    app = kit.Wired(wire)
+    app.scheduler(MultiThreadScheduler(app))
+    result = kit.guarded(app.run, on_hang=app.stop_execution)
+    sink, viewer = app.ops
+    assert sink.values == [(i, i) for i in range(1000)]
+    assert viewer.values[-1] == 999
+    for edge in result.edges:
+        assert edge.sent == edge.received + sum(edge.dropped.values()) and edge.queued == 0
+
+
+def test_an_operator_that_does_not_return_is_named(kit):
+    release, entered = threading.Event(), threading.Event()
+    life = kit.Recorder()
+
+    def hang(value):
+        entered.set()
+        release.wait(30)
+
+    def wire(app):
+        app.chain(life(kit.Source)(app, name="source"), life(kit.Collect)(app, name="stubborn", function=hang))
+
+    app = kit.Wired(wire)
+    app.scheduler(MultiThreadScheduler(app, stop_timeout_s=0.2))
+    future = app.run_async()
+    assert entered.wait(10)
+    app.stop_execution()
+    try:
+        with pytest.raises(OperatorStuck, match=r"0.2 s after the graph stopped: stubborn"):
+            future.result(10)
+    finally:
+        release.set()
+    assert life.names("stop") == ["source"], "an operator that still computes must not be entered by stop"
+
+
+def test_run_async_gives_the_result_and_can_be_stopped_at_once(kit):
+    app = kit.Wired(lambda app: app.chain(kit.Source(app), kit.Collect(app)))
+    for _ in range(20):
+        future = app.run_async()
+        app.stop_execution()
+        assert future.result(10).reason is StopReason.STOPPED
+
+
+def test_an_event_during_a_long_appointment_wakes_greedy(kit):
+    """One operator waits an hour, the other for an event: the event must not wait an hour."""
+    asleep, woken = threading.Event(), threading.Event()
+
+    class Driven(Operator):
+        def compute(self, op_input, op_output, context):
+            if asleep.is_set():
+                woken.set()
+            self.conditions[0].event_state = AsynchronousEventState.EVENT_WAITING
+            asleep.set()
+
+    class Idle(Operator):
+        def compute(self, op_input, op_output, context):
+            pass
+
+    def wire(app):
+        app.add_operator(Idle(app, PeriodicCondition(app, 3600 * 10**9)))
+        event = AsynchronousCondition(app)
+        app.add_operator(Driven(app, event))
+        return event
+
+    app = kit.Wired(wire)
+    future = app.run_async()
+    assert asleep.wait(10)
+    app.ops.event_state = AsynchronousEventState.EVENT_DONE
+    assert woken.wait(10)
+    app.stop_execution()
+    assert future.result(10).reason is StopReason.STOPPED
+
+
+def test_an_unknown_engine_is_refused(kit):
+    with pytest.raises(ValueError, match="unknown engine 'cuda'; choose embedded or holoscan"):
+        run(kit.Wired(lambda app: None), "cuda")
+
+
+@pytest.mark.holoscan
+def test_a_scheduler_without_counterpart_is_refused(kit, sdk):
+    class Own:
+        pass
+
+    app = kit.Wired(lambda app: None)
+    app.scheduler(Own())
+    with pytest.raises(EngineUnsupported, match="no scheduler like Own"):
+        run(app, "holoscan")
+
+
+INTERRUPTED = """
+    import os, signal, sys, threading
+    from operators.graph import *
+
+    class Tick(Operator):
+        def compute(self, op_input, op_output, context):
+            if MODE == "busy":
+                import time; time.sleep(0.001)
+            ticked.set()
+        def stop(self):
+            print("stopped", flush=True)
+
+    ENGINE, SCHEDULER, MODE = sys.argv[1:]
+    ticked = threading.Event()
+
+    class App(Application):
+        def compose(self):
+            self.add_operator(Tick(self, *([PeriodicCondition(self, 3600 * 10**9)] if MODE == "idle" else [])))
+
+    def interrupt():
+        ticked.wait()
+        os.kill(os.getpid(), signal.SIGINT)
+
+    app = App()
+    app.scheduler((GreedyScheduler if SCHEDULER == "GreedyScheduler" else MultiThreadScheduler)(app))
+    threading.Thread(target=interrupt, daemon=True).start()
+    try:
+        run(app, ENGINE)
+    except KeyboardInterrupt:
+        print("interrupted", app.result.reason.value, flush=True)
+"""
+
+
+@pytest.mark.parametrize("mode", ["busy", "idle"])
+def test_ctrl_c_stops_every_operator_and_comes_out_of_run(runner, mode):
+    command = [sys.executable, "-c", textwrap.dedent(INTERRUPTED), runner.engine, runner.kind.__name__, mode]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=os.environ, check=False)
+    assert done.stdout.split("\n")[:2] == ["stopped", "interrupted stopped"], done.stderr
+    assert done.returncode == 0
+
+
+TERMINATED = """
+    import os, signal, sys, time
+    from operators.graph import *
+
+    class Once(Operator):
+        def compute(self, op_input, op_output, context):
+            pass
+
+    class App(Application):
+        def compose(self):
+            self.add_operator(Once(self, CountCondition(self, 1)))
+
+    run(App(), sys.argv[1])
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(30)
+"""
+
+
+def test_sigterm_still_ends_the_process_after_a_run(runner):
+    command = [sys.executable, "-c", textwrap.dedent(TERMINATED), runner.engine]
+    done = subprocess.run(command, capture_output=True, timeout=25, check=False)
+    assert done.returncode == -signal.SIGTERM, done.stderr

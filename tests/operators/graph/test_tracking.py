@@ -1,0 +1,117 @@
+"""Flow tracking: percentiles, paths, reading while running; counts are the same on every engine."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from operators.graph.tracking import FlowTracker, Histogram
+
+
+@given(st.lists(st.integers(0, 2**44 - 1), min_size=1, max_size=200))
+def test_percentiles_are_at_most_one_bucket_above(durations):
+    histogram = Histogram()
+    for duration in durations:
+        histogram.record(duration)
+    summary = histogram.summary()
+    assert summary.count == len(durations)
+    assert summary.max_ms == max(durations) * 1e-6
+    for fraction, found_ms in ((0.5, summary.p50_ms), (0.95, summary.p95_ms), (0.99, summary.p99_ms)):
+        exact_ms = float(np.quantile(durations, fraction, method="inverted_cdf")) * 1e-6
+        assert exact_ms * (1 - 1e-12) <= found_ms <= exact_ms * (1 + 1 / 32) + 1e-12
+
+
+def test_durations_beyond_the_range_are_kept_as_the_longest():
+    histogram = Histogram()
+    histogram.record(2**60)
+    histogram.record(-5)
+    assert histogram.summary().count == 2 and histogram.summary().max_ms == 2**60 * 1e-6
+
+
+def test_an_empty_histogram_is_all_zero():
+    assert Histogram().summary().count == 0 and Histogram().summary().p99_ms == 0.0
+
+
+def diamond(kit, app, count):
+    source, join, sink = (
+        app.counted(count, kit.Source, name="src"),
+        kit.Join(app, name="join"),
+        kit.Collect(app, name="sink"),
+    )
+    left, right = kit.Apply(app, name="depth"), kit.Apply(app, name="mask")
+    left.function = lambda value: time.sleep(0.002) or value
+    app.add_flow(source, left)
+    app.add_flow(source, right)
+    app.add_flow(left, join, {("out", "left")})
+    app.add_flow(right, join, {("out", "right")})
+    app.add_flow(join, sink)
+    app.add_flow(source, kit.Collect(app, name="raw"))
+
+
+def test_every_path_from_root_to_leaf_has_its_latency(kit, runner):
+    app = kit.Wired(lambda app: diamond(kit, app, 12), track=True)
+    for _ in range(2):  # begins anew with each run
+        runner(app)
+        latency, compute = app.track().latency(), app.track().compute()
+        assert {path: summary.count for path, summary in latency.items()} == {
+            "src,depth,join,sink": 12,
+            "src,mask,join,sink": 12,
+            "src,raw": 12,
+        }
+        assert {name: summary.count for name, summary in compute.items()} == app.compute_counts()
+        # Both ways wait for the slower branch at the join.
+        assert min(latency["src,depth,join,sink"].p50_ms, latency["src,mask,join,sink"].p50_ms) >= 2.0
+        assert 2.0 <= compute["depth"].p50_ms <= compute["depth"].p99_ms <= compute["depth"].max_ms
+
+
+def test_flow_is_readable_while_running(kit, runner):
+    passed, go_on = threading.Event(), threading.Event()
+
+    def pause(value):
+        if value == 5:
+            passed.set()
+            assert go_on.wait(10)
+
+    def wire(app):
+        app.chain(app.counted(9, kit.Source, name="src"), kit.Collect(app, name="sink", function=pause))
+
+    app = kit.Wired(wire)
+    tracker = app.track()
+    thread, outcome = runner.in_background(app)
+    assert passed.wait(10)
+    assert app.result is None
+    assert tracker.latency()["src,sink"].count == 5
+    assert tracker.compute()["sink"].count == 5 == app.compute_counts()["sink"]
+    (edge,) = app.edge_stats()
+    assert (edge.edge, edge.received) == ("src.out -> sink.in", 6)
+    go_on.set()
+    thread.join(10)
+    assert outcome and outcome[0] is app.result
+    assert tracker.latency()["src,sink"].count == 9
+
+
+def test_without_tracking_nothing_is_kept(kit, greedy_runner):
+    app = kit.Wired(lambda app: app.chain(app.counted(3, kit.Source), kit.Collect(app)))
+    greedy_runner(app)
+    assert app.track().latency() == {} == app.track().compute()
+
+
+def test_the_oldest_origin_of_a_path_counts_and_loops_end():
+    tracker = FlowTracker()
+    old, new = tracker.begin("src", 100), tracker.begin("src", 200)
+    ((node, began_ns),) = tracker.extend("join", [new, old])
+    assert (node.names, began_ns) == (("src", "join"), 100)
+    assert tracker.extend("src", [((node, began_ns),)]) == ()
+
+
+def test_a_chain_of_diamonds_does_not_explode():
+    tracker, trails = FlowTracker(), []
+    trail = tracker.begin("src", 0)
+    for depth in range(40):
+        trails = [tracker.extend(f"{side}{depth}", [trail]) for side in "ab"]
+        trail = tracker.extend(f"join{depth}", trails)
+    assert len(trail) == 64

@@ -1,0 +1,73 @@
+"""The model that a frame is shown with is the one right after that frame's own steps."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from operators.reconstruct import ReconstructOp
+
+
+class FakeReconstructor:
+    """Writes down what it is asked to do."""
+
+    def __init__(self, make_model):
+        self.calls = []
+        self.version = 0
+        self.make_model = make_model
+
+    def observe(self, frame, *, steps=None, train=True):
+        self.calls.append(("observe", frame.seq, train))
+        return SimpleNamespace(seq=frame.seq, steps=7 if train else 0, loss=0.5 if train else None, gaussians=60)
+
+    def snapshot(self):
+        self.version += 1
+        self.calls.append(("snapshot", self.version))
+        return self.make_model(self.version)
+
+
+def test_each_frame_is_trained_on_before_its_snapshot(frame, model, compute):
+    fake = FakeReconstructor(model)
+    operator = ReconstructOp(None, make_reconstructor=lambda: fake)
+    operator.start()
+    messages = [compute(operator, frame=frame(k))[0] for k in range(2)]
+    assert fake.calls == [("observe", 0, True), ("snapshot", 1), ("observe", 1, True), ("snapshot", 2)]
+    assert [(m.frame.seq, m.model.version, m.steps, m.loss, m.trained) for m in messages] == [
+        (0, 1, 7, 0.5, True),
+        (1, 2, 7, 0.5, True),
+    ]
+    assert operator.model is messages[-1].model
+
+
+def test_held_out_frames_are_passed_on_and_never_trained_on(frame, model, compute):
+    fake = FakeReconstructor(model)
+    operator = ReconstructOp(None, make_reconstructor=lambda: fake, held_out=lambda f: f.seq == 1)
+    operator.start()
+    messages = [compute(operator, frame=frame(k))[0] for k in range(3)]
+    assert [m.trained for m in messages] == [True, False, True]
+    assert [call for call in fake.calls if call[0] == "observe"] == [
+        ("observe", 0, True),
+        ("observe", 1, False),
+        ("observe", 2, True),
+    ]
+    assert (messages[1].steps, messages[1].loss) == (0, None)
+
+
+def test_the_first_frame_is_trained_on_even_when_it_is_held_out(frame, model, compute):
+    operator = ReconstructOp(None, make_reconstructor=lambda: FakeReconstructor(model), held_out=lambda f: True)
+    operator.start()
+    assert [compute(operator, frame=frame(k))[0].trained for k in range(2)] == [True, False]
+
+
+def test_the_heavy_work_begins_at_start_and_the_last_model_survives_stop(frame, model, compute):
+    made = []
+
+    def make():
+        made.append(FakeReconstructor(model))
+        return made[-1]
+
+    operator = ReconstructOp(None, make_reconstructor=make)
+    assert made == []
+    operator.start()
+    compute(operator, frame=frame())
+    operator.stop()
+    assert len(made) == 1 and operator.model.version == 1

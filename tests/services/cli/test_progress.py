@@ -1,0 +1,31 @@
+"""Progress: plain lines when nobody watches, none when JSON is asked for; stdout stays clean."""
+
+from __future__ import annotations
+
+from operators.applications.progress import Progress
+from services.cli.progress import ProgressPrinter
+
+
+def test_plain_lines_have_counts_rates_and_an_estimate(capsys, monkeypatch):
+    now = iter([0.0, 1.0, 7.0, 10.0, 11.0])
+    monkeypatch.setattr("services.cli.progress.time.monotonic", lambda: next(now))
+    with ProgressPrinter() as printer:
+        printer(Progress("replay", 1, 10))
+        printer(Progress("replay", 2, 10))
+        printer(Progress("replay", 7, 10, psnr_tissue_db=38.126))
+        printer(Progress("replay", 10, 10))
+        printer(Progress("evaluate", 1, 5))
+    captured = capsys.readouterr()
+    assert captured.err.splitlines() == [
+        "replay 1/10",
+        "replay 7/10  1.0 frames/s  eta 3 s  38.13 dB",
+        "replay 10/10  1.0 frames/s",
+        "evaluate 1/5",
+    ]
+    assert captured.out == ""
+
+
+def test_quiet_is_quiet(capsys):
+    with ProgressPrinter(quiet=True) as printer:
+        printer(Progress("replay", 10, 10))
+    assert capsys.readouterr() == ("", "")

@@ -1,0 +1,82 @@
+"""A report as a run would make it, and keyframes to go with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.frames import Frame
+from gsplat_core.training.metrics import FrameQuality
+from operators.messages import RenderedFrame
+from operators.metrics import ScoredFrame
+from services.reports.schema import RunReport
+
+PATH = "source,tool_mask,reconstruct,deform,rasterize,video"
+
+
+@pytest.fixture
+def report() -> RunReport:
+    return RunReport.model_validate(
+        {
+            "recording": {
+                "name": "take <7>",
+                "frames": 4,
+                "width_px": 24,
+                "height_px": 16,
+                "fps": 25.0,
+                "digest": "ab" * 32,
+            },
+            "run": {
+                "device": "cpu",
+                "engine": "embedded",
+                "seed": 3,
+                "version": "1.2.3",
+                "threads": 2,
+                "wall_s": 2.5,
+                "field": "basis",
+                "started_at": "2026-01-02T03:04:05+00:00",
+                "stop_reason": "end of recording",
+                "peak_memory_bytes": 2**30,
+                "machine": {"Processor": "abacus"},
+            },
+            "frames": {"ingested": 4, "displayed": 4, "dropped": 0},
+            "latency_ms": {PATH: {"p50": 10.0, "p95": 20.0, "p99": 21.0, "max": 22.5}},
+            "latency_quantiles_ms": {PATH: [10 + k / 8 for k in range(101)]},
+            "operators": {"source": {"calls": 4, "p50_ms": 1.25, "p99_ms": 2.5}},
+            "quality": {
+                "live": {"psnr_tissue_db": 38.5, "psnr_frame_db": 39.25, "ssim": 0.97, "frames": 3},
+                "heldout": {"psnr_tissue_db": 33.0, "psnr_frame_db": 34.0, "ssim": 0.9, "frames": 1},
+                "baselines": {"previous_frame_db": 37.25, "train_mean_db": 24.5, "heldout_previous_frame_db": 36.0},
+            },
+            "model": {"gaussians": 1200, "parameters": 99000, "sha256": "cd" * 32, "version": 4},
+            "frames_sha256": "ef" * 32,
+            "notes": ["no <mask>"],
+            "series": [
+                {
+                    "seq": k,
+                    "time_s": k / 25,
+                    "trained": k != 1,
+                    "model_version": k + 1,
+                    "psnr_tissue_db": 30.0 + k,
+                    "psnr_frame_db": 31.0 + k,
+                    "ssim": 0.9,
+                    "previous_frame_db": None if k == 0 else 37.0,
+                }
+                for k in range(4)
+            ],
+        }
+    )
+
+
+@pytest.fixture
+def scored() -> ScoredFrame:
+    image = np.arange(16 * 24 * 3, dtype=np.uint8).reshape(16, 24, 3)
+    rendered = RenderedFrame(
+        frame=Frame(1, 40_000_000, image, mask=np.ones((16, 24), np.uint8)),
+        image=image,
+        depth=np.full((16, 24), 61.5, np.float32),
+        alpha=np.ones((16, 24), np.float32),
+        model_version=2,
+        trained=False,
+    )
+    return ScoredFrame(rendered, FrameQuality(1, 33.0, 34.0, 0.9), 36.0)

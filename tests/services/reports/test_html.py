@@ -1,0 +1,103 @@
+"""`report.html` needs nothing but itself, says what it must, and cannot be injected into."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from services.reports.html import render_html, write_html
+from services.reports.pictures import keyframe_pictures
+
+
+class Page(HTMLParser):
+    """Collects elements and checks that they nest."""
+
+    VOID = frozenset({"meta", "img", "br", "line", "circle", "polyline"})
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.open = [], []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        if tag in self.VOID:
+            return
+        assert self.open.pop() == tag, tag
+
+    def all(self, tag):
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+@pytest.fixture
+def text(report, scored) -> str:
+    return render_html(report, [keyframe_pictures(scored)], worst_seq=1)
+
+
+def test_nothing_is_fetched_from_anywhere(text):
+    page = Page(text)
+    for tag, attributes in page.elements:
+        assert tag not in ("script", "link", "iframe", "object", "embed", "base", "form", "video", "audio"), tag
+        for name in ("src", "href", "srcset", "poster", "action", "data"):
+            if name in attributes:
+                assert attributes[name].startswith("data:image/"), attributes[name][:60]
+        assert not any(name.startswith("on") for name in attributes)
+    assert not re.findall(r"(?:https?:)?//[a-z0-9.-]+\.[a-z]{2,}", re.sub(r"data:image/[^\"]+", "", text))
+    assert "@import" not in text and "url(" not in text
+    (policy,) = [m["content"] for m in page.all("meta") if m.get("http-equiv") == "Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+
+
+def test_the_four_pictures_are_there_and_described(text):
+    pictures = Page(text).all("img")
+    assert [p["alt"] for p in pictures] == [f"frame 1, {name}" for name in ("raw", "reconstruction", "error", "depth")]
+    assert all(p["src"].startswith("data:image/jpeg;base64,") for p in pictures)
+
+
+def test_it_says_what_it_must(text):
+    assert text.count("Research use only, not a medical device.") >= 2
+    for value in ("38.50", "37.25", "+1.25 dB", "33.00", "24.50", "1,200", "lowest PSNR", "held out", "22.5", "1.25"):
+        assert value in text, value
+    page = Page(text)
+    assert page.all("html")[0]["lang"] == "en"
+    assert all("aria-label" in svg for svg in page.all("svg")) and len(page.all("svg")) == 2
+    assert "prefers-color-scheme: dark" in text
+
+
+def test_names_and_notes_are_escaped(text):
+    assert "take &lt;7&gt;" in text and "take <7>" not in text
+    assert "no &lt;mask&gt;" in text
+
+
+def test_a_run_that_was_interrupted_says_so(report):
+    run = report.run.model_copy(update={"stop_reason": "interrupted", "interrupted": True})
+    text = render_html(report.model_copy(update={"run": run}), [])
+    assert 'role="alert"' in text and "interrupted" in text
+
+
+def test_an_empty_run_still_has_a_page(report):
+    content = report.model_dump() | {
+        "latency_ms": {},
+        "latency_quantiles_ms": {},
+        "operators": {},
+        "series": [],
+        "model": None,
+        "quality": {"live": None, "heldout": None, "baselines": {"previous_frame_db": None, "train_mean_db": None}},
+    }
+    Page(render_html(type(report).model_validate(content), []))
+
+
+def test_the_file_is_written_whole(tmp_path, report, scored):
+    write_html(report, [keyframe_pictures(scored)], tmp_path / "report.html")
+    assert (tmp_path / "report.html").read_text().endswith("</html>\n")
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]

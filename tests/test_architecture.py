@@ -1,0 +1,59 @@
+"""The arrows between the packages point one way, and importing them does nothing but import."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+MAY_IMPORT = {
+    "gsplat_core": {"gsplat_core"},
+    "operators": {"gsplat_core", "operators"},
+    "services": {"gsplat_core", "operators", "services"},
+}
+
+
+def imported_packages(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            found.add(node.module.split(".")[0])
+    return found
+
+
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_arrows_point_one_way(package):
+    files = sorted((ROOT / package).rglob("*.py"))
+    assert files
+    forbidden = set(MAY_IMPORT) | {"tests", "benchmarks"}
+    for path in files:
+        wrong = imported_packages(path) & (forbidden - MAY_IMPORT[package])
+        assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
+
+
+PROGRAM = """
+import socket, subprocess, sys
+import torch  # runs ldconfig on its own account
+
+def forbidden(*arguments, **options):
+    raise AssertionError(f"import did something: {arguments}")
+
+socket.socket.connect = socket.socket.bind = forbidden
+subprocess.Popen.__init__ = forbidden
+import importlib
+importlib.import_module(sys.argv[1])
+assert not torch.cuda.is_initialized()
+assert "torch.utils.cpp_extension" not in sys.modules
+"""
+
+
+@pytest.mark.parametrize("package", [*MAY_IMPORT, "gsplat_core.rendering", "gsplat_core.reference"])
+def test_import_opens_no_socket_starts_no_process_and_compiles_nothing(package):
+    done = subprocess.run([sys.executable, "-c", PROGRAM, package], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
