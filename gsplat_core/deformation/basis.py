@@ -27,6 +27,8 @@ from gsplat_core.reference import deformation as reference
 from gsplat_core.reference.deformation import BUMP_REACH, CHANNEL_GROUPS
 
 CHANNELS = sum(CHANNEL_GROUPS)
+BUMPS_PER_SPACING = math.sqrt(math.pi)
+"""What a row of equal bumps of width 1, one per spacing, adds up to at any time (within 0.02 %)."""
 
 
 @dataclass(frozen=True)
@@ -173,13 +175,13 @@ class BasisField(DeformationField):
 
         return at
 
-    def extend(self, time_window_s: tuple[float, float], *, hold: bool = False) -> None:
+    def extend(self, time_window_s: tuple[float, float], *, hold_at_s: float | None = None) -> None:
         """Move the window on: new bumps at the head, and bumps that ended before the new start dropped.
 
-        The start and the end may only grow. New bumps start still (zero weights), or with `hold` as copies of the newest
-        column, which keeps the last deformation. Past the window the field holds its last state, so a window may be extended
-        ahead of time: each change of the columns copies the field, so extend by several spacings at once. A bump is dropped
-        when its laid-out place is more than 4 spacings before the new start.
+        The start and the end may only grow. New bumps start still (zero weights), or so that they continue the deformation at
+        `hold_at_s`: tissue that a tool hides then stays as it was last seen, instead of falling back to its canonical state.
+        Past the window the field holds its last state. A bump is dropped when its laid-out place is more than 4 spacings before
+        the new start.
         """
         start, end = checked_window(time_window_s)
         if start < self._time_window_s[0] or end < self._time_window_s[1]:
@@ -190,7 +192,7 @@ class BasisField(DeformationField):
         dropped = max(0, math.floor((start - self._origin_s) / spacing - BUMP_REACH))
         dropped = min(dropped, self.bumps + added - 4)
         if added:
-            self._append_columns(added, hold)
+            self._append_columns(added, None if hold_at_s is None else self.deltas(hold_at_s).detach())
         if dropped:
             self._set_parameters(*(p.data[:, dropped:] for p in self._parameters_in_order()))
             self.centers.data -= dropped
@@ -246,10 +248,12 @@ class BasisField(DeformationField):
     def _training_state(self) -> Sequence[object]:
         return (self._moments,)
 
-    def _append_columns(self, added: int, hold: bool) -> None:
+    def _append_columns(self, added: int, held: Tensor | None) -> None:
         centers, log_widths, weights = (p.data for p in self._parameters_in_order())
         columns = torch.arange(self.bumps, self.bumps + added, dtype=centers.dtype).repeat(self.count, 1)
-        new_weights = weights[:, -1:].repeat(1, added, 1) if hold else weights.new_zeros(self.count, added, CHANNELS)
+        new_weights = weights.new_zeros(self.count, added, CHANNELS)
+        if held is not None:
+            new_weights += held[:, None] / BUMPS_PER_SPACING
         self._set_parameters(
             torch.cat([centers, columns], dim=1),
             torch.cat([log_widths, log_widths.new_zeros(self.count, added)], dim=1),

@@ -131,6 +131,10 @@ GSPLAT_INLINE vfloat log2(vfloat x) {
   return fma(p, t, __builtin_convertvector(exponent, vfloat));
 }
 
+GSPLAT_INLINE vint to_int(vfloat x) { return __builtin_convertvector(x, vint); }
+// Towards zero, for |x| < 2^31.
+GSPLAT_INLINE vfloat truncate(vfloat x) { return __builtin_convertvector(to_int(x), vfloat); }
+
 // A set of lanes: a mask register where there are such (GCC turns a vector comparison into a vector and back there).
 #if defined(__AVX512F__)
 typedef __mmask16 vmask;
@@ -173,6 +177,11 @@ GSPLAT_INLINE uint32_t lanes_of(vmask m) { return bits(m); }
 GSPLAT_INLINE vmask no_lanes() { return vint{}; }
 GSPLAT_INLINE vint or_where(vmask m, vint a, int32_t bit) { return a | (m & bit); }
 #endif
+
+GSPLAT_INLINE vfloat ceiling(vfloat x) {
+  const vfloat below = truncate(x);
+  return below + where(above(x, below), splat(1.0f), vfloat{});
+}
 
 // out[i] = sum of the lanes of v[i]: additions in a fixed order, shared between the vectors where the set allows it.
 template <int kCount>

@@ -13,7 +13,7 @@ from gsplat_core.cameras import Camera
 from gsplat_core.frames import Frame
 from gsplat_core.gaussians import SH_C0, Gaussians
 
-SIGMA_IN_SPACINGS = 0.55
+SIGMA_IN_SPACINGS = 0.7
 """Standard deviation of a fresh Gaussian in grid spacings: neighbours overlap and leave no holes."""
 THICKNESS = 0.3
 """Depth of a fresh Gaussian relative to its width: tissue is a surface."""
@@ -30,7 +30,7 @@ def gaussians_from_frame(
     height, width = frame.image.shape[:2]
     spacing = math.sqrt(height * width / count)
     columns, rows = max(1, round(width / spacing)), max(1, round(height / spacing))
-    jitter = np.random.default_rng(seed).uniform(-0.3, 0.3, (2, rows, columns))
+    jitter = np.random.default_rng(seed).uniform(-0.15, 0.15, (2, rows, columns))
     u = (np.arange(columns)[None, :] + 0.5 + jitter[0]) * (width / columns)
     v = (np.arange(rows)[:, None] + 0.5 + jitter[1]) * (height / rows)
     return gaussians_at_pixels(
@@ -71,7 +71,7 @@ def gaussians_at_pixels(
         means=torch.tensor(points, dtype=torch.float32),
         quats=torch.tensor(facing(camera_to_world[:3, :3]), dtype=torch.float32).repeat(count, 1),
         log_scales=torch.tensor(np.log(sigma[:, None] * np.array([1, 1, THICKNESS])), dtype=torch.float32),
-        logit_opacities=torch.full((count,), math.log(0.8 / 0.2)),
+        logit_opacities=torch.full((count,), math.log(0.9 / 0.1)),
         sh=torch.tensor(sh, dtype=torch.float32),
     )
 

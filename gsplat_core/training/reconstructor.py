@@ -19,8 +19,8 @@ from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.step import TrainingStep
 
-EXTEND_AHEAD_BUMPS = 4
-"""Bumps that the online basis field keeps ahead of the newest frame: as far as a bump reaches."""
+EXTEND_AHEAD_BUMPS = 1
+"""Window that the online basis field keeps ahead of the newest frame, in bumps; beyond it lies one more column."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ class Reconstructor:
                 " frames must come in order"
             )
         assert self._step is not None
-        self._last_time_s = observation.time_s
         self._cover_time(observation.time_s)
+        self._last_time_s = observation.time_s
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
         self._window.add(observation)
@@ -162,7 +162,7 @@ class Reconstructor:
         if isinstance(field, BasisField):
             ahead = EXTEND_AHEAD_BUMPS * field.spacing_s
             if time_s + ahead > end:
-                field.extend((start, end + field.spacing_s + max(0.0, time_s + ahead - end)), hold=True)
+                field.extend((start, time_s + ahead + field.spacing_s), hold_at_s=self._last_time_s)
         elif time_s > end:
             field.extend((start, start + 2 * (time_s - start)))
 

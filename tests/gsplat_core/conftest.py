@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from gsplat_core.gaussians import Gaussians
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -94,3 +96,21 @@ def assert_near() -> Callable[..., None]:
             )
 
     return check
+
+
+@pytest.fixture
+def make_gaussians() -> Callable[..., Gaussians]:
+    """`make_gaussians(count, sh_degree=0, seed=0, dtype=float32)`: random Gaussians some 60 mm before the camera."""
+
+    def make(count: int, sh_degree: int = 0, seed: int = 0, dtype: torch.dtype = torch.float32) -> Gaussians:
+        random = torch.Generator().manual_seed(seed)
+        draw = lambda *shape: torch.randn(*shape, generator=random).to(dtype)
+        return Gaussians(
+            means=draw(count, 3) * 10 + torch.tensor([0.0, 0.0, 60.0], dtype=dtype),
+            quats=draw(count, 4),
+            log_scales=draw(count, 3) * 0.3,
+            logit_opacities=draw(count),
+            sh=draw(count, (sh_degree + 1) ** 2, 3) * 0.3,
+        )
+
+    return make

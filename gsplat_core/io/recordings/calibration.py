@@ -95,6 +95,9 @@ def read_poses_bounds(
 
 def read_json(path: Path, findings: Findings) -> dict[str, Any] | None:
     """A JSON object from a file of bounded size."""
+    if not path.is_file():
+        findings.problem(path, "it is not a plain file", "Give a JSON file")
+        return None
     try:
         if path.stat().st_size > MAX_JSON_BYTES:
             findings.problem(path, f"{path.stat().st_size} bytes, more than the bound of {MAX_JSON_BYTES}", "Split it")

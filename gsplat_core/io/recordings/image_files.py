@@ -6,6 +6,7 @@ more pixels than MAX_PIXELS is refused before a decoder allocates anything.
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 from collections.abc import Iterator
@@ -40,6 +41,12 @@ def quiet_decoder() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(level)
 
 
+def check_plain(path: Path) -> None:
+    """Raise UnreadableImage for what is no file: opening a pipe would wait for ever."""
+    if not path.is_file():
+        raise UnreadableImage("it is not a plain file" if os.path.lexists(path) else "the file is not there")
+
+
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
     """Sort key that puts 2.png before 10.png; for zero-padded names the same as sorting by name."""
     parts = re.split(r"(\d+)", path.name)
@@ -54,6 +61,7 @@ def frame_number(path: Path) -> int | None:
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) in pixels as the PNG or JPEG header announces it. Raises UnreadableImage."""
+    check_plain(path)
     try:
         with path.open("rb") as stream:
             head = stream.read(24)

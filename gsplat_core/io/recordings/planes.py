@@ -14,6 +14,7 @@ from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.image_files import (
     MAX_PIXELS,
     UnreadableImage,
+    check_plain,
     decode_image,
     frame_number,
     image_size,
@@ -174,6 +175,7 @@ def check_sizes(
 
 
 def _npy_size(path: Path) -> tuple[int, int]:
+    check_plain(path)
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, SyntaxError) as error:

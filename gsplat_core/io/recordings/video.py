@@ -110,6 +110,9 @@ def open_video(path: Path, findings: Findings) -> VideoFrames | None:
 
 def _check_container(path: Path, findings: Findings) -> bool | None:
     """None: a problem. True: the announced frame count is exact. False: it is an estimate."""
+    if not path.is_file():  # opening a pipe would wait for ever
+        findings.problem(path, "it is not a plain file", "Give a video file")
+        return None
     try:
         size = path.stat().st_size
         with path.open("rb") as stream:

@@ -56,6 +56,18 @@ GSPLAT_INLINE Bumps bumps_at(const float* centers, const float* log_widths, int6
   return b;
 }
 
+constexpr int64_t kAhead = 8;  // Gaussians
+
+// Neighbouring Gaussians have nearly the same active bumps, but their rows lie too far apart for the processor to foresee: ask
+// for the rows that the Gaussian `kAhead` further on will want. A prefetch past the end of the tensor does nothing.
+template <bool kWrite>
+GSPLAT_INLINE void prefetch_rows(const float* weights, int64_t row, int64_t bumps, uint32_t mask) {
+  const int64_t first = row + kAhead * bumps + __builtin_ctz(mask), last = row + kAhead * bumps + 31 - __builtin_clz(mask);
+  const char* end = (const char*)(weights + (last + 1) * kBasisChannels);
+  for (const char* line = (const char*)(weights + first * kBasisChannels); line < end; line += 64)
+    __builtin_prefetch(line, kWrite, 3);
+}
+
 GSPLAT_INLINE int64_t lanes_left(int64_t from, int64_t bumps) { return bumps - from < kLanes ? bumps - from : kLanes; }
 
 void forward(const BasisBumps& field, float* deltas, int64_t begin, int64_t end) {
@@ -67,6 +79,7 @@ void forward(const BasisBumps& field, float* deltas, int64_t begin, int64_t end)
           bumps_at(field.centers + first + from, field.log_widths + first + from, lanes_left(from, field.bumps), field.tau);
       float heights[kLanes];
       store(heights, b.height);
+      if (b.mask != 0) prefetch_rows<false>(field.weights, first + from, field.bumps, b.mask);
       for (uint32_t left = b.mask; left != 0; left &= left - 1) {
         const int lane = __builtin_ctz(left);
         const Row w = load_row(field.weights + (first + from + lane) * kBasisChannels);
@@ -131,6 +144,9 @@ void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t 
       const int64_t at = first + from, count = lanes_left(from, field.bumps);
       const Bumps b = bumps_at(field.centers + at, field.log_widths + at, count, field.tau);
       if (b.mask == 0) continue;
+      prefetch_rows<true>(field.weights, at, field.bumps, b.mask);
+      prefetch_rows<true>(field.m_weights, at, field.bumps, b.mask);
+      prefetch_rows<true>(field.v_weights, at, field.bumps, b.mask);
       float heights[kLanes], along[kLanes] = {}, bias1[kLanes] = {}, bias2[kLanes] = {};
       store(heights, b.height);
       for (uint32_t left = b.mask; left != 0; left &= left - 1) {

@@ -76,7 +76,7 @@ void window_backward(const Compositing& in, const Tile& tile, int x0, int y0, in
                      const CompositingGradients& out, float* scratch) {
   const int width = tile.right - x0 < kWindow ? tile.right - x0 : kWindow;
   const int height = tile.bottom - y0 < kWindow ? tile.bottom - y0 : kWindow;
-  const int channels = D > 0 ? D : in.channels, abs_at = kMoments + channels, row_size = abs_at + (kAbs ? 2 : 0);
+  const int channels = D > 0 ? D : in.channels, abs_at = kMoments + channels;
   alignas(64) float through[kPixels], behind[kPixels];
   alignas(64) int32_t last[kPixels];
   alignas(64) float own_v_colors[D > 0 ? D * kPixels : 1];
@@ -91,21 +91,39 @@ void window_backward(const Compositing& in, const Tile& tile, int x0, int y0, in
   int32_t furthest = -1;
   for (int y = 0; y < height; ++y) {
     const int64_t row = (tile.image * in.height + y0 + y) * in.width + x0;
-    for (int x = 0; x < width; ++x) {
-      const int at = place(x, y);
-      const float* const v = out.v_colors + (row + x) * channels;
-      const float left = 1 - out.alphas[row + x];
-      float v_left = -out.v_alphas[row + x];
-      for (int d = 0; d < channels; ++d) {
-        w.v_colors[d * kPixels + at] = v[d];
-        if (background != nullptr) {
-          v_left += v[d] * background[d];
-          out.v_backgrounds[tile_index * channels + d] += v[d] * left;
+    for (int x = 0; x < width; x += kBlockWidth) {
+      const int at = place(x, y), count = width - x < kBlockWidth ? width - x : kBlockWidth;
+      const int64_t pixel = row + x;
+      const float* const from = out.v_colors + pixel * channels;
+      float* const to = w.v_colors + at;
+      quad left = {1, 1, 1, 1}, v_left = {};
+      if (count == kBlockWidth) {
+        left = 1.0f - load_quad(out.alphas + pixel);
+        v_left = -load_quad(out.v_alphas + pixel);
+        __builtin_memcpy(last + at, out.last + pixel, kBlockWidth * sizeof(int32_t));
+      } else {
+        for (int i = 0; i < count; ++i) {
+          left[i] = 1 - out.alphas[pixel + i];
+          v_left[i] = -out.v_alphas[pixel + i];
+          last[at + i] = out.last[pixel + i];
         }
       }
-      through[at] = left;
-      behind[at] = left * v_left;
-      last[at] = out.last[row + x];
+      if (D == 4 && count == kBlockWidth) {
+        quad a = load_quad(from), b = load_quad(from + 4), c = load_quad(from + 8), d = load_quad(from + 12);
+        transpose(a, b, c, d);
+        store_quad(to, a), store_quad(to + kPixels, b), store_quad(to + 2 * kPixels, c), store_quad(to + 3 * kPixels, d);
+      } else {
+        for (int i = 0; i < count; ++i)
+          for (int d = 0; d < channels; ++d) to[d * kPixels + i] = from[i * channels + d];
+      }
+      if (background != nullptr)
+        for (int d = 0; d < channels; ++d) {
+          const quad v = load_quad(to + d * kPixels), shown = v * left;
+          v_left += v * background[d];
+          out.v_backgrounds[tile_index * channels + d] += (shown[0] + shown[1]) + (shown[2] + shown[3]);
+        }
+      store_quad(through + at, left);
+      store_quad(behind + at, left * v_left);
     }
   }
   for (int block = 0; block < kBlocks; ++block) {
@@ -120,6 +138,10 @@ void window_backward(const Compositing& in, const Tile& tile, int x0, int y0, in
   for (int64_t first = tile.begin + (tile.end - tile.begin - 1) / kLanes * kLanes; first >= tile.begin && first < tile.end;
        first -= kLanes) {
     const int count = tile.end - first < kLanes ? int(tile.end - first) : kLanes;
+    const int64_t ahead = first - 2 * kLanes > tile.begin ? first - 2 * kLanes : tile.begin;
+    prefetch_records(in, ahead, kLanes);
+    for (int64_t i = ahead; i < ahead + kLanes && i < tile.end; ++i)
+      __builtin_prefetch(out.rows + int64_t(out.slots[i]) * out.row_size, 1);
     constexpr int kHalves = (kBlocks + 31) / 32;  // a splat's set of blocks, 32 to an int
     alignas(64) uint32_t touched[kHalves][kLanes] = {};
     if (first <= furthest) {
@@ -133,12 +155,12 @@ void window_backward(const Compositing& in, const Tile& tile, int x0, int y0, in
     }
     for (int i = count - 1; i >= 0; --i) {
       const int64_t position = first + i;
-      float* const to = out.rows + int64_t(out.slots[position]) * row_size;
+      float* const to = out.rows + int64_t(out.slots[position]) * out.row_size;
       uint64_t blocks = touched[0][i];
       if constexpr (kHalves > 1) blocks |= uint64_t(touched[kHalves - 1][i]) << 32;
       if (blocks == 0) {
         if (!add)
-          for (int r = 0; r < row_size; ++r) to[r] = 0;
+          for (int r = 0; r < out.row_size; ++r) to[r] = 0;
         continue;
       }
       constexpr int kShape = kMoments + (kAbs ? 2 : 0);
@@ -149,9 +171,13 @@ void window_backward(const Compositing& in, const Tile& tile, int x0, int y0, in
         for (int r = 0; r < kMoments; ++r) all[r] = sum[r];
         for (int d = 0; d < D; ++d) all[kMoments + d] = color_sum[d];
         for (int r = kMoments; r < kShape; ++r) all[r + D] = sum[r];
-        float row[kShape + D];
-        sums<kShape + D>(all, row);
-        put(to, row, kShape + D, add);
+        if (add) {
+          float row[kShape + D];
+          sums<kShape + D>(all, row);
+          put(to, row, kShape + D, true);
+        } else {
+          sums<kShape + D>(all, to);
+        }
       } else {
         vfloat shape_sum[kShape] = {};
         for (int d = 0; d < channels; ++d) far_sums[d] = vfloat{};
@@ -175,9 +201,8 @@ void tile_backward(const Compositing& in, int64_t index, const CompositingGradie
     for (int x = tile.x; x < tile.right; x += kWindow, add = true)
       window_backward<D, kAbs>(in, tile, x, y, index, add, out, scratch);
   if (!add) {  // a tile outside of the image: its instances reach no pixel
-    const int64_t row_size = kMoments + in.channels + (kAbs ? 2 : 0);
     for (int64_t position = tile.begin; position < tile.end; ++position)
-      for (int64_t r = 0; r < row_size; ++r) out.rows[out.slots[position] * row_size + r] = 0;
+      for (int64_t r = 0; r < out.row_size; ++r) out.rows[out.slots[position] * out.row_size + r] = 0;
   }
 }
 

@@ -23,6 +23,28 @@ GSPLAT_INLINE int place(int x, int y) {
   return (y / kBlockHeight * kColumns + x / kBlockWidth) * kLanes + y % kBlockHeight * kBlockWidth + x % kBlockWidth;
 }
 
+// Four pixels next to each other, which lie next to each other in a block too.
+typedef float quad __attribute__((vector_size(16)));
+typedef int32_t quad_index __attribute__((vector_size(16)));
+GSPLAT_INLINE quad load_quad(const float* p) {
+  quad v;
+  __builtin_memcpy(&v, p, sizeof(v));
+  return v;
+}
+GSPLAT_INLINE void store_quad(float* p, quad v) { __builtin_memcpy(p, &v, sizeof(v)); }
+
+// The columns of four rows: 4 pixels of 4 channels from 4 channels of 4 pixels, and back.
+GSPLAT_INLINE void transpose(quad& a, quad& b, quad& c, quad& d) {
+  const quad ab_low = __builtin_shuffle(a, b, (quad_index){0, 4, 1, 5}),
+             ab_high = __builtin_shuffle(a, b, (quad_index){2, 6, 3, 7});
+  const quad cd_low = __builtin_shuffle(c, d, (quad_index){0, 4, 1, 5}),
+             cd_high = __builtin_shuffle(c, d, (quad_index){2, 6, 3, 7});
+  a = __builtin_shuffle(ab_low, cd_low, (quad_index){0, 1, 4, 5});
+  b = __builtin_shuffle(ab_low, cd_low, (quad_index){2, 3, 6, 7});
+  c = __builtin_shuffle(ab_high, cd_high, (quad_index){0, 1, 4, 5});
+  d = __builtin_shuffle(ab_high, cd_high, (quad_index){2, 3, 6, 7});
+}
+
 // Offsets of a block's pixels from its first.
 GSPLAT_INLINE vfloat lane_x() {
   vfloat v;
@@ -92,6 +114,12 @@ GSPLAT_INLINE void test_blocks(const SplatRecord* records, const int32_t* ids, i
       on_block(row * kColumns + column, vmask(hit | everywhere));
     }
   }
+}
+
+// Splats lie anywhere in memory: their records are on the way while others are blended.
+GSPLAT_INLINE void prefetch_records(const Compositing& in, int64_t first, int count) {
+  const int64_t end = first + count < in.instances ? first + count : in.instances;
+  for (int64_t i = first < 0 ? 0 : first; i < end; ++i) __builtin_prefetch(in.records + in.flatten_ids[i]);
 }
 
 // One tile as the kernels see it.

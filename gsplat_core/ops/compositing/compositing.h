@@ -37,7 +37,7 @@ struct Compositing {
   const bool* masks;         // [images, tile_height, tile_width] or null
 };
 
-// Results of the forward pass; `colors` and `alphas` are written, and `last` too unless it is null.
+// Results of the forward pass. `last` is the last blended position of flatten_ids, -1 where there is none.
 struct CompositedPixels {
   float* colors;  // [images, height, width, channels]
   float* alphas;  // [images, height, width]
@@ -52,7 +52,8 @@ struct CompositingGradients {
   bool absgrad;
   // Where the gradient of every instance goes: position of flatten_ids -> row of `rows`, so that a splat's rows are neighbours.
   const int32_t* slots;
-  float* rows;           // [instances, row_size]: moments, colours, then |dL/dx|, |dL/dy| with absgrad
+  float* rows;  // [instances, row_size]: moments, colours, then |dL/dx|, |dL/dy| with absgrad; on cache lines
+  int64_t row_size;
   float* v_backgrounds;  // [tiles, channels] partial sums, or null
 };
 

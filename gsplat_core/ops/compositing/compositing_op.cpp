@@ -11,6 +11,10 @@ namespace {
 
 constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
 
+struct alignas(64) Line {
+  float floats[16];
+};
+
 // The inputs of either pass, checked, and the record of every splat.
 struct Call {
   Tensor means2d, conics, colors, opacities, offsets, flatten_ids;
@@ -82,15 +86,15 @@ struct Call {
   // run(tile, scratch) for all tiles: threads take the next free one, and no result depends on which takes which.
   template <class Run>
   void for_tiles(const Run& run) const {
+    constexpr int64_t kRun = 4;
     std::atomic<int64_t> next{0};
     const int64_t workers = std::max<int64_t>(1, std::min<int64_t>(torch::stable::get_num_threads(), tiles));
     const int64_t scratch = compositing_kernels().scratch_floats(in.channels);
     torch::stable::parallel_for(0, workers, 1, [&](int64_t, int64_t) {
-      struct alignas(64) Line {
-        float floats[16];
-      };
       const auto lines = uninitialised<Line>(scratch / 16 + 1);
-      for (int64_t tile; (tile = next.fetch_add(1, std::memory_order_relaxed)) < tiles;) run(tile, lines[0].floats);
+      // A few neighbours at a time: they share splats, and the next one's are being fetched.
+      for (int64_t first; (first = next.fetch_add(kRun, std::memory_order_relaxed)) < tiles;)
+        for (int64_t tile = first; tile < std::min(first + kRun, tiles); ++tile) run(tile, lines[0].floats);
     });
   }
 };
@@ -133,12 +137,18 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
   });
   first[count] = int32_t(instances);
 
-  const auto rows = uninitialised<float>(instances * (kMoments + channels + (absgrad ? 2 : 0)));
+  const int64_t lines_per_row = (kMoments + channels + (absgrad ? 2 : 0) + 15) / 16;
+  const auto rows = uninitialised<Line>(instances * lines_per_row);
   std::vector<float> background_parts(backgrounds ? size_t(call.tiles * channels) : 0, 0.0f);
-  const CompositingGradients gradients = {data(alphas_),   last_.const_data_ptr<int32_t>(),
-                                          data(v_colors_), data(v_alphas_),
-                                          absgrad,         slots.get(),
-                                          rows.get(),      backgrounds ? background_parts.data() : nullptr};
+  const CompositingGradients gradients = {data(alphas_),
+                                          last_.const_data_ptr<int32_t>(),
+                                          data(v_colors_),
+                                          data(v_alphas_),
+                                          absgrad,
+                                          slots.get(),
+                                          rows[0].floats,
+                                          lines_per_row * 16,
+                                          backgrounds ? background_parts.data() : nullptr};
   call.for_tiles([&](int64_t tile, float* scratch) { compositing_kernels().tile_backward(call.in, tile, gradients, scratch); });
 
   Tensor v_means2d = empty_floats({count, 2}), v_conics = empty_floats({count, 3}),

@@ -56,6 +56,12 @@ void blend_block(const Compositing& in, const int32_t* ids, int64_t position, ui
   for (int d = 0; d < D; ++d) store(w.colors + d * kPixels + at, sum[d]);
 }
 
+GSPLAT_INLINE void write_pixel(const Window& w, int at, int channels, int64_t pixel, const CompositedPixels& out) {
+  out.alphas[pixel] = 1 - w.kept[at];
+  out.last[pixel] = w.last[at];
+  for (int d = 0; d < channels; ++d) out.colors[pixel * channels + d] = w.colors[d * kPixels + at];
+}
+
 template <int D>
 void blend_window(const Compositing& in, const Tile& tile, int x0, int y0, const CompositedPixels& out, float* scratch) {
   const int width = tile.right - x0 < kWindow ? tile.right - x0 : kWindow;
@@ -69,15 +75,16 @@ void blend_window(const Compositing& in, const Tile& tile, int x0, int y0, const
   uint64_t alive = 0;
   for (int i = 0; i < kPixels; ++i) through[i] = 0, kept[i] = 1, last[i] = -1;
   for (int y = 0; y < height; ++y)
-    for (int x = 0; x < width; ++x) {
+    for (int x = 0; x < width; x += kBlockWidth) {
       const int at = place(x, y);
-      through[at] = 1;
+      for (int i = 0; i < kBlockWidth && x + i < width; ++i) through[at + i] = 1;
       alive |= uint64_t(1) << (at / kLanes);
     }
   const vfloat block_x = lane_x() + (float(x0) + 0.5f), block_y = lane_y() + (float(y0) + 0.5f);
   for (int64_t first = tile.begin; first < tile.end && alive != 0; first += kBatch) {
     const int32_t* const ids = in.flatten_ids + first;
     const int count = tile.end - first < kBatch ? int(tile.end - first) : kBatch;
+    prefetch_records(in, first + kBatch, kBatch);
     uint64_t splats[kBlocks] = {};
     for (int i = 0; i < count; i += kLanes)
       test_blocks(in.records, ids + i, count - i, float(x0) + 0.5f, float(y0) + 0.5f,
@@ -92,13 +99,31 @@ void blend_window(const Compositing& in, const Tile& tile, int x0, int y0, const
   const float* const background = in.backgrounds != nullptr ? in.backgrounds + tile.image * channels : nullptr;
   for (int y = 0; y < height; ++y) {
     const int64_t row = (tile.image * in.height + y0 + y) * in.width + x0;
-    for (int x = 0; x < width; ++x) {
-      const int at = place(x, y);
-      out.alphas[row + x] = 1 - kept[at];
-      if (out.last != nullptr) out.last[row + x] = last[at];
-      float* const to = out.colors + (row + x) * channels;
-      for (int d = 0; d < channels; ++d)
-        to[d] = background != nullptr ? w.colors[d * kPixels + at] + kept[at] * background[d] : w.colors[d * kPixels + at];
+    for (int x = 0; x < width; x += kBlockWidth) {
+      const int at = place(x, y), count = width - x < kBlockWidth ? width - x : kBlockWidth;
+      const int64_t pixel = row + x;
+      if (background != nullptr)
+        for (int d = 0; d < channels; ++d) {
+          float* const color = w.colors + d * kPixels + at;
+          store_quad(color, load_quad(color) + load_quad(kept + at) * background[d]);
+        }
+      if (count < kBlockWidth) {
+        for (int i = 0; i < count; ++i) write_pixel(w, at + i, channels, pixel + i, out);
+        continue;
+      }
+      store_quad(out.alphas + pixel, 1.0f - load_quad(kept + at));
+      __builtin_memcpy(out.last + pixel, last + at, kBlockWidth * sizeof(int32_t));
+      float* const to = out.colors + pixel * channels;
+      const float* const from = w.colors + at;
+      if constexpr (D == 4) {
+        quad a = load_quad(from), b = load_quad(from + kPixels), c = load_quad(from + 2 * kPixels),
+             d = load_quad(from + 3 * kPixels);
+        transpose(a, b, c, d);
+        store_quad(to, a), store_quad(to + 4, b), store_quad(to + 8, c), store_quad(to + 12, d);
+      } else {
+        for (int i = 0; i < kBlockWidth; ++i)
+          for (int d = 0; d < channels; ++d) to[i * channels + d] = from[d * kPixels + i];
+      }
     }
   }
 }

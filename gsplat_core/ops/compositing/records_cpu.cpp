@@ -44,14 +44,14 @@ int64_t scratch_floats(int channels) { return int64_t(channels) * (kPixels + kLa
 
 void gather(const Compositing& in, const CompositingGradients& from, const int32_t* first, int64_t begin, int64_t end,
             float* v_means2d, float* v_conics, float* v_colors, float* v_opacities, float* v_means2d_abs) {
-  const int channels = in.channels, row_size = kMoments + channels + (from.absgrad ? 2 : 0);
+  const int channels = in.channels;
   for (int64_t splat = begin; splat < end; ++splat) {
     float m[kMoments] = {}, absolute[2] = {};
     float* const v_color = v_colors + channels * splat;
     for (int d = 0; d < channels; ++d) v_color[d] = 0;
     const bool usable = in.records[splat].l > -__builtin_inff();
     for (int64_t i = first[splat]; usable && i < first[splat + 1]; ++i) {
-      const float* const row = from.rows + i * row_size;
+      const float* const row = from.rows + i * from.row_size;
       for (int r = 0; r < kMoments; ++r) m[r] += row[r];
       for (int d = 0; d < channels; ++d) v_color[d] += row[kMoments + d];
       if (from.absgrad)

@@ -1,5 +1,4 @@
 #include "covariance.h"
-
 #include "covariance_math.h"
 #include "rows.h"
 #include "simd.h"

@@ -1,8 +1,7 @@
-#include "covariance.h"
-
 #include <optional>
 #include <tuple>
 
+#include "covariance.h"
 #include "tensor_checks.h"
 
 constexpr int64_t kGrain = 4096;
@@ -12,8 +11,8 @@ static void check_sizes(const Tensor& q, const Tensor& s) {
                   "covariance takes quats [M, 4] and scales [M, 3]");
 }
 
-static std::tuple<Tensor, Tensor> quat_scale_to_covar_preci(Tensor quats, Tensor scales, bool compute_covar,
-                                                            bool compute_preci, bool triu) {
+static std::tuple<Tensor, Tensor> quat_scale_to_covar_preci(Tensor quats, Tensor scales, bool compute_covar, bool compute_preci,
+                                                            bool triu) {
   const Tensor q = floats(quats, "quats"), s = floats(scales, "scales");
   check_sizes(q, s);
   const int64_t M = q.size(0);
@@ -38,9 +37,9 @@ static std::tuple<Tensor, Tensor> quat_scale_to_covar_preci_backward(Tensor quat
   std::optional<Tensor> v_covars, v_precis;
   if (v_covars_in.has_value()) v_covars = floats(*v_covars_in, "v_covars");
   if (v_precis_in.has_value()) v_precis = floats(*v_precis_in, "v_precis");
-  STD_TORCH_CHECK((!v_covars.has_value() || v_covars->numel() == M * columns) &&
-                      (!v_precis.has_value() || v_precis->numel() == M * columns),
-                  "covariance backward: the sizes of the gradients do not fit the inputs");
+  STD_TORCH_CHECK(
+      (!v_covars.has_value() || v_covars->numel() == M * columns) && (!v_precis.has_value() || v_precis->numel() == M * columns),
+      "covariance backward: the sizes of the gradients do not fit the inputs");
   Tensor v_quats = empty_floats({M, 4}), v_scales = empty_floats({M, 3});
   float *to_quats = mutable_data(v_quats), *to_scales = mutable_data(v_scales);
   const float *from_covars = v_covars.has_value() ? data(*v_covars) : nullptr,

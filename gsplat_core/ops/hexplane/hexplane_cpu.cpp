@@ -48,7 +48,7 @@ void product(const HexPlanes& level, int first, int last, float* features, int64
 }
 
 void backward_samples(const HexPlanes& level, const float* gradient, float* sample_gradients, float* coordinate_gradients,
-                      int64_t count, int64_t begin, int64_t end) {
+                      int64_t block, int64_t begin, int64_t end) {
   const int64_t channels = level.channels;
   for (int64_t n = begin; n < end; ++n) {
     const float* x = level.coordinates + n * 4;
@@ -69,7 +69,7 @@ void backward_samples(const HexPlanes& level, const float* gradient, float* samp
       for (int p = kPlanes - 1; p >= 0; --p) {
         const vfloat g = before[p] * after;
         after *= values[p];
-        store_first(sample_gradients + (p * count + n) * channels + c, g, lanes);
+        store_first(sample_gradients + (p * kBackwardBlock + n - block) * channels + c, g, lanes);
         const Corners& k = corners[p];
         const vfloat p00 = load_first(k.p00 + c, lanes), p10 = load_first(k.p10 + c, lanes);
         const vfloat p01 = load_first(k.p01 + c, lanes), p11 = load_first(k.p11 + c, lanes);
@@ -86,11 +86,11 @@ void backward_samples(const HexPlanes& level, const float* gradient, float* samp
   }
 }
 
-void scatter(const HexPlanes& level, int plane, const float* sample_gradient, float* plane_gradient, int64_t first, int64_t last,
-             int64_t count) {
+void scatter(const HexPlanes& level, int plane, const float* sample_gradients, float* plane_gradient, int64_t first, int64_t last,
+             int64_t block, int64_t end) {
   const FeaturePlane shape = {plane_gradient, level.planes[plane].width, level.planes[plane].height};
   const int64_t channels = level.channels;
-  for (int64_t n = 0; n < count; ++n) {
+  for (int64_t n = block; n < end; ++n) {
     const float* x = level.coordinates + n * 4;
     const Corners k = corners_of(shape, x[kPlaneAxes[plane][0]], x[kPlaneAxes[plane][1]], channels);
     float* corners[4] = {plane_gradient + (k.p00 - plane_gradient), plane_gradient + (k.p10 - plane_gradient),
@@ -98,7 +98,7 @@ void scatter(const HexPlanes& level, int plane, const float* sample_gradient, fl
     const float weights[4] = {(1 - k.fu) * (1 - k.fv), k.fu * (1 - k.fv), (1 - k.fu) * k.fv, k.fu * k.fv};
     for (int64_t c = first; c < last; c += kLanes) {
       const int64_t lanes = lanes_at(c, last);
-      const vfloat g = load_first(sample_gradient + n * channels + c, lanes);
+      const vfloat g = load_first(sample_gradients + (plane * kBackwardBlock + n - block) * channels + c, lanes);
       for (int i = 0; i < 4; ++i) store_first(corners[i] + c, load_first(corners[i] + c, lanes) + weights[i] * g, lanes);
     }
   }

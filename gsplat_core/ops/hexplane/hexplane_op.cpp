@@ -62,15 +62,15 @@ static Tensor hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Ten
   return features;
 }
 
-// Points write what each plane's sample should change by; then each task adds up its own channels of its own plane in the order
-// of the points. No two tasks share a cell, so the sums are the same for any number of threads.
+// Block by block, points write what each plane's sample should change by; then each task adds up its own channels of its own
+// plane in the order of the points. No two tasks share a cell, so the sums are the same for any number of threads.
 static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_features_backward(
     Tensor gradient, Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, Tensor zt) {
   const Level level(coordinates, {&xy, &xz, &yz, &xt, &yt, &zt});
   const int64_t n = level.count, channels = level.raw.channels;
   const Tensor g = floats(gradient, "gradient");
   STD_TORCH_CHECK(g.dim() == 2 && g.size(0) == n && g.size(1) == channels, "the gradient must be [N, C]");
-  Tensor samples = empty_floats({kPlanes, n, channels}), points = empty_floats({n, 4});
+  Tensor samples = empty_floats({kPlanes, kBackwardBlock, channels}), points = empty_floats({n, 4});
   std::array<Tensor, kPlanes> planes;
   std::array<float*, kPlanes> out;
   for (int p = 0; p < kPlanes; ++p) {
@@ -79,17 +79,20 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexpla
   }
   const float* gp = data(g);
   float *sp = mutable_data(samples), *xp = mutable_data(points);
-  torch::stable::parallel_for(0, n, kGrain, [&](int64_t begin, int64_t end) {
-    hexplane_kernels().backward_samples(level.raw, gp, sp, xp, n, begin, end);
-  });
   const int64_t chunks = (channels + kChannelChunk - 1) / kChannelChunk;
-  torch::stable::parallel_for(0, kPlanes * chunks, 1, [&](int64_t begin, int64_t end) {
-    for (int64_t task = begin; task < end; ++task) {
-      const int plane = int(task % kPlanes);
-      const int64_t first = task / kPlanes * kChannelChunk, last = std::min(channels, first + kChannelChunk);
-      hexplane_kernels().scatter(level.raw, plane, sp + plane * n * channels, out[plane], first, last, n);
-    }
-  });
+  for (int64_t block = 0; block < n; block += kBackwardBlock) {
+    const int64_t block_end = std::min(n, block + kBackwardBlock);
+    torch::stable::parallel_for(block, block_end, kBackwardBlock / 16, [&](int64_t begin, int64_t end) {
+      hexplane_kernels().backward_samples(level.raw, gp, sp, xp, block, begin, end);
+    });
+    torch::stable::parallel_for(0, kPlanes * chunks, 1, [&](int64_t begin, int64_t end) {
+      for (int64_t task = begin; task < end; ++task) {
+        const int plane = int(task % kPlanes);
+        const int64_t first = task / kPlanes * kChannelChunk, last = std::min(channels, first + kChannelChunk);
+        hexplane_kernels().scatter(level.raw, plane, sp, out[plane], first, last, block, block_end);
+      }
+    });
+  }
   return {points, planes[0], planes[1], planes[2], planes[3], planes[4], planes[5]};
 }
 

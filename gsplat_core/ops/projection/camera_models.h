@@ -41,9 +41,7 @@ struct Projector<kPinhole> {
     const vfloat tx = p.x * r, ty = p.y * r;
     const vfloat sx = min(max(tx, splat(k.slope_min[0])), splat(k.slope_max[0]));
     const vfloat sy = min(max(ty, splat(k.slope_min[1])), splat(k.slope_max[1]));
-    return {k.fx * tx + k.cx,
-            k.fy * ty + k.cy,
-            {{k.fx * r, vfloat{}, -k.fx * sx * r}, {vfloat{}, k.fy * r, -k.fy * sy * r}}};
+    return {k.fx * tx + k.cx, k.fy * ty + k.cy, {{k.fx * r, vfloat{}, -k.fx * sx * r}, {vfloat{}, k.fy * r, -k.fy * sy * r}}};
   }
 
   static inline __attribute__((always_inline)) Point3 backward(const Intrinsics& k, const Point3& p, vfloat v_u, vfloat v_v,
@@ -95,10 +93,8 @@ struct Projector<kFisheye> {
     const vfloat inv = 1.0f / p.z, t = r2 * inv * inv, inv3 = inv * inv * inv;
     const vfloat s_axis =
         inv * (1 + t * (-1.f / 3 + t * (1.f / 5 + t * (-1.f / 7 + t * (1.f / 9 + t * (-1.f / 11 + t * (1.f / 13)))))));
-    const vfloat q_axis =
-        inv3 * (-2.f / 3 + t * (4.f / 5 + t * (-6.f / 7 + t * (8.f / 9 + t * (-10.f / 11 + t * (12.f / 13))))));
-    const vfloat e_axis =
-        inv3 * inv * inv * (8.f / 5 + t * (-24.f / 7 + t * (16.f / 3 + t * (-80.f / 11 + t * (120.f / 13)))));
+    const vfloat q_axis = inv3 * (-2.f / 3 + t * (4.f / 5 + t * (-6.f / 7 + t * (8.f / 9 + t * (-10.f / 11 + t * (12.f / 13))))));
+    const vfloat e_axis = inv3 * inv * inv * (8.f / 5 + t * (-24.f / 7 + t * (16.f / 3 + t * (-80.f / 11 + t * (120.f / 13)))));
     const vint axis = (t < 0.0625f) & (p.z > 0);
     return {select(axis, s_axis, s), select(axis, q_axis, q), select(axis, e_axis, e), w};
   }

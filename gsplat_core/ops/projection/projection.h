@@ -9,17 +9,17 @@ enum CameraModel : int32_t { kPinhole = 0, kOrtho = 1, kFisheye = 2 };
 
 // Gaussians of one scene seen by one camera; rows of floats as torch keeps them.
 struct ProjectionInput {
-  const float* means;               // [N, 3]
-  const float* covars;              // [N, 6], or null with the next two given
-  const float* quats;               // [N, 4]
-  const float* scales;              // [N, 3]
-  const float* opacities;           // [N] or null
-  const float* viewmat;             // [4, 4]
-  const float* intrinsics;          // [3, 3]
-  float width, height;              // px
-  float eps2d;                      // px^2, added to the diagonal of the 2D covariance
-  float near_plane, far_plane;      // z
-  float radius_clip;                // px
+  const float* means;           // [N, 3]
+  const float* covars;          // [N, 6], or null with the next two given
+  const float* quats;           // [N, 4]
+  const float* scales;          // [N, 3]
+  const float* opacities;       // [N] or null
+  const float* viewmat;         // [4, 4]
+  const float* intrinsics;      // [3, 3]
+  float width, height;          // px
+  float eps2d;                  // px^2, added to the diagonal of the 2D covariance
+  float near_plane, far_plane;  // z
+  float radius_clip;            // px
   CameraModel model;
 };
 
@@ -42,11 +42,11 @@ struct ProjectionOutputGradient {
 
 struct ProjectionInputGradient {
   float* means;
-  float* covars;   // or null with the next two given
+  float* covars;  // or null with the next two given
   float* quats;
   float* scales;
-  float* viewmat;  // 12 sums over the range: rotation by rows, then translation; or null
-  bool accumulate; // add to means, covars, quats and scales (later cameras) instead of writing them
+  float* viewmat;   // 12 sums over the range: rotation by rows, then translation; or null
+  bool accumulate;  // add to means, covars, quats and scales (later cameras) instead of writing them
 };
 
 struct ProjectionKernels {

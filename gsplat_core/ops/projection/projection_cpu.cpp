@@ -1,7 +1,6 @@
-#include "projection.h"
-
 #include "../covariance/covariance_math.h"
 #include "camera_models.h"
+#include "projection.h"
 #include "rows.h"
 #include "simd.h"
 
@@ -23,7 +22,7 @@ GSPLAT_INLINE vint finite(vfloat x) { return (x > -kHuge) & (x < kHuge); }
 // What forward and backward both need about up to kLanes Gaussians in one camera.
 template <CameraModel model>
 struct View {
-  Matrix3 w;           // rotation of the camera, the same in every lane
+  Matrix3 w;  // rotation of the camera, the same in every lane
   vfloat translation[3];
   Intrinsics k;
 
@@ -80,8 +79,7 @@ GSPLAT_INLINE Ellipse ellipse_of(const View<model>& view, const ImagePoint& imag
   const vfloat full[3][3] = {{s.v[0], s.v[1], s.v[2]}, {s.v[1], s.v[3], s.v[4]}, {s.v[2], s.v[4], s.v[5]}};
   for (int r = 0; r < 2; ++r) {
     for (int c = 0; c < 3; ++c)
-      e.affine[r][c] =
-          image.j[r][0] * view.w.m[0][c] + image.j[r][1] * view.w.m[1][c] + image.j[r][2] * view.w.m[2][c];
+      e.affine[r][c] = image.j[r][0] * view.w.m[0][c] + image.j[r][1] * view.w.m[1][c] + image.j[r][2] * view.w.m[2][c];
     for (int c = 0; c < 3; ++c)
       e.half[r][c] = e.affine[r][0] * full[0][c] + e.affine[r][1] * full[1][c] + e.affine[r][2] * full[2][c];
   }
@@ -227,13 +225,12 @@ static void backward_model(const ProjectionInput& in, const ProjectionOutputGrad
           v_j[r][c] = v_affine[r][0] * view.w.m[c][0] + v_affine[r][1] * view.w.m[c][1] + v_affine[r][2] * view.w.m[c][2];
       const Point3 v_point = Projector<model>::backward(view.k, p, v_means2d[0], v_means2d[1], v_j);
       const vfloat v_p[3] = {v_point.x, v_point.y, v_point.z + v_depth};
-      for (int i = 0; i < 3; ++i)
-        v_mean[i] = view.w.m[0][i] * v_p[0] + view.w.m[1][i] * v_p[1] + view.w.m[2][i] * v_p[2];
+      for (int i = 0; i < 3; ++i) v_mean[i] = view.w.m[0][i] * v_p[0] + view.w.m[1][i] * v_p[1] + view.w.m[2][i] * v_p[2];
       if (to.viewmat != nullptr)
         for (int i = 0; i < 3; ++i) {
           for (int j = 0; j < 3; ++j)
-            v_view[3 * i + j] += select(
-                valid, image.j[0][i] * v_affine[0][j] + image.j[1][i] * v_affine[1][j] + v_p[i] * mean[j], vfloat{});
+            v_view[3 * i + j] +=
+                select(valid, image.j[0][i] * v_affine[0][j] + image.j[1][i] * v_affine[1][j] + v_p[i] * mean[j], vfloat{});
           v_view[9 + i] += select(valid, v_p[i], vfloat{});
         }
       if (in.covars != nullptr) {

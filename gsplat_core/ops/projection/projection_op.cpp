@@ -38,12 +38,11 @@ struct Scene {
     gaussians = means.size(1);
     cameras = viewmats.size(1);
     const int64_t rows = batches * gaussians, views = batches * cameras;
-    STD_TORCH_CHECK(means.numel() == 3 * rows && viewmats.numel() == 16 * views && intrinsics.numel() == 9 * views &&
-                        (!covars.has_value() || covars->numel() == 6 * rows) &&
-                        (!quats.has_value() || quats->numel() == 4 * rows) &&
-                        (!scales.has_value() || scales->numel() == 3 * rows) &&
-                        (!opacities.has_value() || opacities->numel() == rows),
-                    "projection: the sizes of the inputs do not fit together");
+    STD_TORCH_CHECK(
+        means.numel() == 3 * rows && viewmats.numel() == 16 * views && intrinsics.numel() == 9 * views &&
+            (!covars.has_value() || covars->numel() == 6 * rows) && (!quats.has_value() || quats->numel() == 4 * rows) &&
+            (!scales.has_value() || scales->numel() == 3 * rows) && (!opacities.has_value() || opacities->numel() == rows),
+        "projection: the sizes of the inputs do not fit together");
   }
 
   int64_t blocks() const { return (gaussians + kBlock - 1) / kBlock; }
@@ -110,12 +109,10 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians_back
   const OptionalTensor v_means2d = floats(v_means2d_in, "v_means2d"), v_depths = floats(v_depths_in, "v_depths"),
                        v_conics = floats(v_conics_in, "v_conics"),
                        v_compensations = floats(v_compensations_in, "v_compensations");
-  const auto fits = [&](const OptionalTensor& t, int64_t columns) {
-    return !t.has_value() || t->numel() == B * C * N * columns;
-  };
-  STD_TORCH_CHECK(radii.numel() == B * C * N * 2 && fits(v_means2d, 2) && fits(v_depths, 1) && fits(v_conics, 3) &&
-                      fits(v_compensations, 1),
-                  "projection backward: the sizes of the gradients do not fit the inputs");
+  const auto fits = [&](const OptionalTensor& t, int64_t columns) { return !t.has_value() || t->numel() == B * C * N * columns; };
+  STD_TORCH_CHECK(
+      radii.numel() == B * C * N * 2 && fits(v_means2d, 2) && fits(v_depths, 1) && fits(v_conics, 3) && fits(v_compensations, 1),
+      "projection backward: the sizes of the gradients do not fit the inputs");
   const bool from_covars = scene.covars.has_value();
   // With no camera nothing is written below, so the gradients start at zero.
   const auto gradient = [&](bool wanted, int64_t columns) {

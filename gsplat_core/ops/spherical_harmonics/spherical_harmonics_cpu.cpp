@@ -1,7 +1,6 @@
-#include "spherical_harmonics.h"
-
 #include "rows.h"
 #include "simd.h"
+#include "spherical_harmonics.h"
 
 namespace GSPLAT_ISA {
 

@@ -1,8 +1,7 @@
-#include "spherical_harmonics.h"
-
 #include <optional>
 #include <tuple>
 
+#include "spherical_harmonics.h"
 #include "tensor_checks.h"
 
 constexpr int64_t kBlock = 1024;
@@ -32,8 +31,8 @@ struct HarmonicsScene {
   int64_t blocks() const { return (sets + kBlock - 1) / kBlock; }
 
   SphericalHarmonicsInput row(int64_t r) const {
-    return {data(dirs) + r * sets * 3, data(coeffs), mask.has_value() ? mask->const_data_ptr<bool>() + r * sets : nullptr,
-            degree, bases};
+    return {data(dirs) + r * sets * 3, data(coeffs), mask.has_value() ? mask->const_data_ptr<bool>() + r * sets : nullptr, degree,
+            bases};
   }
 };
 
@@ -52,8 +51,7 @@ static Tensor spherical_harmonics(int64_t degree, Tensor dirs, Tensor coeffs, st
 }
 
 static std::tuple<Tensor, Tensor> spherical_harmonics_backward(int64_t degree, Tensor dirs, Tensor coeffs,
-                                                               std::optional<Tensor> masks, Tensor v_colors_in,
-                                                               bool needs_dirs) {
+                                                               std::optional<Tensor> masks, Tensor v_colors_in, bool needs_dirs) {
   const HarmonicsScene scene(degree, dirs, coeffs, masks);
   const Tensor v_colors = floats(v_colors_in, "v_colors");
   const int64_t blocks = scene.blocks(), M = scene.sets, R = scene.rows;
@@ -67,8 +65,8 @@ static std::tuple<Tensor, Tensor> spherical_harmonics_backward(int64_t degree, T
     for (int64_t block = from; block < to; ++block) {
       const int64_t begin = block * kBlock, end = begin + kBlock < M ? begin + kBlock : M;
       for (int64_t r = 0; r < R; ++r)
-        spherical_harmonics_kernels().backward(scene.row(r), v + r * M * 3, needs_dirs ? to_dirs + r * M * 3 : nullptr,
-                                               to_coeffs, r > 0, begin, end);
+        spherical_harmonics_kernels().backward(scene.row(r), v + r * M * 3, needs_dirs ? to_dirs + r * M * 3 : nullptr, to_coeffs,
+                                               r > 0, begin, end);
     }
   });
   return {v_dirs, v_coeffs};

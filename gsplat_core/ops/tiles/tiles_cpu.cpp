@@ -9,89 +9,58 @@
 namespace GSPLAT_ISA {
 namespace {
 
-// a dx^2 + 2 b dx dy + c dy^2 = k around (x, y), solved for dx: slope dy +- sqrt(offset - curve dy^2).
-struct Ellipse {
-  float x, y;
-  float slope, offset, curve;
-  float top;  // dy of the rightmost point; the leftmost is at -top
+// Of one splat per lane: a dx^2 + 2 b dx dy + c dy^2 = k around (x, y), solved for dx: slope dy +- sqrt(offset - curve dy^2).
+struct Ellipses {
+  vfloat x, y;
+  vfloat slope, offset, curve;
+  vfloat top;    // dy of the rightmost point; the leftmost is at -top
+  vmask proper;  // elsewhere the conic is no proper ellipse in float32, and the box alone decides
 };
 
-struct Run {
-  int first, end;
+struct Conics {
+  vfloat a, b, c;
 };
 
-GSPLAT_INLINE int clamp_to(float v, int high) { return v >= float(high) ? high : v > 0 ? int(v) : 0; }
-GSPLAT_INLINE float clamp_between(float v, float low, float high) { return v < low ? low : v > high ? high : v; }
-
-// False where the conic is not a proper ellipse: then the box alone decides.
-GSPLAT_INLINE bool make_ellipse(const SplatBoxes& in, int64_t splat, float k, Ellipse& e) {
-  const float a = in.conics[3 * splat], b = in.conics[3 * splat + 1], c = in.conics[3 * splat + 2];
+GSPLAT_INLINE Ellipses make_ellipses(vfloat x, vfloat y, Conics q, vfloat k) {
+  const vfloat zero = {}, ac = q.a * q.c;
   // A determinant lost to rounding only widens the ellipse.
-  const float ac = a * c, det = ac - b * b - 5e-7f * ac;
-  if (!(a > 0 && c > 0 && ac > 0 && det > 1e-6f * ac)) return false;
-  e.x = in.means2d[2 * splat];
-  e.y = in.means2d[2 * splat + 1];
-  e.slope = -b / a;
-  e.offset = k / a;
-  e.curve = det / (a * a);
-  e.top = -b * __builtin_sqrtf(k / (c * det));
-  return e.top - e.top == 0;
+  const vfloat det = fma(-q.b, q.b, ac) - 5e-7f * ac, inverse = 1.0f / q.a;
+  const vfloat top = -q.b * sqrt(k / (q.c * det));
+  const vmask proper = above(q.a, zero) & above(q.c, zero) & above(det, 1e-6f * ac) & at_least(splat(1e30f), larger(top, -top));
+  return {x, y, -q.b * inverse, k * inverse, det * inverse * inverse, top, proper};
 }
 
-// Tiles of row `row` that the ellipse touches, inside [first, end).
-GSPLAT_INLINE Run run_of_row(const Ellipse& e, int row, int tile_size, Run box) {
-  const float low = float(int64_t(row) * tile_size) + 0.5f - e.y, high = low + float(tile_size - 1);
-  const float at_right = clamp_between(e.top, low, high), at_left = clamp_between(-e.top, low, high);
-  const float right_square = e.offset - e.curve * at_right * at_right, left_square = e.offset - e.curve * at_left * at_left;
-  if (right_square < 0 || left_square < 0) return {0, 0};
+// Columns [first, end) of a row of tiles.
+struct Runs {
+  vint first, end;
+};
+
+// What the ellipses touch in row `row` of their boxes, which reach from column box_first to box_end.
+GSPLAT_INLINE Runs runs_of(const Ellipses& e, vfloat row, float tile_size, vfloat box_first, vfloat box_end) {
+  const vfloat zero = {}, low = fma(row, splat(tile_size), 0.5f - e.y), high = low + (tile_size - 1);
+  const vfloat at_right = smaller(larger(e.top, low), high), at_left = smaller(larger(-e.top, low), high);
+  const vfloat right_square = fma(-e.curve * at_right, at_right, e.offset),
+               left_square = fma(-e.curve * at_left, at_left, e.offset);
   constexpr float kSlack = 2e-3f;  // pixels, against rounding
-  const float right = e.x + e.slope * at_right + __builtin_sqrtf(right_square) + kSlack;
-  const float left = e.x + e.slope * at_left - __builtin_sqrtf(left_square) - kSlack;
-  const float inverse = 1.0f / float(tile_size);
-  // Tile t holds the pixel centres t size + 0.5 ... t size + size - 0.5.
-  const int first = clamp_to((left + 0.5f) * inverse, box.end);
-  const int end = clamp_to((right - 0.5f) * inverse + 1.0f, box.end);
-  // A gap between the last centre of one tile and the first of the next is in neither.
-  const int skip = left > float((int64_t(first) + 1) * tile_size) - 0.5f ? 1 : 0;
-  return {first + skip > box.first ? first + skip : box.first, end};
+  const vfloat right = fma(e.slope, at_right, e.x) + sqrt(larger(right_square, zero)) + kSlack;
+  const vfloat left = fma(e.slope, at_left, e.x) - sqrt(larger(left_square, zero)) - kSlack;
+  // Tile t holds the pixel centres t size + 0.5 ... t size + size - 0.5; a gap between two tiles' centres is in neither.
+  const vfloat inverse = splat(1.0f / tile_size);
+  const vfloat first = truncate(smaller(larger((left + 0.5f) * inverse, box_first), box_end));
+  const vfloat past = first + where(above(left, fma(first + 1.0f, splat(tile_size), splat(-0.5f))), splat(1.0f), zero);
+  const vfloat end = truncate(smaller(larger((right - 0.5f) * inverse + 1.0f, box_first), box_end));
+  const vmask inside = at_least(smaller(right_square, left_square), zero);
+  const vfloat from = where(e.proper, past, box_first), to = where(e.proper, where(inside, end, zero), box_end);
+  return {to_int(from), to_int(to)};
 }
 
-GSPLAT_INLINE bool finite(float v) { return v - v == 0; }
-
-// The contour: sigma <= k / 2, a little outside of alpha = 1/255.
-GSPLAT_INLINE float contour(float opacity) { return opacity > 0 ? 1.3862944f * log2(splat(255.0f * opacity))[0] + 1e-3f : -1.0f; }
-
-TileSpan span_of(const SplatBoxes& in, int64_t splat, float k) {
-  const TileSpan nothing = {0, 0, 0, 0, 0};
-  const int rx = in.radii[2 * splat], ry = in.radii[2 * splat + 1];
-  const float x = in.means2d[2 * splat], y = in.means2d[2 * splat + 1];
-  if (rx <= 0 || ry <= 0 || !finite(x) || !finite(y) || !finite(in.depths[splat])) return nothing;
-  // gsplat's box: floor and ceil of (mean -+ radius) / tile size.
-  const float inverse = 1.0f / float(in.tile_size);
-  const float low_x = (x - float(rx)) * inverse, high_x = (x + float(rx)) * inverse;
-  const float low_y = (y - float(ry)) * inverse, high_y = (y + float(ry)) * inverse;
-  const int x0 = clamp_to(low_x, in.tile_width), x1 = clamp_to(__builtin_ceilf(high_x), in.tile_width);
-  const int y0 = clamp_to(low_y, in.tile_height), y1 = clamp_to(__builtin_ceilf(high_y), in.tile_height);
-  if (x0 >= x1 || y0 >= y1) return nothing;
-  TileSpan span = {uint16_t(x0), uint16_t(y0), uint16_t(x1 - x0), uint16_t(y1 - y0), 0};
-  Ellipse e;
-  bool ellipse = false;
-  if (in.conics != nullptr) {
-    const float* conic = in.conics + 3 * splat;
-    if (!(k >= 0) || !finite(k) || !finite(conic[0]) || !finite(conic[1]) || !finite(conic[2])) return nothing;
-    ellipse = make_ellipse(in, splat, k, e);
-  }
-  if (span.width > 8 || span.height > 8) return span;
-  for (int row = 0; row < span.height; ++row) {
-    Run run = {0, span.width};
-    if (ellipse) {
-      run = run_of_row(e, y0 + row, in.tile_size, {x0, x1});
-      run.first -= x0, run.end -= x0;
-    }
-    if (run.first < run.end) span.touched |= uint64_t((1u << run.end) - (1u << run.first)) << (8 * row);
-  }
-  return span.touched == 0 ? nothing : span;
+// The contour: sigma <= k / 2, a little outside of alpha = 1/255; negative where there is none.
+GSPLAT_INLINE vfloat contours(vfloat opacity) {
+  const vfloat k = fma(log2(opacity * 255.0f), splat(1.3862944f), splat(1e-3f));  // 2 ln(255 o)
+  return where(above(opacity, vfloat{}) & at_least(splat(3e38f), opacity), k, splat(-1.0f));
 }
+
+GSPLAT_INLINE vmask finite(vfloat v) { return at_least(splat(3.4028235e38f), larger(v, -v)) & at_least(v, v); }
 
 // Where the counters of this splat's image start.
 GSPLAT_INLINE int64_t first_tile(const SplatBoxes& in, int64_t splat) {
@@ -101,7 +70,7 @@ GSPLAT_INLINE int64_t first_tile(const SplatBoxes& in, int64_t splat) {
 
 // visit(tile) for every touched tile, row by row.
 template <class Visit>
-GSPLAT_INLINE void for_tiles(const SplatBoxes& in, int64_t splat, const TileSpan& span, const Visit& visit) {
+GSPLAT_INLINE void for_tiles(const SplatBoxes& in, int64_t splat_, const TileSpan& span, const Visit& visit) {
   const int64_t origin = int64_t(span.y) * in.tile_width + span.x;
   if (span.width <= 8 && span.height <= 8) {
     for (uint64_t left = span.touched; left != 0; left &= left - 1) {
@@ -110,31 +79,72 @@ GSPLAT_INLINE void for_tiles(const SplatBoxes& in, int64_t splat, const TileSpan
     }
     return;
   }
-  Ellipse e;
-  const bool ellipse = in.conics != nullptr && make_ellipse(in, splat, contour(in.opacities[splat]), e);
-  for (int row = 0; row < span.height; ++row) {
-    Run run = {span.x, span.x + span.width};
-    if (ellipse) run = run_of_row(e, span.y + row, in.tile_size, run);
-    const int64_t start = int64_t(span.y + row) * in.tile_width;
-    for (int column = run.first; column < run.end; ++column) visit(start + column);
+  const float* const mean = in.means2d + 2 * splat_;
+  const float none[3] = {}, *const q = in.conics != nullptr ? in.conics + 3 * splat_ : none;
+  const vfloat k = contours(splat(in.conics != nullptr ? in.opacities[splat_] : 1.0f));
+  const Ellipses e = make_ellipses(splat(mean[0]), splat(mean[1]), {splat(q[0]), splat(q[1]), splat(q[2])}, k);
+  for (int row = 0; row < span.height; row += kLanes) {
+    const vfloat rows = ramp() + float(span.y + row);
+    const Runs runs = runs_of(e, rows, float(in.tile_size), splat(float(span.x)), splat(float(span.x + span.width)));
+    for (int i = 0; i < kLanes && row + i < span.height; ++i) {
+      const int64_t start = int64_t(span.y + row + i) * in.tile_width;
+      for (int column = runs.first[i]; column < runs.end[i]; ++column) visit(start + column);
+    }
   }
 }
 
 void spans(const SplatBoxes& in, int64_t begin, int64_t end, TileSpan* spans, int32_t* tile_counts) {
+  const vfloat zero = {}, size = splat(float(in.tile_size));
+  const vfloat width = splat(float(in.tile_width)), height = splat(float(in.tile_height));
   for (int64_t first = begin; first < end; first += kLanes) {
     const int n = end - first < kLanes ? int(end - first) : kLanes;
-    float contours[kLanes] = {};
-    if (in.conics != nullptr) {
-      for (int i = 0; i < n; ++i) contours[i] = in.opacities[first + i];
-      const vfloat o = load(contours);
-      // 2 ln(255 o); what is not positive and finite has no contour.
-      const vfloat k = fma(log2(o * 255.0f), splat(1.3862944f), splat(1e-3f));
-      store(contours, where(above(o, vfloat{}) & at_least(splat(3e38f), o), k, splat(-1.0f)));
-    }
+    alignas(64) float fields[9][kLanes] = {};  // radii of 0 where there is no splat
     for (int i = 0; i < n; ++i) {
-      const TileSpan span = span_of(in, first + i, contours[i]);
+      const int64_t at = first + i;
+      fields[0][i] = in.means2d[2 * at];
+      fields[1][i] = in.means2d[2 * at + 1];
+      fields[2][i] = float(in.radii[2 * at]);
+      fields[3][i] = float(in.radii[2 * at + 1]);
+      fields[4][i] = in.depths[at];
+      if (in.conics == nullptr) continue;
+      for (int j = 0; j < 3; ++j) fields[5 + j][i] = in.conics[3 * at + j];
+      fields[8][i] = in.opacities[at];
+    }
+    const vfloat x = load(fields[0]), y = load(fields[1]), rx = load(fields[2]), ry = load(fields[3]);
+    vmask visible = above(rx, zero) & above(ry, zero) & finite(x) & finite(y) & finite(load(fields[4]));
+    // gsplat's box: floor and ceil of (mean -+ radius) / tile size, inside the image.
+    const vfloat x0 = truncate(smaller(larger((x - rx) / size, zero), width)),
+                 y0 = truncate(smaller(larger((y - ry) / size, zero), height));
+    const vfloat x1 = ceiling(smaller(larger((x + rx) / size, zero), width)),
+                 y1 = ceiling(smaller(larger((y + ry) / size, zero), height));
+    visible = visible & above(x1, x0) & above(y1, y0);
+    Ellipses e = {};
+    if (in.conics != nullptr) {
+      const Conics q = {load(fields[5]), load(fields[6]), load(fields[7])};
+      const vfloat k = contours(load(fields[8]));
+      visible = visible & at_least(k, zero) & finite(q.a) & finite(q.b) & finite(q.c);
+      e = make_ellipses(x, y, q, k);
+    }
+    const vint left = to_int(x0), one = splat_int(1), none = {};
+    const vfloat rows = where(visible, y1 - y0, zero), columns = where(visible, x1 - x0, zero);
+    alignas(64) int32_t box[4][kLanes];
+    const vint edges[4] = {left, to_int(y0), to_int(columns), to_int(rows)};
+    __builtin_memcpy(box, edges, sizeof(box));
+    vint touched[2] = {};  // rows 0-3 and 4-7
+    for (int row = 0; row < 8 && lanes_of(above(rows, splat(float(row)))) != 0; ++row) {
+      const Runs runs = runs_of(e, y0 + float(row), float(in.tile_size), x0, x1);
+      const vint run_bits = (one << (runs.end - left)) - (one << (runs.first - left));
+      const vmask any = above(rows, splat(float(row))) & ~at_least(runs.first, runs.end);
+      touched[row / 4] |= where(vmask(any), run_bits, none) << (8 * (row % 4));
+    }
+    alignas(64) uint32_t set[2][kLanes];
+    __builtin_memcpy(set, touched, sizeof(set));
+    for (int i = 0; i < n; ++i) {
+      const bool small = box[2][i] <= 8 && box[3][i] <= 8;
+      TileSpan span = {uint16_t(box[0][i]), uint16_t(box[1][i]), uint16_t(box[2][i]), uint16_t(box[3][i]), 0};
       int64_t tiles = 0;
-      if (span.width <= 8 && span.height <= 8) {
+      if (small) {
+        span.touched = set[0][i] | uint64_t(set[1][i]) << 32;
         tiles = __builtin_popcountll(span.touched);
       } else {
         for_tiles(in, first + i, span, [&](int64_t) { ++tiles; });

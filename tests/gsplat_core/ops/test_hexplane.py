@@ -1,11 +1,13 @@
 """The C++ HexPlane ops against their definition in plain torch."""
 
+import itertools
+
 import pytest
 import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.hexplane.hexplane import hexplane_features, hexplane_modulate, hexplane_space
+from gsplat_core.ops.hexplane.hexplane import hexplane_decode, hexplane_features, hexplane_modulate, hexplane_space
 
 
 def level(channels=32, sizes=(9, 7, 8, 5), dtype=torch.float32, seed=0):
@@ -64,6 +66,39 @@ def test_the_two_halves_equal_the_whole(n):
     torch.testing.assert_close(seen, hexplane_features(x, *planes), rtol=1e-5, atol=1e-5)
 
 
+def network(*sizes):
+    random = torch.Generator().manual_seed(4)
+    pairs = list(itertools.pairwise(sizes))
+    weights = [torch.randn(b, a, generator=random) / a**0.5 for a, b in pairs]
+    return weights, [0.1 * torch.randn(b, generator=random) for _, b in pairs]
+
+
+@pytest.mark.parametrize("n", [0, 1, 5, 48, 1001])
+@pytest.mark.parametrize("sizes", [(64, 64, 64, 64, 11), (10, 3), (10, 100, 7), (35, 48, 17)])
+def test_decoding_equals_the_reference(n, sizes):
+    x, channels = points(n), sizes[0] // 2
+    spaces = [torch.rand(n, c, generator=torch.Generator().manual_seed(c)) for c in (channels, sizes[0] - channels)]
+    lines = [
+        torch.rand(4 + i, s.shape[1], generator=torch.Generator().manual_seed(i)) for s in spaces for i in range(3)
+    ]
+    for given in (lines, []):
+        seen = hexplane_decode(spaces, x, given, *network(*sizes))
+        wanted = reference.hexplane_decode(spaces, x, given, *network(*sizes))
+        torch.testing.assert_close(seen, wanted, rtol=1e-5, atol=1e-5)
+
+
+def test_decoding_shows_a_feature_that_is_not_a_number():
+    space = torch.rand(7, 16)
+    space[4, 3] = float("nan")
+    out = hexplane_decode([space], points(7), [], *network(16, 32, 5))
+    assert out[4].isnan().all() and out[[0, 1, 2, 3, 5, 6]].isfinite().all()
+
+
+def test_layers_that_do_not_fit_are_refused():
+    with pytest.raises(RuntimeError, match="layer 0 must take 16 inputs"):
+        hexplane_decode([torch.rand(7, 16)], points(7), [], *network(8, 3))
+
+
 def test_gradients_do_not_depend_on_the_number_of_threads():
     inputs = (points(4000), *level())
     gradient = torch.randn(4000, 32, generator=torch.Generator().manual_seed(3))
@@ -92,6 +127,7 @@ def test_ops_pass_opcheck():
     torch.library.opcheck(ops.hexplane_features_backward.default, (torch.rand(4, 3), points(4), *planes))
     torch.library.opcheck(ops.hexplane_space.default, (points(4), *planes[:3]))
     lines = [plane[0] for plane in planes[3:]]
+    torch.library.opcheck(ops.hexplane_decode.default, ([torch.rand(4, 3)], points(4), lines, *network(3, 5, 2)))
     torch.library.opcheck(ops.hexplane_modulate.default, (torch.rand(4, 3), points(4), *lines))
 
 

@@ -19,7 +19,7 @@ Array = NDArray[np.floating]
 
 NEWTON_STEPS = 6
 LIGHTS_MM = ((-3.2, -2.2, 0.0), (3.2, -2.2, 0.0))
-"""Two light fibres beside the lens, in the camera's axes."""
+"""Two light fibres at the scope's tip, around its middle."""
 REFERENCE_MM = 66.0
 """A white surface facing the scope at this distance is exposed as 1."""
 
@@ -40,8 +40,14 @@ class Eye:
     v: Array
 
 
-def render_eye(tissue: Tissue, tug: Tug, parts: list[Part], camera: Camera, time_s: float) -> Eye:
-    """One eye's view of the scene at a time."""
+def render_eye(
+    tissue: Tissue, tug: Tug, parts: list[Part], camera: Camera, time_s: float, scope_x_mm: float = 0.0
+) -> Eye:
+    """One eye's view of the scene at a time.
+
+    scope_x_mm: where the middle of the scope's tip is on the eye's x axis; both eyes see by the same lights.
+    """
+    lights = np.array(LIGHTS_MM, np.float32) + np.array([scope_x_mm, 0, 0], np.float32)
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     ray_x, ray_y = pixel_rays(camera)
     u, v, points = cast_tissue(tissue, tug, camera, ray_x, ray_y, time_s)
@@ -57,13 +63,13 @@ def render_eye(tissue: Tissue, tug: Tug, parts: list[Part], camera: Camera, time
     tool_depth = hits.distance_mm.reshape(shape) / length
     cover = hits.cover.reshape(shape)
 
-    radiance = _shade_tissue(tissue, u, v, points, local, rays, rotation, parts, camera)
+    radiance = _shade_tissue(tissue, u, v, points, local, rays, rotation, parts, camera, lights)
     touched = cover > 0
     if touched.any():
         normal = hits.normal.reshape(*shape, 3)[touched] @ rotation.T.astype(np.float32)
         reach = np.where(np.isfinite(tool_depth), tool_depth, tissue_depth * np.float32(0.9))[touched]
         at = rays[touched] * (reach * length[touched])[:, None]
-        steel = _shade_tool(at, normal, rays[touched], hits.material.reshape(shape)[touched])
+        steel = _shade_tool(at, normal, rays[touched], hits.material.reshape(shape)[touched], lights)
         share = cover[touched][:, None]
         radiance[touched] = (1 - share) * radiance[touched] + share * steel
     return Eye(
@@ -129,6 +135,7 @@ def _shade_tissue(
     rotation: NDArray[np.float64],
     parts: list[Part],
     camera: Camera,
+    lights: Array,
 ) -> Array:
     """Linear radiance [H, W, 3] of the tissue: scattering that bleeds red, and a wet film over a fine relief."""
     reflectance, slope = tissue.texture.sample(u, v)
@@ -140,8 +147,8 @@ def _shade_tissue(
     bumpy = _unit(np.cross(along_v - slope[..., 1:] * -smooth, along_u - slope[..., :1] * -smooth).astype(np.float32))
     light_diffuse = np.zeros(u.shape, np.float32)
     light_wet = np.zeros(u.shape, np.float32)
-    for offset in LIGHTS_MM:
-        to_light = np.array(offset, np.float32) - local
+    for light in lights:
+        to_light = light - local
         distance2 = np.einsum("hwi,hwi->hw", to_light, to_light)
         to_light /= np.sqrt(distance2)[..., None]
         # Fibres shine in a cone about the view axis.
@@ -151,7 +158,7 @@ def _shade_tissue(
         shine = np.clip(np.einsum("hwi,hwi->hw", bumpy, half), 0, 1)
         light_diffuse += power * np.clip((facing + np.float32(0.12)) / np.float32(1.12), 0, 1)
         light_wet += power * (np.float32(9.0) * shine ** np.float32(900) + np.float32(0.20) * shine ** np.float32(40))
-    shade = _tool_shade(parts, camera, local)
+    shade = _tool_shade(parts, camera, local, lights.mean(axis=0))
     diffuse = (light_diffuse * shade)[..., None]
     # Light that has wandered through tissue comes out red: lift red where little arrives directly.
     bleed = np.array([0.060, 0.014, 0.010], np.float32) * np.sqrt(np.maximum(diffuse, 0))
@@ -159,13 +166,13 @@ def _shade_tissue(
     return np.asarray(reflectance[..., :3] * diffuse + bleed + wet, np.float32)
 
 
-def _tool_shade(parts: list[Part], camera: Camera, local: Array) -> Array:
+def _tool_shade(parts: list[Part], camera: Camera, local: Array, light: Array) -> Array:
     """How much light reaches the tissue past the tool: sampled on a coarse grid, along the way to the scope."""
     step = 3
     rotation = camera.world_to_camera[:3, :3].astype(np.float32)
     coarse = local[::step, ::step].reshape(-1, 3)
-    # The lights sit above the lens, so that the tool throws its shadow downwards.
-    to_light = np.array([0.0, -9.0, 0.0], np.float32) - coarse
+    # From a little above the lights, so that the shadow does not hide behind the tool.
+    to_light = light + np.array([0.0, -7.0, 0.0], np.float32) - coarse
     shade = np.ones(len(coarse), np.float32)
     for reach in (0.015, 0.05, 0.10, 0.17, 0.26, 0.37):
         at = (coarse + np.float32(reach) * to_light) @ rotation + camera.position.astype(np.float32)
@@ -186,7 +193,7 @@ def _upsample(coarse: Array, rows: int, columns: int, step: int) -> Array:
     return np.asarray((1 - weight) * wide[low] + weight * wide[high], np.float32)
 
 
-def _shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8]) -> Array:
+def _shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8], lights: Array) -> Array:
     """Linear radiance [N, 3] of the tool: dark polymer shaft, brushed steel that mirrors the pink surroundings."""
     metal = (material != SHAFT)[:, None]
     base = np.where(metal, np.array([0.26, 0.265, 0.28], np.float32), np.array([0.085, 0.093, 0.108], np.float32))
@@ -194,8 +201,8 @@ def _shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8
     gloss = np.where(metal[:, 0], np.float32(64), np.float32(14))
     glint = np.where(metal[:, 0], np.float32(2.6), np.float32(0.16))
     total = np.zeros((len(at), 3), np.float32)
-    for offset in LIGHTS_MM:
-        to_light = np.array(offset, np.float32) - at
+    for light in lights:
+        to_light = light - at
         distance2 = np.einsum("ni,ni->n", to_light, to_light)
         to_light /= np.sqrt(distance2)[:, None]
         power = np.float32(0.5 * REFERENCE_MM**2) / np.maximum(distance2, 400) * np.clip(-to_light[:, 2], 0, 1) ** 2

@@ -73,13 +73,13 @@ class SyntheticScene:
 
     def render(self, time_s: float, eye: Literal["left", "right"] = "left") -> Eye:
         """What an eye sees at a time."""
-        camera = self.camera_at(time_s)
+        camera, scope_x_mm = self.camera_at(time_s), BASELINE_MM / 2
         if eye == "right":
             pose = camera.world_to_camera.copy()
             pose[0, 3] -= BASELINE_MM
-            camera = camera.with_pose(pose)
+            camera, scope_x_mm = camera.with_pose(pose), -BASELINE_MM / 2
         parts = self.motion.parts(self.tissue, time_s)
-        return render_eye(self.tissue, self.motion.tug(time_s), parts, camera, time_s)
+        return render_eye(self.tissue, self.motion.tug(time_s), parts, camera, time_s, scope_x_mm)
 
     def track(self, time_s: float) -> NDArray[np.float32]:
         """A grid of material points in the world [63, 3], mm."""

@@ -92,12 +92,12 @@ def test_depth_carries_the_left_image_onto_the_right_one(scene: SyntheticScene, 
     # Seen by the right eye too: the depth that it has there is the same.
     visible = inside & (np.abs(_lookup(right.depth, pixels) - z) < 0.2)
     assert visible.mean() > 0.75
-    difference = np.abs(left.image.reshape(-1, 3)[visible] - _lookup(right.image, pixels[visible])).mean(axis=1)
-    assert np.median(difference) < 4
-    # The wrong depth does not do as well.
-    wrong, _ = _project(other, _backproject(camera, left.depth * 1.08))
-    worse = np.abs(left.image.reshape(-1, 3)[visible] - _lookup(right.image, wrong[visible])).mean(axis=1)
-    assert worse.mean() > 1.3 * difference.mean()
+    colour = left.image.reshape(-1, 3)[visible]
+    difference = np.median(np.abs(colour - _lookup(right.image, pixels[visible])).mean(axis=1))
+    assert difference < 1.2  # of 255: texture sampled at other places, highlights that depend on the view
+    for factor in (0.97, 1.03):  # a depth that is 3 % off does worse
+        elsewhere, _ = _project(other, _backproject(camera, left.depth * np.float32(factor)))
+        assert np.median(np.abs(colour - _lookup(right.image, elsewhere[visible])).mean(axis=1)) > 1.4 * difference
 
 
 @pytest.mark.parametrize("time_s", TIMES_S)

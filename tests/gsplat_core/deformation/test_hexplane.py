@@ -1,0 +1,136 @@
+"""The HexPlane field: its box, its axes, its network and its penalties."""
+
+import pytest
+import torch
+
+from gsplat_core.deformation import HexPlaneField
+from gsplat_core.deformation.hexplane import PLANE_NAMES, TIME_PLANES
+from gsplat_core.errors import InvalidInput
+
+WINDOW = (2.0, 4.0)
+SMALL = {"channels": 8, "resolution": (6, 7, 5, 9), "levels": (1, 2), "width": 16, "depth": 2}
+
+
+def small_field(gaussians, window=WINDOW):
+    torch.manual_seed(3)
+    return HexPlaneField(gaussians, window, **SMALL)
+
+
+def test_planes_have_the_stated_sizes(make_gaussians):
+    field = small_field(make_gaussians(9))
+    shapes = [{name: tuple(level[name].shape) for name in PLANE_NAMES} for level in field.planes]
+    assert shapes[0] == {
+        "xy": (7, 6, 8), "xz": (5, 6, 8), "yz": (5, 7, 8), "xt": (9, 6, 8), "yt": (9, 7, 8), "zt": (9, 5, 8),
+    }  # fmt: skip
+    assert shapes[1]["xy"] == (14, 12, 8) and shapes[1]["zt"] == (9, 10, 8)
+
+
+def test_the_default_is_the_small_grid(make_gaussians):
+    field = HexPlaneField(make_gaussians(2), WINDOW)
+    assert field.config() == {
+        "kind": "hexplane", "time_window_s": [2.0, 4.0], "channels": 32, "resolution": [64, 64, 64, 25],
+        "levels": [1, 2], "width": 64, "depth": 3,
+    }  # fmt: skip
+
+
+def test_the_box_holds_the_gaussians_and_each_axis_uses_its_whole_grid(make_gaussians):
+    gaussians = make_gaussians(500)
+    field = small_field(gaussians)
+    first = field.coordinates(gaussians.means, WINDOW[0])
+    last = field.coordinates(gaussians.means, WINDOW[1])
+    assert (first[:, 3] == -1).all() and (last[:, 3] == 1).all()
+    assert field.coordinates(gaussians.means, 3.0)[0, 3] == 0.0
+    for axis in range(3):
+        reach = first[:, axis]
+        assert -1 < float(reach.min()) < -0.8 and 0.8 < float(reach.max()) < 1
+    corners = field.coordinates(field.box, 3.0)[:, :3]
+    torch.testing.assert_close(corners, torch.tensor([[-1.0] * 3, [1.0] * 3]))
+
+
+def test_positions_outside_the_box_are_clamped_to_its_surface(make_gaussians):
+    field = small_field(make_gaussians(20))
+    outside = field.box.mean(dim=0) + torch.tensor([[1e4, 0.0, 0.0], [0.0, -1e4, 1e4]])
+    coordinates = field.coordinates(outside, 3.0)
+    assert coordinates[0, 0] == 1 and coordinates[1, 1] == -1 and coordinates[1, 2] == 1
+
+
+@pytest.mark.parametrize("name", PLANE_NAMES)
+def test_every_cell_row_of_every_axis_is_read(name, make_gaussians):
+    """A change of the first or the last row or column of any plane shows in the features: no part of an axis is unused."""
+    gaussians = make_gaussians(5)
+    field = small_field(gaussians)
+    low, high = field.box
+    ends = {0: (low, WINDOW[0]), -1: (high, WINDOW[1])}
+    with torch.no_grad():
+        for end, (corner, time_s) in ends.items():
+            before = field.features(corner[None], time_s)
+            field.planes[0][name][end, end] += 1.0
+            after = field.features(corner[None], time_s)
+            assert (after[:, :8] != before[:, :8]).all()
+            assert torch.equal(after[:, 8:], before[:, 8:])
+
+
+def test_the_field_varies_in_space_and_in_time(make_gaussians):
+    gaussians = make_gaussians(200)
+    field = small_field(gaussians)
+    with torch.no_grad():
+        for parameter in field.parameters():
+            parameter += 0.3 * torch.randn_like(parameter)
+        deltas = torch.stack([field(gaussians, t).means - gaussians.means for t in torch.linspace(*WINDOW, 9).tolist()])
+    in_time, in_space = deltas.std(dim=0).mean(), deltas.std(dim=1).mean()
+    assert float(in_time) > 0.01 and float(in_space) > 0.01
+    # The second half of the window differs from the first: time is not squeezed into half of the axis.
+    assert float((deltas[-1] - deltas[4]).abs().mean()) > 0.01
+    assert float((deltas[4] - deltas[0]).abs().mean()) > 0.01
+
+
+def test_an_extended_window_keeps_what_was_learned_where_it_was(make_gaussians):
+    gaussians = make_gaussians(50)
+    field = small_field(gaussians)
+    with torch.no_grad():
+        for level in field.planes:
+            for name in TIME_PLANES:  # a straight line in time, which interpolation keeps
+                level[name].copy_(torch.linspace(0.5, 1.5, 9)[:, None, None].expand_as(level[name]))
+        before = field.features(gaussians.means, 2.5)
+        end = field.features(gaussians.means, 4.0)
+        field.extend((2.0, 6.0))
+        torch.testing.assert_close(field.features(gaussians.means, 2.5), before)
+        torch.testing.assert_close(field.features(gaussians.means, 6.0), end)
+        assert field.time_window_s == (2.0, 6.0)
+
+
+def test_penalties_are_zero_where_there_is_nothing_to_penalise(make_gaussians):
+    field = small_field(make_gaussians(3))
+    assert field.time_smoothness().item() == 0 and field.time_sparsity().item() == 0
+    assert field.plane_smoothness().item() > 0
+    with torch.no_grad():
+        field.planes[0]["xt"][4] += 1.0
+        for level in field.planes:
+            for name in ("xy", "xz", "yz"):
+                level[name].fill_(0.25)
+    assert field.plane_smoothness().item() == 0
+    # One row of nine raised by 1: second differences 1, -2, 1 in 7 rows; one of six planes.
+    assert field.time_smoothness().item() == pytest.approx((1 + 4 + 1) / 7 / 6)
+    assert field.time_sparsity().item() == pytest.approx(1 / 9 / 6)
+    (field.plane_smoothness() + field.time_smoothness() + field.time_sparsity()).backward()
+    assert field.planes[0]["xt"].grad.abs().sum() > 0
+
+
+def test_nan_positions_do_not_make_the_box(make_gaussians):
+    gaussians = make_gaussians(10)
+    gaussians.means[3, 1] = float("nan")
+    field = small_field(gaussians)
+    assert field.box.isfinite().all()
+    torch.nn.init.ones_(field.head.weight)
+    with torch.no_grad():
+        moved = field(gaussians, 3.0).means
+    assert moved[3].isnan().any()
+    assert moved[[0, 1, 2, 4, 5, 6, 7, 8, 9]].isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"resolution": (1, 4, 4, 4)}, {"resolution": (4, 4, 4)}, {"levels": ()}, {"channels": 0}, {"depth": 0}]
+)
+def test_impossible_architectures_are_refused(wrong, make_gaussians):
+    with pytest.raises(InvalidInput):
+        HexPlaneField(make_gaussians(2), WINDOW, **(SMALL | wrong))

@@ -1,0 +1,149 @@
+"""Saving and loading a model: bit for bit, atomically, and never half."""
+
+import errno
+import json
+import os
+
+import pytest
+import torch
+
+from gsplat_core.cameras import Camera
+from gsplat_core.deformation import new_field
+from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
+from gsplat_core.io import atomic_files, bundle
+from gsplat_core.io.bundle import load_bundle, save_bundle
+from gsplat_core.model import Model
+
+CAMERA = Camera([[812.5, 0, 319.25], [0, 811.0, 255.75], [0, 0, 1]], 640, 512)
+
+
+def make_model(gaussians, kind="basis", version=3):
+    field = None
+    if kind is not None:
+        torch.manual_seed(7)
+        field = new_field(kind, gaussians, (0.5, 2.5)).detached_copy()
+        for parameter in field.parameters():
+            parameter += torch.randn_like(parameter)
+    return Model(version, gaussians, field, CAMERA, (0.5, 2.0), "0f" * 32)
+
+
+@pytest.mark.parametrize("kind", ["basis", "hexplane", None])
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_the_round_trip_is_exact(kind, count, make_gaussians, tmp_path):
+    model = make_model(make_gaussians(count, sh_degree=2), kind)
+    save_bundle(model, tmp_path / "deep" / "model")
+    loaded = load_bundle(tmp_path / "deep" / "model")
+    assert loaded.sha256() == model.sha256()
+    assert loaded.tensors().keys() == model.tensors().keys()
+    for name, tensor in model.tensors().items():
+        assert torch.equal(loaded.tensors()[name].view(torch.int32), tensor.view(torch.int32)), name
+    assert loaded.version == 3 and loaded.training_digest == "0f" * 32
+    assert loaded.camera == CAMERA and loaded.time_window_s == (0.5, 2.0)
+    assert torch.equal(loaded.at(1.0).means, model.at(1.0).means)
+
+
+def test_an_extended_and_trimmed_field_survives(make_gaussians, tmp_path):
+    gaussians = make_gaussians(5)
+    field = new_field("basis", gaussians, (0.0, 1.0), spacing_s=0.1)
+    field.extend((7.3, 9.1))
+    with torch.no_grad():
+        field.weights.normal_(generator=torch.Generator().manual_seed(0))
+    model = Model(1, gaussians, field.detached_copy(), CAMERA, (7.3, 9.1))
+    save_bundle(model, tmp_path)
+    assert torch.equal(load_bundle(tmp_path).at(8.8).means, model.at(8.8).means)
+
+
+def test_the_folder_holds_two_files_and_the_manifest_says_what_is_in_them(make_gaussians, tmp_path):
+    save_bundle(make_model(make_gaussians(6)), tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["manifest.json", "model.safetensors"]
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    assert manifest["format_version"] == 1 and manifest["version"] == 3
+    assert manifest["gaussians"] == {"count": 6, "sh_degree": 0}
+    assert manifest["units"] == {"length": "mm", "time": "s"}
+    assert manifest["field"]["kind"] == "basis"
+    assert manifest["tensors"]["bytes"] == (tmp_path / "model.safetensors").stat().st_size
+
+
+def test_saving_again_replaces_the_model(make_gaussians, tmp_path):
+    save_bundle(make_model(make_gaussians(6), version=1), tmp_path)
+    save_bundle(make_model(make_gaussians(9), version=2), tmp_path)
+    loaded = load_bundle(tmp_path)
+    assert (loaded.version, loaded.gaussians.count) == (2, 9)
+
+
+@pytest.mark.parametrize("fails_at", ["model.next.safetensors", "manifest.next.json"])
+def test_a_full_disk_leaves_the_previous_bundle(fails_at, make_gaussians, tmp_path, monkeypatch):
+    before = make_model(make_gaussians(6))
+    save_bundle(before, tmp_path)
+    real_fsync = os.fsync
+
+    def full_disk(descriptor):
+        if os.readlink(f"/proc/self/fd/{descriptor}").endswith(fails_at):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real_fsync(descriptor)
+
+    monkeypatch.setattr(atomic_files.os, "fsync", full_disk)
+    with pytest.raises(BundleError, match=r"No space left on device") as raised:
+        save_bundle(make_model(make_gaussians(9)), tmp_path)
+    assert str(tmp_path) in str(raised.value)
+    monkeypatch.undo()
+    assert load_bundle(tmp_path).sha256() == before.sha256()
+    assert not (tmp_path / fails_at).exists()
+
+
+@pytest.mark.parametrize("renames", [0, 1])
+def test_a_crash_between_the_renames_leaves_a_whole_bundle(renames, make_gaussians, tmp_path, monkeypatch):
+    """Without any rename the old model is there; with the tensors renamed and the manifest not, the new one is."""
+    old, new = make_model(make_gaussians(6)), make_model(make_gaussians(6, seed=4))
+    save_bundle(old, tmp_path)
+    done = []
+
+    def stop_after(source, target):
+        if len(done) == renames:
+            raise KeyboardInterrupt
+        done.append(target)
+        atomic_files.replace_durably(source, target)
+
+    monkeypatch.setattr(bundle, "replace_durably", stop_after)
+    with pytest.raises(KeyboardInterrupt):
+        save_bundle(new, tmp_path)
+    monkeypatch.undo()
+    assert load_bundle(tmp_path).sha256() == (new if renames else old).sha256()
+    save_bundle(old, tmp_path)
+    assert load_bundle(tmp_path).sha256() == old.sha256()
+
+
+def test_a_first_save_that_crashed_between_the_renames_loads(make_gaussians, tmp_path):
+    model = make_model(make_gaussians(3))
+    save_bundle(model, tmp_path)
+    (tmp_path / "manifest.json").rename(tmp_path / "manifest.next.json")
+    assert load_bundle(tmp_path).sha256() == model.sha256()
+
+
+def test_a_place_that_cannot_be_written_is_named(make_gaussians, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(BundleError, match=r"file/model"):
+        save_bundle(make_model(make_gaussians(1)), tmp_path / "file" / "model")
+
+
+def test_a_model_that_is_not_finite_is_not_saved(make_gaussians, tmp_path):
+    good = make_model(make_gaussians(6))
+    save_bundle(good, tmp_path)
+    bad = make_model(make_gaussians(6))
+    bad.field.weights[2, 3, :2] = float("nan")
+    with pytest.raises(BundleCorrupt, match=r"field\.weights holds 2 of"):
+        save_bundle(bad, tmp_path)
+    assert load_bundle(tmp_path).sha256() == good.sha256()
+
+
+def test_large_finite_values_are_not_taken_for_infinite(make_gaussians, tmp_path):
+    gaussians = make_gaussians(6)
+    gaussians.means[:] = 3e38
+    model = make_model(gaussians, None)
+    save_bundle(model, tmp_path)
+    assert load_bundle(tmp_path).sha256() == model.sha256()
+
+
+def test_only_float32_is_saved(make_gaussians, tmp_path):
+    with pytest.raises(InvalidInput, match="float64"):
+        save_bundle(make_model(make_gaussians(2).to(dtype=torch.float64), None), tmp_path)
