@@ -24,6 +24,7 @@ class ProgressPrinter:
         self._terminal = not quiet and sys.stderr.isatty()
         self._stage = ""
         self._began_s = self._printed_s = 0.0
+        self._began_done = 0
         self._bar: Bar | None = None
         self._task: TaskID | None = None
 
@@ -66,9 +67,11 @@ class ProgressPrinter:
         now_s = time.monotonic()
         first = progress.stage != self._stage
         if first:
+            # The rate is measured from the first event on: what came before it was not work of the same kind.
             self._stage, self._began_s, self._printed_s = progress.stage, now_s, now_s
+            self._began_done = progress.done
         elapsed_s = now_s - self._began_s
-        rate = progress.done / elapsed_s if elapsed_s > 0 else 0.0
+        rate = (progress.done - self._began_done) / elapsed_s if elapsed_s > 0 else 0.0
         quality = "" if progress.psnr_tissue_db is None else f"{progress.psnr_tissue_db:.2f} dB"
         rate_text = f"{rate:.1f} {progress.unit}/s" if rate else ""
         if self._bar is not None:

@@ -40,7 +40,7 @@ def print_report(report: RunReport, out: Path, *, as_json: bool) -> None:
         typer.echo(report.model_dump_json(indent=2))
         return
     if report.run.interrupted:
-        typer.echo("interrupted: what follows covers the frames that were displayed", err=True)
+        typer.echo("interrupted: the figures cover the frames that were displayed", err=True)
     for note in report.notes:
         typer.echo(f"note: {note}", err=True)
     frames, run, quality = report.frames, report.run, report.quality

@@ -18,8 +18,8 @@ def test_plain_lines_have_counts_rates_and_an_estimate(capsys, monkeypatch):
     captured = capsys.readouterr()
     assert captured.err.splitlines() == [
         "replay 1/10",
-        "replay 7/10  1.0 frames/s  eta 3 s  38.13 dB",
-        "replay 10/10  1.0 frames/s",
+        "replay 7/10  0.9 frames/s  eta 4 s  38.13 dB",
+        "replay 10/10  0.9 frames/s",
         "evaluate 1/5",
     ]
     assert captured.out == ""
