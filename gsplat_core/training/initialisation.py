@@ -69,7 +69,7 @@ def gaussians_at_pixels(
     sh[:, 0] = (colour - 0.5) / SH_C0
     return Gaussians(
         means=torch.tensor(points, dtype=torch.float32),
-        quats=torch.tensor(facing(camera_to_world[:3, :3]), dtype=torch.float32).repeat(count, 1),
+        quats=torch.tensor(facing(np.asarray(camera_to_world[:3, :3], np.float64)), dtype=torch.float32).repeat(count, 1),
         log_scales=torch.tensor(np.log(sigma[:, None] * np.array([1, 1, THICKNESS])), dtype=torch.float32),
         logit_opacities=torch.full((count,), math.log(0.9 / 0.1)),
         sh=torch.tensor(sh, dtype=torch.float32),
@@ -105,7 +105,7 @@ def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
     if frame.mask is None or frame.mask.all() or not frame.mask.any():
         return frame.image
     tool = cv2.dilate((frame.mask == 0).astype(np.uint8), np.ones((5, 5), np.uint8))
-    return inpaint_quarter_size(frame.image, tool)
+    return inpaint_quarter_size(frame.image, np.asarray(tool, np.uint8))
 
 
 def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -96,7 +96,5 @@ def _colours(gaussians: Gaussians, position: object) -> tuple[Tensor, Tensor | N
     if gaussians.sh_degree == 0:
         return gaussians.sh[:, 0] * SH_C0 + 0.5, None
     directions = gaussians.means - torch.as_tensor(position, dtype=torch.float32)
-    colours = torch.ops.gsplat_core.spherical_harmonics(
-        gaussians.sh_degree, directions[None], gaussians.sh, None
-    )[0]
+    colours = torch.ops.gsplat_core.spherical_harmonics(gaussians.sh_degree, directions[None], gaussians.sh, None)[0]
     return colours + 0.5, directions

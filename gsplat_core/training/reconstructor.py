@@ -163,7 +163,7 @@ class Reconstructor:
             ahead = EXTEND_AHEAD_BUMPS * field.spacing_s
             if time_s + ahead > end:
                 field.extend((start, time_s + ahead + field.spacing_s), hold_at_s=self._last_time_s)
-        elif time_s > end:
+        elif isinstance(field, HexPlaneField) and time_s > end:
             field.extend((start, start + 2 * (time_s - start)))
 
     def _grow(self, frame: Frame, observation: Observation) -> None:

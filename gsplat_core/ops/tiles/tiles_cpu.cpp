@@ -62,6 +62,12 @@ GSPLAT_INLINE vfloat contours(vfloat opacity) {
 
 GSPLAT_INLINE vmask finite(vfloat v) { return at_least(splat(3.4028235e38f), larger(v, -v)) & at_least(v, v); }
 
+// Splats in depth order lie anywhere in memory: the span of a later one is on its way meanwhile.
+GSPLAT_INLINE void prefetch_span(const TileSpan* spans, const uint32_t* order, int64_t i, int64_t end) {
+  constexpr int64_t kAhead = 16;
+  if (i + kAhead < end) __builtin_prefetch(spans + order[i + kAhead]);
+}
+
 // Where the counters of this splat's image start.
 GSPLAT_INLINE int64_t first_tile(const SplatBoxes& in, int64_t splat) {
   const int64_t image = in.image_ids != nullptr ? in.image_ids[splat] : splat < in.per_image ? 0 : splat / in.per_image;
@@ -157,6 +163,7 @@ void spans(const SplatBoxes& in, int64_t begin, int64_t end, TileSpan* spans, in
 
 void count(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, int64_t begin, int64_t end, int32_t* counters) {
   for (int64_t i = begin; i < end; ++i) {
+    prefetch_span(spans, order, i, end);
     int32_t* const mine = counters + first_tile(in, order[i]);
     for_tiles(in, order[i], spans[order[i]], [&](int64_t tile) { ++mine[tile]; });
   }
@@ -180,6 +187,7 @@ struct Key {
 void emit(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, int64_t begin, int64_t end, int32_t* cursors,
           int32_t* flatten_ids, int64_t* keys) {
   for (int64_t i = begin; i < end; ++i) {
+    prefetch_span(spans, order, i, end);
     const int64_t splat = order[i];
     int32_t* const mine = cursors + first_tile(in, splat);
     if (keys == nullptr) {
