@@ -50,7 +50,7 @@ class ReconstructorConfig:
     """Optimiser steps that each new frame gets."""
     first_frame_steps: int = 60
     """Steps on the very first frame, from which the model starts."""
-    newest_share: float = 0.5
+    newest_share: float = 0.7
     """Share of the steps that go to the newest frame; the rest goes to the window."""
     window_frames: int = 30
     """Recent frames that are trained on again, so that the model does not forget them."""
