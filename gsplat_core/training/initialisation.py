@@ -63,9 +63,9 @@ def gaussians_at_pixels(
     colour = smooth[row, column].astype(np.float64) / 255
     z = depth_mm[row, column].astype(np.float64)
     camera_to_world = np.linalg.inv(camera.world_to_camera)
-    points = unprojected(pixels, z, camera) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
-    per_pixel = np.ones_like(z) if camera.model == "ortho" else z
-    sigma = SIGMA_IN_SPACINGS * spacing_px * per_pixel / camera.K[0, 0]
+    points, pixel_mm = unprojected(pixels, z, camera)
+    points = points @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
+    sigma = SIGMA_IN_SPACINGS * spacing_px * pixel_mm
     count = len(pixels)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
     sh[:, 0] = (colour - 0.5) / SH_C0
@@ -78,17 +78,21 @@ def gaussians_at_pixels(
     )
 
 
-def unprojected(pixels: NDArray[np.float64], z: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Camera-space points [M, 3] with distance `z` [M] along the axis, seen at `pixels` [M, 2]: the camera model inverted."""
+def unprojected(
+    pixels: NDArray[np.float64], z: NDArray[np.float64], camera: Camera
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The camera model inverted: points [M, 3] in camera space at depth `z` [M], and how long a pixel is there [M]."""
     plane = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
     if camera.model == "ortho":
-        return np.concatenate([plane, z[:, None]], 1)
+        return np.concatenate([plane, z[:, None]], 1), np.full_like(z, 1 / camera.K[0, 0])
+    pixel = z / camera.K[0, 0]
     if camera.model == "fisheye":
-        # The plane holds the angle from the axis; from MAX_ANGLE on no plane of constant z is met.
-        angle = np.linalg.norm(plane, axis=1, keepdims=True)
-        bounded = np.clip(angle, 1e-9, MAX_ANGLE_RAD)
-        plane = plane * np.tan(bounded) / np.maximum(angle, 1e-9)
-    return np.concatenate([plane * z[:, None], z[:, None]], 1)
+        # So far the plane holds the angle. A pixel is 1 / cos² long outwards and tan / angle across: their geometric mean.
+        angle = np.clip(np.linalg.norm(plane, axis=1), 1e-9, MAX_ANGLE_RAD)
+        stretch = np.tan(angle) / np.maximum(np.linalg.norm(plane, axis=1), 1e-9)
+        plane = plane * stretch[:, None]
+        pixel = pixel * np.sqrt(stretch) / np.cos(angle)
+    return np.concatenate([plane * z[:, None], z[:, None]], 1), pixel
 
 
 def facing(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -119,7 +123,10 @@ def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
     """The image with tools painted over by the tissue around them; RGB uint8 [H, W, 3]."""
     if frame.mask is None or frame.mask.all() or not frame.mask.any():
         return frame.image
-    tool = cv2.dilate((frame.mask == 0).astype(np.uint8), np.ones((5, 5), np.uint8))
+    bare_tool = (frame.mask == 0).astype(np.uint8)
+    tool = cv2.dilate(bare_tool, np.ones((5, 5), np.uint8))
+    if tool.all():  # no tissue would be left
+        tool = bare_tool
     return inpaint_quarter_size(frame.image, tool)
 
 
@@ -129,9 +136,8 @@ def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> N
     small = (max(1, width // 4), max(1, height // 4))
     small_hole = (cv2.resize((hole > 0).astype(np.float32), small, interpolation=cv2.INTER_AREA) > 0).astype(np.uint8)
     if small_hole.all():  # nothing is left to grow from at this size
-        outside = image[hole == 0]
-        mean = outside.mean(0) if len(outside) else image.mean((0, 1))
-        return np.where(hole[..., None] > 0, np.rint(mean), image).astype(np.uint8)
+        outside = image[hole == 0] if not hole.all() else image.reshape(-1, 3)
+        return np.where(hole[..., None] > 0, np.rint(outside.mean(0)), image).astype(np.uint8)
     filled = cv2.inpaint(cv2.resize(image, small, interpolation=cv2.INTER_AREA), small_hole, 3, cv2.INPAINT_TELEA)
     large = cv2.resize(filled, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.where(hole[..., None] > 0, large, image).astype(np.uint8)
