@@ -73,7 +73,8 @@ class Gaussians:
     @property
     def opacities(self) -> Tensor:
         """Opacities [N] in 0..1."""
-        return self.logit_opacities.sigmoid()
+        # torch.sigmoid rounds differently at the ends of each thread's share; tanh does not, and is the same function.
+        return 0.5 + 0.5 * torch.tanh(0.5 * self.logit_opacities)
 
     @property
     def device(self) -> torch.device:

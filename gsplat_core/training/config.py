@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -76,6 +77,15 @@ class ReconstructorConfig:
                 raise InvalidInput(f"{name} is {getattr(self, name)}; it must be at least 1")
         if not 0 <= self.sh_degree <= 4:
             raise InvalidInput(f"sh_degree is {self.sh_degree}; it must be 0 to 4")
+        if self.max_gaussians < self.gaussians:
+            raise InvalidInput(f"max_gaussians is {self.max_gaussians}, below the {self.gaussians} gaussians to start with")
+        for name in ("bump_spacing_s", "default_depth_mm"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InvalidInput(f"{name} is {getattr(self, name)}; it must be positive")
+        if not 0 <= self.ssim_weight <= 1:
+            raise InvalidInput(f"ssim_weight is {self.ssim_weight}; it must be between 0 and 1")
+        if not 0 <= self.depth_weight < math.inf:
+            raise InvalidInput(f"depth_weight is {self.depth_weight}; it must be at least 0")
         if not 0 < self.newest_share <= 1:
             raise InvalidInput(f"newest_share is {self.newest_share}; it must be in (0, 1]")
 

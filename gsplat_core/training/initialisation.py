@@ -18,6 +18,9 @@ SIGMA_IN_SPACINGS = 0.7
 THICKNESS = 0.3
 """Depth of a fresh Gaussian relative to its width: tissue is a surface."""
 
+MAX_ANGLE_RAD = math.radians(85)
+"""Widest angle from the axis at which a fisheye pixel is placed; what lies farther out is placed there."""
+
 
 def gaussians_from_frame(
     frame: Frame, camera: Camera, count: int, *, sh_degree: int, default_depth_mm: float, seed: int = 0
@@ -59,11 +62,10 @@ def gaussians_at_pixels(
     smooth = cv2.GaussianBlur(image, (0, 0), max(0.3, 0.3 * spacing_px))
     colour = smooth[row, column].astype(np.float64) / 255
     z = depth_mm[row, column].astype(np.float64)
-    x = (pixels[:, 0] - camera.K[0, 2]) / camera.K[0, 0] * z
-    y = (pixels[:, 1] - camera.K[1, 2]) / camera.K[1, 1] * z
     camera_to_world = np.linalg.inv(camera.world_to_camera)
-    points = np.stack([x, y, z], -1) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
-    sigma = SIGMA_IN_SPACINGS * spacing_px * z / camera.K[0, 0]
+    points, pixel_mm = unprojected(pixels, z, camera)
+    points = points @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
+    sigma = SIGMA_IN_SPACINGS * spacing_px * pixel_mm
     count = len(pixels)
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
     sh[:, 0] = (colour - 0.5) / SH_C0
@@ -74,6 +76,23 @@ def gaussians_at_pixels(
         logit_opacities=torch.full((count,), math.log(0.9 / 0.1)),
         sh=torch.tensor(sh, dtype=torch.float32),
     )
+
+
+def unprojected(
+    pixels: NDArray[np.float64], z: NDArray[np.float64], camera: Camera
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The camera model inverted: points [M, 3] in camera space at depth `z` [M], and how long a pixel is there [M]."""
+    plane = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
+    if camera.model == "ortho":
+        return np.concatenate([plane, z[:, None]], 1), np.full_like(z, 1 / camera.K[0, 0])
+    pixel = z / camera.K[0, 0]
+    if camera.model == "fisheye":
+        # So far the plane holds the angle. A pixel is 1 / cos² long outwards and tan / angle across: their geometric mean.
+        angle = np.clip(np.linalg.norm(plane, axis=1), 1e-9, MAX_ANGLE_RAD)
+        stretch = np.tan(angle) / np.maximum(np.linalg.norm(plane, axis=1), 1e-9)
+        plane = plane * stretch[:, None]
+        pixel = pixel * np.sqrt(stretch) / np.cos(angle)
+    return np.concatenate([plane * z[:, None], z[:, None]], 1), pixel
 
 
 def facing(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -104,7 +123,10 @@ def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
     """The image with tools painted over by the tissue around them; RGB uint8 [H, W, 3]."""
     if frame.mask is None or frame.mask.all() or not frame.mask.any():
         return frame.image
-    tool = cv2.dilate((frame.mask == 0).astype(np.uint8), np.ones((5, 5), np.uint8))
+    bare_tool = (frame.mask == 0).astype(np.uint8)
+    tool = cv2.dilate(bare_tool, np.ones((5, 5), np.uint8))
+    if tool.all():  # no tissue would be left
+        tool = bare_tool
     return inpaint_quarter_size(frame.image, np.asarray(tool, np.uint8))
 
 
@@ -112,12 +134,11 @@ def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> N
     """Fill `hole` (non-zero) of `image`. At a quarter of the size: what lies under a tool is a guess, and large holes take seconds at full size."""
     height, width = hole.shape
     small = (max(1, width // 4), max(1, height // 4))
-    filled = cv2.inpaint(
-        cv2.resize(image, small, interpolation=cv2.INTER_AREA),
-        (cv2.resize(hole, small, interpolation=cv2.INTER_AREA) > 0).astype(np.uint8),
-        3,
-        cv2.INPAINT_TELEA,
-    )
+    small_hole = (cv2.resize((hole > 0).astype(np.float32), small, interpolation=cv2.INTER_AREA) > 0).astype(np.uint8)
+    if small_hole.all():  # nothing is left to grow from at this size
+        outside = image[hole == 0] if not hole.all() else image.reshape(-1, 3)
+        return np.where(hole[..., None] > 0, np.rint(outside.mean(0)), image).astype(np.uint8)
+    filled = cv2.inpaint(cv2.resize(image, small, interpolation=cv2.INTER_AREA), small_hole, 3, cv2.INPAINT_TELEA)
     large = cv2.resize(filled, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.where(hole[..., None] > 0, large, image).astype(np.uint8)
 
@@ -127,7 +148,7 @@ def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
     height, width = frame.image.shape[:2]
     if frame.depth is None:
         return np.full((height, width), default_depth_mm, np.float32)
-    known = frame.depth > 0
+    known = np.isfinite(frame.depth) & (frame.depth > 0)
     if frame.mask is not None:
         known &= frame.mask > 0
     if not known.any():

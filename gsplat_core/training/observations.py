@@ -44,8 +44,14 @@ class Observation:
             camera=camera if frame.pose is None else camera.with_pose(frame.pose),
             image=tensor_of(frame.image),
             mask=tensor_of(mask.astype(np.uint8, copy=False)),
-            depth=None if frame.depth is None else tensor_of(frame.depth.astype(np.float32, copy=False)),
+            depth=None if frame.depth is None else tensor_of(known_depth(frame.depth)),
         )
+
+
+def known_depth(depth_mm: NDArray[np.floating]) -> NDArray[np.float32]:
+    """The depth map with 0 (unknown) where it holds no positive finite number."""
+    known = np.isfinite(depth_mm) & (depth_mm > 0)
+    return np.where(known, depth_mm, 0).astype(np.float32)
 
 
 def tensor_of(array: NDArray) -> Tensor:
@@ -71,6 +77,10 @@ class ObservationWindow:
 
     def schedule(self, steps: int) -> list[Observation]:
         """Observations for the next `steps` steps. The last one is the newest frame, which is about to be shown."""
+        if steps < 0:
+            raise InvalidInput(f"steps is {steps}; it must be at least 0")
+        if steps == 0:
+            return []
         newest = self._frames[-1]
         older = len(self._frames) - 1
         if older == 0:

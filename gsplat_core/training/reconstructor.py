@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+import torch
 
 from gsplat_core.cameras import Camera
 from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
@@ -111,6 +113,14 @@ class Reconstructor:
         observations = [(frame, Observation.of(frame, self.camera)) for frame in frames]
         if not observations:
             raise InvalidInput("there are no frames to train on")
+        if steps < 1:
+            raise InvalidInput(f"steps is {steps}; it must be at least 1")
+        for (_, before), (frame, after) in pairwise(observations):
+            if after.time_s < before.time_s:
+                raise InvalidInput(
+                    f"frame {frame.seq} is at {after.time_s:.3f} s, before the last one at {before.time_s:.3f} s;"
+                    " frames must come in order"
+                )
         first_frame, first = observations[0]
         self._start(first_frame, first, end_s=observations[-1][1].time_s)
         assert self._step is not None
@@ -153,13 +163,16 @@ class Reconstructor:
             seed=self._seed,
         )
         self._first_time_s = observation.time_s
+        self.camera = observation.camera
         self._step = TrainingStep(gaussians, self._new_field(gaussians, end_s), self.config, self.camera)
 
     def _new_field(self, gaussians: Gaussians, end_s: float | None) -> DeformationField:
         start = self._first_time_s
         spacing = self.config.bump_spacing_s
         if self.config.chosen_field == "hexplane":
-            return HexPlaneField(gaussians, (start, start + spacing if end_s is None else end_s))
+            with torch.random.fork_rng(devices=[]):  # planes and layers start random
+                torch.manual_seed(self._seed)
+                return HexPlaneField(gaussians, (start, start + spacing if end_s is None else end_s))
         ahead = EXTEND_AHEAD_BUMPS * spacing
         span = ahead if end_s is None else max(end_s - start, spacing)
         bumps = max(4, round(span / spacing) + 3)

@@ -68,6 +68,8 @@ class TrainingStep:
         deltas = torch.cat(
             [gradients["means"], gradients["quats"], gradients["log_scales"], gradients["sh"][:, 0]], dim=1
         )
+        if not torch.isfinite(deltas.sum()):  # such a Gaussian is left alone, as `FusedAdam` does
+            deltas[~deltas.isfinite().all(1)] = 0
         field.adam_step(
             observation.time_s,
             deltas,
