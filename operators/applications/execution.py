@@ -72,6 +72,7 @@ class Execution:
 
         Raises RunFailed, with the outcome, when any part failed; the other parts are saved first.
         """
+        self.app.announce()
         # The caller's random numbers are not ours to move.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.settings.seed)

@@ -142,16 +142,16 @@ class ReplayApplication(Application):
     def _held_out(self, frame: Frame) -> bool:
         return self.settings.heldout and is_heldout(frame.seq)
 
+    def announce(self) -> None:
+        """Say how much there is to do: the first frame, which starts the model, takes long."""
+        self._tell(0, None)
+
     def _report(self, scored: ScoredFrame) -> None:
+        self._tell(len(self.metrics.series), scored.quality.psnr_tissue_db)
+
+    def _tell(self, done: int, psnr_tissue_db: float | None) -> None:
         if self._progress is not None:
-            self._progress(
-                Progress(
-                    self.stage,
-                    len(self.metrics.series),
-                    self.recording.frame_count,
-                    psnr_tissue_db=scored.quality.psnr_tissue_db,
-                )
-            )
+            self._progress(Progress(self.stage, done, self.recording.frame_count, psnr_tissue_db=psnr_tissue_db))
 
 
 def replay(

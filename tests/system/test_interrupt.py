@@ -33,7 +33,7 @@ def test_an_interrupted_replay_writes_what_it_has(long, tmp_path, start, engine)
         pytest.importorskip("holoscan")
     out = tmp_path / "out"
     process = start("replay", long, "--out", out, "--engine", engine, "--steps-per-frame", 12)
-    wait_for_line(process, "replay 1/40")
+    wait_for_line(process, "replay 1")
     process.send_signal(signal.SIGINT)
     stdout, stderr = process.communicate(timeout=60)
     assert process.returncode == 130, stderr

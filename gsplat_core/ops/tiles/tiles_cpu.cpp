@@ -76,7 +76,7 @@ GSPLAT_INLINE int64_t first_tile(const SplatBoxes& in, int64_t splat) {
 
 // visit(tile) for every touched tile, row by row.
 template <class Visit>
-GSPLAT_INLINE void for_tiles(const SplatBoxes& in, int64_t splat_, const TileSpan& span, const Visit& visit) {
+GSPLAT_INLINE void for_tiles(const SplatBoxes& in, int64_t id, const TileSpan& span, const Visit& visit) {
   const int64_t origin = int64_t(span.y) * in.tile_width + span.x;
   if (span.width <= 8 && span.height <= 8) {
     for (uint64_t left = span.touched; left != 0; left &= left - 1) {
@@ -85,9 +85,9 @@ GSPLAT_INLINE void for_tiles(const SplatBoxes& in, int64_t splat_, const TileSpa
     }
     return;
   }
-  const float* const mean = in.means2d + 2 * splat_;
-  const float none[3] = {}, *const q = in.conics != nullptr ? in.conics + 3 * splat_ : none;
-  const vfloat k = contours(splat(in.conics != nullptr ? in.opacities[splat_] : 1.0f));
+  const float* const mean = in.means2d + 2 * id;
+  const float none[3] = {}, *const q = in.conics != nullptr ? in.conics + 3 * id : none;
+  const vfloat k = contours(splat(in.conics != nullptr ? in.opacities[id] : 1.0f));
   const Ellipses e = make_ellipses(splat(mean[0]), splat(mean[1]), {splat(q[0]), splat(q[1]), splat(q[2])}, k);
   for (int row = 0; row < span.height; row += kLanes) {
     const vfloat rows = ramp() + float(span.y + row);
