@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 from functools import cache
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pytest
+import torch
 import typer
 
+from gsplat_core import Frame, Gaussians
+from gsplat_core.io.manifest import manifest_bytes, parse_manifest
+from gsplat_core.io.recordings import open_recording
+from gsplat_core.model import Model
+from operators.display import CallbackSinkOp
+from operators.graph import Application, Operator, OperatorSpec
+from operators.ingest import SourceOp
 from services.cli.app import app
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -157,3 +169,78 @@ def test_every_locked_package_has_its_licence():
         if f"| {name} | {version} |".lower() not in text and f"{name} {version}".lower() not in text
     ]
     assert missing == [], "run `make licences`"
+
+
+def json_examples(name: str) -> list[dict]:
+    """The JSON blocks of a document."""
+    text = (ROOT / "docs" / name).read_text(encoding="utf-8")
+    return [json.loads(block) for block in re.findall(r"^```json\n(.*?)^```", text, re.MULTILINE | re.DOTALL)]
+
+
+def test_the_calibration_files_in_the_guide_are_read_as_it_says(tmp_path):
+    cameras, described = json_examples("recordings.md")
+    (tmp_path / "cameras" / "images").mkdir(parents=True)
+    cv2.imwrite(
+        str(tmp_path / "cameras" / "images" / "000000.png"),
+        np.full((cameras["height"], cameras["width"], 3), 90, np.uint8),
+    )
+    (tmp_path / "cameras" / "cameras.json").write_text(json.dumps(cameras))
+    recording = open_recording(tmp_path / "cameras")
+    assert (recording.camera.K[0, 0], recording.fps, recording.fields) == (cameras["fx"], cameras["fps"], {"pose"})
+
+    size = described["camera"]["height"], described["camera"]["width"]
+    (tmp_path / "described" / "depth").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "described" / "000000.png"), np.full((*size, 3), 90, np.uint8))
+    cv2.imwrite(str(tmp_path / "described" / "depth" / "000000.png"), np.full(size, 6000, np.uint16))
+    (tmp_path / "described" / "recording.json").write_text(json.dumps(described))
+    recording = open_recording(tmp_path / "described")
+    frame = next(iter(recording))
+    assert frame.depth is not None
+    assert frame.depth.min() == pytest.approx(6000 * described["depth_unit_mm"])
+    assert recording.camera.K[0, 0] == described["camera"]["fx"]
+
+
+def test_the_manifest_in_the_guide_is_one():
+    (example,) = json_examples("bundle.md")
+    example["training_digest"] = example["tensors"]["sha256"] = 64 * "0"
+    manifest = parse_manifest(json.dumps(example).encode(), "docs/bundle.md")
+    gaussians, field = manifest.skeleton()
+    assert field is not None
+    tensors = [*gaussians.tensors().values(), *field.state_dict().values()]
+    assert sum(tensor.numel() for tensor in tensors) == example["parameters"]
+    model = Model(
+        1,
+        Gaussians(*(torch.zeros_like(t, device="cpu") for t in gaussians.tensors().values())),
+        None,
+        manifest.camera,
+        (0, 1),
+    )
+    assert set(example) == set(json.loads(manifest_bytes(model, 0, 64 * "0")))
+
+
+def test_the_operator_in_the_guide_works():
+    text = (ROOT / "docs" / "operators.md").read_text(encoding="utf-8")
+    (source,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    names: dict[str, Any] = {"Operator": Operator, "OperatorSpec": OperatorSpec, "Frame": Frame, "Any": Any}
+    exec(source, names)
+    seen: list[float] = []
+
+    class Two(Application):
+        def compose(self) -> None:
+            source = SourceOp(self, name="source", recording=_Frames())
+            share = names["ToolShareOp"](self, name="share", only_every=2)
+            self.add_flow(source, share)
+            self.add_flow(share, CallbackSinkOp(self, name="show", callback=seen.append))
+
+    Two().run()
+    assert seen == [0.5, 0.5]
+
+
+class _Frames:
+    """Four frames, half tool."""
+
+    frame_count = 4
+
+    def __iter__(self):
+        mask = np.array([[1, 0]], np.uint8)
+        return (Frame(seq=i, pts_ns=i, image=np.zeros((1, 2, 3), np.uint8), mask=mask) for i in range(4))
