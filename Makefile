@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 OUT ?= out/demo
+# Waiting threads sleep: tests and benchmarks share the machine.
+export OMP_WAIT_POLICY ?= PASSIVE
 CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h')
 
 .PHONY: demo test lint format bench native lock licences clean
