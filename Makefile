@@ -48,5 +48,8 @@ lock: .venv/.development
 	$(BIN)/uv pip compile pyproject.toml --extra build --universal --generate-hashes --quiet --no-emit-index-url -o requirements.lock
 	$(BIN)/uv pip compile pyproject.toml --extra build --extra dev --extra holoscan --universal --generate-hashes --quiet --no-emit-index-url -c requirements.lock -o requirements-dev.lock
 
+licences: .venv/.development
+	$(BIN)/python deploy/third_party_licences.py
+
 clean:
 	rm -rf build gsplat_core/*.so .venv
