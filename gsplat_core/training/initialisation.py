@@ -71,7 +71,9 @@ def gaussians_at_pixels(
     sh[:, 0] = (colour - 0.5) / SH_C0
     return Gaussians(
         means=torch.tensor(points, dtype=torch.float32),
-        quats=torch.tensor(facing(np.asarray(camera_to_world[:3, :3], np.float64)), dtype=torch.float32).repeat(count, 1),
+        quats=torch.tensor(facing(np.asarray(camera_to_world[:3, :3], np.float64)), dtype=torch.float32).repeat(
+            count, 1
+        ),
         log_scales=torch.tensor(np.log(sigma[:, None] * np.array([1, 1, THICKNESS])), dtype=torch.float32),
         logit_opacities=torch.full((count,), math.log(0.9 / 0.1)),
         sh=torch.tensor(sh, dtype=torch.float32),
