@@ -24,7 +24,8 @@ HEADER = """# Third-party licences
 The packages that `requirements.lock` installs on Linux with Python {python}, and the licence that each states. Written by
 `deploy/third_party_licences.py`. None of them is part of this repository.
 
-OpenCV's wheel carries FFmpeg's libraries, which are under the LGPL 2.1. Packages of NVIDIA come with torch for its GPU builds; IntraSplat does not call them.
+OpenCV's wheel carries FFmpeg's libraries, which are under the LGPL 2.1. NVIDIA's packages come with torch; IntraSplat does not
+call them.
 
 | package | version | licence |
 |---|---|---|
