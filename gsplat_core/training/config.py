@@ -74,7 +74,9 @@ class ReconstructorConfig:
         if not 0 <= self.sh_degree <= 4:
             raise InvalidInput(f"sh_degree is {self.sh_degree}; it must be 0 to 4")
         if self.max_gaussians < self.gaussians:
-            raise InvalidInput(f"max_gaussians is {self.max_gaussians}, below the {self.gaussians} gaussians to start with")
+            raise InvalidInput(
+                f"max_gaussians is {self.max_gaussians}, below the {self.gaussians} gaussians to start with"
+            )
         for name in ("bump_spacing_s", "default_depth_mm"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidInput(f"{name} is {getattr(self, name)}; it must be positive")

@@ -33,7 +33,12 @@ def make_frame() -> Callable[..., Frame]:
     """`make_frame(seq, fps=20, shift_px=0, width, height, **fields)`: one frame; fields are Frame's mask, depth, pose."""
 
     def make(
-        seq: int = 0, fps: float = 20, shift_px: float = 0, width: int = WIDTH_PX, height: int = HEIGHT_PX, **fields: object
+        seq: int = 0,
+        fps: float = 20,
+        shift_px: float = 0,
+        width: int = WIDTH_PX,
+        height: int = HEIGHT_PX,
+        **fields: object,
     ) -> Frame:
         return Frame(seq, round(seq * 1e9 / fps), texture(width, height, shift_px), **fields)  # type: ignore[arg-type]
 

@@ -57,7 +57,9 @@ def by_autograd(gaussians, seen, weights):
 
 
 @pytest.mark.parametrize("sh_degree", [0, 3])
-@pytest.mark.parametrize("weights", [LossWeights(), LossWeights(ssim=0.3), LossWeights(depth=5.0), LossWeights(0.2, 5.0)])
+@pytest.mark.parametrize(
+    "weights", [LossWeights(), LossWeights(ssim=0.3), LossWeights(depth=5.0), LossWeights(0.2, 5.0)]
+)
 @pytest.mark.parametrize(("model", "pose"), [("pinhole", None), ("pinhole", MOVED), ("fisheye", MOVED)])
 def test_equals_render_loss_and_backward(make_gaussians, assert_near, sh_degree, weights, model, pose):
     gaussians, seen = make_gaussians(150, sh_degree), observation(model, pose)
