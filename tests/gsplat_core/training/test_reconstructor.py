@@ -213,7 +213,7 @@ def test_tissue_that_comes_into_view_is_added(make_frame, camera, field):
 def test_tissue_that_a_tool_hides_stays_as_it_was_last_seen(tissue_video, make_frame, camera, window_frames):
     frames = tissue_video(9)  # 2 px to the right in 0.4 s
     learning = learn(frames, camera, dataclasses.replace(CONFIG, window_frames=window_frames))
-    last_s, first = frames[-1].time_s, learning.snapshot()
+    last_s = frames[-1].time_s
     mask = np.ones((40, 48), np.uint8)
     mask[:, 24:] = 0
     for seq in range(9, 29):  # one more second, of which the right half shows nothing
