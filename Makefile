@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 OUT ?= out/demo
+# Waiting threads sleep: tests and benchmarks share the machine.
+export OMP_WAIT_POLICY ?= PASSIVE
 CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h')
 
 .PHONY: demo test lint format bench native lock licences clean
@@ -45,6 +47,9 @@ native: .venv/.runtime
 lock: .venv/.development
 	$(BIN)/uv pip compile pyproject.toml --extra build --universal --generate-hashes --quiet --no-emit-index-url -o requirements.lock
 	$(BIN)/uv pip compile pyproject.toml --extra build --extra dev --extra holoscan --universal --generate-hashes --quiet --no-emit-index-url -c requirements.lock -o requirements-dev.lock
+
+licences: .venv/.development
+	$(BIN)/python deploy/third_party_licences.py
 
 clean:
 	rm -rf build gsplat_core/*.so .venv

@@ -18,13 +18,13 @@ std::unique_ptr<T[]> uninitialised(int64_t count) {
 // count(begin, end, counts): adds to counts[b] for every output of items [begin, end) that belongs to bucket b.
 // emit(begin, end, cursor): writes each of those outputs at cursor[b]++, in the same order.
 // starts, where given, receives the first position of every bucket. Returns the number of outputs.
+// `chunk` is the number of items worth a thread of its own: below it, handing them out costs more than doing them.
 template <class Count, class Emit>
-int64_t counting_sort(int64_t items, int64_t buckets, int32_t* starts, const Count& count, const Emit& emit) {
-  constexpr int64_t kSmallest = 4096;  // a chunk with fewer items costs more to hand out than to do
+int64_t counting_sort(int64_t items, int64_t chunk, int64_t buckets, int32_t* starts, const Count& count, const Emit& emit) {
   // A chunk also costs a row of counters, so there are no more counters than a few per item.
   const int64_t by_counters = std::max<int64_t>(1, 4 * items / std::max<int64_t>(buckets, 1));
-  const int64_t chunks = std::max<int64_t>(
-      1, std::min<int64_t>({int64_t(torch::stable::get_num_threads()), (items + kSmallest - 1) / kSmallest, by_counters}));
+  const int64_t chunks =
+      std::max<int64_t>(1, std::min<int64_t>({int64_t(torch::stable::get_num_threads()), items / chunk, by_counters}));
   std::vector<int32_t> counters(size_t(chunks * buckets), 0);
   const auto for_chunks = [&](const auto& work) {
     torch::stable::parallel_for(0, chunks, 1, [&](int64_t first, int64_t last) {

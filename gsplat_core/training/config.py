@@ -47,14 +47,18 @@ class ReconstructorConfig:
     """Bound on Gaussians over the whole stream."""
     sh_degree: int = 0
     """Degree of the view-dependent colour; 0 suits a scope whose light moves with the camera."""
-    steps_per_frame: int = 8
+    steps_per_frame: int = 10
     """Optimiser steps that each new frame gets."""
     first_frame_steps: int = 60
     """Steps on the very first frame, from which the model starts."""
-    newest_share: float = 0.5
+    newest_share: float = 0.7
     """Share of the steps that go to the newest frame; the rest goes to the window."""
     window_frames: int = 30
     """Recent frames that are trained on again, so that the model does not forget them."""
+    jump_ratio: float = 1.8
+    """A new frame whose loss is this many times the usual one shows a jump (a cut, a pull) and gets extra steps."""
+    jump_extra: int = 4
+    """Extra steps for a jump, in multiples of the frame's own."""
     bump_spacing_s: float = 0.2
     """Time between the basis functions of the basis field."""
     ssim_weight: float = 0.0

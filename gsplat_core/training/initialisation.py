@@ -71,7 +71,9 @@ def gaussians_at_pixels(
     sh[:, 0] = (colour - 0.5) / SH_C0
     return Gaussians(
         means=torch.tensor(points, dtype=torch.float32),
-        quats=torch.tensor(facing(camera_to_world[:3, :3]), dtype=torch.float32).repeat(count, 1),
+        quats=torch.tensor(facing(np.asarray(camera_to_world[:3, :3], np.float64)), dtype=torch.float32).repeat(
+            count, 1
+        ),
         log_scales=torch.tensor(np.log(sigma[:, None] * np.array([1, 1, THICKNESS])), dtype=torch.float32),
         logit_opacities=torch.full((count,), math.log(0.9 / 0.1)),
         sh=torch.tensor(sh, dtype=torch.float32),
@@ -127,7 +129,7 @@ def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
     tool = cv2.dilate(bare_tool, np.ones((5, 5), np.uint8))
     if tool.all():  # no tissue would be left
         tool = bare_tool
-    return inpaint_quarter_size(frame.image, tool)
+    return inpaint_quarter_size(frame.image, np.asarray(tool, np.uint8))
 
 
 def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -23,6 +24,8 @@ from gsplat_core.training.step import TrainingStep
 
 EXTEND_AHEAD_BUMPS = 1
 """Window that the online basis field keeps ahead of the newest frame, in bumps; beyond it lies one more column."""
+USUAL_DECAY = 0.1
+"""How fast the usual loss of a new frame follows the newest ones."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class Reconstructor:
         self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
         self._step: TrainingStep | None = None
         self._version = 0
+        self._usual_surprise = math.inf
         self._first_time_s = 0.0
         self._last_time_s = 0.0
 
@@ -88,10 +92,17 @@ class Reconstructor:
         if not first:
             self._grow(frame, observation)
         count = steps if steps is not None else self.config.first_frame_steps if first else self.config.steps_per_frame
-        loss = None
-        for chosen in self._window.schedule(count):
+        surprise = self._step(observation)
+        schedule = self._window.schedule(count - 1) if count > 1 else []
+        if not first and surprise > self.config.jump_ratio * self._usual_surprise:
+            schedule += [observation] * (count * self.config.jump_extra)
+        loss = surprise
+        for chosen in schedule:
             loss = self._step(chosen)
-        return ObserveReport(frame.seq, count, loss, self.gaussians)
+        if not first:
+            known = self._usual_surprise if self._usual_surprise < math.inf else surprise
+            self._usual_surprise = known + USUAL_DECAY * (min(surprise, self.config.jump_ratio * known) - known)
+        return ObserveReport(frame.seq, 1 + len(schedule), loss, self.gaussians)
 
     def fit(
         self, frames: Iterable[Frame], steps: int, progress: Callable[[int, float], None] | None = None
@@ -177,7 +188,7 @@ class Reconstructor:
             ahead = EXTEND_AHEAD_BUMPS * field.spacing_s
             if time_s + ahead > end:
                 field.extend((start, time_s + ahead + field.spacing_s), hold_at_s=self._last_time_s)
-        elif time_s > end:
+        elif isinstance(field, HexPlaneField) and time_s > end:
             field.extend((start, start + 2 * (time_s - start)))
 
     def _grow(self, frame: Frame, observation: Observation) -> None:

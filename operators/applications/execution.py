@@ -16,6 +16,7 @@ from gsplat_core.errors import CoreError
 from gsplat_core.frames import Frame
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.recordings import Recording
+from gsplat_core.model import Model
 from gsplat_core.training.baselines import Baselines, measure_baselines
 from operators.applications.result import RunOutcome, peak_memory_bytes
 from operators.errors import OperatorsError, RunFailed
@@ -28,10 +29,25 @@ if TYPE_CHECKING:
 PERCENTILES = tuple(k / 100 for k in range(101))
 
 
+@dataclass(frozen=True)
+class Start:
+    """When a run began: for people, and for measuring."""
+
+    at: datetime
+    s: float
+    """By `perf_counter`."""
+
+    @staticmethod
+    def now() -> Start:
+        """This moment."""
+        return Start(datetime.now(UTC), perf_counter())
+
+
 class Execution:
     """One run of a composed application, from start to outcome.
 
-    `command` is what the run is called in reports; `began_s` is where its wall time begins, by `perf_counter`.
+    `command` is what the run is called in reports. `fitted` is a model that was there before the graph ran, and is saved whether or not
+    a frame is shown with it. The run's wall time begins at `start`.
     """
 
     def __init__(
@@ -41,10 +57,13 @@ class Execution:
         stop_requested: Callable[[], bool],
         *,
         command: Literal["replay", "reconstruct"] = "replay",
+        fitted: Model | None = None,
+        start: Start | None = None,
     ) -> None:
         self.app, self.notes, self.stop_requested, self.command = app, notes, stop_requested, command
         self.recording, self.settings = app.recording, app.settings
-        self.started_at, self.began_s = datetime.now(UTC), perf_counter()
+        self.fitted = fitted
+        self.start = start or Start.now()
         self.outputs: dict[str, Path] = {}
         self.failure: Exception | None = None
 
@@ -53,11 +72,12 @@ class Execution:
 
         Raises RunFailed, with the outcome, when any part failed; the other parts are saved first.
         """
+        self.app.announce()
         # The caller's random numbers are not ours to move.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.settings.seed)
             self._attempt(lambda: run(self.app, self.settings.engine))
-        wall_s = perf_counter() - self.began_s
+        wall_s = perf_counter() - self.start.s
         if self.app.video.displayed and self.app.video_path.exists():
             self.outputs["video"] = self.app.video_path
         self._attempt(self._save_model)
@@ -77,7 +97,7 @@ class Execution:
             return None
 
     def _save_model(self) -> None:
-        model = self.app.reconstruct.model
+        model = self.fitted or self.app.reconstruct.model
         if model is not None:
             folder = self.settings.out / "model"
             with storage_errors(self.settings.out):
@@ -111,7 +131,7 @@ class Execution:
             seed=settings.seed,
             scale=settings.scale,
             steps_per_frame=settings.reconstructor_config().steps_per_frame if self.command == "replay" else None,
-            started_at=self.started_at,
+            started_at=self.start.at,
             wall_s=wall_s,
             stop_reason=reason,
             interrupted=interrupted,
@@ -128,7 +148,7 @@ class Execution:
             series=tuple(metrics.series),
             keyframes=tuple(app.keyframes.keyframes),
             worst_seq=app.keyframes.worst_seq,
-            model=app.reconstruct.model,
+            model=self.fitted or app.reconstruct.model,
             frames_sha256=metrics.frames_sha256,
             notes=(*self.notes, *app.tool_mask.notes),
             outputs=self.outputs,

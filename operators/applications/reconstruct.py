@@ -16,7 +16,7 @@ from gsplat_core.frames import Frame
 from gsplat_core.io.recordings import Recording, is_heldout
 from gsplat_core.model import Model
 from gsplat_core.training.reconstructor import ObserveReport, Reconstructor
-from operators.applications.execution import Execution
+from operators.applications.execution import Execution, Start
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplayApplication, ReplaySettings, prepare
 from operators.applications.result import RunOutcome
@@ -49,7 +49,7 @@ def reconstruct(
 ) -> RunOutcome:
     """Train offline for `steps` steps, then evaluate; writes what a replay writes.
 
-    When `stop_requested` answers True while training, the model is taken as it is and evaluated; while evaluating, as in a replay.
+    When `stop_requested` answers True while training, the model is saved as it is then and not evaluated; while evaluating, as in a replay.
 
     Raises as `replay`; InvalidInput for fewer steps than one.
     """
@@ -57,23 +57,23 @@ def reconstruct(
         raise InvalidInput(f"steps is {steps}; it must be at least 1")
     settings = replace(settings, heldout=True)
     recording, notes = prepare(settings, "reconstruct")
-    learning = Reconstructor(
-        settings.reconstructor_config(), recording.camera, seed=settings.seed, recording_digest=recording.digest
-    )
+    start = Start.now()
+    config = settings.reconstructor_config(recording.width_px * recording.height_px)
+    learning = Reconstructor(config, recording.camera, seed=settings.seed, recording_digest=recording.digest)
+    done = _fit(learning, recording, settings.seed, steps, progress, stop_requested)
+    if done < steps:
+        notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
+    model = learning.snapshot()
     app = ReplayApplication(
         recording,
         settings,
         video=settings.out / "reconstruction.mp4",
         progress=progress,
         stop_requested=stop_requested,
-        make_reconstructor=lambda: FittedModel(learning.snapshot()),
+        make_reconstructor=lambda: FittedModel(model),
         stage="evaluate",
     )
-    execution = Execution(app, notes, stop_requested, command="reconstruct")
-    done = _fit(learning, recording, settings.seed, steps, progress, stop_requested)
-    if done < steps:
-        notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
-    return execution.execute()
+    return Execution(app, notes, stop_requested, command="reconstruct", fitted=model, start=start).execute()
 
 
 def _fit(

@@ -39,6 +39,7 @@ from operators.tool_mask import RecordedToolMaskOp
 REPORT_RESERVE_BYTES = 8 * 2**20
 """Room on the disk that stays free for the video's index and the report."""
 KEYFRAMES = 5
+PIXELS_PER_GAUSSIAN = 4
 
 
 @dataclass(frozen=True)
@@ -64,9 +65,15 @@ class ReplaySettings:
         if self.seed < 0:
             raise InvalidInput(f"seed is {self.seed}; it must not be negative")
 
-    def reconstructor_config(self) -> ReconstructorConfig:
-        """The reconstructor's settings. Raises InvalidInput."""
+    def reconstructor_config(self, pixels: int | None = None) -> ReconstructorConfig:
+        """The reconstructor's settings for frames of so many pixels. Raises InvalidInput."""
         config = ReconstructorConfig(field=self.field)
+        if pixels is not None:
+            # More Gaussians than a quarter of the pixels have nothing to show.
+            most = max(64, pixels // PIXELS_PER_GAUSSIAN)
+            config = replace(
+                config, gaussians=min(config.gaussians, most), max_gaussians=min(config.max_gaussians, 2 * most)
+            )
         return config if self.steps_per_frame is None else replace(config, steps_per_frame=self.steps_per_frame)
 
 
@@ -126,7 +133,7 @@ class ReplayApplication(Application):
 
     def _new_reconstructor(self) -> Reconstructor:
         return Reconstructor(
-            self.settings.reconstructor_config(),
+            self.settings.reconstructor_config(self.recording.width_px * self.recording.height_px),
             self.recording.camera,
             seed=self.settings.seed,
             recording_digest=self.recording.digest,
@@ -135,16 +142,16 @@ class ReplayApplication(Application):
     def _held_out(self, frame: Frame) -> bool:
         return self.settings.heldout and is_heldout(frame.seq)
 
+    def announce(self) -> None:
+        """Say how much there is to do: the first frame, which starts the model, takes long."""
+        self._tell(0, None)
+
     def _report(self, scored: ScoredFrame) -> None:
+        self._tell(len(self.metrics.series), scored.quality.psnr_tissue_db)
+
+    def _tell(self, done: int, psnr_tissue_db: float | None) -> None:
         if self._progress is not None:
-            self._progress(
-                Progress(
-                    self.stage,
-                    len(self.metrics.series),
-                    self.recording.frame_count,
-                    psnr_tissue_db=scored.quality.psnr_tissue_db,
-                )
-            )
+            self._progress(Progress(self.stage, done, self.recording.frame_count, psnr_tissue_db=psnr_tissue_db))
 
 
 def replay(

@@ -23,7 +23,8 @@ class ProgressPrinter:
         self._quiet = quiet
         self._terminal = not quiet and sys.stderr.isatty()
         self._stage = ""
-        self._began_s = self._printed_s = 0.0
+        self._printed_s = 0.0
+        self._measured_from: tuple[float, int] | None = None
         self._bar: Bar | None = None
         self._task: TaskID | None = None
 
@@ -66,9 +67,14 @@ class ProgressPrinter:
         now_s = time.monotonic()
         first = progress.stage != self._stage
         if first:
-            self._stage, self._began_s, self._printed_s = progress.stage, now_s, now_s
-        elapsed_s = now_s - self._began_s
-        rate = progress.done / elapsed_s if elapsed_s > 0 else 0.0
+            self._stage, self._printed_s, self._measured_from = progress.stage, now_s, None
+        begun = self._measured_from is None and progress.done > 0
+        if begun:
+            # The first frame starts the model and takes far longer than those after it: the rate leaves it out.
+            self._measured_from = now_s, progress.done
+        rate = 0.0
+        if self._measured_from and now_s > self._measured_from[0]:
+            rate = (progress.done - self._measured_from[1]) / (now_s - self._measured_from[0])
         quality = "" if progress.psnr_tissue_db is None else f"{progress.psnr_tissue_db:.2f} dB"
         rate_text = f"{rate:.1f} {progress.unit}/s" if rate else ""
         if self._bar is not None:
@@ -78,11 +84,11 @@ class ProgressPrinter:
             self._bar.update(self._task, completed=progress.done, rate=rate_text, quality=quality)
             return
         finished = progress.done == progress.total
-        if not (first or finished or now_s - self._printed_s >= PLAIN_PERIOD_S):
+        if not (first or begun or finished or now_s - self._printed_s >= PLAIN_PERIOD_S):
             return
         self._printed_s = now_s
         parts = [f"{progress.stage} {progress.done}/{progress.total}"]
-        if rate and not first:
+        if rate:
             parts.append(rate_text)
             if not finished:
                 parts.append(f"eta {(progress.total - progress.done) / rate:.0f} s")

@@ -27,8 +27,12 @@ def report_run(run: Run, out: Path, *, as_json: bool) -> int:
         except RunFailed as failed:
             # What the run had reached is worth a report, whatever ended it.
             assert isinstance(failed.result, RunOutcome)
-            write_reports(failed.result, out)
+            if failed.result.outputs:
+                write_reports(failed.result, out)
             raise
+        if not outcome.outputs:
+            typer.echo("interrupted before there was anything to write", err=True)
+            return INTERRUPTED
         report = write_reports(outcome, out)
     print_report(report, out, as_json=as_json)
     return INTERRUPTED if interrupt.requested else OK
@@ -40,7 +44,7 @@ def print_report(report: RunReport, out: Path, *, as_json: bool) -> None:
         typer.echo(report.model_dump_json(indent=2))
         return
     if report.run.interrupted:
-        typer.echo("interrupted: what follows covers the frames that were displayed", err=True)
+        typer.echo("interrupted: the figures cover the frames that were displayed", err=True)
     for note in report.notes:
         typer.echo(f"note: {note}", err=True)
     frames, run, quality = report.frames, report.run, report.quality

@@ -27,9 +27,7 @@ def validate_command(recording: Path, *, as_json: bool) -> int:
         typer.echo(f"error: {problem}", err=True)
     if report.ok:
         typer.echo("the recording can be used")
-        return OK
-    typer.echo(f"{len(report.problems)} problems: the recording cannot be used as it is", err=True)
-    return BAD_INPUT
+    return OK if report.ok else BAD_INPUT
 
 
 def _shown(value: object) -> str:

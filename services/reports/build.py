@@ -45,7 +45,7 @@ def build_report(outcome: RunOutcome) -> RunReport:
             seed=outcome.seed,
             version=product_version(),
             threads=torch.get_num_threads(),
-            wall_s=outcome.wall_s,
+            wall_s=round(outcome.wall_s, 3),
             command=outcome.command,
             field=outcome.field,
             steps_per_frame=outcome.steps_per_frame,
@@ -58,10 +58,11 @@ def build_report(outcome: RunOutcome) -> RunReport:
         ),
         frames=FrameCounts(ingested=outcome.ingested, displayed=outcome.displayed, dropped=outcome.dropped),
         latency_ms={
-            path: Latency(p50=t.p50_ms, p95=t.p95_ms, p99=t.p99_ms, max=t.max_ms) for path, t in outcome.latency.items()
+            path: Latency(p50=_ms(t.p50_ms), p95=_ms(t.p95_ms), p99=_ms(t.p99_ms), max=_ms(t.max_ms))
+            for path, t in outcome.latency.items()
         },
         operators={
-            name: OperatorTimes(calls=t.count, p50_ms=t.p50_ms, p99_ms=t.p99_ms)
+            name: OperatorTimes(calls=t.count, p50_ms=_ms(t.p50_ms), p99_ms=_ms(t.p99_ms))
             for name, t in outcome.operators.items()
         },
         quality=QualityReport(
@@ -86,7 +87,7 @@ def build_report(outcome: RunOutcome) -> RunReport:
         frames_sha256=outcome.frames_sha256,
         notes=list(outcome.notes),
         outputs={name: path.name for name, path in outcome.outputs.items()},
-        latency_quantiles_ms=outcome.latency_quantiles_ms,
+        latency_quantiles_ms={path: [_ms(v) for v in curve] for path, curve in outcome.latency_quantiles_ms.items()},
         series=[FrameEntry.model_validate(entry) for entry in outcome.series],
     )
 
@@ -104,3 +105,8 @@ def write_reports(outcome: RunOutcome, folder: Path) -> RunReport:
 
 def _quality(tracker: QualityTracker | None) -> Quality | None:
     return None if tracker is None else Quality(**tracker.means(), frames=len(tracker.frames))
+
+
+def _ms(value: float) -> float:
+    """Milliseconds to the microsecond; the clock knows no more."""
+    return round(value, 3)

@@ -9,9 +9,18 @@ from importlib.resources import files
 from pathlib import Path
 
 from operators.storage import write_whole
-from services.reports.charts import NARROW, Chart, Line
 from services.reports.pictures import KeyframePictures
-from services.reports.schema import Quality, RunReport
+from services.reports.schema import RunReport
+from services.reports.sections import (
+    baselines_section,
+    facts_section,
+    latency_section,
+    notes_section,
+    operators_section,
+    pictures_section,
+    quality_over_time_section,
+    tiles_section,
+)
 
 # Nothing may be fetched, whatever a later edit writes into the page.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
@@ -28,12 +37,12 @@ def render_html(report: RunReport, keyframes: Sequence[KeyframePictures], worst_
     """The page as text: inline style, inline SVG, pictures as `data:`, no script, no foreign origin."""
     recording, run = report.recording, report.run
     sections = [
-        _tiles(report),
-        _pictures(keyframes, worst_seq, report),
-        _quality_over_time(report),
-        f'<div class="two">{_baselines(report)}{_latency(report)}</div>',
-        f'<div class="two">{_operators(report)}{_facts(report)}</div>',
-        _notes(report),
+        tiles_section(report),
+        pictures_section(keyframes, worst_seq, report),
+        quality_over_time_section(report),
+        f'<div class="two">{baselines_section(report)}{latency_section(report)}</div>',
+        f'<div class="two">{operators_section(report)}{facts_section(report)}</div>',
+        notes_section(report),
     ]
     ended = (
         f'<p class="notice ended" role="alert">This run did not reach the end of the recording: {escape(run.stop_reason)}. '
@@ -68,251 +77,3 @@ def render_html(report: RunReport, keyframes: Sequence[KeyframePictures], worst_
 @cache
 def _style() -> str:
     return files("services.reports").joinpath("style.css").read_text(encoding="utf-8")
-
-
-def _decibels(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
-
-
-def _tile(name: str, value: str, unit: str, more: str) -> str:
-    return f'<li><span class="name">{name}</span><b>{value}<span>{unit}</span></b><span class="more">{more}</span></li>'
-
-
-def _headline(report: RunReport) -> tuple[str, Quality | None, float | None]:
-    """The quality that this run is about, and the baseline that belongs to it."""
-    quality = report.quality
-    if quality.live is not None:
-        return "Live quality, tissue", quality.live, quality.baselines.previous_frame_db
-    return "Held-out quality, tissue", quality.heldout, quality.baselines.heldout_previous_frame_db
-
-
-def _tiles(report: RunReport) -> str:
-    name, quality, baseline = _headline(report)
-    psnr = quality.psnr_tissue_db if quality else None
-    versus = "no baseline"
-    if psnr is not None and baseline is not None:
-        gain = psnr - baseline
-        versus = f'<span class="{"good" if gain >= 0 else "bad"}">{gain:+.2f} dB</span> against the previous frame'
-    frames, wall = report.frames, report.run.wall_s
-    rate = frames.displayed / wall if wall else 0.0
-    tiles = [
-        _tile(name, _decibels(psnr), "dB", versus),
-        _tile("Frames displayed", f"{frames.displayed:,}", f"of {frames.ingested:,}", f"{frames.dropped:,} dropped"),
-    ]
-    if report.latency_ms:
-        path = _display_path(report)
-        latency = report.latency_ms[path]
-        tiles.append(
-            _tile(
-                "Latency to display",
-                f"{latency.p50:,.0f}",
-                "ms",
-                f"p95 {latency.p95:,.0f} ms, max {latency.max:,.0f} ms",
-            )
-        )
-    tiles.append(_tile("Run time", f"{wall:,.1f}", "s", f"{rate:.2f} frames a second"))
-    if report.model:
-        tiles.append(
-            _tile(
-                "Gaussians",
-                f"{report.model.gaussians:,}",
-                "",
-                f"{report.model.parameters:,} parameters, {escape(report.run.field)} field",
-            )
-        )
-    return f'<ul class="tiles">{"".join(tiles)}</ul>'
-
-
-def _display_path(report: RunReport) -> str:
-    """The path that ends where frames are shown."""
-    return next((path for path in report.latency_ms if path.endswith("video")), next(iter(report.latency_ms)))
-
-
-def _pictures(keyframes: Sequence[KeyframePictures], worst_seq: int | None, report: RunReport) -> str:
-    if not keyframes:
-        return ""
-    cells = ["".join(f'<div class="head">{name}</div>' for name in ("Raw", "Reconstruction", "Error", "Depth"))]
-    for pictures in keyframes:
-        rendered, quality = pictures.scored.rendered, pictures.scored.quality
-        seq = rendered.frame.seq
-        tags = "" if rendered.trained else '<span class="tag held">held out</span>'
-        if seq == worst_seq:
-            tags += '<span class="tag worst">lowest PSNR</span>'
-        near_far = pictures.depth_range
-        depth = f"depth {near_far[0]:.1f} to {near_far[1]:.1f} mm" if near_far else "no depth"
-        cells.append(
-            f'<div class="row"><b>Frame {seq}</b><span>{rendered.frame.time_s:.2f} s</span><span>model {rendered.model_version}</span>'
-            f"<span>{_finite(quality.psnr_tissue_db)} dB tissue</span><span>SSIM {_finite(quality.ssim, 4)}</span><span>{depth}</span>{tags}</div>"
-        )
-        for name, uri in (
-            ("raw", pictures.raw),
-            ("reconstruction", pictures.reconstruction),
-            ("error", pictures.error),
-            ("depth", pictures.depth),
-        ):
-            cells.append(f'<img src="{uri}" alt="frame {seq}, {name}" loading="lazy">')
-    return (
-        "<section><h2>Frames</h2>"
-        '<p class="lead">Error <span class="scale inferno"></span> from 0 to 32 grey levels or more; '
-        'depth <span class="scale viridis"></span> from near to far; grey marks tools, which are not scored, and unknown depth.</p>'
-        f'<div class="frames">{"".join(cells)}</div></section>'
-    )
-
-
-def _finite(value: float, digits: int = 2) -> str:
-    return f"{value:.{digits}f}" if value == value else "–"
-
-
-def _quality_over_time(report: RunReport) -> str:
-    trained = [entry for entry in report.series if entry.trained]
-    held_out = [entry for entry in report.series if not entry.trained]
-    if not report.series:
-        return ""
-    lines = []
-    if trained:
-        name = "Reconstruction, training frames" if report.quality.live is None else "Reconstruction, live"
-        lines.append(Line(name, [e.time_s for e in trained], [e.psnr_tissue_db for e in trained], "main"))
-    lines.append(
-        Line(
-            "Previous frame shown instead",
-            [e.time_s for e in report.series],
-            [e.previous_frame_db for e in report.series],
-            "base",
-        )
-    )
-    if held_out:
-        lines.append(
-            Line(
-                "Reconstruction, held-out frames",
-                [e.time_s for e in held_out],
-                [e.psnr_tissue_db for e in held_out],
-                "second",
-                marks=True,
-            )
-        )
-    chart = Chart(
-        title="Tissue PSNR over time",
-        description="Higher is better. A reconstruction under the dashed line shows less than a frozen video would.",
-        x_label="time in the recording, s",
-        y_label="tissue PSNR, dB",
-        lines=tuple(lines),
-        x_unit=" s",
-        y_unit=" dB",
-    )
-    return f"<section><h2>Quality over time</h2>{chart.figure()}</section>"
-
-
-def _baselines(report: RunReport) -> str:
-    quality, baselines = report.quality, report.quality.baselines
-    rows: list[tuple[str, float | None, bool]] = []
-    if quality.live is not None:
-        rows += [
-            (f"IntraSplat, live, {quality.live.frames} frames", quality.live.psnr_tissue_db, True),
-            ("Previous frame shown instead", baselines.previous_frame_db, False),
-        ]
-    if quality.training is not None:
-        rows.append(
-            (f"IntraSplat, training frames, {quality.training.frames} frames", quality.training.psnr_tissue_db, True)
-        )
-    if quality.heldout is not None:
-        rows.append((f"IntraSplat, held out, {quality.heldout.frames} frames", quality.heldout.psnr_tissue_db, True))
-    rows += [
-        ("Held-out frames: previous frame", baselines.heldout_previous_frame_db, False),
-        ("Held-out frames: mean of both neighbours (sees the future)", baselines.heldout_neighbour_mean_db, False),
-        ("Held-out frames: mean of all training frames", baselines.train_mean_db, False),
-    ]
-    known = [value for _, value, _ in rows if value is not None]
-    low, high = (min(known) - 1, max(known) + 1) if known else (0.0, 1.0)
-    body = ""
-    for name, value, ours in rows:
-        if value is None:
-            continue
-        share = 100 * (value - low) / (high - low)
-        body += (
-            f'<tr{" class=ours" if ours else ""}><th scope="row">{escape(name)}</th><td class="n">{value:.2f}</td>'
-            f'<td class="track"><span class="rail"><span class="dot" style="left:{share:.1f}%"></span></span></td></tr>'
-        )
-    extra = ""
-    for name, part in (("Live", quality.live), ("Held out", quality.heldout), ("Training", quality.training)):
-        if part is not None:
-            ssim = "–" if part.ssim is None else f"{part.ssim:.4f}"
-            extra += f"{name}: whole-frame PSNR {_decibels(part.psnr_frame_db)} dB, SSIM {ssim}. "
-    return (
-        '<section><h2>Against doing nothing</h2><p class="lead">Tissue PSNR in dB, mean over frames.</p>'
-        f'<table><thead><tr><th scope="col">What is shown</th><th scope="col" class="n">dB</th><th scope="col" class="ends"><span>{low:.0f}</span><span>{high:.0f}</span></th></tr></thead>'
-        f'<tbody>{body}</tbody></table><p class="note">{extra}</p></section>'
-    )
-
-
-def _latency(report: RunReport) -> str:
-    if not report.latency_ms:
-        return ""
-    styles = ("main", "base", "second", "third")
-    shares = [k / 100 for k in range(101)]
-    lines = tuple(
-        Line(path.rsplit(",", 1)[-1], values, shares, styles[k % len(styles)])
-        for k, (path, values) in enumerate(report.latency_quantiles_ms.items())
-        if len(values) == len(shares)
-    )
-    chart = Chart(
-        title="Latency distribution",
-        description="Share of frames that arrived within a time, from leaving the source to the end of each path.",
-        x_label="latency, ms (logarithmic)",
-        y_label="share of frames",
-        lines=lines,
-        x_unit=" ms",
-        y_range=(0.0, 1.0),
-        x_log=True,
-        width=NARROW,
-    )
-    rows = "".join(
-        f'<tr><th scope="row">{escape(path.rsplit(",", 1)[-1])}</th>'
-        f'<td class="n">{v.p50:,.1f}</td><td class="n">{v.p95:,.1f}</td><td class="n">{v.p99:,.1f}</td><td class="n">{v.max:,.1f}</td></tr>'
-        for path, v in report.latency_ms.items()
-    )
-    return (
-        f"<section><h2>Latency</h2>{chart.figure() if lines else ''}"
-        '<table><thead><tr><th scope="col">To</th><th scope="col" class="n">p50 ms</th><th scope="col" class="n">p95</th>'
-        f'<th scope="col" class="n">p99</th><th scope="col" class="n">max</th></tr></thead><tbody>{rows}</tbody></table></section>'
-    )
-
-
-def _operators(report: RunReport) -> str:
-    if not report.operators:
-        return ""
-    rows = "".join(
-        f'<tr><th scope="row">{escape(name)}</th><td class="n">{t.calls:,}</td><td class="n">{t.p50_ms:,.2f}</td><td class="n">{t.p99_ms:,.2f}</td></tr>'
-        for name, t in report.operators.items()
-    )
-    return (
-        '<section><h2>Operators</h2><table><thead><tr><th scope="col">Name</th><th scope="col" class="n">calls</th>'
-        f'<th scope="col" class="n">p50 ms</th><th scope="col" class="n">p99 ms</th></tr></thead><tbody>{rows}</tbody></table></section>'
-    )
-
-
-def _facts(report: RunReport) -> str:
-    recording, run, model = report.recording, report.run, report.model
-    facts = {
-        "Recording": f"{recording.frames} frames, {recording.width_px} x {recording.height_px} px, {recording.fps:g} fps",
-        "Device, engine": f"{run.device}, {run.engine}",
-        "Threads": str(run.threads),
-        "Seed": str(run.seed),
-        "Field": run.field,
-        "Steps per frame": "default" if run.steps_per_frame is None else str(run.steps_per_frame),
-        "Peak memory": "–" if run.peak_memory_bytes is None else f"{run.peak_memory_bytes / 2**30:.2f} GiB",
-        "Ended by": run.stop_reason,
-        **run.machine,
-    }
-    digests = {"Recording": recording.digest, "Model": model.sha256 if model else None, "Frames": report.frames_sha256}
-    rows = "".join(f'<tr><th scope="row">{escape(k)}</th><td>{escape(v)}</td></tr>' for k, v in facts.items())
-    rows += "".join(
-        f'<tr><th scope="row">{k} SHA-256</th><td><code>{v}</code></td></tr>' for k, v in digests.items() if v
-    )
-    return f"<section><h2>Run</h2><table><tbody>{rows}</tbody></table></section>"
-
-
-def _notes(report: RunReport) -> str:
-    if not report.notes:
-        return ""
-    items = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
-    return f'<section><h2>Notes</h2><ul class="notes">{items}</ul></section>'

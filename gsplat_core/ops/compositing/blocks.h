@@ -57,16 +57,16 @@ GSPLAT_INLINE vfloat lane_y() {
   return v;
 }
 
-// log2(alpha) of a splat at the pixels (x, y), before the cut-offs.
+// log2(alpha) of one splat at the pixels (x, y), before the cut-offs.
 struct Falloff {
   vfloat dx, dy, power;
 };
-GSPLAT_INLINE Falloff falloff(const SplatRecord& splat_, vfloat x, vfloat y) {
+GSPLAT_INLINE Falloff falloff(const SplatRecord& record, vfloat x, vfloat y) {
   Falloff f;
-  f.dx = x - splat_.x;
-  f.dy = y - splat_.y;
-  const vfloat across = fma(splat(splat_.b), f.dy, f.dx * splat_.a);
-  const vfloat down = fma(f.dy * splat_.c, f.dy, splat(splat_.l));
+  f.dx = x - record.x;
+  f.dy = y - record.y;
+  const vfloat across = fma(splat(record.b), f.dy, f.dx * record.a);
+  const vfloat down = fma(f.dy * record.c, f.dy, splat(record.l));
   f.power = fma(across, f.dx, down);
   return f;
 }

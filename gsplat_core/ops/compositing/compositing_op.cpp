@@ -132,7 +132,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
   const auto add = [&](int64_t begin, int64_t end, int32_t* counters) {
     for (int64_t i = begin; i < end; ++i) ++counters[ids[i]];
   };
-  counting_sort(instances, count, first.get(), add, [&](int64_t begin, int64_t end, int32_t* cursors) {
+  counting_sort(instances, 1 << 15, count, first.get(), add, [&](int64_t begin, int64_t end, int32_t* cursors) {
     for (int64_t i = begin; i < end; ++i) slots[i] = cursors[ids[i]]++;
   });
   first[count] = int32_t(instances);

@@ -62,6 +62,12 @@ GSPLAT_INLINE vfloat contours(vfloat opacity) {
 
 GSPLAT_INLINE vmask finite(vfloat v) { return at_least(splat(3.4028235e38f), larger(v, -v)) & at_least(v, v); }
 
+// Splats in depth order lie anywhere in memory: the span of a later one is on its way meanwhile.
+GSPLAT_INLINE void prefetch_span(const TileSpan* spans, const uint32_t* order, int64_t i, int64_t end) {
+  constexpr int64_t kAhead = 16;
+  if (i + kAhead < end) __builtin_prefetch(spans + order[i + kAhead]);
+}
+
 // Where the counters of this splat's image start.
 GSPLAT_INLINE int64_t first_tile(const SplatBoxes& in, int64_t splat) {
   const int64_t image = in.image_ids != nullptr ? in.image_ids[splat] : splat < in.per_image ? 0 : splat / in.per_image;
@@ -70,7 +76,7 @@ GSPLAT_INLINE int64_t first_tile(const SplatBoxes& in, int64_t splat) {
 
 // visit(tile) for every touched tile, row by row.
 template <class Visit>
-GSPLAT_INLINE void for_tiles(const SplatBoxes& in, int64_t splat_, const TileSpan& span, const Visit& visit) {
+GSPLAT_INLINE void for_tiles(const SplatBoxes& in, int64_t id, const TileSpan& span, const Visit& visit) {
   const int64_t origin = int64_t(span.y) * in.tile_width + span.x;
   if (span.width <= 8 && span.height <= 8) {
     for (uint64_t left = span.touched; left != 0; left &= left - 1) {
@@ -79,9 +85,9 @@ GSPLAT_INLINE void for_tiles(const SplatBoxes& in, int64_t splat_, const TileSpa
     }
     return;
   }
-  const float* const mean = in.means2d + 2 * splat_;
-  const float none[3] = {}, *const q = in.conics != nullptr ? in.conics + 3 * splat_ : none;
-  const vfloat k = contours(splat(in.conics != nullptr ? in.opacities[splat_] : 1.0f));
+  const float* const mean = in.means2d + 2 * id;
+  const float none[3] = {}, *const q = in.conics != nullptr ? in.conics + 3 * id : none;
+  const vfloat k = contours(splat(in.conics != nullptr ? in.opacities[id] : 1.0f));
   const Ellipses e = make_ellipses(splat(mean[0]), splat(mean[1]), {splat(q[0]), splat(q[1]), splat(q[2])}, k);
   for (int row = 0; row < span.height; row += kLanes) {
     const vfloat rows = ramp() + float(span.y + row);
@@ -157,6 +163,7 @@ void spans(const SplatBoxes& in, int64_t begin, int64_t end, TileSpan* spans, in
 
 void count(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, int64_t begin, int64_t end, int32_t* counters) {
   for (int64_t i = begin; i < end; ++i) {
+    prefetch_span(spans, order, i, end);
     int32_t* const mine = counters + first_tile(in, order[i]);
     for_tiles(in, order[i], spans[order[i]], [&](int64_t tile) { ++mine[tile]; });
   }
@@ -180,6 +187,7 @@ struct Key {
 void emit(const SplatBoxes& in, const TileSpan* spans, const uint32_t* order, int64_t begin, int64_t end, int32_t* cursors,
           int32_t* flatten_ids, int64_t* keys) {
   for (int64_t i = begin; i < end; ++i) {
+    prefetch_span(spans, order, i, end);
     const int64_t splat = order[i];
     int32_t* const mine = cursors + first_tile(in, splat);
     if (keys == nullptr) {

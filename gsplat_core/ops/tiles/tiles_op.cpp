@@ -7,6 +7,8 @@
 
 namespace {
 
+// Items worth a thread: a splat takes about 2 ns in a pass of the depth sort, 10 ns in one over its tiles.
+constexpr int64_t kRadixChunk = 1 << 16, kTilesChunk = 1 << 13;
 constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
 
 Tensor empty_longs(int64_t count) {
@@ -96,7 +98,7 @@ struct Binning {
           for (int64_t i = begin; i < end; ++i)
             if (counts[i] != 0) ++counters[(bits[i] - low) & mask];
         };
-        counting_sort(count, mask + 1, nullptr, add, [&](int64_t begin, int64_t end, int32_t* cursor) {
+        counting_sort(count, kRadixChunk, mask + 1, nullptr, add, [&](int64_t begin, int64_t end, int32_t* cursor) {
           for (int64_t i = begin; i < end; ++i)
             if (counts[i] != 0) put(bits[i] - low, uint32_t(i), cursor);
         });
@@ -104,7 +106,7 @@ struct Binning {
         const auto add = [&](int64_t begin, int64_t end, int32_t* counters) {
           for (int64_t i = begin; i < end; ++i) ++counters[(from[i].key >> shift) & mask];
         };
-        counting_sort(visible, mask + 1, nullptr, add, [&](int64_t begin, int64_t end, int32_t* cursor) {
+        counting_sort(visible, kRadixChunk, mask + 1, nullptr, add, [&](int64_t begin, int64_t end, int32_t* cursor) {
           for (int64_t i = begin; i < end; ++i) put(from[i].key, from[i].splat, cursor);
         });
       }
@@ -123,7 +125,7 @@ struct Binning {
     const auto add = [&](int64_t begin, int64_t end, int32_t* counters) {
       kernels.count(boxes, spans.get(), order.get(), begin, end, counters);
     };
-    counting_sort(visible, tiles, offsets, add, [&](int64_t begin, int64_t end, int32_t* cursors) {
+    counting_sort(visible, kTilesChunk, tiles, offsets, add, [&](int64_t begin, int64_t end, int32_t* cursors) {
       kernels.emit(boxes, spans.get(), order.get(), begin, end, cursors, ids, keys);
     });
     return flatten_ids;

@@ -7,9 +7,10 @@ from services.cli.progress import ProgressPrinter
 
 
 def test_plain_lines_have_counts_rates_and_an_estimate(capsys, monkeypatch):
-    now = iter([0.0, 1.0, 7.0, 10.0, 11.0])
+    now = iter([0.0, 4.0, 5.0, 10.0, 13.0, 14.0])
     monkeypatch.setattr("services.cli.progress.time.monotonic", lambda: next(now))
     with ProgressPrinter() as printer:
+        printer(Progress("replay", 0, 10))
         printer(Progress("replay", 1, 10))
         printer(Progress("replay", 2, 10))
         printer(Progress("replay", 7, 10, psnr_tissue_db=38.126))
@@ -17,6 +18,7 @@ def test_plain_lines_have_counts_rates_and_an_estimate(capsys, monkeypatch):
         printer(Progress("evaluate", 1, 5))
     captured = capsys.readouterr()
     assert captured.err.splitlines() == [
+        "replay 0/10",
         "replay 1/10",
         "replay 7/10  1.0 frames/s  eta 3 s  38.13 dB",
         "replay 10/10  1.0 frames/s",

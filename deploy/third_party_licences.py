@@ -1,0 +1,80 @@
+"""Write LICENSES.md: name, version and licence of every package that `requirements.lock` pins for this platform.
+
+The versions are those of the lock file, the licences those that the installed packages state, as `pip-licenses` reads them.
+
+Usage: python deploy/third_party_licences.py [--out LICENSES.md]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parent.parent
+UNSTATED = {"cuda-toolkit": "no code of its own: requires NVIDIA's CUDA packages"}
+"""Packages whose metadata have no licence, and why that is no gap."""
+HEADER = """# Third-party licences
+The packages that `requirements.lock` installs on Linux with Python {python}, and the licence that each states. Written by
+`deploy/third_party_licences.py`. None of them is part of this repository.
+
+OpenCV's wheel carries FFmpeg's libraries, which are under the LGPL 2.1. Packages of NVIDIA come with torch for its GPU builds; IntraSplat does not call them.
+
+| package | version | licence |
+|---|---|---|
+"""
+
+
+def locked(path: Path) -> tuple[dict[str, Requirement], list[str]]:
+    """What the lock file pins for this platform by name, and `name version` of what it pins for others."""
+    here: dict[str, Requirement] = {}
+    elsewhere: list[str] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if not re.match(r"[A-Za-z0-9]", line):
+            continue
+        requirement = Requirement(line.rstrip(" \\"))
+        if requirement.marker is None or requirement.marker.evaluate({"extra": "build"}):
+            here[canonicalize_name(requirement.name)] = requirement
+        else:
+            elsewhere.append(f"{requirement.name} {version_of(requirement)}")
+    return here, elsewhere
+
+
+def version_of(requirement: Requirement) -> str:
+    """The pinned version."""
+    return str(requirement.specifier).removeprefix("==")
+
+
+def stated_licences() -> dict[str, str]:
+    """Licence of each installed package, by canonical name; long texts are cut to their first line."""
+    command = [sys.executable, "-m", "piplicenses", "--python", sys.executable, "--with-system", "--format=json"]
+    listed = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    return {canonicalize_name(entry["Name"]): entry["License"].splitlines()[0] for entry in listed}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=ROOT / "LICENSES.md")
+    out = parser.parse_args().out
+    here, elsewhere = locked(ROOT / "requirements.lock")
+    licences = stated_licences() | UNSTATED
+    unknown = [name for name in here if licences.get(name, "UNKNOWN") == "UNKNOWN"]
+    if unknown:
+        sys.stderr.write(f"no licence is stated by {', '.join(unknown)}: install requirements.lock, or look it up\n")
+        return 1
+    rows = [f"| {name} | {version_of(entry)} | {licences[name]} |\n" for name, entry in sorted(here.items())]
+    text = HEADER.format(python=f"{sys.version_info.major}.{sys.version_info.minor}") + "".join(rows)
+    if elsewhere:
+        text += f"\nPinned for other platforms or Python versions: {', '.join(sorted(elsewhere))}.\n"
+    out.write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,49 @@
+"""Rendering a finished model: how many frames, where, and what is refused."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.io.bundle import save_bundle
+from operators.applications.render import render_model
+from operators.errors import OutputError, OutputFolderInUse
+
+
+@pytest.fixture
+def bundle(model, tmp_path):
+    save_bundle(model(), tmp_path / "model")
+    return tmp_path / "model"
+
+
+def test_the_time_window_is_covered_from_end_to_end(bundle, tmp_path):
+    events = []
+    assert render_model(bundle, tmp_path / "images", fps=4, progress=events.append) == 5, "0, 0.25, 0.5, 0.75 and 1 s"
+    assert len(list((tmp_path / "images").glob("*.png"))) == 5
+    assert [event.done for event in events] == [1, 2, 3, 4, 5]
+
+
+def test_a_stop_leaves_whole_frames(bundle, tmp_path):
+    shown = []
+    written = render_model(
+        bundle, tmp_path / "v.mp4", fps=10, progress=shown.append, stop_requested=lambda: len(shown) == 3
+    )
+    assert written == 3 and (tmp_path / "v.mp4").stat().st_size > 0
+
+
+@pytest.mark.parametrize("fps", [0, -1, math.nan, math.inf, 1e6])
+def test_a_rate_that_makes_no_sense_is_refused(bundle, tmp_path, fps):
+    with pytest.raises(InvalidInput, match="fps is"):
+        render_model(bundle, tmp_path / "v.mp4", fps=fps)
+
+
+def test_nothing_is_written_where_it_does_not_belong(bundle, tmp_path):
+    with pytest.raises(OutputError, match="there is no folder"):
+        render_model(bundle, tmp_path / "missing" / "v.mp4")
+    with pytest.raises(OutputFolderInUse, match="not made by intrasplat"):
+        render_model(bundle, bundle)
+    (tmp_path / "folder.mp4").mkdir()
+    with pytest.raises(OutputError, match="is a folder"):
+        render_model(bundle, tmp_path / "folder.mp4")

@@ -1,0 +1,82 @@
+"""The replay as a function: progress, stops, failures that carry what was reached, and no side effects on the caller."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput, RecordingMissing
+from operators.applications.replay import ReplaySettings, replay
+from operators.applications.result import RunOutcome
+from operators.errors import DeviceMissing, OutputFolderInUse, RunFailed, StorageFull
+
+
+@pytest.fixture
+def settings(tiny, tmp_path):
+    return ReplaySettings(recording=tiny, out=tmp_path / "out", steps_per_frame=1)
+
+
+def test_progress_tells_each_displayed_frame(settings):
+    events = []
+    outcome = replay(settings, events.append)
+    assert [(e.stage, e.done, e.total) for e in events] == [("replay", k, 4) for k in (0, 1, 2, 3, 4)]
+    assert all(e.psnr_tissue_db > 20 for e in events[1:])
+    assert (outcome.ingested, outcome.displayed, outcome.dropped) == (4, 4, 0)
+    assert [entry["seq"] for entry in outcome.series] == [0, 1, 2, 3]
+    assert outcome.model.version == 4
+
+
+def test_each_frame_is_shown_with_the_model_that_has_just_seen_it(settings):
+    outcome = replay(settings)
+    assert [entry["model_version"] for entry in outcome.series] == [1, 2, 3, 4]
+
+
+def test_a_stop_request_ends_cleanly_and_leaves_out_the_second_reading(settings):
+    shown = []
+    outcome = replay(settings, shown.append, stop_requested=lambda: len(shown) > 2)
+    assert outcome.interrupted and outcome.stop_reason == "interrupted"
+    assert outcome.displayed == outcome.ingested == 2
+    assert outcome.baselines is None and any("second reading" in note for note in outcome.notes)
+    assert set(outcome.outputs) == {"video", "model"}
+
+
+def test_a_failure_carries_what_was_reached(settings):
+    def fail_on_the_third(progress):
+        if progress.done == 3:
+            raise StorageFull("no room for progress")
+
+    with pytest.raises(RunFailed, match="operator 'progress' failed in compute on frame 2") as caught:
+        replay(settings, fail_on_the_third)
+    outcome = caught.value.result
+    assert isinstance(outcome, RunOutcome)
+    assert outcome.displayed == 3 and outcome.model.version == 3
+    assert (settings.out / "reconstruction.mp4").exists() and (settings.out / "model").is_dir()
+
+
+def test_the_callers_random_numbers_are_untouched(settings):
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    replay(settings)
+    torch.testing.assert_close(torch.rand(3), expected, rtol=0, atol=0)
+
+
+def test_what_is_wrong_is_said_before_anything_is_written(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    out = tmp_path / "out"
+    for error, settings in (
+        (RecordingMissing, ReplaySettings(tmp_path / "nowhere", out)),
+        (DeviceMissing, ReplaySettings(tiny, out, device="cuda")),
+        (InvalidInput, ReplaySettings(tiny, out, steps_per_frame=0)),
+        (InvalidInput, ReplaySettings(tiny, out, max_frames=0)),
+        (OutputFolderInUse, ReplaySettings(tiny, tiny)),
+    ):
+        with pytest.raises(error):
+            replay(settings)
+    assert not out.exists()
+
+
+def test_a_small_frame_gets_no_more_gaussians_than_it_can_show(tiny, tmp_path):
+    settings = ReplaySettings(tiny, tmp_path / "out")
+    assert settings.reconstructor_config(64 * 48).gaussians == 64 * 48 // 4
+    assert settings.reconstructor_config(640 * 512).gaussians == settings.reconstructor_config().gaussians

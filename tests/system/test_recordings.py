@@ -1,0 +1,47 @@
+"""Real endoscopy through the whole program; the recordings are not part of the repository."""
+
+from __future__ import annotations
+
+import pytest
+
+from services.reports.schema import RunReport
+
+pytestmark = pytest.mark.recordings
+
+
+def replayed(intrasplat, recording, out, *options) -> RunReport:
+    done = intrasplat("replay", recording, "--out", out, "--json", *options)
+    assert done.code == 0, done.err
+    return RunReport.model_validate_json(done.out)
+
+
+def test_cutting_gives_the_same_frames_twice_and_on_both_engines(recordings_dir, tmp_path, intrasplat):
+    options = ("--max-frames", 20, "--scale", 0.5, "--steps-per-frame", 3)
+    recording = recordings_dir / "cutting"
+    first = replayed(intrasplat, recording, tmp_path / "first", *options)
+    second = replayed(intrasplat, recording, tmp_path / "second", *options)
+    assert (first.frames.ingested, first.frames.displayed, first.frames.dropped) == (20, 20, 0)
+    assert first.quality.live.psnr_tissue_db > 33
+    assert first.frames_sha256 == second.frames_sha256
+    assert first.model.sha256 == second.model.sha256
+    pytest.importorskip("holoscan", reason="the Holoscan engine is an extra")
+    holoscan = replayed(intrasplat, recording, tmp_path / "holoscan", *options, "--engine", "holoscan")
+    assert holoscan.frames_sha256 == first.frames_sha256
+    assert holoscan.frames == first.frames
+    assert {name: o.calls for name, o in holoscan.operators.items()} == {n: o.calls for n, o in first.operators.items()}
+
+
+def test_sinus_with_its_moving_camera_replays(recordings_dir, tmp_path, intrasplat):
+    report = replayed(
+        intrasplat,
+        recordings_dir / "sinus",
+        tmp_path / "out",
+        "--max-frames",
+        6,
+        "--scale",
+        0.5,
+        "--steps-per-frame",
+        3,
+    )
+    assert report.frames.displayed == 6
+    assert report.quality.live.psnr_tissue_db > 23

@@ -1,0 +1,246 @@
+"""The documents say what is there: links lead somewhere, commands and flags exist, decisions are numbered, no private places are named."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import typer
+
+from gsplat_core import Frame, Gaussians
+from gsplat_core.io.manifest import manifest_bytes, parse_manifest
+from gsplat_core.io.recordings import open_recording
+from gsplat_core.model import Model
+from operators.display import CallbackSinkOp
+from operators.graph import Application, Operator, OperatorSpec
+from operators.ingest import SourceOp
+from services.cli.app import app
+
+ROOT = Path(__file__).resolve().parent.parent
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+CODE_BLOCK = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+MACHINE_PLACES = re.compile(
+    r"(?<![\w.])/(?:home|Users|root|work|workspace|mnt|private)/\w"  # somebody's folder
+    r"|https?://(?!127\.|localhost)[^\s/\"'<>]*(?:\d{1,3}(?:\.\d{1,3}){3}|\.internal|\.local|\.corp|proxy|mirror|artifactory|nexus)\b"
+    r"|--(?:extra-)?index-url[= ]\S"
+)
+TEXT_SUFFIXES = {".py", ".md", ".toml", ".lock", ".cpp", ".h", ".txt", ".css", ".yaml", ".yml", ".json", ".sh", ""}
+
+
+@cache
+def tracked() -> tuple[Path, ...]:
+    """Files under version control; in an unpacked archive without git, every file that git would not ignore by name."""
+    try:
+        listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+        names = [ROOT / line for line in listed.splitlines()]
+    except (OSError, subprocess.CalledProcessError):
+        skipped = {".venv", "build", "out", "dist", "__pycache__"}
+        names = [path for path in ROOT.rglob("*") if not skipped & set(path.relative_to(ROOT).parts)]
+    return tuple(path for path in names if path.is_file())
+
+
+DOCUMENTS = [path for path in tracked() if path.suffix == ".md"]
+
+
+def anchors(document: Path) -> set[str]:
+    """The anchors of a document's headings, as repository hosts make them."""
+    text = CODE_BLOCK.sub("", document.read_text(encoding="utf-8"))
+    headings = re.findall(r"^#+ +(.+?) *$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_relative_links_resolve(document):
+    broken = []
+    for target in LINK.findall(CODE_BLOCK.sub("", document.read_text(encoding="utf-8"))):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        file = document.parent / name if name else document
+        if not file.exists() or (anchor and anchor not in anchors(file)):
+            broken.append(target)
+    assert broken == []
+
+
+def commands() -> dict[str, set[str]]:
+    """The options of each command; those of the program itself under the empty name."""
+    group = typer.main.get_command(app)
+    options = {name: {"--help"} for name in ["", *group.commands]}
+    for name, command in [("", group), *group.commands.items()]:
+        for parameter in command.params:
+            options[name] |= {*parameter.opts, *parameter.secondary_opts}
+    return options
+
+
+def command_lines(document: Path) -> list[str]:
+    """What follows `intrasplat` in code blocks and in code within sentences."""
+    text = document.read_text(encoding="utf-8").replace("\\|", "|")  # tables escape their bars
+    code = "\n".join([*CODE_BLOCK.findall(text), *re.findall(r"`([^`\n]+)`", CODE_BLOCK.sub("", text))])
+    return re.findall(r"^(?:\S*/)?intrasplat +(\S.*)$", code, re.MULTILINE)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_commands_and_flags_exist(document):
+    known = commands()
+    for line in command_lines(document):
+        first = line.split()[0]
+        command = "" if first.startswith("--") else first
+        assert command in known, f"intrasplat {line}: there is no command {command}"
+        unknown = set(re.findall(r"--[a-z-]+", line)) - known[command]
+        assert not unknown, f"intrasplat {line}: {command} has no {unknown}"
+
+
+def test_command_lines_are_found():
+    assert "replay RECORDING --out DIR" in command_lines(ROOT / "README.md")
+
+
+def test_flags_that_documents_name_alone_exist():
+    every = set().union(*commands().values())
+    for document in DOCUMENTS:
+        for flag in re.findall(r"`(--[a-z-]+)[^`]*`", document.read_text(encoding="utf-8")):
+            assert flag in every, f"{document.name} names {flag}, which no command has"
+
+
+def test_the_readme_names_every_command():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert [name for name in commands() if name and not re.search(rf"\b{name}\b", text)] == []
+
+
+def test_make_targets_exist():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"^([a-z]+):", makefile, re.MULTILINE))
+    for document in DOCUMENTS:
+        for name in re.findall(r"(?:`|^)make ([a-z]+)", document.read_text(encoding="utf-8"), re.MULTILINE):
+            assert name in targets, f"{document.name}: there is no target {name}"
+
+
+def test_decisions_are_numbered_without_gaps():
+    decisions = sorted(path for path in (ROOT / "docs" / "adr").glob("*.md"))
+    assert [int(path.name[:4]) for path in decisions] == list(range(1, len(decisions) + 1))
+    for path in decisions:
+        assert re.fullmatch(r"\d{4}(-[a-z0-9]+)+\.md", path.name)
+        text = path.read_text(encoding="utf-8")
+        assert text.startswith(f"# {path.name[:4]}: ")
+        assert "**Decision.**" in text and "**Why.**" in text, path.name
+
+
+def test_no_file_names_a_machine_or_a_registry():
+    found = []
+    for path in tracked():
+        if path.suffix not in TEXT_SUFFIXES or path == Path(__file__).resolve():
+            continue
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            if MACHINE_PLACES.search(line):
+                found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()[:100]}")
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "see /home/somebody/x",
+        "/work/main",
+        "https://pypi.internal/simple",
+        "http://10.0.0.7:8080/simple",
+        "--index-url https://host/simple",
+        "https://mirror.example/simple",
+    ],
+)
+def test_private_places_are_recognised(line):
+    assert MACHINE_PLACES.search(line)
+
+
+def test_every_locked_package_has_its_licence():
+    text = (ROOT / "LICENSES.md").read_text(encoding="utf-8").lower()
+    lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+    pinned = re.findall(r"^([A-Za-z0-9._-]+)==([^\s;\\]+)", lock, re.MULTILINE)
+    assert pinned
+    missing = [
+        f"{name} {version}"
+        for name, version in pinned
+        if f"| {name} | {version} |".lower() not in text and f"{name} {version}".lower() not in text
+    ]
+    assert missing == [], "run `make licences`"
+
+
+def json_examples(name: str) -> list[dict]:
+    """The JSON blocks of a document."""
+    text = (ROOT / "docs" / name).read_text(encoding="utf-8")
+    return [json.loads(block) for block in re.findall(r"^```json\n(.*?)^```", text, re.MULTILINE | re.DOTALL)]
+
+
+def test_the_calibration_files_in_the_guide_are_read_as_it_says(tmp_path):
+    cameras, described = json_examples("recordings.md")
+    (tmp_path / "cameras" / "images").mkdir(parents=True)
+    cv2.imwrite(
+        str(tmp_path / "cameras" / "images" / "000000.png"),
+        np.full((cameras["height"], cameras["width"], 3), 90, np.uint8),
+    )
+    (tmp_path / "cameras" / "cameras.json").write_text(json.dumps(cameras))
+    recording = open_recording(tmp_path / "cameras")
+    assert (recording.camera.K[0, 0], recording.fps, recording.fields) == (cameras["fx"], cameras["fps"], {"pose"})
+
+    size = described["camera"]["height"], described["camera"]["width"]
+    (tmp_path / "described" / "depth").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "described" / "000000.png"), np.full((*size, 3), 90, np.uint8))
+    cv2.imwrite(str(tmp_path / "described" / "depth" / "000000.png"), np.full(size, 6000, np.uint16))
+    (tmp_path / "described" / "recording.json").write_text(json.dumps(described))
+    recording = open_recording(tmp_path / "described")
+    frame = next(iter(recording))
+    assert frame.depth is not None
+    assert frame.depth.min() == pytest.approx(6000 * described["depth_unit_mm"])
+    assert recording.camera.K[0, 0] == described["camera"]["fx"]
+
+
+def test_the_manifest_in_the_guide_is_one():
+    (example,) = json_examples("bundle.md")
+    example["training_digest"] = example["tensors"]["sha256"] = 64 * "0"
+    manifest = parse_manifest(json.dumps(example).encode(), "docs/bundle.md")
+    gaussians, field = manifest.skeleton()
+    assert field is not None
+    tensors = [*gaussians.tensors().values(), *field.state_dict().values()]
+    assert sum(tensor.numel() for tensor in tensors) == example["parameters"]
+    model = Model(
+        1,
+        Gaussians(*(torch.zeros_like(t, device="cpu") for t in gaussians.tensors().values())),
+        None,
+        manifest.camera,
+        (0, 1),
+    )
+    assert set(example) == set(json.loads(manifest_bytes(model, 0, 64 * "0")))
+
+
+def test_the_operator_in_the_guide_works():
+    text = (ROOT / "docs" / "operators.md").read_text(encoding="utf-8")
+    (source,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    names: dict[str, Any] = {"Operator": Operator, "OperatorSpec": OperatorSpec, "Frame": Frame, "Any": Any}
+    exec(source, names)
+    seen: list[float] = []
+
+    class Two(Application):
+        def compose(self) -> None:
+            source = SourceOp(self, name="source", recording=_Frames())
+            share = names["ToolShareOp"](self, name="share", only_every=2)
+            self.add_flow(source, share)
+            self.add_flow(share, CallbackSinkOp(self, name="show", callback=seen.append))
+
+    Two().run()
+    assert seen == [0.5, 0.5]
+
+
+class _Frames:
+    """Four frames, half tool."""
+
+    frame_count = 4
+
+    def __iter__(self):
+        mask = np.array([[1, 0]], np.uint8)
+        return (Frame(seq=i, pts_ns=i, image=np.zeros((1, 2, 3), np.uint8), mask=mask) for i in range(4))

@@ -1,0 +1,63 @@
+"""Each example runs as its docstring says, on a machine without the recordings."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+RUNS = {
+    "01_render.py": (["--out", "sphere.png"], r"600 Gaussians, 600 in view", ["sphere.png"]),
+    "02_fit_an_image.py": (["--steps", "40"], r"(\d+\.\d) dB before, (\d+\.\d) dB after", []),
+    "03_online_reconstruction.py": (["--frames", "3"], r"frame 2: \d+ steps, model 3, live \d+", []),
+    "04_operator_graph.py": ([], r"finished; tool share(?: 0\.\d\d){6}\nfault: operator 'failing' .* frame 2", []),
+    "05_bundle_and_ply.py": (
+        ["--out", "bundle"],
+        r"format 1, ",
+        ["bundle/model.safetensors", "bundle/manifest.json", "bundle/last_frame.ply"],
+    ),
+}
+"""Options, what the output must say, and the files that must be there."""
+
+
+def test_examples_are_numbered_from_one_and_all_run_here():
+    assert [path.name for path in EXAMPLES] == sorted(RUNS)
+    assert [int(path.name[:2]) for path in EXAMPLES] == list(range(1, len(EXAMPLES) + 1))
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
+def test_docstring_opens_with_a_sentence_and_gives_the_usage(path):
+    docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+    assert docstring is not None
+    assert docstring.splitlines()[0].endswith(".")
+    assert re.search(rf"^Usage: python examples/{re.escape(path.name)}", docstring, re.MULTILINE)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
+def test_runs(path, tmp_path):
+    options, expected, files = RUNS[path.name]
+    search = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(path), *options],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": search, "OMP_NUM_THREADS": "2"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    said = re.search(expected, done.stdout)
+    assert said, done.stdout
+    for name in files:
+        assert (tmp_path / name).stat().st_size > 0
+    if path.name == "02_fit_an_image.py":
+        before_db, after_db = map(float, said.groups())
+        assert after_db > before_db + 5
