@@ -43,7 +43,8 @@ class Reconstructor:
     """Owns the model that is being learned.
 
     Online: `observe` each frame in order, `snapshot` whenever the result is to be shown. Offline: `fit`. Deterministic: the same frames,
-    settings and seed give the same model, whatever the number of threads.
+    settings and seed give the same model. With the basis field that holds for any number of threads; the HexPlane's network is
+    trained by torch's matrix products, which round differently with another number.
     """
 
     def __init__(
