@@ -14,7 +14,16 @@ from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.meta import Deferred, Meta
 from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, pack
-from gsplat_core.render_settings import RasterizeMode, RenderMode, RenderSettings, refuse_unsupported
+from gsplat_core.render_settings import (
+    EPS2D,
+    FAR_PLANE,
+    NEAR_PLANE,
+    TILE_SIZE,
+    RasterizeMode,
+    RenderMode,
+    RenderSettings,
+    refuse_unsupported,
+)
 
 Rasterized = tuple[Tensor, Tensor, Meta]
 """Colours [..., C, H, W, X], alphas [..., C, H, W, 1] and what was computed on the way."""
@@ -41,14 +50,14 @@ class Operations:
         Ks: Tensor,
         width: int,
         height: int,
-        near_plane: float = 0.01,
-        far_plane: float = 1e10,
+        near_plane: float = NEAR_PLANE,
+        far_plane: float = FAR_PLANE,
         radius_clip: float = 0.0,
-        eps2d: float = 0.3,
+        eps2d: float = EPS2D,
         sh_degree: int | None = None,
         *,
         packed: bool = True,
-        tile_size: int | None = 16,
+        tile_size: int | None = TILE_SIZE,
         backgrounds: Tensor | None = None,
         render_mode: RenderMode = "RGB",
         sparse_grad: bool = False,
@@ -112,7 +121,7 @@ class Operations:
         )  # fmt: skip
         settings = RenderSettings(
             width=width, height=height, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
-            sh_degree=sh_degree, packed=packed, tile_size=16 if tile_size is None else tile_size,
+            sh_degree=sh_degree, packed=packed, tile_size=TILE_SIZE if tile_size is None else tile_size,
             render_mode=render_mode, absgrad=absgrad, rasterize_mode=rasterize_mode, camera_model=camera_model,
         )  # fmt: skip
         return _rasterize(self, means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, settings)

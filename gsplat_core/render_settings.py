@@ -11,6 +11,13 @@ from gsplat_core.gaussians import MAX_SH_DEGREE
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
 
+NEAR_PLANE, FAR_PLANE = 0.01, 1e10
+"""Default range of z that is rendered, in the scene's unit."""
+EPS2D = 0.3
+"""Default blur, pixels² added to the diagonal of a splat's covariance."""
+TILE_SIZE = 16
+"""Default side of a tile in pixels."""
+
 
 @dataclass(frozen=True)
 class RenderSettings:

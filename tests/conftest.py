@@ -19,3 +19,17 @@ def recordings_dir() -> Path:
             pytest.fail(message)
         pytest.skip(message)
     return folder
+
+
+@pytest.fixture
+def sdk() -> None:
+    """The Holoscan SDK, an extra: without it the test is skipped, unless INTRASPLAT_REQUIRE_HOLOSCAN says that it must be there."""
+    from operators.errors import EngineMissing
+    from operators.graph.sdk import load_sdk
+
+    try:
+        load_sdk()
+    except EngineMissing as error:
+        if os.environ.get("INTRASPLAT_REQUIRE_HOLOSCAN") == "1":
+            pytest.fail(f"the Holoscan SDK is required here: {error}")
+        pytest.skip(str(error))

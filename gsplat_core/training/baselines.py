@@ -14,14 +14,8 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.frames import Frame
+from gsplat_core.io.recordings.split import is_heldout
 from gsplat_core.training.metrics import mean_of_scored, psnr_tissue_db
-
-HELDOUT_PERIOD = 8
-
-
-def is_heldout(index: int) -> bool:
-    """Whether the field's protocol tests on frame `index` (0-based) and never trains on it: 1, 9, 17, ..."""
-    return index % HELDOUT_PERIOD == 1
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,8 @@ from torch import Tensor
 from gsplat_core.cameras import CAMERA_MODELS
 from gsplat_core.gaussians import SH_C0, Gaussians
 from gsplat_core.ops.image_loss.image_loss import image_loss
+from gsplat_core.render_settings import EPS2D, FAR_PLANE, NEAR_PLANE, TILE_SIZE
 from gsplat_core.training.observations import Observation
-
-NEAR_MM, FAR_MM = 0.01, 1e10
-EPS2D_PX2 = 0.3
-TILE_PX = 16
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ def loss_and_gradients(
 
     means2d, depths, conics, _, radii = ops.project_gaussians(
         means, None, quats, scales[None], opacities[None], viewmat, intrinsics,
-        width, height, EPS2D_PX2, NEAR_MM, FAR_MM, 0.0, False, model,
+        width, height, EPS2D, NEAR_PLANE, FAR_PLANE, 0.0, False, model,
     )  # fmt: skip
     radii, means2d, depths, conics = radii[0], means2d[0, 0], depths[0, 0], conics[0, 0]
     unclamped, directions = _colours(gaussians, camera.position)
@@ -53,12 +50,12 @@ def loss_and_gradients(
         finite = colours.isfinite().all(1, keepdim=True)
         radii, colours = radii * finite, torch.where(finite, colours, 0.0)
     channels = torch.cat([colours, depths[:, None]], 1) if use_depth else colours
-    columns, rows = -(-width // TILE_PX), -(-height // TILE_PX)
+    columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
     _, flatten_ids, offsets = ops.bin_splats(
-        means2d[None], radii, depths[None], conics[None], opacities[None], None, 1, TILE_PX, columns, rows
+        means2d[None], radii, depths[None], conics[None], opacities[None], None, 1, TILE_SIZE, columns, rows
     )
     splats = (means2d, conics, channels, opacities, offsets, flatten_ids, None, None)
-    picture, alphas, last = ops.composite(*splats, None, width, height, TILE_PX)
+    picture, alphas, last = ops.composite(*splats, None, width, height, TILE_SIZE)
 
     image, alpha = picture[0, ..., :3].contiguous(), alphas[0].reshape(height, width)
     expected = picture[0, ..., 3] / alpha.clamp(min=1e-10) if use_depth else None
@@ -72,12 +69,12 @@ def loss_and_gradients(
         v_picture = torch.cat([v_picture, v_depth[..., None]], -1)
         v_alphas = (-expected * v_depth).reshape(alphas.shape)
     v_means2d, v_conics, v_channels, v_opacities, _, _ = ops.composite_backward(
-        *splats, width, height, TILE_PX, alphas, last, v_picture.reshape(picture.shape), v_alphas, False
+        *splats, width, height, TILE_SIZE, alphas, last, v_picture.reshape(picture.shape), v_alphas, False
     )
     v_depths = v_channels[:, 3].contiguous()[None, None] if use_depth else None
     v_means, _, v_quats, v_scales, _ = ops.project_gaussians_backward(
         means, None, quats, scales[None], viewmat, intrinsics, radii[None], v_means2d[None, None], v_depths,
-        v_conics[None, None], None, width, height, EPS2D_PX2, model, False,
+        v_conics[None, None], None, width, height, EPS2D, model, False,
     )  # fmt: skip
     v_colours = v_channels[:, :3] * (unclamped > 0)
     v_means, v_sh = v_means[0], v_colours[:, None] * SH_C0

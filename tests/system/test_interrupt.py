@@ -28,9 +28,9 @@ def wait_for_line(process, beginning: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ["embedded", pytest.param("holoscan", marks=pytest.mark.holoscan)])
-def test_an_interrupted_replay_writes_what_it_has(long, tmp_path, start, engine):
+def test_an_interrupted_replay_writes_what_it_has(request, long, tmp_path, start, engine):
     if engine == "holoscan":
-        pytest.importorskip("holoscan")
+        request.getfixturevalue("sdk")
     out = tmp_path / "out"
     process = start("replay", long, "--out", out, "--engine", engine, "--steps-per-frame", 12)
     wait_for_line(process, "replay 1")

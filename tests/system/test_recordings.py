@@ -15,7 +15,7 @@ def replayed(intrasplat, recording, out, *options) -> RunReport:
     return RunReport.model_validate_json(done.out)
 
 
-def test_cutting_gives_the_same_frames_twice_and_on_both_engines(recordings_dir, tmp_path, intrasplat):
+def test_cutting_gives_the_same_frames_twice_and_on_both_engines(request, recordings_dir, tmp_path, intrasplat):
     options = ("--max-frames", 20, "--scale", 0.5, "--steps-per-frame", 3)
     recording = recordings_dir / "cutting"
     first = replayed(intrasplat, recording, tmp_path / "first", *options)
@@ -24,7 +24,7 @@ def test_cutting_gives_the_same_frames_twice_and_on_both_engines(recordings_dir,
     assert first.quality.live.psnr_tissue_db > 33
     assert first.frames_sha256 == second.frames_sha256
     assert first.model.sha256 == second.model.sha256
-    pytest.importorskip("holoscan", reason="the Holoscan engine is an extra")
+    request.getfixturevalue("sdk")
     holoscan = replayed(intrasplat, recording, tmp_path / "holoscan", *options, "--engine", "holoscan")
     assert holoscan.frames_sha256 == first.frames_sha256
     assert holoscan.frames == first.frames

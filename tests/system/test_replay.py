@@ -52,9 +52,9 @@ def test_quality_is_told_apart_and_stands_beside_its_baselines(finished):
 
 
 @pytest.mark.parametrize("engine", ["embedded", pytest.param("holoscan", marks=pytest.mark.holoscan)])
-def test_one_seed_gives_the_same_bytes(tiny, tmp_path, intrasplat, finished, engine):
+def test_one_seed_gives_the_same_bytes(request, tiny, tmp_path, intrasplat, finished, engine):
     if engine == "holoscan":
-        pytest.importorskip("holoscan")
+        request.getfixturevalue("sdk")
     done = intrasplat("replay", tiny, "--out", tmp_path / "again", "--heldout", "--json", "--engine", engine, *QUICK)
     assert done.code == 0, done.err
     again, before = RunReport.model_validate_json(done.out), RunReport.read(finished / "report.json")

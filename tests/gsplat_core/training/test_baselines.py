@@ -10,7 +10,8 @@ import pytest
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.frames import Frame
-from gsplat_core.training.baselines import is_heldout, measure_baselines
+from gsplat_core.io.recordings import is_heldout
+from gsplat_core.training.baselines import measure_baselines
 
 RECORDINGS = Path(
     os.environ.get("INTRASPLAT_RECORDINGS", Path(__file__).resolve().parents[4] / "shared" / "recordings")

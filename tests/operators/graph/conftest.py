@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import faulthandler
 import itertools
-import os
 import threading
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -12,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from operators.errors import EngineMissing
 from operators.graph import (
     Application,
     Clock,
@@ -206,30 +204,12 @@ class Runner:
         return thread, outcome
 
 
-def require_sdk() -> None:
-    """Skip without the SDK, unless it must be there."""
-    from operators.graph.sdk import load_sdk
-
-    try:
-        load_sdk()
-    except EngineMissing as error:
-        if os.environ.get("CI") and os.environ.get("INTRASPLAT_REQUIRE_HOLOSCAN") == "1":
-            pytest.fail(f"the Holoscan SDK is required here: {error}")
-        pytest.skip(str(error))
-
-
-@pytest.fixture
-def sdk() -> None:
-    """The Holoscan SDK can be loaded."""
-    require_sdk()
-
-
 @pytest.fixture(params=ENGINES)
 def runner(request: pytest.FixtureRequest) -> Runner:
     """Every engine with every scheduler."""
     engine, scheduler = request.param
     if engine == "holoscan":
-        require_sdk()
+        request.getfixturevalue("sdk")
     return Runner(engine, scheduler)
 
 
@@ -238,5 +218,5 @@ def greedy_runner(request: pytest.FixtureRequest) -> Runner:
     """Every engine with the greedy scheduler."""
     engine, scheduler = request.param
     if engine == "holoscan":
-        require_sdk()
+        request.getfixturevalue("sdk")
     return Runner(engine, scheduler)
