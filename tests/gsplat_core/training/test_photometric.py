@@ -138,6 +138,7 @@ def test_no_gaussians_give_the_loss_of_a_black_picture(make_gaussians, weights):
 @pytest.mark.parametrize("sh_degree", [0, 3])
 def test_a_gaussian_that_is_not_finite_does_not_touch_the_others(make_gaussians, name, sh_degree, bad):
     gaussians, seen = make_gaussians(40, sh_degree), observation()
+    gaussians.means[7] = torch.tensor([1.0, 2.0, 50.0])  # in the middle of the picture
     others = torch.arange(40) != 7
     broken = gaussians.clone()
     broken.tensors()[name][7, ...] = bad
@@ -161,12 +162,14 @@ def test_odd_sizes(make_gaussians, assert_near, size):
 def test_the_number_of_threads_does_not_change_a_bit(make_gaussians):
     # More than 32768 Gaussians: from there on torch splits elementwise work among its threads.
     gaussians, seen = make_gaussians(50_016), observation()
+    gaussians.logit_opacities.mul_(3)
     before = torch.get_num_threads()
     try:
         results = []
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            results.append(loss_and_gradients(gaussians, seen, LossWeights(0.2, 0.1)))
+            loss, gradients = loss_and_gradients(gaussians, seen, LossWeights(0.2, 0.1))
+            results.append((loss, gradients | {"opacities": gaussians.opacities}))
     finally:
         torch.set_num_threads(before)
     for loss, gradients in results[1:]:
