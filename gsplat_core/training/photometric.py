@@ -45,10 +45,6 @@ def loss_and_gradients(
     radii, means2d, depths, conics = radii[0], means2d[0, 0], depths[0, 0], conics[0, 0]
     unclamped, directions = _colours(gaussians, camera.position)
     colours = unclamped.clamp(min=0)
-    # One cheap sum in the common case. A Gaussian whose colour is not finite is culled, as in `rasterization`.
-    if not torch.isfinite(colours.sum()):
-        finite = colours.isfinite().all(1, keepdim=True)
-        radii, colours = radii * finite, torch.where(finite, colours, 0.0)
     channels = torch.cat([colours, depths[:, None]], 1) if use_depth else colours
     columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
     _, flatten_ids, offsets = ops.bin_splats(
