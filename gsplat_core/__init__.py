@@ -11,49 +11,74 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gsplat_core.cameras import Camera
+    from gsplat_core.deformation import DeformationField
     from gsplat_core.errors import CoreError, InvalidInput
     from gsplat_core.frames import Frame, FrameStatus
     from gsplat_core.gaussians import Gaussians
+    from gsplat_core.io.bundle import load_bundle, save_bundle
+    from gsplat_core.io.ply import load_ply, save_ply
+    from gsplat_core.io.recordings import open_recording
+    from gsplat_core.model import Model
     from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
     from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
     from gsplat_core.ops.projection.projection import fully_fused_projection
     from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
     from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
     from gsplat_core.rendering import RenderOutput, rasterization, render
+    from gsplat_core.training.config import ReconstructorConfig
+    from gsplat_core.training.reconstructor import Reconstructor
 
 __all__ = [
     "Camera",
     "CoreError",
+    "DeformationField",
     "Frame",
     "FrameStatus",
     "Gaussians",
     "InvalidInput",
+    "Model",
+    "Reconstructor",
+    "ReconstructorConfig",
     "RenderOutput",
     "fully_fused_projection",
     "isect_offset_encode",
     "isect_tiles",
+    "load_bundle",
+    "load_ply",
+    "open_recording",
     "quat_scale_to_covar_preci",
     "rasterization",
     "rasterize_to_pixels",
     "render",
+    "save_bundle",
+    "save_ply",
     "spherical_harmonics",
 ]
 
 _HOME = {
     "Camera": "cameras",
     "CoreError": "errors",
+    "DeformationField": "deformation",
     "Frame": "frames",
     "FrameStatus": "frames",
     "Gaussians": "gaussians",
     "InvalidInput": "errors",
+    "Model": "model",
+    "Reconstructor": "training.reconstructor",
+    "ReconstructorConfig": "training.config",
     "RenderOutput": "rendering",
     "fully_fused_projection": "ops.projection.projection",
     "isect_offset_encode": "ops.tiles.tiles",
     "isect_tiles": "ops.tiles.tiles",
+    "load_bundle": "io.bundle",
+    "load_ply": "io.ply",
+    "open_recording": "io.recordings",
     "quat_scale_to_covar_preci": "ops.covariance.covariance",
     "rasterization": "rendering",
     "rasterize_to_pixels": "ops.compositing.compositing",
     "render": "rendering",
+    "save_bundle": "io.bundle",
+    "save_ply": "io.ply",
     "spherical_harmonics": "ops.spherical_harmonics.spherical_harmonics",
 }
 """The module that each public name lives in."""

@@ -67,6 +67,10 @@ class DeformationField(torch.nn.Module):
         """Attributes that belong to training and become None in a `detached_copy`."""
         return ()
 
+    def extend(self, time_window_s: tuple[float, float]) -> None:
+        """Cover a window that reaches further ahead; what was learned keeps its place in time."""
+        raise NotImplementedError
+
     def select(self, index: Tensor) -> None:
         """Keep the per-Gaussian state of the Gaussians in `index` (int64 positions or a bool mask), in that order."""
         raise NotImplementedError

@@ -26,8 +26,8 @@ class LearningRates:
     basis_log_scales: float = 5e-3
     basis_sh: float = 1e-2
     basis_timing: float = 1e-3
-    hexplane_planes: float = 5e-3
-    hexplane_network: float = 5e-4
+    hexplane_planes: float = 2e-2
+    hexplane_network: float = 5e-3
 
     def __post_init__(self) -> None:
         for name, rate in vars(self).items():

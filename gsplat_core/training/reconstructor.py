@@ -72,6 +72,8 @@ class Reconstructor:
         `steps` overrides the configured number for this frame. Raises InvalidInput when the first frame is not to be trained on (there is
         nothing to show yet), when time runs backwards, or when the frame does not fit the camera.
         """
+        if steps is not None and steps < 0:
+            raise InvalidInput(f"steps is {steps}; it must be at least 0")
         observation = Observation.of(frame, self.camera)
         first = self._step is None
         if first:
@@ -92,8 +94,10 @@ class Reconstructor:
         if not first:
             self._grow(frame, observation)
         count = steps if steps is not None else self.config.first_frame_steps if first else self.config.steps_per_frame
+        if count == 0:
+            return ObserveReport(frame.seq, 0, None, self.gaussians)
         surprise = self._step(observation)
-        schedule = self._window.schedule(count - 1) if count > 1 else []
+        schedule = self._window.schedule(count - 1)
         if not first and surprise > self.config.jump_ratio * self._usual_surprise:
             schedule += [observation] * (count * self.config.jump_extra)
         loss = surprise
@@ -188,7 +192,7 @@ class Reconstructor:
             ahead = EXTEND_AHEAD_BUMPS * field.spacing_s
             if time_s + ahead > end:
                 field.extend((start, time_s + ahead + field.spacing_s), hold_at_s=self._last_time_s)
-        elif isinstance(field, HexPlaneField) and time_s > end:
+        elif time_s > end:
             field.extend((start, start + 2 * (time_s - start)))
 
     def _grow(self, frame: Frame, observation: Observation) -> None:

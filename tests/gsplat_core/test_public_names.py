@@ -11,9 +11,10 @@ import gsplat_core
 from gsplat_core import reference
 
 PUBLIC = [
-    "Camera", "CoreError", "Frame", "FrameStatus", "Gaussians", "InvalidInput", "RenderOutput", "fully_fused_projection",
-    "isect_offset_encode", "isect_tiles", "quat_scale_to_covar_preci", "rasterization", "rasterize_to_pixels", "render",
-    "spherical_harmonics",
+    "Camera", "CoreError", "DeformationField", "Frame", "FrameStatus", "Gaussians", "InvalidInput", "Model",
+    "Reconstructor", "ReconstructorConfig", "RenderOutput", "fully_fused_projection", "isect_offset_encode",
+    "isect_tiles", "load_bundle", "load_ply", "open_recording", "quat_scale_to_covar_preci", "rasterization",
+    "rasterize_to_pixels", "render", "save_bundle", "save_ply", "spherical_harmonics",
 ]  # fmt: skip
 
 # gsplat 1.5.3, in its order.
