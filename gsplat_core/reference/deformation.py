@@ -57,6 +57,8 @@ def basis_field_backward_adam_(
 ) -> None:
     """One lazy Adam step of every bump active at `tau`, in place; the other bumps and their moments are left alone.
 
+    So is a Gaussian whose gradient is zero in every channel: the frame does not show it, and momentum must not move what nobody sees.
+
     `first_moments` and `second_moments` hold (centers, log_widths, weights) shaped tensors; `steps` int32 [N, B] counts the
     updates of each bump, so that each one sees Adam's bias correction (Kingma and Ba 2015, algorithm 1) from its own first
     update, however late in a stream it was added. `learning_rates`: position, rotation, log-scale, colour, centres, widths.
@@ -64,6 +66,7 @@ def basis_field_backward_adam_(
     with torch.no_grad():
         gradients = basis_field_backward(gradient, centers, log_widths, weights, tau)
         active = ~(((tau - centers) * torch.exp(-log_widths)).abs() > BUMP_REACH)
+        active &= (gradient != 0).any(dim=1, keepdim=True)
         steps += active.to(steps.dtype)
         count = steps.clamp(min=1).to(centers.dtype)
         bias1, bias2 = 1 - beta1**count, 1 - beta2**count

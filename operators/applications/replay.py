@@ -184,6 +184,11 @@ def prepare(settings: ReplaySettings, made_by: str) -> tuple[Recording, list[str
     check_output_folder(settings.out)
     recording = open_recording(settings.recording, scale=settings.scale, max_frames=settings.max_frames)
     notes = list(recording.notes)
+    if "depth" not in recording.fields:
+        notes.append(
+            f"the recording has no depth: the scene starts on a plane {settings.reconstructor_config().default_depth_mm:g} mm away, and its"
+            " depth has no measured scale"
+        )
     if claim_output_folder(settings.out, made_by):
         notes.append("the output folder held an earlier run; this one replaces its files")
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()

@@ -35,6 +35,12 @@ GSPLAT_INLINE float dot(const Row& a, const Row& b) {
   return sum(s);
 }
 
+GSPLAT_INLINE bool is_zero(const Row& r) {
+  uint32_t set = bits(r.v[0] != 0.0f);
+  for (int i = 1; i < kRowVectors; ++i) set |= bits(r.v[i] != 0.0f);
+  return set == 0;
+}
+
 // A vector of neighbouring bumps of one Gaussian at one time.
 struct Bumps {
   vfloat u, inverse_width, height;  // height is exp(-u^2), zero where inactive
@@ -139,6 +145,7 @@ void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t 
   for (int i = 0; i < kRowVectors; ++i) rates.v[i] = load(field.channel_rates + i * kLanes);
   for (int64_t n = begin; n < end; ++n) {
     const Row g = load_row(gradient + n * kBasisChannels);
+    if (is_zero(g)) continue;  // the frame does not show this Gaussian
     const int64_t first = n * field.bumps;
     for (int64_t from = 0; from < field.bumps; from += kLanes) {
       const int64_t at = first + from, count = lanes_left(from, field.bumps);

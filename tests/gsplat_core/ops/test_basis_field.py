@@ -95,6 +95,19 @@ def test_fused_adam_equals_the_reference_over_many_steps(n, b):
         assert difference.numel() == 0 or difference.mean() < 1e-3 * rate
 
 
+def test_momentum_does_not_move_what_the_frame_does_not_show():
+    seen, m, v = training_state(50, 7)
+    steps = torch.zeros(50, 7, dtype=torch.int32)
+    basis_field_backward_adam_(gradient_of(50), 3.0, *seen, m, v, steps, RATES)
+    before = [t.clone() for t in (*seen, *m, *v, steps)]
+    hidden = gradient_of(50, 1)
+    hidden[::2] = 0
+    basis_field_backward_adam_(hidden, 3.0, *seen, m, v, steps, RATES)
+    after = (*seen, *m, *v, steps)
+    assert all(torch.equal(a[::2], b[::2]) for a, b in zip(after, before, strict=True))
+    assert not any(torch.equal(a[1::2], b[1::2]) for a, b in zip(after, before, strict=True))
+
+
 def test_fused_adam_is_torch_adam_while_every_bump_is_active():
     seen, m, v = training_state(50, 3)
     wanted = [t.clone().requires_grad_() for t in seen]

@@ -1,0 +1,20 @@
+#!/usr/bin/env bash
+# Measures this machine: every figure of benchmarks/RESULTS.md, as JSON lines. Needs the real recordings for the replays.
+# Usage: benchmarks/run_all.sh [FOLDER FOR THE OUTPUT, default out/bench]
+set -euo pipefail
+cd "$(dirname "$0")/.."
+out=${1:-out/bench}
+recordings=${INTRASPLAT_RECORDINGS:-../shared/recordings}
+python=.venv/bin/python
+mkdir -p "$out"
+measure() {
+  echo "$1"
+  "$python" "benchmarks/$1.py" "${@:3}" | tee "$out/$2.json"
+}
+measure replay_cpu replay_cutting "$recordings/cutting"
+measure replay_cpu replay_sinus "$recordings/sinus" --fields basis --engines embedded
+measure graph_overhead graph --holoscan
+measure losses_cpu losses
+measure deformation_cpu deformation
+measure training_cpu training
+measure splat_cpu splat
