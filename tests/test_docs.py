@@ -147,7 +147,7 @@ def test_no_file_names_a_machine_or_a_registry():
     "line",
     [
         "see /home/somebody/x",
-        "/work/main",
+        "/" + "work/checkout",
         "https://pypi.internal/simple",
         "http://10.0.0.7:8080/simple",
         "--index-url https://host/simple",
