@@ -51,14 +51,12 @@ def require_kernels(op: str, name: str, tensor: Tensor) -> None:
     """Raise InvalidInput unless this build has kernels for the device of `tensor`."""
     if tensor.device.type == "cpu":
         return
-    why = "there are kernels for cpu and cuda only"
-    if tensor.device.type == "cuda":
-        from gsplat_core.ops.native import CUDA_MISSING  # here, because the reference works without the compiled core
+    from gsplat_core.ops.native import CUDA_MISSING  # here, because the reference works without the compiled core
 
-        if CUDA_MISSING is None:
-            return
-        why = f"the CUDA kernels are {CUDA_MISSING}"
+    if tensor.device.type == "cuda" and CUDA_MISSING is None:
+        return
+    why = "and CUDA" if CUDA_MISSING is None else f"only: those for CUDA are {CUDA_MISSING}"
     raise InvalidInput(
-        f"{op}: {name} is on {tensor.device}, and {why}; move it with .cpu(), or use gsplat_core.reference, which runs on"
-        " any device"
+        f"{op}: {name} is on {tensor.device}, and this build has kernels for the CPU {why}; move it with .cpu(), or use"
+        " gsplat_core.reference, which runs on any device"
     )
