@@ -4,11 +4,15 @@ BIN := .venv/bin
 OUT ?= out/demo
 # Waiting threads sleep: tests and benchmarks share the machine.
 export OMP_WAIT_POLICY ?= PASSIVE
-CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h')
+CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*.cu' 'gsplat_core/*.cuh')
+# For which GPUs `make cuda` builds, as CMake names them: the one in this machine, or 80-real;90-real;120 for a list.
+CUDA_ARCHITECTURES ?= native
+CUDA_TOOLKIT := build/cuda-toolkit
+GPU := $(shell nvidia-smi --list-gpus 2>/dev/null | grep -c .)
 
-.PHONY: demo test lint format bench native lock licences clean
+.PHONY: demo test lint format bench native cuda lock licences clean
 
-demo: native
+demo: native $(if $(filter-out 0,$(GPU)),cuda)
 	$(BIN)/intrasplat synthesize --out out/recording
 	$(BIN)/intrasplat replay out/recording --out $(OUT)
 
@@ -32,6 +36,19 @@ bench: native .venv/.development
 # Rebuilds the C++ core where its sources changed; a no-op otherwise.
 native: .venv/.runtime
 	@$(BIN)/cmake --build build/editable | grep -v "no work to do" || true
+
+# The CUDA kernels. The compiler is NVIDIA's from pip, in a folder of its own beside no torch, or the nvcc that CUDACXX names.
+cuda: .venv/.runtime $(if $(CUDACXX),,$(CUDA_TOOLKIT)/.installed)
+	@$(BIN)/cmake -S . -B build/cuda -G Ninja -DINTRASPLAT_CUDA=ON -DINTRASPLAT_INPLACE=ON \
+	  -DINTRASPLAT_CUDA_ARCHITECTURES="$(CUDA_ARCHITECTURES)" -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
+	  -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja --log-level=WARNING
+	@$(BIN)/cmake --build build/cuda --target gsplat_core_cuda
+
+$(CUDA_TOOLKIT)/.installed: pyproject.toml .venv/.runtime
+	rm -rf $(CUDA_TOOLKIT)
+	$(BIN)/python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['optional-dependencies']['cuda-build'])" \
+	  | xargs $(BIN)/pip install --quiet --no-deps --target $(CUDA_TOOLKIT)
+	touch $@
 
 # The build tools come first, so that the install builds against the torch that it will run with.
 .venv/.runtime: requirements.lock pyproject.toml

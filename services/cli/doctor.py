@@ -97,7 +97,7 @@ def _core() -> list[Check]:
     from gsplat_core.errors import NativeLibraryMissing
 
     try:
-        from gsplat_core.ops.native import LIBRARY_PATH, instruction_set
+        from gsplat_core.ops.native import CUDA_MISSING, LIBRARY_PATH, instruction_set
     except NativeLibraryMissing as error:
         return [Check("compiled core", "missing", False, str(error))]
     names = sorted(
@@ -116,9 +116,9 @@ def _core() -> list[Check]:
         Check("ops on the CPU", f"{len(where['CPU'])}: {', '.join(where['CPU'])}"),
         Check(
             "ops on the GPU",
-            ", ".join(where["CUDA"]) or "none in this version",
-            bool(where["CUDA"]),
-            "" if where["CUDA"] else "everything runs on the CPU; use --device cpu",
+            f"{len(where['CUDA'])}: {', '.join(where['CUDA'])}" if CUDA_MISSING is None else CUDA_MISSING,
+            CUDA_MISSING is None,
+            "" if CUDA_MISSING is None else "everything runs on the CPU; use --device cpu",
             needed=False,
         ),
     ]
