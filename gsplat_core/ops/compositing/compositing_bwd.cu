@@ -19,7 +19,8 @@ constexpr int quads_of(int shape, int channels) { return (shape + channels + 3) 
 // value i / 2.
 __device__ inline float warp_sums(float (&v)[kValues], int lane) {
 #pragma unroll
-  for (int half = kValues / 2; half >= 1; half /= 2) {
+  for (int step = 3; step >= 0; --step) {
+    const int half = 1 << step;
     const bool upper = (lane & 2 * half) != 0;
 #pragma unroll
     for (int i = 0; i < half; ++i) {
