@@ -1,7 +1,6 @@
 #include <atomic>
-#include <cmath>
 
-#include "adam.h"
+#include "adam_options.h"
 #include "tensor_checks.h"
 
 static int64_t active_isa_op() { return int64_t(active_isa()); }
@@ -13,12 +12,7 @@ static Tensor adam_(Tensor parameter, Tensor gradient, Tensor first_moment, Tens
     STD_TORCH_CHECK(t->is_cpu() && t->scalar_type() == ScalarType::Float && t->is_contiguous() && t->numel() == g.numel(),
                     "adam_ updates contiguous float32 CPU tensors of the gradient's size in place");
   STD_TORCH_CHECK(row_size >= 1 && g.numel() % row_size == 0, "row_size must divide the number of values");
-  const AdamStep options{float(learning_rate / (1 - std::pow(beta1, double(step)))),
-                         float(1 / std::sqrt(1 - std::pow(beta2, double(step)))),
-                         float(1 - beta1),
-                         float(1 - beta2),
-                         float(epsilon),
-                         row_size};
+  const AdamStep options = adam_step_of(step, learning_rate, beta1, beta2, epsilon, row_size);
   float *p = mutable_data(parameter), *m = mutable_data(first_moment), *v = mutable_data(second_moment);
   const float* gp = data(g);
   std::atomic<int64_t> skipped{0};

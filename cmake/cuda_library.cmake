@@ -1,0 +1,44 @@
+# gsplat_core_cuda: the CUDA kernels, a library of its own, so that the CPU's neither needs nor notices it.
+#
+# The compiler is, in this order: CMAKE_CUDA_COMPILER or $CUDACXX, then the one that `make cuda` puts into build/cuda-toolkit
+# (NVIDIA's pip packages), then an nvcc on the PATH. CMake's own FindCUDAToolkit expects a whole toolkit and is not used.
+set(CUDA_PACKAGES ${CMAKE_CURRENT_SOURCE_DIR}/build/cuda-toolkit/nvidia/cu13)
+if(NOT CMAKE_CUDA_COMPILER AND NOT DEFINED ENV{CUDACXX} AND EXISTS ${CUDA_PACKAGES}/bin/nvcc)
+  set(CMAKE_CUDA_COMPILER ${CUDA_PACKAGES}/bin/nvcc)
+endif()
+if(CMAKE_CUDA_COMPILER MATCHES "^${CUDA_PACKAGES}/")
+  set(ENV{LIBRARY_PATH} "${CUDA_PACKAGES}/lib:$ENV{LIBRARY_PATH}")  # CMake links a program to try the compiler
+endif()
+set(CMAKE_CUDA_ARCHITECTURES ${INTRASPLAT_CUDA_ARCHITECTURES})
+enable_language(CUDA)
+set(CMAKE_CUDA_STANDARD 20)
+set(CMAKE_CUDA_STANDARD_REQUIRED ON)
+
+find_library(TORCH_CUDA_LIBRARY torch_cuda PATHS ${TORCH_ROOT}/lib NO_DEFAULT_PATH)
+if(NOT TORCH_CUDA_LIBRARY)
+  message(FATAL_ERROR "the torch in ${TORCH_ROOT} was built without CUDA; install one with CUDA, or leave INTRASPLAT_CUDA off")
+endif()
+
+# Headers and static runtime lie beside the compiler, whose folder may be a link (/usr/local/cuda/bin).
+file(REAL_PATH ${CMAKE_CUDA_COMPILER} CUDA_COMPILER_PATH)
+cmake_path(GET CUDA_COMPILER_PATH PARENT_PATH CUDA_BIN)
+cmake_path(GET CUDA_BIN PARENT_PATH CUDA_ROOT)
+find_path(CUDA_INCLUDE cuda_runtime.h PATHS ${CUDA_ROOT}/include ${CUDA_ROOT}/targets/x86_64-linux/include
+          ${CUDA_ROOT}/targets/sbsa-linux/include REQUIRED NO_DEFAULT_PATH)
+find_library(CUDA_RUNTIME NAMES libcudart_static.a PATHS ${CUDA_ROOT}/lib ${CUDA_ROOT}/lib64
+             ${CUDA_ROOT}/targets/x86_64-linux/lib ${CUDA_ROOT}/targets/sbsa-linux/lib REQUIRED NO_DEFAULT_PATH)
+
+file(GLOB CUDA_SOURCES CONFIGURE_DEPENDS gsplat_core/ops/*/*.cu gsplat_core/ops/*/*_cuda_op.cpp)
+add_library(gsplat_core_cuda SHARED ${CUDA_SOURCES})
+target_compile_definitions(gsplat_core_cuda PRIVATE ${CORE_DEFINITIONS} GSPLAT_ISA=cuda)
+target_compile_options(gsplat_core_cuda PRIVATE
+  $<$<COMPILE_LANGUAGE:CXX>:${CORE_FLAGS}>
+  $<$<COMPILE_LANGUAGE:CUDA>:--expt-relaxed-constexpr --extended-lambda -Xcompiler=-fvisibility=hidden,-Wall>)
+target_include_directories(gsplat_core_cuda PRIVATE gsplat_core/native)
+target_include_directories(gsplat_core_cuda SYSTEM PRIVATE ${TORCH_ROOT}/include
+                           $<$<COMPILE_LANGUAGE:CXX>:${CUDA_INCLUDE}>)
+find_package(Threads REQUIRED)
+target_link_libraries(gsplat_core_cuda PRIVATE ${TORCH_CPU_LIBRARY} ${TORCH_CUDA_LIBRARY} ${CUDA_RUNTIME} Threads::Threads dl rt)
+# The static runtime is linked by its path: every toolkit then gives a library that needs no CUDA but the driver.
+set_target_properties(gsplat_core_cuda PROPERTIES PREFIX "" SKIP_BUILD_RPATH ON LINKER_LANGUAGE CXX CUDA_RUNTIME_LIBRARY None
+                      CUDA_VISIBILITY_PRESET hidden)

@@ -1,0 +1,45 @@
+#include "adam_cuda.h"
+#include "cuda_scratch.h"
+
+namespace {
+
+constexpr int kMostRows = 1024;           // of a block
+constexpr int64_t kChunk = 4 * kThreads;  // values of a block, unless a row is longer
+
+// A block looks through all values of its rows for one whose square is not finite, and then updates the rows that have none.
+__global__ void __launch_bounds__(kThreads)
+    adam_rows(float* __restrict__ p, const float* __restrict__ g, float* __restrict__ m, float* __restrict__ v, int64_t rows,
+              int rows_per_block, AdamStep step, unsigned long long* skipped) {
+  __shared__ int poisoned[kMostRows];
+  const int64_t first = int64_t(blockIdx.x) * rows_per_block;
+  const int count = int(rows - first < rows_per_block ? rows - first : rows_per_block);
+  const int64_t at = first * step.row_size, size = count * step.row_size;
+  for (int r = threadIdx.x; r < count; r += kThreads) poisoned[r] = 0;
+  __syncthreads();
+  for (int64_t i = threadIdx.x; i < size; i += kThreads) {
+    const float x = g[at + i];
+    if (!isfinite(x * x)) poisoned[count == 1 ? 0 : int(i) / int(step.row_size)] = 1;  // whoever writes writes the same
+  }
+  __syncthreads();
+  for (int64_t i = threadIdx.x; i < size; i += kThreads) {
+    if (poisoned[count == 1 ? 0 : int(i) / int(step.row_size)]) continue;
+    const int64_t k = at + i;
+    const float x = g[k], m_old = m[k], v_old = v[k];
+    const float m_new = m_old + step.fresh1 * (x - m_old), v_new = v_old + step.fresh2 * (x * x - v_old);
+    m[k] = m_new;
+    v[k] = v_new;
+    p[k] -= step.rate * m_new / (sqrtf(v_new) * step.inv_bias2 + step.epsilon);
+  }
+  for (int r = threadIdx.x; r < count; r += kThreads)
+    if (poisoned[r]) atomicAdd(skipped, 1ULL);  // whole numbers: their sum does not depend on the order
+}
+
+}  // namespace
+
+void adam_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step, int64_t* skipped,
+                    cudaStream_t stream) {
+  if (rows == 0) return;
+  const int64_t fit = kChunk / step.row_size, per_block = fit < 1 ? 1 : fit < kMostRows ? fit : kMostRows;
+  adam_rows<<<blocks_for(rows, per_block), kThreads, 0, stream>>>(p, g, m, v, rows, int(per_block), step,
+                                                                  reinterpret_cast<unsigned long long*>(skipped));
+}
