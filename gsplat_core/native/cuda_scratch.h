@@ -19,7 +19,9 @@ class CudaScratch {
 
 constexpr int kThreads = 256;  // of a block, where a thread does one item
 
-constexpr unsigned blocks_for(int64_t items, int64_t per_block = kThreads) { return unsigned((items + per_block - 1) / per_block); }
+constexpr unsigned blocks_for(int64_t items, int64_t per_block = kThreads) {
+  return unsigned((items + per_block - 1) / per_block);
+}
 
 // The bits that hold the numbers 0 to n - 1, one at least.
 constexpr int bits_below(int64_t n) {

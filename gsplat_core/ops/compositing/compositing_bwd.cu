@@ -1,7 +1,7 @@
 // The gradient of compositing, back to front from the saved transmittance, by the formulas of backward_cpu.cpp.
 //
-// Every instance (a splat in a window) has a row of its own, the sum over the window's pixels in a fixed order; the rows of a splat
-// are summed in the order of the lists. No atomics, so the same bits every time.
+// Every instance (a splat in a window) has a row of its own, the sum over the window's pixels in a fixed order; the rows of a
+// splat are summed in the order of the lists. No atomics, so the same bits every time.
 #include <cub/device/device_radix_sort.cuh>
 
 #include "splat_records.cuh"
@@ -15,20 +15,21 @@ constexpr int kValues = 16;  // that a warp sums at once
 constexpr int shape_size(int D, bool absgrad) { return kShapeMoments + (D == 0 || absgrad ? 2 : 0); }
 constexpr int quads_of(int shape, int channels) { return (shape + channels + 3) / 4; }
 
-// Sums 16 values over the warp with 16 exchanges: a lane gives half of its values away each time. Lane i returns the sum of
-// value i / 2.
-__device__ inline float warp_sums(float (&v)[kValues], int lane) {
+// Sums 2 kHalf values over groups of 4 kHalf lanes with one exchange per value: a lane gives half of its values away, then half
+// of the rest. For 16 values lane i of the warp returns the sum of value i / 2.
+template <int kHalf>
+__device__ inline float warp_sums(float* v, int lane) {
+  if constexpr (kHalf == 0) {
+    return v[0] + __shfl_xor_sync(kAll, v[0], 1);
+  } else {
+    const bool upper = (lane & 2 * kHalf) != 0;
 #pragma unroll
-  for (int step = 3; step >= 0; --step) {
-    const int half = 1 << step;
-    const bool upper = (lane & 2 * half) != 0;
-#pragma unroll
-    for (int i = 0; i < half; ++i) {
-      const float gone = upper ? v[i] : v[i + half], kept = upper ? v[i + half] : v[i];
-      v[i] = kept + __shfl_xor_sync(kAll, gone, 2 * half);
+    for (int i = 0; i < kHalf; ++i) {
+      const float low = v[i], high = v[i + kHalf];
+      v[i] = (upper ? high : low) + __shfl_xor_sync(kAll, upper ? low : high, 2 * kHalf);
     }
+    return warp_sums<kHalf / 2>(v, lane);
   }
-  return v[0] + __shfl_xor_sync(kAll, v[0], 1);
 }
 
 __device__ inline float block_sum(float value) {
@@ -187,7 +188,7 @@ __global__ void __launch_bounds__(kBlockThreads)
           }
           add_moments<kAbs>(r, f[p], b, g, pixels[p], v);
         }
-        const float sum = warp_sums(v, lane);
+        const float sum = warp_sums<kValues / 2>(v, lane);
         if ((lane & 1) == 0 && lane / 2 < 4 * kQuads) reinterpret_cast<float*>(sums[warp][i])[lane / 2] = sum;
         used |= 1u << bit;
       }
@@ -210,9 +211,9 @@ __global__ void __launch_bounds__(kBlockThreads)
 
 // Any number of channels: the whole block takes one splat at a time, and 16 values of its row at a time.
 template <bool kAbs>
-__global__ void __launch_bounds__(kBlockThreads) backward_windows_of_any(DeviceCompositing in, const Record<0>* records,
-                                                                         DeviceGradients out, float4* rows,
-                                                                         float* background_parts) {
+__global__ void __launch_bounds__(kBlockThreads)
+    backward_windows_of_any(DeviceCompositing in, const Record<0>* records, DeviceGradients out, float4* rows,
+                            float* background_parts) {
   constexpr int kShape = shape_size(0, kAbs);
   __shared__ float sums[kWarps][kValues];
   const Window w(in);
@@ -249,7 +250,7 @@ __global__ void __launch_bounds__(kBlockThreads) backward_windows_of_any(DeviceC
             if (weight[p] > 0) v[i] = fmaf(weight[p], out.v_colors[w.pixel(in, p) * in.channels + d], v[i]);
         }
       }
-      const float sum = warp_sums(v, lane);
+      const float sum = warp_sums<kValues / 2>(v, lane);
       if ((lane & 1) == 0) sums[warp][lane / 2] = sum;
       __syncthreads();
       if (threadIdx.x < kValues && base + int(threadIdx.x) < 4 * quads) {
@@ -286,8 +287,8 @@ __device__ inline float4 from_lane_xor(const float4& v, int mask) {
                      __shfl_xor_sync(kAll, v.w, mask));
 }
 
-// Sums the rows of each splat and turns the sums into gradients: four lanes per splat, each a float4 of the row at a time. A splat
-// with very many rows is left to the whole warp, in an order that depends on their number alone.
+// Sums the rows of each splat and turns the sums into gradients: four lanes per splat, each a float4 of the row at a time. A
+// splat with very many rows is left to the whole warp, in an order that depends on their number alone.
 template <int D>
 __global__ void gather_rows(DeviceCompositing in, const Record<D>* records, const uint32_t* positions, const uint2* ranges,
                             const float4* rows, int windows, int shape, DeviceGradients out) {
@@ -394,11 +395,11 @@ void run_backward(const DeviceCompositing& in, const DeviceGradients& out, CudaS
   if (in.count > 0) {
     const Instances instances = by_splat(in, scratch, stream);
     gather_rows<D><<<blocks_for(4 * in.count), kThreads, 0, stream>>>(in, records, instances.positions, instances.ranges, rows,
-                                                                     int(windows), shape, out);
+                                                                      int(windows), shape, out);
   }
   if (parts != nullptr && in.images > 0 && in.channels > 0)
     sum_backgrounds<<<unsigned(in.images * in.channels), kThreads, 0, stream>>>(parts, blocks / in.images, in.channels,
-                                                                              out.v_backgrounds);
+                                                                                out.v_backgrounds);
 }
 
 }  // namespace

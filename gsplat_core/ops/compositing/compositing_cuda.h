@@ -1,23 +1,23 @@
 // Compositing on CUDA: what the op's host code asks of the kernels. All pointers are to device memory.
 //
-// A block of four warps composites a window of 16x16 pixels (a tile, where tiles have that size), each warp a quadrant of 8x8 with
-// two pixels per thread. Splats are staged in shared memory; a warp then tests 32 of them at once against its quadrant and goes
-// through those alone that reach it.
+// A block of four warps composites a window of 16x16 pixels (a tile, where tiles have that size), each warp a quadrant of 8x8
+// with two pixels per thread. Splats are staged in shared memory; a warp then tests 32 of them at once against its quadrant and
+// goes through those alone that reach it.
 #pragma once
 
 #include <cuda_runtime.h>
 
 #include "cuda_scratch.h"
 
-constexpr int kWindowSize = 16;  // pixels on a side
+constexpr int kWindowSize = 16;   // pixels on a side
 constexpr int kShapeMoments = 6;  // sum over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
 
 struct DeviceCompositing {
-  const float* means2d;      // [count, 2]
-  const float* conics;       // [count, 3]
-  const float* colors;       // [count, channels]
-  const float* opacities;    // [count]
-  const int32_t* offsets;    // [images, tile_height, tile_width]
+  const float* means2d;    // [count, 2]
+  const float* conics;     // [count, 3]
+  const float* colors;     // [count, channels]
+  const float* opacities;  // [count]
+  const int32_t* offsets;  // [images, tile_height, tile_width]
   const int32_t* flatten_ids;
   const float* backgrounds;  // [images, channels] or null
   const bool* masks;         // [images, tile_height, tile_width] or null

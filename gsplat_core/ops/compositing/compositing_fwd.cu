@@ -5,7 +5,8 @@ namespace {
 constexpr int kBatch = kBlockThreads;  // splats that are staged at once, one per thread
 
 template <int D>
-__global__ void __launch_bounds__(kBlockThreads) composite_windows(DeviceCompositing in, const Record<D>* records, DevicePixels out) {
+__global__ void __launch_bounds__(kBlockThreads)
+    composite_windows(DeviceCompositing in, const Record<D>* records, DevicePixels out) {
   __shared__ Record<D> staged[kBatch];
   __shared__ int staged_ids[D == 0 ? kBatch : 1];
   Window w(in);

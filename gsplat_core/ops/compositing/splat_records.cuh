@@ -19,8 +19,8 @@ constexpr float kStop = 1e-4f;             // a splat that would leave less tran
 constexpr float kLn2 = 0.69314718f, kLog2E = 1.44269504f;
 
 // log2(alpha) = a dx^2 + b dx dy + c dy^2 + l with dx, dy from the mean to the pixel. A splat with a value that is not finite has
-// l = -infinity, so that it reaches no pixel. log2(alpha) beyond `cap` is skipped: l where the conic is indefinite (sigma would be
-// negative), else infinity. With D > 0 its colours come along, in the rest of the last 16 bytes and on.
+// l = -infinity, so that it reaches no pixel. log2(alpha) beyond `cap` is skipped: l where the conic is indefinite (sigma would
+// be negative), else infinity. With D > 0 its colours come along, in the rest of the last 16 bytes and on.
 template <int D>
 struct alignas(16) Record {
   float4 xyab;
@@ -127,8 +127,8 @@ __device__ inline float reciprocal(float x) {
 }
 
 // Whether the contour alpha = 1/255 may reach a pixel centre of the quadrant whose first centre is (x, y). Its part in the
-// quadrant's rows reaches in x from the left to the right solution of a dx^2 + 2 b dx dy + c dy^2 = k at the dy of those rows that
-// is nearest to the outermost point; never less than that, for a splat left out would be missing in the image.
+// quadrant's rows reaches in x from the left to the right solution of a dx^2 + 2 b dx dy + c dy^2 = k at the dy of those rows
+// that is nearest to the outermost point; never less than that, for a splat left out would be missing in the image.
 template <int D>
 __device__ inline bool reaches(const Record<D>& r, float x, float y) {
   const float k = r.l + (2e-3f - kFaintest);  // a little outside of the contour, against rounding

@@ -1,7 +1,8 @@
 // Tile lists on CUDA: what the op's host code asks of the kernels. All pointers are to device memory.
 //
 // Visible splats are sorted by depth first (32 bits, as many items as splats), then their tiles are written in that order and
-// sorted by tile alone (as few bits as there are tiles). Radix sorts are stable, so ties in depth stay in the order of the splats.
+// sorted by tile alone (as few bits as there are tiles). Radix sorts are stable, so ties in depth stay in the order of the
+// splats.
 #pragma once
 
 #include <cuda_runtime.h>

@@ -95,7 +95,8 @@ Tensor isect_offset_encode(Tensor isect_ids, int64_t images, int64_t tile_width,
   const int64_t tiles = tile_width * tile_height;
   STD_TORCH_CHECK(sorted.numel() <= kMostInts && images * tiles <= kMostInts, "isect_offset_encode: more than 2^31 - 1 entries");
   Tensor offsets = call.empty({images, tile_height, tile_width}, ScalarType::Int);
-  encode_offsets(sorted.const_data_ptr<int64_t>(), sorted.numel(), images, tiles, offsets.mutable_data_ptr<int32_t>(), call.stream);
+  encode_offsets(sorted.const_data_ptr<int64_t>(), sorted.numel(), images, tiles, offsets.mutable_data_ptr<int32_t>(),
+                 call.stream);
   check_cuda(cudaGetLastError(), "isect_offset_encode");
   return offsets;
 }

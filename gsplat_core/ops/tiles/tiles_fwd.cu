@@ -60,7 +60,8 @@ __global__ void offsets_of_tiles(const uint32_t* sorted, int64_t count, int64_t 
   if (tile < tiles) offsets[tile] = int32_t(count_below(count, tile, [&](int64_t i) { return int64_t(sorted[i]); }));
 }
 
-__global__ void offsets_of_ids(const int64_t* ids, int64_t count, int64_t images, int64_t tiles, int tile_bits, int32_t* offsets) {
+__global__ void offsets_of_ids(const int64_t* ids, int64_t count, int64_t images, int64_t tiles, int tile_bits,
+                               int32_t* offsets) {
   const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (at >= images * tiles) return;
   const int64_t key = (at / tiles) << tile_bits | at % tiles;
@@ -119,7 +120,8 @@ void sort_by_tile(const DeviceBoxes& in, TileInstances& instances, CudaScratch& 
 
 void encode_offsets(const TileInstances& instances, int64_t tiles, int32_t* offsets, cudaStream_t stream) {
   if (tiles == 0) return;
-  offsets_of_tiles<<<blocks_for(tiles), kThreads, 0, stream>>>(instances.tiles[instances.current], instances.count, tiles, offsets);
+  offsets_of_tiles<<<blocks_for(tiles), kThreads, 0, stream>>>(instances.tiles[instances.current], instances.count, tiles,
+                                                               offsets);
 }
 
 void encode_offsets(const int64_t* ids, int64_t count, int64_t images, int64_t tiles_per_image, int32_t* offsets,
