@@ -30,7 +30,7 @@ find_library(CUDA_RUNTIME NAMES libcudart_static.a PATHS ${CUDA_ROOT}/lib ${CUDA
 
 file(GLOB CUDA_SOURCES CONFIGURE_DEPENDS gsplat_core/ops/*/*.cu gsplat_core/ops/*/*_cuda_op.cpp)
 add_library(gsplat_core_cuda SHARED ${CUDA_SOURCES})
-target_compile_definitions(gsplat_core_cuda PRIVATE ${CORE_DEFINITIONS} GSPLAT_ISA=cuda)
+target_compile_definitions(gsplat_core_cuda PRIVATE ${CORE_DEFINITIONS} GSPLAT_ISA=device)
 target_compile_options(gsplat_core_cuda PRIVATE
   $<$<COMPILE_LANGUAGE:CXX>:${CORE_FLAGS}>
   $<$<COMPILE_LANGUAGE:CUDA>:--expt-relaxed-constexpr --extended-lambda -Xcompiler=-fvisibility=hidden,-Wall>)

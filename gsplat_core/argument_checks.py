@@ -31,18 +31,34 @@ def require_same_kind(**tensors: Tensor | None) -> None:
         raise InvalidInput(f"all inputs must have one floating-point dtype and one device, got {found}")
 
 
-def require_float32_cpu(op: str, **tensors: Tensor | None) -> None:
-    """Raise InvalidInput unless all given tensors are float32 on the CPU, which the compiled kernels need."""
-    for name, tensor in tensors.items():
-        if tensor is None:
-            continue
+def require_float32(op: str, **tensors: Tensor | None) -> None:
+    """Raise InvalidInput unless all given tensors are float32, on one device for which this build has `op`'s kernels."""
+    given = {name: tensor for name, tensor in tensors.items() if tensor is not None}
+    first = next(iter(given.values()), None)
+    for name, tensor in given.items():
         if tensor.dtype != torch.float32:
             raise InvalidInput(
                 f"{op}: {name} must be float32, got {tensor.dtype}; convert it, or use gsplat_core.reference, which takes"
                 " any floating-point dtype"
             )
-        if tensor.device.type != "cpu":
-            raise InvalidInput(
-                f"{op}: {name} is on {tensor.device}, and this build has kernels for the CPU only; move it with .cpu(), or"
-                " use gsplat_core.reference, which runs on any device"
-            )
+        if first is not None and tensor.device != first.device:
+            found = ", ".join(f"{name}: {tensor.device}" for name, tensor in given.items())
+            raise InvalidInput(f"{op}: all inputs must be on one device, got {found}")
+        require_kernels(op, name, tensor)
+
+
+def require_kernels(op: str, name: str, tensor: Tensor) -> None:
+    """Raise InvalidInput unless this build has kernels for the device of `tensor`."""
+    if tensor.device.type == "cpu":
+        return
+    why = "there are kernels for cpu and cuda only"
+    if tensor.device.type == "cuda":
+        from gsplat_core.ops.native import CUDA_MISSING  # here, because the reference works without the compiled core
+
+        if CUDA_MISSING is None:
+            return
+        why = f"the CUDA kernels are {CUDA_MISSING}"
+    raise InvalidInput(
+        f"{op}: {name} is on {tensor.device}, and {why}; move it with .cpu(), or use gsplat_core.reference, which runs on"
+        " any device"
+    )

@@ -2,7 +2,12 @@
 //
 // Only kernel files (*_cpu.cpp) include this. Everything is static inside the per-set namespace, and kernel files include no
 // standard header with inline code: a shared inline function compiled with AVX-512 would crash older processors.
+// Headers with the maths of an op include it too, and are shared with CUDA, where a "vector" is the one float of a thread.
 #pragma once
+
+#if defined(__CUDACC__)
+#include "simd_cuda.h"
+#else
 
 #include <cstdint>
 #if defined(__SSE2__)
@@ -10,6 +15,7 @@
 #endif
 
 #define GSPLAT_INLINE static inline __attribute__((always_inline))
+#define GSPLAT_METHOD inline __attribute__((always_inline))
 
 namespace GSPLAT_ISA {
 
@@ -178,6 +184,17 @@ GSPLAT_INLINE vmask no_lanes() { return vint{}; }
 GSPLAT_INLINE vint or_where(vmask m, vint a, int32_t bit) { return a | (m & bit); }
 #endif
 
+// Lane by lane, for any float.
+GSPLAT_INLINE vfloat ceil(vfloat x) {
+  for (int i = 0; i < kLanes; ++i) x[i] = __builtin_ceilf(x[i]);
+  return x;
+}
+GSPLAT_INLINE vfloat atan2(vfloat y, vfloat x) {
+  vfloat angle;
+  for (int i = 0; i < kLanes; ++i) angle[i] = __builtin_atan2f(y[i], x[i]);
+  return angle;
+}
+
 GSPLAT_INLINE vfloat ceiling(vfloat x) {
   const vfloat below = truncate(x);
   return below + where(above(x, below), splat(1.0f), vfloat{});
@@ -224,3 +241,4 @@ GSPLAT_INLINE void sums(const vfloat* v, float* out) {
 }
 
 }  // namespace GSPLAT_ISA
+#endif

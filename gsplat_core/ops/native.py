@@ -1,4 +1,4 @@
-"""Loads the compiled core once, and says what to do when it is not there."""
+"""Loads the compiled core once, the CUDA kernels where they were built, and says what to do when it is not there."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from gsplat_core.errors import NativeLibraryMissing
 
 LIBRARY_PATH = Path(__file__).resolve().parent.parent / "gsplat_core_cpu.so"
+CUDA_LIBRARY_PATH = LIBRARY_PATH.with_name("gsplat_core_cuda.so")
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 
 
@@ -31,9 +32,27 @@ def load_native() -> None:
         ) from error
 
 
+def load_cuda() -> str | None:
+    """Register the CUDA kernels too, where they were built; otherwise returns why not, in a sentence. Touches no GPU.
+
+    They are an addition: whatever keeps them from loading leaves the CPU's as they are.
+    """
+    if not CUDA_LIBRARY_PATH.exists():
+        return "not built (on a machine with an NVIDIA GPU `make cuda` in the repository builds them)"
+    if torch.version.cuda is None:
+        return f"built, and torch {torch.__version__} has no CUDA"
+    try:
+        torch.ops.load_library(str(CUDA_LIBRARY_PATH))
+    except OSError as error:
+        return f"built, and torch {torch.__version__} cannot load them ({error}); rebuild them with `make cuda`"
+    return None
+
+
 def instruction_set() -> str:
     """The vector instruction set that the compiled core uses on this machine."""
     return INSTRUCTION_SETS[torch.ops.gsplat_core.active_isa()]
 
 
 load_native()
+CUDA_MISSING = load_cuda()
+"""Why the CUDA kernels are not there; None when they are."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsplat_core.argument_checks import require_float32
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 
@@ -33,11 +34,12 @@ def adam_step(
         row_size: values that share their fate; 1 = each for itself. It divides the number of values.
 
     Returns:
-        How many rows were left alone.
+        How many rows were left alone. On CUDA the host waits for this number; `torch.ops.gsplat_core.adam_` gives it as a tensor
+        on the device and does not wait.
 
     Raises:
-        InvalidInput: shapes differ, a tensor is not float32 or not contiguous, or step is below 1; `gsplat_core.reference.adam` takes
-            any floating type.
+        InvalidInput: shapes or devices differ, a tensor is not float32 or not contiguous, or step is below 1;
+            `gsplat_core.reference.adam` takes any floating type.
     """
     for name, tensor in (("parameter", parameter), ("first_moment", first_moment), ("second_moment", second_moment)):
         if tensor.shape != gradient.shape or not tensor.is_contiguous():
@@ -45,10 +47,9 @@ def adam_step(
                 f"{name} must be contiguous and of the gradient's shape {list(gradient.shape)},"
                 f" got {list(tensor.shape)} with strides {list(tensor.stride())}"
             )
-    if any(t.dtype != torch.float32 for t in (parameter, gradient, first_moment, second_moment)):
-        raise InvalidInput(
-            f"adam_step takes float32, got {parameter.dtype}; gsplat_core.reference has it for other types"
-        )
+    require_float32(
+        "adam_step", parameter=parameter, gradient=gradient, first_moment=first_moment, second_moment=second_moment
+    )
     if step < 1 or row_size < 1 or gradient.numel() % row_size:
         raise InvalidInput(
             f"step counts from 1 and row_size divides {gradient.numel()} values, got step {step}, row_size {row_size}"

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_float32_cpu
+from gsplat_core.argument_checks import require_float32
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.reference.covariance import check_covariance_arguments
 
@@ -26,7 +26,7 @@ def quat_scale_to_covar_preci(
     Differentiable in both. Raises InvalidInput for wrong shapes, dtypes or devices.
     """
     check_covariance_arguments(quats, scales)
-    require_float32_cpu("quat_scale_to_covar_preci", quats=quats, scales=scales)
+    require_float32("quat_scale_to_covar_preci", quats=quats, scales=scales)
     results = torch.ops.gsplat_core.quat_scale_to_covar_preci(
         quats.reshape(-1, 4), scales.reshape(-1, 3), compute_covar, compute_preci, triu
     )

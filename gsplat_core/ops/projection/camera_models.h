@@ -36,7 +36,7 @@ struct Projector;
 
 template <>
 struct Projector<kPinhole> {
-  static inline __attribute__((always_inline)) ImagePoint forward(const Intrinsics& k, const Point3& p) {
+  static GSPLAT_METHOD ImagePoint forward(const Intrinsics& k, const Point3& p) {
     const vfloat r = 1.0f / p.z;
     const vfloat tx = p.x * r, ty = p.y * r;
     const vfloat sx = min(max(tx, splat(k.slope_min[0])), splat(k.slope_max[0]));
@@ -44,8 +44,7 @@ struct Projector<kPinhole> {
     return {k.fx * tx + k.cx, k.fy * ty + k.cy, {{k.fx * r, vfloat{}, -k.fx * sx * r}, {vfloat{}, k.fy * r, -k.fy * sy * r}}};
   }
 
-  static inline __attribute__((always_inline)) Point3 backward(const Intrinsics& k, const Point3& p, vfloat v_u, vfloat v_v,
-                                                               const vfloat v_j[2][3]) {
+  static GSPLAT_METHOD Point3 backward(const Intrinsics& k, const Point3& p, vfloat v_u, vfloat v_v, const vfloat v_j[2][3]) {
     const vfloat r = 1.0f / p.z;
     const vfloat t[2] = {p.x * r, p.y * r}, v_image[2] = {v_u, v_v};
     const float f[2] = {k.fx, k.fy};
@@ -66,12 +65,11 @@ struct Projector<kPinhole> {
 
 template <>
 struct Projector<kOrtho> {
-  static inline __attribute__((always_inline)) ImagePoint forward(const Intrinsics& k, const Point3& p) {
+  static GSPLAT_METHOD ImagePoint forward(const Intrinsics& k, const Point3& p) {
     return {k.fx * p.x + k.cx, k.fy * p.y + k.cy, {{splat(k.fx), vfloat{}, vfloat{}}, {vfloat{}, splat(k.fy), vfloat{}}}};
   }
 
-  static inline __attribute__((always_inline)) Point3 backward(const Intrinsics& k, const Point3& p, vfloat v_u, vfloat v_v,
-                                                               const vfloat v_j[2][3]) {
+  static GSPLAT_METHOD Point3 backward(const Intrinsics& k, const Point3& p, vfloat v_u, vfloat v_v, const vfloat v_j[2][3]) {
     return {k.fx * v_u, k.fy * v_v, vfloat{}};
   }
 };
@@ -84,11 +82,9 @@ struct Projector<kFisheye> {
     vfloat s, q, e, w;
   };
 
-  static inline __attribute__((always_inline)) Terms terms(const Point3& p) {
+  static GSPLAT_METHOD Terms terms(const Point3& p) {
     const vfloat r2 = p.x * p.x + p.y * p.y, r = sqrt(r2), w = 1.0f / (r2 + p.z * p.z);
-    vfloat theta;
-    for (int i = 0; i < kLanes; ++i) theta[i] = __builtin_atan2f(r[i], p.z[i]);
-    const vfloat s = theta / r, q = (p.z * w - s) / r2, e = -(2 * p.z * w * w + 3 * q) / r2;
+    const vfloat s = atan2(r, p.z) / r, q = (p.z * w - s) / r2, e = -(2 * p.z * w * w + 3 * q) / r2;
     // Near the axis these quotients lose their digits, so they are taken from their series in (r / z)^2.
     const vfloat inv = 1.0f / p.z, t = r2 * inv * inv, inv3 = inv * inv * inv;
     const vfloat s_axis =
@@ -99,7 +95,7 @@ struct Projector<kFisheye> {
     return {select(axis, s_axis, s), select(axis, q_axis, q), select(axis, e_axis, e), w};
   }
 
-  static inline __attribute__((always_inline)) ImagePoint forward(const Intrinsics& k, const Point3& p) {
+  static GSPLAT_METHOD ImagePoint forward(const Intrinsics& k, const Point3& p) {
     const Terms t = terms(p);
     const vfloat xy = t.q * p.x * p.y;
     return {k.fx * p.x * t.s + k.cx,
@@ -108,8 +104,7 @@ struct Projector<kFisheye> {
              {k.fy * xy, k.fy * (t.s + t.q * p.y * p.y), -k.fy * p.y * t.w}}};
   }
 
-  static inline __attribute__((always_inline)) Point3 backward(const Intrinsics& k, const Point3& p, vfloat v_u, vfloat v_v,
-                                                               const vfloat v_j[2][3]) {
+  static GSPLAT_METHOD Point3 backward(const Intrinsics& k, const Point3& p, vfloat v_u, vfloat v_v, const vfloat v_j[2][3]) {
     const Terms t = terms(p);
     const vfloat a0 = k.fx * v_j[0][0], a1 = k.fx * v_j[0][1], a2 = k.fx * v_j[0][2];
     const vfloat b0 = k.fy * v_j[1][0], b1 = k.fy * v_j[1][1], b2 = k.fy * v_j[1][2];

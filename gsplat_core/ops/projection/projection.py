@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_float32_cpu
+from gsplat_core.argument_checks import require_float32
 from gsplat_core.cameras import CAMERA_MODELS
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, check_projection_arguments, pack
@@ -62,7 +62,7 @@ def fully_fused_projection(
     batch_dims = check_projection_arguments(
         means, covars, quats, scales, viewmats, Ks, width, height, sparse_grad, camera_model, opacities
     )
-    require_float32_cpu(
+    require_float32(
         "fully_fused_projection", means=means, covars=covars, quats=quats, scales=scales, viewmats=viewmats, Ks=Ks,
         opacities=opacities,
     )  # fmt: skip

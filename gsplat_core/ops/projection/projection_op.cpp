@@ -1,74 +1,21 @@
-#include <optional>
 #include <tuple>
 
 #include "projection.h"
+#include "projection_scene.h"
 #include "tensor_checks.h"
-
-using OptionalTensor = std::optional<Tensor>;
 
 // Fixed, so that sums over blocks come out the same on any number of threads; a multiple of every vector width.
 constexpr int64_t kBlock = 1024;
 
-static OptionalTensor floats(const OptionalTensor& t, const char* name) {
-  if (!t.has_value()) return std::nullopt;
-  return floats(*t, name);
-}
-
-// The inputs made contiguous, and pointers to one camera's share of them.
-struct Scene {
-  Tensor means, viewmats, intrinsics;
-  OptionalTensor covars, quats, scales, opacities;
-  int64_t batches, cameras, gaussians;
-  ProjectionInput settings;
-
-  Scene(const Tensor& means_in, const OptionalTensor& covars_in, const OptionalTensor& quats_in, const OptionalTensor& scales_in,
-        const OptionalTensor& opacities_in, const Tensor& viewmats_in, const Tensor& intrinsics_in)
-      : means(floats(means_in, "means")),
-        viewmats(floats(viewmats_in, "viewmats")),
-        intrinsics(floats(intrinsics_in, "Ks")),
-        covars(floats(covars_in, "covars")),
-        quats(floats(quats_in, "quats")),
-        scales(floats(scales_in, "scales")),
-        opacities(floats(opacities_in, "opacities")),
-        settings{} {
-    STD_TORCH_CHECK(means.dim() == 3 && viewmats.dim() == 4, "projection takes means [B, N, 3] and viewmats [B, C, 4, 4]");
-    STD_TORCH_CHECK(covars.has_value() != (quats.has_value() && scales.has_value()),
-                    "projection takes covars, or quats and scales");
-    batches = means.size(0);
-    gaussians = means.size(1);
-    cameras = viewmats.size(1);
-    const int64_t rows = batches * gaussians, views = batches * cameras;
-    STD_TORCH_CHECK(
-        means.numel() == 3 * rows && viewmats.numel() == 16 * views && intrinsics.numel() == 9 * views &&
-            (!covars.has_value() || covars->numel() == 6 * rows) && (!quats.has_value() || quats->numel() == 4 * rows) &&
-            (!scales.has_value() || scales->numel() == 3 * rows) && (!opacities.has_value() || opacities->numel() == rows),
-        "projection: the sizes of the inputs do not fit together");
-  }
-
-  int64_t blocks() const { return (gaussians + kBlock - 1) / kBlock; }
-
-  ProjectionInput view(int64_t batch, int64_t camera) const {
-    const auto at = [&](const OptionalTensor& t, int64_t columns) {
-      return t.has_value() ? data(*t) + batch * gaussians * columns : nullptr;
-    };
-    const int64_t image = batch * cameras + camera;
-    ProjectionInput in = settings;
-    in.means = data(means) + batch * gaussians * 3;
-    in.covars = at(covars, 6);
-    in.quats = at(quats, 4);
-    in.scales = at(scales, 3);
-    in.opacities = at(opacities, 1);
-    in.viewmat = data(viewmats) + image * 16;
-    in.intrinsics = data(intrinsics) + image * 9;
-    return in;
-  }
-};
+static constexpr auto on_cpu = [](const Tensor& t, const char* name) { return floats(t, name); };
+static OptionalTensor floats(const OptionalTensor& t, const char* name) { return optional_floats(on_cpu, t, name); }
+static int64_t blocks_of(const ProjectionScene& scene) { return (scene.gaussians + kBlock - 1) / kBlock; }
 
 static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians(
     Tensor means, OptionalTensor covars, OptionalTensor quats, OptionalTensor scales, OptionalTensor opacities, Tensor viewmats,
     Tensor intrinsics, int64_t width, int64_t height, double eps2d, double near_plane, double far_plane, double radius_clip,
     bool compensate, int64_t camera_model) {
-  Scene scene(means, covars, quats, scales, opacities, viewmats, intrinsics);
+  ProjectionScene scene(on_cpu, means, covars, quats, scales, opacities, viewmats, intrinsics);
   ProjectionInput& s = scene.settings;
   s.width = float(width);
   s.height = float(height);
@@ -77,7 +24,7 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians(
   s.far_plane = float(far_plane);
   s.radius_clip = float(radius_clip);
   s.model = CameraModel(camera_model);
-  const int64_t B = scene.batches, C = scene.cameras, N = scene.gaussians, blocks = scene.blocks();
+  const int64_t B = scene.batches, C = scene.cameras, N = scene.gaussians, blocks = blocks_of(scene);
   Tensor radii = empty_ints({B, C, N, 2}), means2d = empty_floats({B, C, N, 2}), depths = empty_floats({B, C, N}),
          conics = empty_floats({B, C, N, 3});
   Tensor compensations = compensate ? empty_floats({B, C, N}) : empty_floats({0});
@@ -99,12 +46,12 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians_back
     Tensor means, OptionalTensor covars, OptionalTensor quats, OptionalTensor scales, Tensor viewmats, Tensor intrinsics,
     Tensor radii_in, OptionalTensor v_means2d_in, OptionalTensor v_depths_in, OptionalTensor v_conics_in,
     OptionalTensor v_compensations_in, int64_t width, int64_t height, double eps2d, int64_t camera_model, bool needs_viewmats) {
-  Scene scene(means, covars, quats, scales, std::nullopt, viewmats, intrinsics);
+  ProjectionScene scene(on_cpu, means, covars, quats, scales, std::nullopt, viewmats, intrinsics);
   scene.settings.width = float(width);
   scene.settings.height = float(height);
   scene.settings.eps2d = float(eps2d);
   scene.settings.model = CameraModel(camera_model);
-  const int64_t B = scene.batches, C = scene.cameras, N = scene.gaussians, blocks = scene.blocks();
+  const int64_t B = scene.batches, C = scene.cameras, N = scene.gaussians, blocks = blocks_of(scene);
   const Tensor radii = ints(radii_in, "radii");
   const OptionalTensor v_means2d = floats(v_means2d_in, "v_means2d"), v_depths = floats(v_depths_in, "v_depths"),
                        v_conics = floats(v_conics_in, "v_conics"),

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_float32_cpu
+from gsplat_core.argument_checks import require_float32
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.reference.spherical_harmonics import check_spherical_harmonics_arguments
 
@@ -26,7 +26,7 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks
     Differentiable in dirs and coeffs. Raises InvalidInput for wrong shapes, dtypes or devices.
     """
     check_spherical_harmonics_arguments(degrees_to_use, dirs, coeffs, masks)
-    require_float32_cpu("spherical_harmonics", dirs=dirs, coeffs=coeffs)
+    require_float32("spherical_harmonics", dirs=dirs, coeffs=coeffs)
     leading, bases = dirs.shape[:-1], coeffs.shape[-2]
     shared = coeffs.dim() - 2
     if coeffs.shape[:-2] != leading[len(leading) - shared :]:

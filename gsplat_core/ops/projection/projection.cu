@@ -1,0 +1,155 @@
+#include "cuda_scratch.h"
+#include "projection_cuda.h"
+#include "projection_math.h"
+
+using namespace GSPLAT_ISA;
+
+namespace {
+
+constexpr int kWarps = kThreads / 32;
+constexpr int kViewSums = 12;  // rotation by rows, then translation
+
+// One camera's share of the inputs.
+__device__ ProjectionInput seen_by(ProjectionInput in, int64_t batch, int64_t image, int64_t gaussians) {
+  const int64_t row = batch * gaussians;
+  in.means += 3 * row;
+  if (in.covars != nullptr) in.covars += 6 * row;
+  if (in.quats != nullptr) in.quats += 4 * row;
+  if (in.scales != nullptr) in.scales += 3 * row;
+  if (in.opacities != nullptr) in.opacities += row;
+  in.viewmat += 16 * image;
+  in.intrinsics += 9 * image;
+  return in;
+}
+
+template <int K>
+__device__ void load(const float* p, int64_t row, float* v) {
+  for (int k = 0; k < K; ++k) v[k] = p[K * row + k];
+}
+template <int K>
+__device__ void store(float* p, int64_t row, const float* v) {
+  for (int k = 0; k < K; ++k) p[K * row + k] = v[k];
+}
+
+__device__ Geometry load_geometry(const ProjectionInput& in, int64_t n) {
+  if (in.covars != nullptr) {
+    Symmetric3 sigma;
+    load<6>(in.covars, n, sigma.v);
+    return geometry_of(sigma);
+  }
+  float quat[4], scales[3];
+  load<4>(in.quats, n, quat);
+  load<3>(in.scales, n, scales);
+  return geometry_of(quat, scales);
+}
+
+// A block is of one image.
+template <CameraModel model>
+__global__ void __launch_bounds__(kThreads) forward(ProjectionInput all, ProjectionSize size, ProjectionOutput out) {
+  const int64_t blocks = (size.gaussians + kThreads - 1) / kThreads, image = blockIdx.x / blocks;
+  const int64_t n = (blockIdx.x % blocks) * kThreads + threadIdx.x;
+  if (n >= size.gaussians) return;
+  const ProjectionInput in = seen_by(all, image / size.cameras, image, size.gaussians);
+  const View<model> view(in);
+  float mean[3];
+  load<3>(in.means, n, mean);
+  const bool compensate = out.compensations != nullptr;
+  const Projected p =
+      project(in, view, mean, load_geometry(in, n), in.opacities != nullptr ? in.opacities + n : nullptr, compensate);
+  const int64_t at = image * size.gaussians + n;
+  out.radii[2 * at] = p.valid ? int32_t(p.radius_x) : 0;
+  out.radii[2 * at + 1] = p.valid ? int32_t(p.radius_y) : 0;
+  out.means2d[2 * at] = p.valid ? p.u : 0;
+  out.means2d[2 * at + 1] = p.valid ? p.v : 0;
+  out.depths[at] = p.valid ? p.depth : 0;
+  for (int k = 0; k < 3; ++k) out.conics[3 * at + k] = p.valid ? p.conic[k] : 0;
+  if (compensate) out.compensations[at] = p.valid ? p.compensation : 0;
+}
+
+// The block's sums of 12 values per thread, in a fixed order: halves of a warp, then warp after warp.
+__device__ void sum_over_block(const float* v, float* sums) {
+  __shared__ float warps[kWarps][kViewSums];
+  for (int i = 0; i < kViewSums; ++i) {
+    float x = v[i];
+    for (int half = 16; half > 0; half /= 2) x += __shfl_down_sync(~0u, x, half);
+    if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32][i] = x;
+  }
+  __syncthreads();
+  if (threadIdx.x < kViewSums) {
+    float total = 0;
+    for (int w = 0; w < kWarps; ++w) total += warps[w][threadIdx.x];
+    sums[threadIdx.x] = total;
+  }
+  __syncthreads();
+}
+
+// A block is of one batch: each thread has one Gaussian and goes through the cameras in order.
+template <CameraModel model>
+__global__ void __launch_bounds__(kThreads)
+    backward(ProjectionInput all, ProjectionSize size, ProjectionOutputGradient from, ProjectionInputGradient to) {
+  const int64_t blocks = (size.gaussians + kThreads - 1) / kThreads, batch = blockIdx.x / blocks, block = blockIdx.x % blocks;
+  const int64_t n = block * kThreads + threadIdx.x;
+  BackProjected total = {};
+  for (int64_t camera = 0; camera < size.cameras; ++camera) {
+    const int64_t image = batch * size.cameras + camera, at = image * size.gaussians + n;
+    BackProjected g = {};
+    if (n < size.gaussians && from.radii[2 * at] > 0) {
+      const ProjectionInput in = seen_by(all, batch, image, size.gaussians);
+      const View<model> view(in);
+      float mean[3];
+      load<3>(in.means, n, mean);
+      ProjectedGradient v = {};
+      if (from.means2d != nullptr) load<2>(from.means2d, at, v.means2d);
+      if (from.depths != nullptr) v.depth = from.depths[at];
+      if (from.conics != nullptr) load<3>(from.conics, at, v.conic);
+      if (from.compensations != nullptr) v.compensation = from.compensations[at];
+      g = project_backward(in, view, mean, load_geometry(in, n), v, from.compensations != nullptr, to.viewmat != nullptr);
+      for (int k = 0; k < 3; ++k) total.mean[k] += g.mean[k];
+      for (int k = 0; k < 6; ++k) total.sigma.v[k] += g.sigma.v[k];
+      for (int k = 0; k < 4; ++k) total.quat[k] += g.quat[k];
+      for (int k = 0; k < 3; ++k) total.scales[k] += g.scales[k];
+    }
+    if (to.viewmat != nullptr) sum_over_block(g.viewmat, to.viewmat + (image * blocks + block) * kViewSums);
+  }
+  if (n >= size.gaussians) return;
+  const int64_t row = batch * size.gaussians + n;
+  store<3>(to.means, row, total.mean);
+  if (all.covars != nullptr) {
+    store<6>(to.covars, row, total.sigma.v);
+  } else {
+    store<4>(to.quats, row, total.quat);
+    store<3>(to.scales, row, total.scales);
+  }
+}
+
+// A warp per image and sum; each lane adds up every 32nd block, and the lanes are added in a fixed order.
+__global__ void sum_over_blocks(const float* sums, int64_t blocks, float* v_viewmats) {
+  const int64_t image = blockIdx.x;
+  const int i = threadIdx.x / 32, lane = threadIdx.x % 32;
+  double total = 0;
+  for (int64_t block = lane; block < blocks; block += 32) total += sums[(image * blocks + block) * kViewSums + i];
+  for (int half = 16; half > 0; half /= 2) total += __shfl_down_sync(~0u, total, half);
+  if (lane == 0) v_viewmats[image * 16 + (i < 9 ? i / 3 * 4 + i % 3 : (i - 9) * 4 + 3)] = float(total);
+}
+
+}  // namespace
+
+void project_on_device(const ProjectionInput& in, const ProjectionSize& size, const ProjectionOutput& out, cudaStream_t stream) {
+  const int64_t blocks = size.batches * size.cameras * blocks_for(size.gaussians);
+  if (blocks == 0) return;
+  const auto kernel = in.model == kOrtho ? forward<kOrtho> : in.model == kFisheye ? forward<kFisheye> : forward<kPinhole>;
+  kernel<<<unsigned(blocks), kThreads, 0, stream>>>(in, size, out);
+}
+
+int64_t camera_sums(const ProjectionSize& size) { return size.batches * size.cameras * blocks_for(size.gaussians); }
+
+void project_backward_on_device(const ProjectionInput& in, const ProjectionSize& size, const ProjectionOutputGradient& from,
+                                const ProjectionInputGradient& to, float* v_viewmats, cudaStream_t stream) {
+  const int64_t per_image = blocks_for(size.gaussians), blocks = size.batches * per_image;
+  if (blocks == 0) return;
+  const auto kernel = in.model == kOrtho ? backward<kOrtho> : in.model == kFisheye ? backward<kFisheye> : backward<kPinhole>;
+  kernel<<<unsigned(blocks), kThreads, 0, stream>>>(in, size, from, to);
+  const int64_t images = size.batches * size.cameras;
+  if (to.viewmat != nullptr && images > 0)
+    sum_over_blocks<<<unsigned(images), 32 * kViewSums, 0, stream>>>(to.viewmat, per_image, v_viewmats);
+}
