@@ -14,10 +14,7 @@ from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.reference import compositing as reference
 
-pytestmark = [
-    pytest.mark.cuda,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU that torch sees"),
-]
+pytestmark = pytest.mark.cuda
 Results = dict[str, Tensor]
 
 

@@ -10,10 +10,7 @@ from torch import Tensor
 
 from gsplat_core import rasterization, reference
 
-pytestmark = [
-    pytest.mark.cuda,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU that torch sees"),
-]
+pytestmark = pytest.mark.cuda
 
 
 def run(function, scene, device="cuda", **options) -> tuple[list[Tensor], dict]:

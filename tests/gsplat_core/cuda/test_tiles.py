@@ -11,10 +11,7 @@ from torch import Tensor
 from gsplat_core.ops.tiles.tiles import bin_splats, isect_offset_encode, isect_tiles
 from gsplat_core.reference import tiles as reference
 
-pytestmark = [
-    pytest.mark.cuda,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU that torch sees"),
-]
+pytestmark = pytest.mark.cuda
 WIDTH, HEIGHT = 150, 100
 
 
