@@ -132,7 +132,7 @@ __device__ inline void zero_rows(const DeviceCompositing& in, const Window& w, i
 }
 
 template <int D, bool kAbs>
-__global__ void __launch_bounds__(kBlockThreads)
+__global__ void __launch_bounds__(kBlockThreads, 8)
     backward_windows(DeviceCompositing in, const Record<D>* records, DeviceGradients out, float4* rows, float* background_parts) {
   constexpr int kShape = shape_size(D, kAbs), kQuads = quads_of(kShape, D);
   __shared__ Record<D> staged[kBatch];
