@@ -1,0 +1,139 @@
+#include <cub/device/device_radix_sort.cuh>
+#include <cub/device/device_scan.cuh>
+
+#include "tile_ellipse.cuh"
+
+namespace {
+
+__device__ int64_t image_of(const DeviceBoxes& in, int64_t splat) {
+  return in.image_ids != nullptr ? in.image_ids[splat] : splat / in.per_image;
+}
+
+// Tile counts, and what the depth sort needs: depths as bits, so positive ones in front of negative ones, as gsplat sorts.
+__global__ void measure_splats(DeviceBoxes in, int32_t* tile_counts, uint32_t* keys, uint32_t* splats) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= in.count) return;
+  int tiles = 0;
+  for_tile_rows(in, tile_box(in, i), [&](int, int first, int end) { tiles += end - first; });
+  tile_counts[i] = tiles;
+  if (keys == nullptr) return;
+  keys[i] = tiles > 0 ? __float_as_uint(in.depths[i]) : ~0u;
+  splats[i] = uint32_t(i);
+}
+
+__global__ void counts_in_order(int64_t count, const uint32_t* splats, const int32_t* tile_counts, int64_t* counts) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i <= count) counts[i] = i == count ? 0 : tile_counts[splats != nullptr ? splats[i] : i];
+}
+
+__global__ void emit(DeviceBoxes in, TileOrder order, uint32_t* tiles, int32_t* splats) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= in.count || order.starts[i] == order.starts[i + 1]) return;
+  const int64_t splat = order.splats != nullptr ? order.splats[i] : i;
+  const uint32_t first_tile = uint32_t(image_of(in, splat) * in.tile_width * in.tile_height);
+  int64_t at = order.starts[i];
+  for_tile_rows(in, tile_box(in, splat), [&](int row, int first, int end) {
+    for (int column = first; column < end; ++column, ++at) {
+      tiles[at] = first_tile + uint32_t(row * in.tile_width + column);
+      splats[at] = int32_t(splat);
+    }
+  });
+}
+
+// How many of the `count` sorted values key(0), key(1), ... are below `value`.
+template <class Key>
+__device__ int64_t count_below(int64_t count, int64_t value, const Key& key) {
+  int64_t low = 0, high = count;
+  while (low < high) {
+    const int64_t middle = (low + high) / 2;
+    if (key(middle) < value) {
+      low = middle + 1;
+    } else {
+      high = middle;
+    }
+  }
+  return low;
+}
+
+__global__ void offsets_of_tiles(const uint32_t* sorted, int64_t count, int64_t tiles, int32_t* offsets) {
+  const int64_t tile = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (tile < tiles) offsets[tile] = int32_t(count_below(count, tile, [&](int64_t i) { return int64_t(sorted[i]); }));
+}
+
+__global__ void offsets_of_ids(const int64_t* ids, int64_t count, int64_t images, int64_t tiles, int tile_bits,
+                               int32_t* offsets) {
+  const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (at >= images * tiles) return;
+  const int64_t key = (at / tiles) << tile_bits | at % tiles;
+  offsets[at] = int32_t(count_below(count, key, [&](int64_t i) { return ids[i] >> 32; }));
+}
+
+// The bits that n values need, as gsplat counts them: floor(log2(n)) + 1.
+int gsplat_bits(int64_t n) { return n > 0 ? 64 - __builtin_clzll(uint64_t(n)) : 1; }
+
+__global__ void ids_of_instances(DeviceBoxes in, const uint32_t* tiles, const int32_t* splats, int64_t count, int tile_bits,
+                                 int64_t* ids) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= count) return;
+  const int64_t per_image = int64_t(in.tile_width) * in.tile_height, image = tiles[i] / per_image, tile = tiles[i] % per_image;
+  ids[i] = image << (32 + tile_bits) | tile << 32 | int64_t(__float_as_uint(in.depths[splats[i]]));
+}
+
+}  // namespace
+
+TileOrder order_splats(const DeviceBoxes& in, bool by_depth, int32_t* tile_counts, CudaScratch& scratch, cudaStream_t stream) {
+  TileOrder order = {nullptr, scratch.array<int64_t>(in.count + 1)};
+  if (by_depth) {
+    cub::DoubleBuffer<uint32_t> keys(scratch.array<uint32_t>(in.count), scratch.array<uint32_t>(in.count));
+    cub::DoubleBuffer<uint32_t> splats(scratch.array<uint32_t>(in.count), scratch.array<uint32_t>(in.count));
+    measure_splats<<<blocks_for(in.count), kThreads, 0, stream>>>(in, tile_counts, keys.Current(), splats.Current());
+    size_t size = 0;
+    cub::DeviceRadixSort::SortPairs(nullptr, size, keys, splats, in.count, 0, 32, stream);
+    cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, keys, splats, in.count, 0, 32, stream);
+    order.splats = splats.Current();
+  } else {
+    measure_splats<<<blocks_for(in.count), kThreads, 0, stream>>>(in, tile_counts, nullptr, nullptr);
+  }
+  counts_in_order<<<blocks_for(in.count + 1), kThreads, 0, stream>>>(in.count, order.splats, tile_counts, order.starts);
+  size_t size = 0;
+  cub::DeviceScan::ExclusiveSum(nullptr, size, order.starts, order.starts, in.count + 1, stream);
+  cub::DeviceScan::ExclusiveSum(scratch.bytes(size), size, order.starts, order.starts, in.count + 1, stream);
+  return order;
+}
+
+void emit_instances(const DeviceBoxes& in, const TileOrder& order, TileInstances& instances, cudaStream_t stream) {
+  instances.current = 0;
+  if (instances.count == 0) return;
+  emit<<<blocks_for(in.count), kThreads, 0, stream>>>(in, order, instances.tiles[0], instances.splats[0]);
+}
+
+void sort_by_tile(const DeviceBoxes& in, TileInstances& instances, CudaScratch& scratch, cudaStream_t stream) {
+  if (instances.count == 0) return;
+  cub::DoubleBuffer<uint32_t> tiles(instances.tiles[0], instances.tiles[1]);
+  cub::DoubleBuffer<int32_t> splats(instances.splats[0], instances.splats[1]);
+  const int bits = bits_below(int64_t(in.images) * in.tile_width * in.tile_height);
+  size_t size = 0;
+  cub::DeviceRadixSort::SortPairs(nullptr, size, tiles, splats, instances.count, 0, bits, stream);
+  cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, tiles, splats, instances.count, 0, bits, stream);
+  instances.current = tiles.selector;
+}
+
+void encode_offsets(const TileInstances& instances, int64_t tiles, int32_t* offsets, cudaStream_t stream) {
+  if (tiles == 0) return;
+  offsets_of_tiles<<<blocks_for(tiles), kThreads, 0, stream>>>(instances.tiles[instances.current], instances.count, tiles,
+                                                               offsets);
+}
+
+void encode_offsets(const int64_t* ids, int64_t count, int64_t images, int64_t tiles_per_image, int32_t* offsets,
+                    cudaStream_t stream) {
+  if (images * tiles_per_image == 0) return;
+  offsets_of_ids<<<blocks_for(images * tiles_per_image), kThreads, 0, stream>>>(ids, count, images, tiles_per_image,
+                                                                                gsplat_bits(tiles_per_image), offsets);
+}
+
+void make_ids(const DeviceBoxes& in, const TileInstances& instances, int64_t* ids, cudaStream_t stream) {
+  if (instances.count == 0) return;
+  ids_of_instances<<<blocks_for(instances.count), kThreads, 0, stream>>>(
+      in, instances.tiles[instances.current], instances.splats[instances.current], instances.count,
+      gsplat_bits(int64_t(in.tile_width) * in.tile_height), ids);
+}

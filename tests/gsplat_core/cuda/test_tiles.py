@@ -1,0 +1,183 @@
+"""The tile lists of the CUDA kernels, against plain torch and against the CPU's."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsplat_core.ops.tiles.tiles import bin_splats, isect_offset_encode, isect_tiles
+from gsplat_core.reference import tiles as reference
+
+pytestmark = pytest.mark.cuda
+WIDTH, HEIGHT = 150, 100
+
+
+def splats(count: int, image_dims: tuple[int, ...] = (1,), seed: int = 0, median_px: float = 3.0) -> list[Tensor]:
+    """means2d, radii, depths, conics, opacities of random ellipses in and around the image, on the CPU."""
+    random = torch.Generator().manual_seed(seed)
+    shape = (*image_dims, count)
+    means2d = torch.rand(*shape, 2, generator=random) * torch.tensor([WIDTH + 60.0, HEIGHT + 60.0]) - 30
+    size = median_px * torch.exp(0.7 * torch.randn(*shape, 1, 1, generator=random))
+    axes = torch.randn(*shape, 2, 2, generator=random) * size
+    covars = axes @ axes.mT + 0.3 * torch.eye(2)
+    conics = torch.linalg.inv(covars).flatten(-2)[..., [0, 1, 3]]
+    opacities = torch.sigmoid(2 * torch.randn(shape, generator=random))
+    reach = torch.sqrt(2 * torch.log(255 * opacities).clamp(min=0))
+    radii = torch.ceil(reach[..., None] * covars.diagonal(dim1=-2, dim2=-1).sqrt()).int()
+    depths = (1 + torch.rand(shape, generator=random)).mul(8).round().div(8)  # many ties
+    depths[..., ::7] *= -1
+    return [means2d, radii, depths, conics, opacities]
+
+
+def grid(tile_size: int) -> tuple[int, int, int]:
+    return tile_size, math.ceil(WIDTH / tile_size), math.ceil(HEIGHT / tile_size)
+
+
+def cuda(tensors: list[Tensor]) -> list[Tensor]:
+    return [t.cuda() for t in tensors]
+
+
+def assert_equal(seen: tuple[Tensor, ...], wanted: tuple[Tensor, ...]) -> None:
+    for s, w in zip(seen, wanted, strict=True):
+        assert s.dtype == w.dtype
+        assert torch.equal(s.cpu(), w.cpu())
+
+
+def pairs(found: tuple[Tensor, Tensor, Tensor]) -> set[tuple[int, int]]:
+    """(image and tile, splat) of every entry."""
+    return set(zip((found[1] >> 32).tolist(), found[2].tolist(), strict=True))
+
+
+@pytest.mark.parametrize("tile_size", [16, 7])
+@pytest.mark.parametrize("image_dims", [(1,), (), (2, 3)])
+@pytest.mark.parametrize("sort", [True, False])
+def test_boxes_equal_those_of_the_cpu_and_of_the_reference(
+    tile_size: int, image_dims: tuple[int, ...], sort: bool
+) -> None:
+    here = splats(500, image_dims)[:3]
+    seen = isect_tiles(*cuda(here), *grid(tile_size), sort)
+    assert seen[0].is_cuda
+    assert_equal(seen, isect_tiles(*here, *grid(tile_size), sort))
+    assert_equal(seen, reference.isect_tiles(*here, *grid(tile_size), sort))
+
+
+@pytest.mark.parametrize("median_px", [0.5, 3.0, 40.0])
+@pytest.mark.parametrize("tile_size", [16, 5])
+def test_exact_test_lists_what_the_ellipse_touches_and_no_more(tile_size: int, median_px: float) -> None:
+    means2d, radii, depths, conics, opacities = splats(800, median_px=median_px, seed=3)
+    *where, gpu_conics, gpu_opacities = cuda([means2d, radii, depths, conics, opacities])
+    found = isect_tiles(*where, *grid(tile_size), conics=gpu_conics, opacities=gpu_opacities)
+    seen = pairs(found)
+    exact = {"conics": conics.double(), "opacities": opacities.double()}
+    assert pairs(reference.isect_tiles(means2d.double(), radii, depths, *grid(tile_size), **exact)) <= seen
+    # Rounding may add a tile that the ellipse misses by a few thousandths of a pixel.
+    exact["opacities"] = exact["opacities"] * 1.04
+    assert seen <= pairs(reference.isect_tiles(means2d.double(), radii, depths, *grid(tile_size), **exact))
+    on_cpu = isect_tiles(means2d, radii, depths, *grid(tile_size), conics=conics, opacities=opacities)
+    assert len(pairs(on_cpu) ^ seen) <= 1e-3 * len(seen) + 1
+    # By image, tile and depth, ties by index.
+    ids, order = found[1], found[2].long()
+    again = torch.argsort(ids, stable=True)
+    assert (ids.diff() >= 0).all()
+    assert torch.equal(again, torch.arange(len(ids), device="cuda"))
+    assert ((order.diff() > 0) | (ids.diff() > 0)).all()
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_bin_splats_is_isect_tiles_and_offsets_in_one(exact: bool) -> None:
+    means2d, radii, depths, conics, opacities = cuda(splats(700, (2, 2)))
+    options = {"conics": conics, "opacities": opacities} if exact else {}
+    size, across, down = grid(16)
+    counts, ids, order = isect_tiles(means2d, radii, depths, size, across, down, **options)
+    offsets = isect_offset_encode(ids, 4, across, down)
+    assert torch.equal(offsets.cpu(), reference.isect_offset_encode(ids.cpu(), 4, across, down))
+    wanted = (counts, order, offsets.reshape(2, 2, down, across))
+    assert_equal(bin_splats(means2d, radii, depths, size, across, down, **options), wanted)
+
+
+def test_packed_splats_give_the_lists_of_their_images() -> None:
+    means2d, radii, depths, conics, opacities = cuda(splats(300, (3,)))
+    visible = (radii > 0).all(-1)
+    image_ids, gaussian_ids = torch.where(visible)
+    packed = dict(packed=True, n_images=3, image_ids=image_ids, gaussian_ids=gaussian_ids)
+    chosen = [t[visible] for t in (means2d, radii, depths)]
+    seen = isect_tiles(*chosen, *grid(16), **packed, conics=conics[visible], opacities=opacities[visible])
+    counts, ids, order = isect_tiles(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities)
+    row = torch.cumsum(visible.flatten(), 0) - 1
+    assert_equal(seen, (counts[visible], ids, row[order.long()].int()))
+
+
+@pytest.mark.parametrize("count", [0, 1, 64])
+def test_nothing_visible_gives_empty_lists(count: int) -> None:
+    means2d, radii, depths, conics, opacities = cuda(splats(count))
+    counts, order, offsets = bin_splats(means2d, radii * 0, depths, *grid(16), conics=conics, opacities=opacities)
+    assert order.numel() == 0
+    assert counts.shape == (1, count)
+    assert not counts.any()
+    assert offsets.shape == (1, 7, 10)
+    assert not offsets.any()
+
+
+def test_splats_that_are_not_finite_or_far_away_are_in_no_list() -> None:
+    means2d, radii, depths, conics, opacities = splats(14)
+    means2d[:], radii[:], opacities[:] = 50.0, 20, 0.9
+    means2d[0, 0, 0], means2d[0, 1, 1], means2d[0, 2, 0] = math.nan, math.inf, -3e38
+    means2d[0, 3] = torch.tensor([3e9, -3e9])
+    depths[0, 4], depths[0, 5], conics[0, 6, 0], conics[0, 7, 2] = math.nan, math.inf, math.nan, math.inf
+    opacities[0, 8:13] = torch.tensor([math.nan, math.inf, 0.0, -1.0, 0.9 / 255])
+    means2d, radii, depths, conics, opacities = cuda([means2d, radii, depths, conics, opacities])
+    counts, order, _ = bin_splats(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities)
+    assert counts[0, :13].tolist() == [0] * 13
+    assert set(order.tolist()) == {13}
+
+
+def test_an_image_id_that_is_no_images_is_in_no_list() -> None:
+    means2d, radii, depths, _, _ = (t[0] for t in cuda(splats(50)))
+    image_ids = torch.full((50,), 7, device="cuda")
+    counts, _, order = isect_tiles(means2d, radii, depths, *grid(16), packed=True, n_images=2, image_ids=image_ids)
+    assert not counts.any()
+    assert not order.numel()
+
+
+def test_a_splat_over_everything_is_in_every_tile() -> None:
+    size, across, down = grid(8)
+    means2d = torch.tensor([[[1e4, -1e4]]], device="cuda")
+    radii = torch.full((1, 1, 2), 2**31 - 1, dtype=torch.int32, device="cuda")
+    conics = torch.tensor([[[1e-12, 0.0, 1e-12]]], device="cuda")
+    one = torch.ones(1, 1, device="cuda")
+    counts, order, offsets = bin_splats(means2d, radii, one, size, across, down, conics=conics, opacities=one)
+    assert counts.item() == order.numel() == across * down
+    assert torch.equal(offsets.flatten(), torch.arange(across * down, dtype=torch.int32, device="cuda"))
+
+
+def test_the_same_lists_twice_and_on_a_side_stream() -> None:
+    means2d, radii, depths, conics, opacities = cuda(splats(100_000, median_px=1.0))
+    found = [bin_splats(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities) for _ in range(2)]
+    assert_equal(found[0], found[1])
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        aside = bin_splats(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities)
+    stream.synchronize()
+    assert_equal(found[0], aside)
+
+
+def test_strided_inputs_are_taken() -> None:
+    means2d, radii, depths, conics, opacities = cuda(splats(400))
+    wanted = bin_splats(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities)
+    wide = torch.cat([conics, conics], -1)[..., :3]
+    turned = means2d.mT.contiguous().mT
+    assert_equal(bin_splats(turned, radii, depths, *grid(16), conics=wide, opacities=opacities), wanted)
+
+
+def test_ops_pass_opcheck() -> None:
+    means2d, radii, depths, conics, opacities = (t[0] for t in cuda(splats(40)))
+    ops = torch.ops.gsplat_core
+    args = (means2d, radii, depths, conics, opacities, None, 1, *grid(16))
+    torch.library.opcheck(ops.isect_tiles.default, (*args, True))
+    torch.library.opcheck(ops.bin_splats.default, args)
+    ids = isect_tiles(means2d, radii, depths, *grid(16))[1]
+    torch.library.opcheck(ops.isect_offset_encode.default, (ids, 1, *grid(16)[1:]))
