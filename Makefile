@@ -8,11 +8,10 @@ CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*
 # For which GPUs `make cuda` builds, as CMake names them: the one in this machine, or 80-real;90-real;120 for a list.
 CUDA_ARCHITECTURES ?= native
 CUDA_TOOLKIT := build/cuda-toolkit
-GPU := $(shell nvidia-smi --list-gpus 2>/dev/null | grep -c .)
 
 .PHONY: demo test lint format bench native cuda lock licences clean
 
-demo: native $(if $(filter-out 0,$(GPU)),cuda)
+demo: native
 	$(BIN)/intrasplat synthesize --out out/recording
 	$(BIN)/intrasplat replay out/recording --out $(OUT)
 
@@ -35,7 +34,7 @@ bench: native .venv/.development
 
 # Rebuilds the C++ core where its sources changed; a no-op otherwise.
 native: .venv/.runtime
-	@$(BIN)/cmake --build build/editable | grep -v "no work to do" || true
+	@$(BIN)/cmake --build build/editable -- --quiet
 
 # The CUDA kernels. The compiler is NVIDIA's from pip, in a folder of its own beside no torch, or the nvcc that CUDACXX names.
 cuda: .venv/.runtime $(if $(CUDACXX),,$(CUDA_TOOLKIT)/.installed)
