@@ -6,7 +6,7 @@ import sys
 
 def main() -> None:
     """Entry point of the console script; exits with 0, 1 (a bug), 2 (bad input) or 130 (interrupted)."""
-    # Threads of the C++ core that wait must sleep, not spin: on a busy machine spinning makes a render ten times slower. Read once,
+    # Threads of the C++ core that wait must sleep, not spin: on a busy machine spinning can make a render many times slower. Read once,
     # when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from services.cli.app import run
