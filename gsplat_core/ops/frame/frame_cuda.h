@@ -1,0 +1,46 @@
+// The fused frame path on CUDA: what the ops' host code asks of the kernels. All pointers are to device memory.
+//
+// Raw Gaussians become a picture in four launches, without a wait of the host: preprocess (deform, activate, project, colour,
+// count tiles), scan, fill (one key per splat and tile), and per tile sort and blend. The gradient takes two: per tile one row
+// per instance, then per splat the sum of its rows and the way back to the raw parameters. Instances of a splat are numbered in
+// the order of the splats, so a splat's rows lie together and every sum has one fixed order.
+#pragma once
+
+#include <cuda_runtime.h>
+
+#include "cuda_scratch.h"
+
+constexpr int kFrameTile = 16;    // pixels on a side
+constexpr int kRawColumns = 16;   // position 3, rotation 4, log-scale 3, colour 3, opacity logit 1, 2 unused
+constexpr int kRowQuads = 3;      // float4s of an instance's gradient row: 6 moments, 4 channels, 2 unused
+constexpr int kStatusNeeded = 0;  // instances that the frame needs
+constexpr int kStatusMost = 1;    // most instances in one tile
+constexpr int kStatusCut = 2;     // 1 where they did not fit and some were left out
+
+// One camera's view of N Gaussians.
+struct FrameScene {
+  const float *means, *quats, *log_scales, *logit_opacities;  // [N, 3], [N, 4], [N, 3], [N]
+  const float* sh;                                            // [N, bases, 3]
+  const float* deltas;                                        // [N, kRawColumns], or null
+  const float *viewmat, *intrinsics;                          // [4, 4], [3, 3]
+  const float* background;                                    // [3], or null: black
+  int64_t count;
+  int32_t bases, sh_degree;
+  int32_t width, height, tile_width, tile_height;
+  float eps2d, near_plane, far_plane;
+  int32_t camera_model;
+
+  int64_t tiles() const { return int64_t(tile_width) * tile_height; }
+};
+
+// What the forward pass leaves behind: records, and for every tile its instances in depth order.
+struct FrameLists {
+  void* records;             // Record<4> [N]: colours are red, green, blue, z
+  int32_t* tile_offsets;     // [tiles + 1]
+  uint64_t* keys;            // [capacity], scratch: depth bits << 32 | splat, or instance when training
+  int32_t* sorted;           // [capacity], training: instances by tile and depth
+  int32_t* splat_starts;     // [N + 1], training: where each splat's instances start
+  int32_t* instance_splats;  // [capacity], training: the splat of every instance
+  int32_t* status;           // [4]
+  int64_t capacity;
+};
