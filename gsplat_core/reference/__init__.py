@@ -12,6 +12,7 @@ from gsplat_core.reference.deformation import (
     hexplane_modulate,
     hexplane_space,
 )
+from gsplat_core.reference.frame import render_frame
 from gsplat_core.reference.image_loss import image_loss
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
@@ -35,6 +36,7 @@ __all__ = [
     "quat_scale_to_covar_preci",
     "rasterization",
     "rasterize_to_pixels",
+    "render_frame",
     "spherical_harmonics",
     "ssim_map",
 ]
