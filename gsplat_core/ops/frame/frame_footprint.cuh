@@ -1,7 +1,7 @@
 // Which tiles a splat of the frame path touches: told by preprocess to fill in eight bytes.
 #pragma once
 
-#include "../compositing/splat_records.cuh"
+#include "../compositing/blend_window.cuh"
 #include "../tiles/tile_ellipse.cuh"
 #include "frame_cuda.h"
 
