@@ -35,7 +35,7 @@ class Frame(NamedTuple):
     """int32 [H, W]: the position in `sorted` of the last instance blended, -1 where there is none. Empty unless training."""
     records: Tensor
     """[N, 12]: the projected splats as the kernels keep them; rows of culled Gaussians are not written. A colour of exactly 0
-    was clamped. Columns: x, y, and log2 of alpha's polynomial (xx, xy, yy, 1), unused, red, green, blue, z."""
+    was clamped. Columns: x, y, and log2 of alpha's polynomial (xx, xy, yy, 1), infinity, red, green, blue, z, 0."""
     tile_offsets: Tensor
     """int32 [tiles + 1]: where each tile's instances start in `sorted`."""
     sorted: Tensor

@@ -43,12 +43,13 @@ __device__ inline Footprint footprint_of(const TileBox& box) {
 // visit(tile, j) for the tiles of a small footprint; j counts them.
 template <class Visit>
 __device__ inline void for_small_tiles(const Footprint& footprint, int tile_width, const Visit& visit) {
-  if (footprint.large()) return;
-  const int width = footprint.width();
-  uint32_t bits = footprint.y;
-  for (int tile = footprint.top() * tile_width + footprint.left(), j = 0; bits != 0; tile += tile_width) {
-    for (uint32_t row = bits & (kAll >> (32 - width)); row != 0; row &= row - 1, ++j) visit(tile + __ffs(int(row)) - 1, j);
-    bits = width < 32 ? bits >> width : 0;
+  const int width = footprint.width(), first = footprint.top() * tile_width + footprint.left();
+  // i / width = i * inverse >> 10 for i below 32, whichever way the reciprocal is rounded.
+  const int inverse = int(1024 * reciprocal(float(width))) + 1;
+  int j = 0;
+  for (uint32_t bits = footprint.large() ? 0 : footprint.y; bits != 0; bits &= bits - 1, ++j) {
+    const int i = __ffs(int(bits)) - 1, row = i * inverse >> 10;
+    visit(first + i + row * (tile_width - width), j);
   }
 }
 

@@ -84,12 +84,34 @@ __global__ void __launch_bounds__(kScanThreads) scan(FrameScene in, FrameLists l
   lists.status[kStatusCut + 1] = 0;
 }
 
+// Puts a key into the list of a tile.
+template <bool training>
+struct Emitter {
+  const FrameLists& lists;
+  const FrameScratch& scratch;
+
+  __device__ uint32_t reserve(int tile) const { return atomicAdd(scratch.cursors + tile, 1u); }
+  __device__ void put(uint32_t position, uint32_t depth, int64_t splat, uint32_t instance) const {
+    const uint32_t capacity = uint32_t(lists.capacity);
+    if constexpr (training) {
+      if (instance < capacity) lists.instance_splats[instance] = int32_t(splat);
+    }
+    if (position >= capacity) return;
+    const uint32_t number = training ? instance : uint32_t(splat);
+    lists.keys[position] = training && instance >= capacity ? ~0ull : uint64_t(depth) << 32 | number;
+  }
+};
+
+constexpr int kAtOnce = 4;  // reservations of a thread that are on their way together
+
 // One key per splat and tile, in any order within the tile: sorting puts them into the one that they have every time.
 template <bool training>
 __global__ void __launch_bounds__(kFrameThreads) fill(FrameScene in, FrameLists lists, FrameScratch scratch) {
+  __shared__ uint32_t touched[kFrameThreads / 32][32 * 32];  // by each warp's small splats: lane << 26 | tile
   const int64_t n = int64_t(blockIdx.x) * kFrameThreads + threadIdx.x;
   const int lane = threadIdx.x & 31;
   const Record<4>* const records = static_cast<const Record<4>*>(lists.records);
+  const Emitter<training> emitter = {lists, scratch};
   Footprint footprint = {0, 0};
   if (n < in.count) {
     const uint2 words = scratch.footprints[n];
@@ -97,10 +119,11 @@ __global__ void __launch_bounds__(kFrameThreads) fill(FrameScene in, FrameLists 
   }
   const uint32_t depth = footprint.y != 0 ? scratch.depths[n] : 0;
   const unsigned any_large = __ballot_sync(kAll, footprint.large());
+  const int small = footprint.small_count();
   uint32_t start = 0;
   if constexpr (training) {
     __shared__ int64_t of_warps[32];
-    int tiles = footprint.small_count();
+    int tiles = small;
     for (unsigned large = any_large; large != 0; large &= large - 1) {
       const int owner = __ffs(int(large)) - 1;
       const int count = for_large_tiles(footprint, records, n, owner, in.tile_width, [](int, int) {});
@@ -111,23 +134,42 @@ __global__ void __launch_bounds__(kFrameThreads) fill(FrameScene in, FrameLists 
     if (n < in.count) lists.splat_starts[n] = int32_t(start);
     if (n == in.count - 1) lists.splat_starts[n + 1] = capped(int64_t(start) + tiles);
   }
-  const uint32_t capacity = uint32_t(lists.capacity);
-  const auto emit = [&](int tile, uint32_t depth_bits, int64_t splat, uint32_t instance) {
-    const uint32_t position = atomicAdd(scratch.cursors + tile, 1u);
-    if constexpr (training) {
-      if (instance < capacity) lists.instance_splats[instance] = int32_t(splat);
+
+  // A splat has one tile or thirty: the warp's are written down first and then dealt out evenly.
+  int through = small;
+  for (int step = 1; step < 32; step *= 2) {
+    const int before = __shfl_up_sync(kAll, through, step);
+    if (lane >= step) through += before;
+  }
+  const int first = through - small, all = __shfl_sync(kAll, through, 31);
+  uint32_t* const list = touched[threadIdx.x / 32];
+  for_small_tiles(footprint, in.tile_width, [&](int tile, int j) { list[first + j] = uint32_t(lane) << 26 | uint32_t(tile); });
+  __syncwarp();
+  for (int from = 0; from < all; from += 32 * kAtOnce) {
+    uint32_t position[kAtOnce];
+    int owner[kAtOnce];
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) {
+      const int i = from + 32 * k + lane;
+      const uint32_t entry = i < all ? list[i] : 0;
+      owner[k] = int(entry >> 26);
+      if (i < all) position[k] = emitter.reserve(int(entry & 0x3ffffff));
     }
-    if (position >= capacity) return;
-    const uint32_t number = training ? instance : uint32_t(splat);
-    lists.keys[position] = training && instance >= capacity ? ~0ull : uint64_t(depth_bits) << 32 | number;
-  };
-  for_small_tiles(footprint, in.tile_width, [&](int tile, int j) { emit(tile, depth, n, start + uint32_t(j)); });
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) {
+      const int i = from + 32 * k + lane;
+      const uint32_t its_depth = __shfl_sync(kAll, depth, owner[k]);
+      const uint32_t instance = __shfl_sync(kAll, start - uint32_t(first), owner[k]) + uint32_t(i);
+      if (i < all) emitter.put(position[k], its_depth, n - lane + owner[k], instance);
+    }
+  }
+
   for (unsigned large = any_large; large != 0; large &= large - 1) {
     const int owner = __ffs(int(large)) - 1;
     const uint32_t its_depth = __shfl_sync(kAll, depth, owner), its_start = __shfl_sync(kAll, start, owner);
     const int64_t splat = n - lane + owner;
     for_large_tiles(footprint, records, n, owner, in.tile_width,
-                    [&](int tile, int j) { emit(tile, its_depth, splat, its_start + uint32_t(j)); });
+                    [&](int tile, int j) { emitter.put(emitter.reserve(tile), its_depth, splat, its_start + uint32_t(j)); });
   }
 }
 

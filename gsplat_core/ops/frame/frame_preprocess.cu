@@ -24,7 +24,7 @@ struct StagedHarmonics {
   static constexpr int kStride = 4 * (kQuads | 1);
   float4 rows[32 * kStride / 4];
 
-  // By a warp, those of the Gaussians in `shown` alone: what is culled is not read.
+  // By a warp, those of the Gaussians in `shown` alone: what is culled is not read. They are there after `wait`.
   __device__ void load(const float* from, unsigned shown, bool aligned) {
     const int lane = threadIdx.x & 31;
     float* const to = reinterpret_cast<float*>(rows);
@@ -41,6 +41,9 @@ struct StagedHarmonics {
         if (shown >> row & 1) copy_async<4>(to + row * kStride + i % kRow, from + i);
       }
     }
+  }
+
+  __device__ static void wait() {
     asm volatile("cp.async.wait_all;" ::: "memory");
     __syncwarp();
   }
@@ -76,54 +79,53 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
     preprocess(FrameScene in, FrameLists lists, FrameScratch scratch) {
   __shared__ FrameCamera camera;
   __shared__ StagedHarmonics<degree> harmonics[kFrameThreads / 32];
-  load_camera(in, camera);
   const int64_t n = int64_t(blockIdx.x) * kFrameThreads + threadIdx.x;
   const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
   Record<4>* const records = static_cast<Record<4>*>(lists.records);
 
   RawGaussian g;
   g.usable = false;
-  Record<4> r;
-  Footprint footprint = {0, 0};
   if (n < in.count) g = load_gaussian(in, n);
+  load_camera(in, camera);
+  Projected p;
+  p.valid = 0;
+  float opacity = 0;
   if (g.usable) {
-    const float opacity = opacity_of(g);
-    const Projected p = project_with(in, projection_input(in, camera), g.mean, geometry_of(g), opacity);
-    if (p.valid) {
-      r.xyab = make_float4(p.u, p.v, -0.5f * kLog2E * p.conic[0], -kLog2E * p.conic[1]);
-      r.c = -0.5f * kLog2E * p.conic[2];
-      r.l = log2f(opacity);
-      r.cap = INFINITY;  // the conic is definite
-      r.colors[3] = p.depth;
-      TileBox box = box_around(p.u, p.v, p.radius_x, p.radius_y, kFrameTile, in.tile_width, in.tile_height);
-      box.ellipse = ellipse_of_record(r.xyab, r.c, r.l);
-      footprint = footprint_of(box);
-    }
+    opacity = opacity_of(g);
+    p = project_with(in, projection_input(in, camera), g.mean, geometry_of(g), opacity);
   }
+  const unsigned shown = __ballot_sync(kAll, p.valid);
+  if constexpr (degree > 0)
+    harmonics[warp].load(in.sh + (n - lane) * StagedHarmonics<degree>::kRow, shown, in.aligned);  // on their way meanwhile
 
-  const unsigned shown = __ballot_sync(kAll, footprint.y != 0);
-  if (shown != 0) {
+  Record<4> r = {};
+  Footprint footprint = {0, 0};
+  if (p.valid) {
+    r.xyab = make_float4(p.u, p.v, -0.5f * kLog2E * p.conic[0], -kLog2E * p.conic[1]);
+    r.c = -0.5f * kLog2E * p.conic[2];
+    r.l = log2f(opacity);
+    r.cap = INFINITY;  // the conic is definite
+    TileBox box = box_around(p.u, p.v, p.radius_x, p.radius_y, kFrameTile, in.tile_width, in.tile_height);
+    box.ellipse = ellipse_of_record(r.xyab, r.c, r.l);
+    footprint = footprint_of(box);
+  }
+  if constexpr (degree > 0) StagedHarmonics<degree>::wait();
+  if (footprint.y != 0) {
+    float color[3], direction[3];
+    for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, g.color[j], 0.5f);
     if constexpr (degree > 0) {
-      constexpr int kRow = StagedHarmonics<degree>::kRow;
-      harmonics[warp].load(in.sh + (n - lane) * kRow, shown, in.aligned);
+      unit_direction(camera, g.mean, direction);
+      harmonics[warp].color_at(direction, color);
+    } else {
+      for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, in.sh[3 * n + j], color[j]);
     }
-    if (footprint.y != 0) {
-      float color[3];
-      for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, g.color[j], 0.5f);
-      if constexpr (degree > 0) {
-        float direction[3];
-        unit_direction(camera, g.mean, direction);
-        harmonics[warp].color_at(direction, color);
-      } else {
-        for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, in.sh[3 * n + j], color[j]);
-      }
-      if (0 * color[0] + 0 * color[1] + 0 * color[2] == 0) {
-        for (int j = 0; j < 3; ++j) r.colors[j] = fmaxf(color[j], 0.0f);
-        records[n] = r;
-        scratch.depths[n] = __float_as_uint(r.colors[3]);
-      } else {
-        footprint = {0, 0};
-      }
+    if (0 * color[0] + 0 * color[1] + 0 * color[2] == 0) {
+      for (int j = 0; j < 3; ++j) r.colors[j] = fmaxf(color[j], 0.0f);
+      r.colors[3] = p.depth;
+      records[n] = r;
+      scratch.depths[n] = __float_as_uint(p.depth);
+    } else {
+      footprint = {0, 0};
     }
   }
   if (n < in.count) scratch.footprints[n] = make_uint2(footprint.x, footprint.y);

@@ -1,13 +1,59 @@
-// A block sorts the keys of one tile: bitonic, with all exchanges towards the front, so that a list need not be a power of two
-// long: what would be behind its end never moves.
+// A block of 128 threads sorts the keys of one tile, bitonic (Batcher 1968): short lists in registers, longer ones in shared
+// memory, the longest in global memory with the help of shared memory.
 #pragma once
 
-#include <cstdint>
+#include "../compositing/blend_window.cuh"
 
 namespace {
 
-constexpr int kSortKeys = 2048;  // that a block sorts in shared memory
+constexpr int kSortKeys = 2048;   // that a block sorts in shared memory
+constexpr int kMostInThread = 8;  // keys that a thread sorts in registers
 
+__device__ inline void put_in_order(uint64_t& a, uint64_t& b, bool ascending) {
+  const uint64_t x = a, y = b;
+  const bool swap = (x > y) == ascending;
+  a = swap ? y : x;
+  b = swap ? x : y;
+}
+
+// Thread t holds the keys t kEach and on. `room` is shared memory for 256 kEach keys, and may be used again after the next
+// barrier. What is behind `count` must be the greatest keys.
+template <int kEach>
+__device__ inline void sort_in_registers(uint64_t (&keys)[kEach], int count, uint64_t* room) {
+  const int t = threadIdx.x;
+#pragma unroll
+  for (int size = 2; size < kEach; size *= 2)
+#pragma unroll
+    for (int distance = size / 2; distance > 0; distance /= 2)
+#pragma unroll
+      for (int i = 0; i < kEach; ++i)
+        if ((i & distance) == 0) put_in_order(keys[i], keys[i | distance], (i & size) == 0);
+  // From here on, `size` and `step` count threads.
+  for (int size = 1; size <= kBlockThreads && size * kEach < 2 * count; size *= 2) {
+    const bool ascending = (t & size) == 0;
+    for (int step = size / 2; step > 0; step /= 2) {
+      const bool keep_less = ascending == ((t & step) == 0);
+      uint64_t others[kEach];
+      if (step >= 32) {
+        uint64_t* const half = room + (step == size / 2 && size == kBlockThreads ? kEach * kBlockThreads : 0);
+        for (int i = 0; i < kEach; ++i) half[i * kBlockThreads + t] = keys[i];
+        __syncthreads();  // one is enough: the next exchange is in the other half
+        for (int i = 0; i < kEach; ++i) others[i] = half[i * kBlockThreads + (t ^ step)];
+      } else {
+        for (int i = 0; i < kEach; ++i) others[i] = __shfl_xor_sync(kAll, keys[i], step);
+      }
+      for (int i = 0; i < kEach; ++i) keys[i] = (keys[i] < others[i]) == keep_less ? keys[i] : others[i];
+    }
+#pragma unroll
+    for (int distance = kEach / 2; distance > 0; distance /= 2)
+#pragma unroll
+      for (int i = 0; i < kEach; ++i)
+        if ((i & distance) == 0) put_in_order(keys[i], keys[i | distance], ascending);
+  }
+}
+
+// In shared and global memory all exchanges go towards the front, so that a list need not be a power of two long: what would be
+// behind its end never moves.
 __device__ inline void exchange(uint64_t* keys, int64_t low, int64_t high, int64_t count) {
   if (high >= count) return;
   const uint64_t a = keys[low], b = keys[high];

@@ -120,7 +120,7 @@ def check_lists(frame: Frame) -> None:
     assert torch.equal(instances.sort().values, torch.arange(needed))
     owners = frame.instance_splats[:needed].cpu().long()
     assert torch.equal(owners, torch.repeat_interleave(torch.arange(len(starts) - 1), starts.diff()))
-    depths = frame.records.cpu()[owners[instances], 11]
+    depths = frame.records.cpu()[owners[instances], 10]
     tiles = torch.repeat_interleave(torch.arange(len(offsets) - 1), offsets.diff())
     same = tiles[1:] == tiles[:-1]
     ordered = (depths[1:] > depths[:-1]) | ((depths[1:] == depths[:-1]) & (instances[1:] > instances[:-1]))
