@@ -79,6 +79,15 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "image_loss(Tensor image, Tensor target, Tensor? mask, Tensor? depth, Tensor? target_depth, float ssim_weight, "
       "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
 
+  // The same of the frame path: image [H, W, 4] with colours and the sum of weight times z, alphas [H, W]; (loss, terms,
+  // dL/dimage, dL/dalphas).
+  m.def(
+      "frame_loss(Tensor image, Tensor alphas, Tensor target, Tensor? mask, Tensor? target_depth, float ssim_weight, "
+      "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
+
+  // Writes up to 32 values, which travel with the launch.
+  m.def("store_scalars_(Tensor(a!) to, float[] values) -> ()");
+
   // HexPlane features of one level: the product of six plane samples [N, C], its gradients, and the parts used for inference.
   m.def("hexplane_features(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
   m.def(
