@@ -59,6 +59,13 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
       "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 
+  // One frame from raw Gaussians (CUDA only): image [H, W, 4] with depth, and what its gradient needs.
+  m.def(
+      "render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_opacities, Tensor sh, Tensor? deltas, "
+      "Tensor viewmat, Tensor K, Tensor? background, int width, int height, float eps2d, float near_plane, float far_plane, "
+      "int camera_model, int capacity, bool training) -> (Tensor image, Tensor alphas, Tensor last, Tensor records, "
+      "Tensor tile_offsets, Tensor sorted, Tensor splat_starts, Tensor instance_splats, Tensor status)");
+
   // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
   m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, float tau) -> Tensor");
   m.def(

@@ -13,6 +13,8 @@ from gsplat_core.reference.deformation import (
     hexplane_space,
 )
 from gsplat_core.reference.image_loss import frame_loss, image_loss
+from gsplat_core.reference.frame import render_frame
+from gsplat_core.reference.image_loss import image_loss
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
@@ -36,6 +38,7 @@ __all__ = [
     "quat_scale_to_covar_preci",
     "rasterization",
     "rasterize_to_pixels",
+    "render_frame",
     "spherical_harmonics",
     "ssim_map",
 ]

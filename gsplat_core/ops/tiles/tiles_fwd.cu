@@ -14,7 +14,7 @@ __global__ void measure_splats(DeviceBoxes in, int32_t* tile_counts, uint32_t* k
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.count) return;
   int tiles = 0;
-  for_tile_rows(in, tile_box(in, i), [&](int, int first, int end) { tiles += end - first; });
+  for_tile_rows(tile_box(in, i), float(in.tile_size), [&](int, int first, int end) { tiles += end - first; });
   tile_counts[i] = tiles;
   if (keys == nullptr) return;
   keys[i] = tiles > 0 ? __float_as_uint(in.depths[i]) : ~0u;
@@ -32,7 +32,7 @@ __global__ void emit(DeviceBoxes in, TileOrder order, uint32_t* tiles, int32_t* 
   const int64_t splat = order.splats != nullptr ? order.splats[i] : i;
   const uint32_t first_tile = uint32_t(image_of(in, splat) * in.tile_width * in.tile_height);
   int64_t at = order.starts[i];
-  for_tile_rows(in, tile_box(in, splat), [&](int row, int first, int end) {
+  for_tile_rows(tile_box(in, splat), float(in.tile_size), [&](int row, int first, int end) {
     for (int column = first; column < end; ++column, ++at) {
       tiles[at] = first_tile + uint32_t(row * in.tile_width + column);
       splats[at] = int32_t(splat);
