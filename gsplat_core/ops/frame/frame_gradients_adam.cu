@@ -33,10 +33,16 @@ __device__ inline AdamFactors factors_of(const FrameAdam& adam, int lane) {
   return f;
 }
 
+// To two units in the last place, which is far below what Adam's epsilon and rates leave of a step's precision.
+__device__ inline float square_root(float x) {
+  float y;
+  asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
 __device__ inline void update(float& p, float g, float& m, float& v, float rate, const AdamFactors& f) {
-  m += f.fresh1 * (g - m);
-  v += f.fresh2 * (g * g - v);
-  p -= rate * m / (sqrtf(v) * f.inv_bias2 + f.epsilon);
+  m = fmaf(f.fresh1, g - m, m);
+  v = fmaf(f.fresh2, fmaf(g, g, -v), v);
+  p -= __fdividef(rate * m, fmaf(square_root(v), f.inv_bias2, f.epsilon));
 }
 
 // One tensor's share of the warp: gradient(value of the share); rows with a bit in `poisoned` stay as they are.
@@ -46,24 +52,25 @@ __device__ inline void update_rows(const FrameAdam& adam, int tensor, int64_t fi
   const int64_t at = first * kColumns;
   float *const p = adam.parameters[tensor] + at, *const m = adam.first[tensor] + at, *const v = adam.second[tensor] + at;
   const float rate = factors.rates[tensor];
-  const auto usable = [&](int value) { return (poisoned >> (value / kColumns) & 1) == 0; };
-  each_value<kColumns>(
-      rows, lane,
-      [&](int i) {
-        float4 parameter = reinterpret_cast<float4*>(p)[i], mean = reinterpret_cast<float4*>(m)[i],
-               square = reinterpret_cast<float4*>(v)[i];
-        if (usable(4 * i)) update(parameter.x, gradient(4 * i), mean.x, square.x, rate, factors);
-        if (usable(4 * i + 1)) update(parameter.y, gradient(4 * i + 1), mean.y, square.y, rate, factors);
-        if (usable(4 * i + 2)) update(parameter.z, gradient(4 * i + 2), mean.z, square.z, rate, factors);
-        if (usable(4 * i + 3)) update(parameter.w, gradient(4 * i + 3), mean.w, square.w, rate, factors);
-        reinterpret_cast<float4*>(p)[i] = parameter;
-        reinterpret_cast<float4*>(m)[i] = mean;
-        reinterpret_cast<float4*>(v)[i] = square;
-      },
-      [&](int i) {
-        if (usable(i)) update(p[i], gradient(i), m[i], v[i], rate, factors);
-      });
-  if (lane == 0 && poisoned != 0) atomicAdd(adam.skipped + tensor, (unsigned long long)(__popc(poisoned)));
+  const auto single = [&](int i) {
+    if ((poisoned >> (i / kColumns) & 1) == 0) update(p[i], gradient(i), m[i], v[i], rate, factors);
+  };
+  const auto quad = [&](int i) {
+    float4 &parameter = reinterpret_cast<float4*>(p)[i], &mean = reinterpret_cast<float4*>(m)[i],
+           &square = reinterpret_cast<float4*>(v)[i];
+    float4 new_parameter = parameter, new_mean = mean, new_square = square;
+    update(new_parameter.x, gradient(4 * i), new_mean.x, new_square.x, rate, factors);
+    update(new_parameter.y, gradient(4 * i + 1), new_mean.y, new_square.y, rate, factors);
+    update(new_parameter.z, gradient(4 * i + 2), new_mean.z, new_square.z, rate, factors);
+    update(new_parameter.w, gradient(4 * i + 3), new_mean.w, new_square.w, rate, factors);
+    parameter = new_parameter, mean = new_mean, square = new_square;
+  };
+  if (poisoned == 0) {
+    each_value<kColumns>(rows, lane, quad, single);
+    return;
+  }
+  for (int i = lane; i < rows * kColumns; i += 32) single(i);
+  if (lane == 0) atomicAdd(adam.skipped + tensor, (unsigned long long)(__popc(poisoned)));
 }
 
 // Whether Adam can use these gradients: their squares too are finite.
@@ -76,14 +83,19 @@ __device__ inline bool usable_gradient(const float* v) {
 }
 
 template <int kDegree>
-__global__ void __launch_bounds__(kSplatThreads)
+__global__ void __launch_bounds__(kSplatThreads<kDegree>)
     update_splats(FrameScene scene, FrameLists lists, const float4* rows, RawGradients to, FrameAdam adam) {
-  __shared__ WarpGradients<kDegree> warps[kSplatWarps];
+  __shared__ WarpGradients<kDegree> warps[kSplatThreads<kDegree> / 32];
   const int lane = threadIdx.x & 31;
-  const int64_t first = int64_t(blockIdx.x) * kSplatThreads + threadIdx.x / 32 * 32;
+  const int64_t first = int64_t(blockIdx.x) * kSplatThreads<kDegree> + threadIdx.x / 32 * 32;
   if (first >= scene.count) return;
   const int count = int(scene.count - first < 32 ? scene.count - first : 32);
   WarpGradients<kDegree>& warp = warps[threadIdx.x / 32];
+  constexpr int columns[] = {3, 4, 3, 1, warp.kHarmonics};
+  for (int i = 0; i < kRateCount; ++i) {
+    prefetch(adam.first[i] + first * columns[i], count * columns[i], lane);
+    prefetch(adam.second[i] + first * columns[i], count * columns[i], lane);
+  }
   warp.compute(scene, lists, rows, first, count, lane);
 
   float raw[kRawColumns], sh[warp.kHarmonics];
@@ -124,7 +136,7 @@ void splat_gradients_adam_on_device(const FrameScene& scene, const FrameLists& l
                                     const RawGradients& to, const FrameAdam& adam, cudaStream_t stream) {
   if (scene.count == 0) return;
   with_degree(scene.bases, [&](auto degree) {
-    update_splats<decltype(degree)::value>
-        <<<blocks_for(scene.count, kSplatThreads), kSplatThreads, 0, stream>>>(scene, lists, from.rows, to, adam);
+    constexpr int kDegree = decltype(degree)::value, kBlock = kSplatThreads<kDegree>;
+    update_splats<kDegree><<<blocks_for(scene.count, kBlock), kBlock, 0, stream>>>(scene, lists, from.rows, to, adam);
   });
 }

@@ -9,68 +9,33 @@ namespace {
 
 using namespace GSPLAT_ISA;
 
-constexpr unsigned kAllLanes = 0xffffffffu;
-constexpr int kManyRows = 32;  // a splat with more is summed by the whole warp
-
+// The sum of a Gaussian's rows.
 struct SplatRow {
   float moments[6];  // sums over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
   float colors[4];   // red, green, blue, z
 };
 
-__device__ inline void add_row(const float4* row, SplatRow& sum) {
-  const float4 a = row[0], b = row[1];
-  const float2 c = *reinterpret_cast<const float2*>(row + 2);
-  const float values[10] = {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y};
-  for (int i = 0; i < 6; ++i) sum.moments[i] += values[i];
-  for (int i = 0; i < 4; ++i) sum.colors[i] += values[6 + i];
-}
-
-// The sum of `count` rows from `start` on for each lane, in an order that depends on their number alone.
-__device__ inline SplatRow sum_rows(const float4* rows, int start, int count, int lane) {
-  SplatRow sum = {};
-  if (count <= kManyRows) {
-#pragma unroll 2
-    for (int i = 0; i < count; ++i) add_row(rows + int64_t(start + i) * kRowQuads, sum);
-  }
-  for (unsigned left = __ballot_sync(kAllLanes, count > kManyRows); left != 0; left &= left - 1) {
-    const int owner = __ffs(int(left)) - 1;
-    const int first = __shfl_sync(kAllLanes, start, owner), many = __shfl_sync(kAllLanes, count, owner);
-    SplatRow part = {};
-#pragma unroll 4
-    for (int i = lane; i < many; i += 32) add_row(rows + int64_t(first + i) * kRowQuads, part);
-    for (int half = 16; half > 0; half /= 2) {
-      for (float& value : part.moments) value += __shfl_xor_sync(kAllLanes, value, half);
-      for (float& value : part.colors) value += __shfl_xor_sync(kAllLanes, value, half);
-    }
-    if (lane == owner) sum = part;
-  }
-  return sum;
-}
-
-// A Gaussian as the forward pass saw it: deformed and activated.
-struct SeenSplat {
-  float mean[3], quat[4], scales[3], opacity, color[3];  // the colour: what a field adds to its first coefficient
+// A Gaussian as the forward pass saw it, deformed but not yet activated; `color` is what a field adds to its first coefficient.
+struct RawSplat {
+  float mean[3], quat[4], log_scales[3], logit, color[3];
 };
 
-__device__ inline SeenSplat seen_splat(const FrameScene& scene, int64_t n) {
-  SeenSplat s = {};
+__device__ inline RawSplat raw_splat(const FrameScene& scene, int64_t n) {
+  RawSplat s = {};
   const float4 q = reinterpret_cast<const float4*>(scene.quats)[n];
-  const float quat[4] = {q.x, q.y, q.z, q.w};
+  s.quat[0] = q.x, s.quat[1] = q.y, s.quat[2] = q.z, s.quat[3] = q.w;
   for (int k = 0; k < 3; ++k) s.mean[k] = scene.means[3 * n + k];
-  for (int k = 0; k < 4; ++k) s.quat[k] = quat[k];
-  for (int k = 0; k < 3; ++k) s.scales[k] = scene.log_scales[3 * n + k];
-  float logit = scene.logit_opacities[n];
+  for (int k = 0; k < 3; ++k) s.log_scales[k] = scene.log_scales[3 * n + k];
+  s.logit = scene.logit_opacities[n];
   if (scene.deltas != nullptr) {
     const float4* const row = reinterpret_cast<const float4*>(scene.deltas) + n * (kRawColumns / 4);
     const float4 a = row[0], b = row[1], c = row[2], d = row[3];
     s.mean[0] += a.x, s.mean[1] += a.y, s.mean[2] += a.z;
     s.quat[0] += a.w, s.quat[1] += b.x, s.quat[2] += b.y, s.quat[3] += b.z;
-    s.scales[0] += b.w, s.scales[1] += c.x, s.scales[2] += c.y;
+    s.log_scales[0] += b.w, s.log_scales[1] += c.x, s.log_scales[2] += c.y;
     s.color[0] = c.z, s.color[1] = c.w, s.color[2] = d.x;
-    logit += d.y;
+    s.logit += d.y;
   }
-  for (float& value : s.scales) value = expf(value);
-  s.opacity = 1.0f / (1.0f + expf(-logit));
   return s;
 }
 
@@ -80,7 +45,7 @@ struct RawGradient {
 };
 
 template <CameraModel model>
-__device__ inline RawGradient projection_gradient(const FrameScene& scene, const SeenSplat& splat, const SplatRow& sum) {
+__device__ inline RawGradient projection_gradient(const FrameScene& scene, const RawSplat& splat, const SplatRow& sum) {
   ProjectionInput in = {};
   in.viewmat = scene.viewmat;
   in.intrinsics = scene.intrinsics;
@@ -88,7 +53,9 @@ __device__ inline RawGradient projection_gradient(const FrameScene& scene, const
   in.height = float(scene.height);
   in.eps2d = scene.eps2d;
   const View<model> view(in);
-  const Geometry geometry = geometry_of(splat.quat, splat.scales);
+  float scales[3];
+  for (int k = 0; k < 3; ++k) scales[k] = expf(splat.log_scales[k]);
+  const Geometry geometry = geometry_of(splat.quat, scales);
   const Ellipse e = ellipse_of(view, Projector<model>::forward(view.k, view.to_camera(splat.mean)), geometry.sigma);
   const float a = e.a0 + scene.eps2d, c = e.c0 + scene.eps2d, inverse = 1.0f / (a * c - e.b * e.b);
   const float conic[3] = {c * inverse, -e.b * inverse, a * inverse};
@@ -101,12 +68,12 @@ __device__ inline RawGradient projection_gradient(const FrameScene& scene, const
   RawGradient to = {};
   for (int k = 0; k < 3; ++k) to.mean[k] = back.mean[k];
   for (int k = 0; k < 4; ++k) to.quat[k] = back.quat[k];
-  for (int k = 0; k < 3; ++k) to.log_scales[k] = back.scales[k] * splat.scales[k];
-  to.logit = m[0] * (1 - splat.opacity);
+  for (int k = 0; k < 3; ++k) to.log_scales[k] = back.scales[k] * scales[k];
+  to.logit = m[0] / (1.0f + expf(splat.logit));  // dL/dlogit = o (1 - o) dL/do, and m[0] is o dL/do
   return to;
 }
 
-__device__ inline RawGradient projection_gradient(const FrameScene& scene, const SeenSplat& splat, const SplatRow& sum) {
+__device__ inline RawGradient projection_gradient(const FrameScene& scene, const RawSplat& splat, const SplatRow& sum) {
   switch (scene.camera_model) {
     case kOrtho: return projection_gradient<kOrtho>(scene, splat, sum);
     case kFisheye: return projection_gradient<kFisheye>(scene, splat, sum);
@@ -120,7 +87,7 @@ constexpr int kBasesOf = (kDegree + 1) * (kDegree + 1);
 // The colour's way back: to the direction, and so to the mean, and to the coefficients c, which their gradient replaces. A
 // channel that was raised to zero passes nothing on.
 template <int kDegree>
-__device__ inline void harmonics_gradient(const FrameScene& scene, const SeenSplat& splat, const float* v_color,
+__device__ inline void harmonics_gradient(const FrameScene& scene, const RawSplat& splat, const float* v_color,
                                           float (&c)[3 * kBasesOf<kDegree>], RawGradient& to) {
   constexpr int kBases = kBasesOf<kDegree>;
   float direction[3], b[kBases];

@@ -6,11 +6,11 @@
 namespace {
 
 template <int kDegree>
-__global__ void __launch_bounds__(kSplatThreads)
+__global__ void __launch_bounds__(kSplatThreads<kDegree>)
     gradients_of_splats(FrameScene scene, FrameLists lists, const float4* rows, RawGradients to) {
-  __shared__ WarpGradients<kDegree> warps[kSplatWarps];
+  __shared__ WarpGradients<kDegree> warps[kSplatThreads<kDegree> / 32];
   const int lane = threadIdx.x & 31;
-  const int64_t first = int64_t(blockIdx.x) * kSplatThreads + threadIdx.x / 32 * 32;
+  const int64_t first = int64_t(blockIdx.x) * kSplatThreads<kDegree> + threadIdx.x / 32 * 32;
   if (first >= scene.count) return;
   const int count = int(scene.count - first < 32 ? scene.count - first : 32);
   WarpGradients<kDegree>& warp = warps[threadIdx.x / 32];
@@ -26,7 +26,7 @@ void splat_gradients_on_device(const FrameScene& scene, const FrameLists& lists,
                                const RawGradients& to, cudaStream_t stream) {
   if (scene.count == 0) return;
   with_degree(scene.bases, [&](auto degree) {
-    gradients_of_splats<decltype(degree)::value>
-        <<<blocks_for(scene.count, kSplatThreads), kSplatThreads, 0, stream>>>(scene, lists, from.rows, to);
+    constexpr int kDegree = decltype(degree)::value, kBlock = kSplatThreads<kDegree>;
+    gradients_of_splats<kDegree><<<blocks_for(scene.count, kBlock), kBlock, 0, stream>>>(scene, lists, from.rows, to);
   });
 }

@@ -10,12 +10,14 @@ import torch
 from torch import Tensor
 
 from gsplat_core import fully_fused_projection, spherical_harmonics
+from gsplat_core.ops.frame.frame_gradients import DC, RawGradients, render_frame_backward
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.reference.frame import render_frame as reference_frame
 from gsplat_core.render_settings import FAR_PLANE, NEAR_PLANE
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
 TILE = 16
+COLUMNS = {"means": slice(0, 3), "quats": slice(3, 7), "log_scales": slice(7, 10), "logit_opacities": 13}
 
 
 class Forward(NamedTuple):
@@ -188,3 +190,28 @@ def forward_of_plain_ops(scene: FrameScene) -> Forward:
         ids[order],
         status,
     )
+
+
+def lists_of(forward: Forward) -> tuple[Tensor, ...]:
+    """In the order of the raw ops' arguments."""
+    f = forward
+    return f.records, f.tile_offsets, f.sorted, f.splat_starts, f.instance_splats, f.status, f.alphas, f.last
+
+
+def on_gpu(scene: FrameScene) -> FrameScene:
+    return scene.to("cuda")
+
+
+def backward(scene: FrameScene, forward: Forward | None = None, with_alphas: bool = True) -> RawGradients:
+    """The gradients of `scene.picture_gradients`; the scene is on the GPU."""
+    v_image, v_alphas = scene.picture_gradients(with_alphas)
+    return render_frame_backward(
+        scene.gaussians, scene.deltas, scene.viewmat, scene.K, scene.background, forward or forward_of_plain_ops(scene),
+        v_image.cuda(), None if v_alphas is None else v_alphas.cuda(), camera_model=scene.camera_model,
+    )  # fmt: skip
+
+
+def by_name(gradients: RawGradients, bases: int) -> dict[str, Tensor]:
+    named = {name: gradients.raw[:, columns] for name, columns in COLUMNS.items()}
+    named["sh"] = gradients.sh if bases > 1 else gradients.raw[:, None, DC]
+    return {name: value.cpu().double() for name, value in named.items()}
