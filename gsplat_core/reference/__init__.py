@@ -12,9 +12,8 @@ from gsplat_core.reference.deformation import (
     hexplane_modulate,
     hexplane_space,
 )
-from gsplat_core.reference.image_loss import frame_loss, image_loss
 from gsplat_core.reference.frame import render_frame
-from gsplat_core.reference.image_loss import image_loss
+from gsplat_core.reference.image_loss import frame_loss, image_loss
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
