@@ -13,7 +13,7 @@ from gsplat_core.reference.deformation import (
     hexplane_space,
 )
 from gsplat_core.reference.frame import render_frame
-from gsplat_core.reference.image_loss import image_loss
+from gsplat_core.reference.image_loss import frame_loss, image_loss
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
@@ -25,6 +25,7 @@ __all__ = [
     "basis_field",
     "basis_field_backward",
     "basis_field_backward_adam_",
+    "frame_loss",
     "fully_fused_projection",
     "hexplane_decode",
     "hexplane_features",
