@@ -3,73 +3,80 @@
 namespace {
 
 constexpr int kScanThreads = 1024;
-constexpr int kScanEach = 4;
-constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
+constexpr int kScanEach = 8;
+constexpr uint32_t kMost = 0x7fffffffu;  // sums stop here: min(a + b, kMost) is associative
 
-// The sums of all threads up to this one and of the whole block.
+__device__ inline uint32_t add(uint32_t a, uint32_t b) { return min(a + b, kMost); }
+
+// The sums of all threads up to this one and of the whole block. `of_warps` may be used again after the next barrier.
 struct BlockSum {
-  int64_t through, all;
+  uint32_t before, all;
 };
-__device__ inline BlockSum sum_over_block(int64_t value, int64_t* of_warps) {
-  const int lane = threadIdx.x & 31, warp = threadIdx.x / 32, warps = int(blockDim.x) / 32;
+__device__ inline uint32_t sum_up_to_lane(uint32_t value) {
   for (int step = 1; step < 32; step *= 2) {
-    const int64_t before = __shfl_up_sync(kAll, value, step);
-    if (lane >= step) value += before;
+    const uint32_t before = __shfl_up_sync(kAll, value, step);
+    if ((threadIdx.x & 31) >= step) value = add(value, before);
   }
-  if (lane == 31) of_warps[warp] = value;
+  return value;
+}
+__device__ inline BlockSum sum_over_block(uint32_t value, uint32_t* of_warps) {
+  const int lane = threadIdx.x & 31, warp = threadIdx.x / 32, warps = int(blockDim.x) / 32;
+  const uint32_t through = sum_up_to_lane(value), before = __shfl_up_sync(kAll, through, 1);
+  if (lane == 31) of_warps[warp] = through;
   __syncthreads();
-  if (warp == 0) {
-    int64_t sum = lane < warps ? of_warps[lane] : 0;
-    for (int step = 1; step < 32; step *= 2) {
-      const int64_t before = __shfl_up_sync(kAll, sum, step);
-      if (lane >= step) sum += before;
-    }
-    of_warps[lane] = sum;
-  }
-  __syncthreads();
-  const BlockSum result = {value + (warp > 0 ? of_warps[warp - 1] : 0), of_warps[warps - 1]};
-  __syncthreads();
-  return result;
+  // Every warp sums the warps for itself, which saves a barrier.
+  const uint32_t sums = sum_up_to_lane(lane < warps ? of_warps[lane] : 0);
+  const uint32_t in_front = __shfl_sync(kAll, sums, max(warp - 1, 0));
+  return {add(warp > 0 ? in_front : 0, lane > 0 ? before : 0), __shfl_sync(kAll, sums, 31)};
 }
 
-// write(i, the sum of counts in front of i) for i from 0 to count, by one block; returns the sum of all.
+// write(i, the sum of the counts in front of i) for i from 0 to count - 1, by one block; returns the sum of all. `counts` begin
+// at a multiple of 16 bytes and can be read to a multiple of 4 of them.
 template <class Write>
-__device__ inline int64_t scan_counts(const int32_t* counts, int64_t count, int& most, const Write& write) {
-  __shared__ int64_t of_warps[32];
-  int64_t in_front = 0;
-  for (int64_t first = 0; first < count; first += kScanThreads * kScanEach) {
-    int values[kScanEach];
-    int64_t mine = 0;
-    const int64_t at = first + threadIdx.x * kScanEach;
+__device__ inline uint32_t scan_counts(const int32_t* counts, int64_t count, uint32_t& most, const Write& write) {
+  __shared__ uint32_t of_warps[2][32];
+  uint32_t values[kScanEach];
+  const auto load = [&](int64_t at) {
+    for (int k = 0; k < kScanEach; k += 4) {
+      if (at + k + 3 < count) {
+        const int4 four = *reinterpret_cast<const int4*>(counts + at + k);
+        values[k] = uint32_t(four.x), values[k + 1] = uint32_t(four.y);
+        values[k + 2] = uint32_t(four.z), values[k + 3] = uint32_t(four.w);
+      } else {
+        for (int j = k; j < k + 4; ++j) values[j] = at + j < count ? uint32_t(counts[at + j]) : 0;
+      }
+    }
+  };
+  uint32_t in_front = 0;
+  int64_t at = int64_t(threadIdx.x) * kScanEach;
+  load(at);
+  for (int64_t first = 0; first < count; first += kScanThreads * kScanEach, at += kScanThreads * kScanEach) {
+    uint32_t starts[kScanEach], mine = 0;
     for (int k = 0; k < kScanEach; ++k) {
-      values[k] = at + k < count ? counts[at + k] : 0;
+      starts[k] = mine;
+      mine = add(mine, values[k]);
       most = max(most, values[k]);
-      mine += values[k];
     }
-    const BlockSum sum = sum_over_block(mine, of_warps);
-    int64_t start = in_front + sum.through - mine;
-    for (int k = 0; k < kScanEach; ++k) {
-      if (at + k < count) write(at + k, start);
-      start += values[k];
-    }
-    in_front += sum.all;
+    load(at + kScanThreads * kScanEach);  // on its way meanwhile
+    const BlockSum sum = sum_over_block(mine, of_warps[first / (kScanThreads * kScanEach) & 1]);
+    for (int k = 0; k < kScanEach; ++k)
+      if (at + k < count) write(at + k, add(in_front, add(sum.before, starts[k])));
+    in_front = add(in_front, sum.all);
   }
   return in_front;
 }
 
-__device__ inline int32_t capped(int64_t value) { return int32_t(value < kMostInts ? value : kMostInts); }
-
 // The first block has the tiles, the second one, when training, the blocks of Gaussians.
 __global__ void __launch_bounds__(kScanThreads) scan(FrameScene in, FrameLists lists, FrameScratch scratch, int64_t blocks) {
-  __shared__ int most_of_warps[32];
-  int most = 0;
+  __shared__ uint32_t most_of_warps[32];
+  uint32_t most = 0;
   if (blockIdx.x == 1) {
-    scan_counts(scratch.sums, blocks, most, [&](int64_t i, int64_t start) { scratch.starts[i] = uint32_t(capped(start)); });
+    scan_counts(scratch.sums, blocks, most, [&](int64_t i, uint32_t start) { scratch.starts[i] = start; });
     return;
   }
-  const int64_t all = scan_counts(scratch.counts, in.tiles(), most, [&](int64_t i, int64_t start) {
-    lists.tile_offsets[i] = capped(start);
-    scratch.cursors[i] = uint32_t(capped(start));
+  const uint32_t all = scan_counts(scratch.counts, in.tiles(), most, [&](int64_t i, uint32_t start) {
+    lists.tile_offsets[i] = int32_t(start);
+    scratch.cursors[i] = start;
   });
   most = __reduce_max_sync(kAll, most);
   if (threadIdx.x % 32 == 0) most_of_warps[threadIdx.x / 32] = most;
@@ -77,9 +84,9 @@ __global__ void __launch_bounds__(kScanThreads) scan(FrameScene in, FrameLists l
   if (threadIdx.x >= 32) return;
   most = __reduce_max_sync(kAll, most_of_warps[threadIdx.x]);
   if (threadIdx.x > 0) return;
-  lists.tile_offsets[in.tiles()] = capped(all);
-  lists.status[kStatusNeeded] = capped(all);
-  lists.status[kStatusMost] = most;
+  lists.tile_offsets[in.tiles()] = int32_t(all);
+  lists.status[kStatusNeeded] = int32_t(all);
+  lists.status[kStatusMost] = int32_t(most);
   lists.status[kStatusCut] = all > lists.capacity;
   lists.status[kStatusCut + 1] = 0;
 }
@@ -122,26 +129,20 @@ __global__ void __launch_bounds__(kFrameThreads) fill(FrameScene in, FrameLists 
   const int small = footprint.small_count();
   uint32_t start = 0;
   if constexpr (training) {
-    __shared__ int64_t of_warps[32];
-    int tiles = small;
+    __shared__ uint32_t of_warps[32];
+    uint32_t tiles = uint32_t(small);
     for (unsigned large = any_large; large != 0; large &= large - 1) {
       const int owner = __ffs(int(large)) - 1;
       const int count = for_large_tiles(footprint, records, n, owner, in.tile_width, [](int, int) {});
-      if (lane == owner) tiles = count;
+      if (lane == owner) tiles = uint32_t(count);
     }
-    const BlockSum sum = sum_over_block(tiles, of_warps);
-    start = uint32_t(capped(scratch.starts[blockIdx.x] + sum.through - tiles));
+    start = add(scratch.starts[blockIdx.x], sum_over_block(tiles, of_warps).before);
     if (n < in.count) lists.splat_starts[n] = int32_t(start);
-    if (n == in.count - 1) lists.splat_starts[n + 1] = capped(int64_t(start) + tiles);
+    if (n == in.count - 1) lists.splat_starts[n + 1] = int32_t(add(start, tiles));
   }
 
   // A splat has one tile or thirty: the warp's are written down first and then dealt out evenly.
-  int through = small;
-  for (int step = 1; step < 32; step *= 2) {
-    const int before = __shfl_up_sync(kAll, through, step);
-    if (lane >= step) through += before;
-  }
-  const int first = through - small, all = __shfl_sync(kAll, through, 31);
+  const int through = int(sum_up_to_lane(uint32_t(small))), first = through - small, all = __shfl_sync(kAll, through, 31);
   uint32_t* const list = touched[threadIdx.x / 32];
   for_small_tiles(footprint, in.tile_width, [&](int tile, int j) { list[first + j] = uint32_t(lane) << 26 | uint32_t(tile); });
   __syncwarp();
