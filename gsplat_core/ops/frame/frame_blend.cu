@@ -1,5 +1,6 @@
 #include "../compositing/blend_forward.cuh"
 #include "frame_cuda.h"
+#include "frame_launch.cuh"
 #include "frame_sort.cuh"
 
 namespace {
@@ -72,6 +73,7 @@ struct TileSplats {
 
 template <bool training>
 __global__ void __launch_bounds__(kBlockThreads) blend(FrameScene in, FrameLists lists, FramePixels out) {
+  wait_for_kernel_in_front();
   __shared__ BlendRoom room;
   const int begin = int(min(int64_t(lists.tile_offsets[blockIdx.x]), lists.capacity));
   const int end = int(min(int64_t(lists.tile_offsets[blockIdx.x + 1]), lists.capacity));
@@ -104,5 +106,5 @@ __global__ void __launch_bounds__(kBlockThreads) blend(FrameScene in, FrameLists
 void blend_frame(const FrameScene& in, const FrameLists& lists, const FramePixels& out, cudaStream_t stream) {
   if (in.tiles() == 0) return;
   const auto kernel = lists.splat_starts != nullptr ? blend<true> : blend<false>;
-  kernel<<<unsigned(in.tiles()), kBlockThreads, 0, stream>>>(in, lists, out);
+  launch_behind(kernel, unsigned(in.tiles()), kBlockThreads, stream, in, lists, out);
 }

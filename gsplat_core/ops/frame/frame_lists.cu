@@ -1,4 +1,5 @@
 #include "frame_footprint.cuh"
+#include "frame_launch.cuh"
 
 namespace {
 
@@ -59,24 +60,41 @@ __device__ inline uint32_t scan_counts(const int32_t* counts, int64_t count, uin
     }
     load(at + kScanThreads * kScanEach);  // on its way meanwhile
     const BlockSum sum = sum_over_block(mine, of_warps[first / (kScanThreads * kScanEach) & 1]);
-    for (int k = 0; k < kScanEach; ++k)
-      if (at + k < count) write(at + k, add(in_front, add(sum.before, starts[k])));
+    const uint32_t before = add(in_front, sum.before);
+    for (int k = 0; k < kScanEach; k += 4) {
+      const uint4 four =
+          make_uint4(add(before, starts[k]), add(before, starts[k + 1]), add(before, starts[k + 2]), add(before, starts[k + 3]));
+      if (at + k < count) write(at + k, four);
+    }
     in_front = add(in_front, sum.all);
   }
   return in_front;
 }
 
+// Those of the four that are in front of `count`.
+__device__ inline void store_four(uint32_t* to, int64_t at, int64_t count, uint4 four) {
+  if (at + 3 < count) {
+    *reinterpret_cast<uint4*>(to + at) = four;
+  } else {
+    to[at] = four.x;
+    if (at + 1 < count) to[at + 1] = four.y;
+    if (at + 2 < count) to[at + 2] = four.z;
+  }
+}
+
 // The first block has the tiles, the second one, when training, the blocks of Gaussians.
 __global__ void __launch_bounds__(kScanThreads) scan(FrameScene in, FrameLists lists, FrameScratch scratch, int64_t blocks) {
+  let_kernel_behind_come();
+  wait_for_kernel_in_front();
   __shared__ uint32_t most_of_warps[32];
   uint32_t most = 0;
   if (blockIdx.x == 1) {
-    scan_counts(scratch.sums, blocks, most, [&](int64_t i, uint32_t start) { scratch.starts[i] = start; });
+    scan_counts(scratch.sums, blocks, most, [&](int64_t i, uint4 starts) { store_four(scratch.starts, i, blocks, starts); });
     return;
   }
-  const uint32_t all = scan_counts(scratch.counts, in.tiles(), most, [&](int64_t i, uint32_t start) {
-    lists.tile_offsets[i] = int32_t(start);
-    scratch.cursors[i] = start;
+  const uint32_t all = scan_counts(scratch.counts, in.tiles(), most, [&](int64_t i, uint4 starts) {
+    store_four(reinterpret_cast<uint32_t*>(lists.tile_offsets), i, in.tiles(), starts);
+    store_four(scratch.cursors, i, in.tiles(), starts);
   });
   most = __reduce_max_sync(kAll, most);
   if (threadIdx.x % 32 == 0) most_of_warps[threadIdx.x / 32] = most;
@@ -114,6 +132,8 @@ constexpr int kAtOnce = 4;  // reservations of a thread that are on their way to
 // One key per splat and tile, in any order within the tile: sorting puts them into the one that they have every time.
 template <bool training>
 __global__ void __launch_bounds__(kFrameThreads) fill(FrameScene in, FrameLists lists, FrameScratch scratch) {
+  let_kernel_behind_come();
+  wait_for_kernel_in_front();
   __shared__ uint32_t touched[kFrameThreads / 32][32 * 32];  // by each warp's small splats: lane << 26 | tile
   const int64_t n = int64_t(blockIdx.x) * kFrameThreads + threadIdx.x;
   const int lane = threadIdx.x & 31;
@@ -181,7 +201,7 @@ __global__ void no_splats(int32_t* splat_starts) { splat_starts[0] = 0; }
 void scan_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream) {
   const int64_t blocks = scratch.sums != nullptr ? blocks_for(in.count, kFrameThreads) : 0;
   const unsigned parts = blocks > 0 ? 2 : 1;
-  scan<<<parts, kScanThreads, 0, stream>>>(in, lists, scratch, blocks);
+  launch_behind(scan, parts, kScanThreads, stream, in, lists, scratch, blocks);
 }
 
 void fill_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream) {
@@ -191,5 +211,5 @@ void fill_frame(const FrameScene& in, const FrameLists& lists, const FrameScratc
     return;
   }
   const auto kernel = training ? fill<true> : fill<false>;
-  kernel<<<blocks_for(in.count, kFrameThreads), kFrameThreads, 0, stream>>>(in, lists, scratch);
+  launch_behind(kernel, blocks_for(in.count, kFrameThreads), kFrameThreads, stream, in, lists, scratch);
 }

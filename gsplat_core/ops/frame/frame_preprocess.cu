@@ -1,6 +1,7 @@
 #include "../spherical_harmonics/spherical_harmonics_bases.h"
 #include "frame_footprint.cuh"
 #include "frame_gaussian.cuh"
+#include "frame_launch.cuh"
 
 using namespace GSPLAT_ISA;
 
@@ -77,6 +78,7 @@ constexpr float kConstantBase = 0.28209479177387814f;
 template <int degree>
 __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
     preprocess(FrameScene in, FrameLists lists, FrameScratch scratch) {
+  let_kernel_behind_come();
   __shared__ FrameCamera camera;
   __shared__ StagedHarmonics<degree> harmonics[kFrameThreads / 32];
   const int64_t n = int64_t(blockIdx.x) * kFrameThreads + threadIdx.x;
