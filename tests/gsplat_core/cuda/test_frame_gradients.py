@@ -20,6 +20,7 @@ from tests.gsplat_core.cuda.frame_scenes import (
     frame_scene,
     lists_of,
     on_gpu,
+    rendered,
 )
 
 pytestmark = pytest.mark.cuda
@@ -74,6 +75,13 @@ def test_any_image_size(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize("count", [1, 31, 33, 129])
 def test_any_number_of_gaussians(count: int) -> None:
     check(frame_scene(count, degree=3, median_px=6.0, deltas=True))
+
+
+def test_lists_of_the_plain_ops_serve_as_well() -> None:
+    scene = on_gpu(frame_scene(400, degree=2, deltas=True))
+    seen, wanted = backward(scene, forward_of_plain_ops(scene)), backward(scene)
+    for s, w in zip(seen, wanted, strict=True):
+        assert (s - w).norm() <= 1e-4 * w.norm()
 
 
 def test_no_gaussians_at_all() -> None:
@@ -155,14 +163,14 @@ def test_strided_and_misaligned_inputs_give_the_same_bits() -> None:
 
     for change in (shifted, strided):
         values = {name: change(getattr(scene, name)) for name in (*NAMES, "deltas", "viewmat", "K", "background")}
-        seen = backward(replace(scene, **values), forward_of_plain_ops(scene))
+        seen = backward(replace(scene, **values), rendered(scene))
         assert torch.equal(seen.raw, wanted.raw)
         assert torch.equal(seen.sh, wanted.sh)
 
 
 def test_the_same_bits_every_time_and_in_a_graph() -> None:
     scene = on_gpu(frame_scene(5000, 300, 200, degree=3, deltas=True))
-    forward = forward_of_plain_ops(scene)
+    forward = rendered(scene)
     wanted = backward(scene, forward)
     assert torch.equal(backward(scene, forward).raw, wanted.raw)
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
@@ -188,7 +196,7 @@ def test_the_same_bits_every_time_and_in_a_graph() -> None:
 
 def test_a_frame_whose_lists_were_cut_has_no_gradient() -> None:
     scene = on_gpu(frame_scene(300, degree=1))
-    forward = forward_of_plain_ops(scene)
+    forward = rendered(scene)
     forward.status[2] = 1
     gradients = backward(scene, forward)
     assert not gradients.raw.any()
@@ -197,7 +205,7 @@ def test_a_frame_whose_lists_were_cut_has_no_gradient() -> None:
 
 def test_wrong_arguments_are_refused() -> None:
     scene = on_gpu(frame_scene(20, 20, 18))
-    forward = forward_of_plain_ops(scene)
+    forward = rendered(scene)
     v_image = scene.picture_gradients()[0].cuda()
     camera = (scene.viewmat, scene.K, None, forward)
     with pytest.raises(InvalidInput, match="float32"):
@@ -218,7 +226,7 @@ def test_wrong_arguments_are_refused() -> None:
 def test_op_passes_opcheck(degree: int) -> None:
     scene = on_gpu(frame_scene(30, 20, 18, degree=degree, deltas=degree > 0))
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
-    lists = lists_of(forward_of_plain_ops(scene))
+    lists = lists_of(rendered(scene))
     inputs = (scene.deltas, scene.viewmat, scene.K, scene.background, *lists, v_image, v_alphas)
     sizes = (scene.width, scene.height, 0.3, 0)
     torch.library.opcheck(torch.ops.gsplat_core.render_frame_backward.default, (*scene.gaussians, *inputs, *sizes))
