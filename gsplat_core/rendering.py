@@ -24,6 +24,7 @@ rasterization = Operations(
     isect_tiles=isect_tiles,
     bin_splats=bin_splats,
     rasterize_to_pixels=rasterize_to_pixels,
+    passes_no_zeros_on=True,
 ).rasterization
 
 

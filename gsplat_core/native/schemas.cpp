@@ -45,6 +45,12 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "bin_splats(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
       "int tile_size, int tile_width, int tile_height) -> (Tensor tiles_per_gauss, Tensor flatten_ids, Tensor isect_offsets)");
+  // The same in a list of `capacity` entries, without waiting for how many are needed: the unused ones, -1, are in front of the
+  // first tile's, and splats that do not fit, the farthest ones, are in no list. `needed` is int64 [1].
+  m.def(
+      "bin_splats_within(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, "
+      "int images, int tile_size, int tile_width, int tile_height, int capacity) -> (Tensor tiles_per_gauss, "
+      "Tensor flatten_ids, Tensor isect_offsets, Tensor needed)");
   m.def("isect_offset_encode(Tensor isect_ids, int images, int tile_width, int tile_height) -> Tensor");
 
   // Compositing: splats over pixels. `last` is the last blended position of flatten_ids per pixel, -1 where there is none.
