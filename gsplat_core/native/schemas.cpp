@@ -126,4 +126,9 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def("hexplane_space(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz) -> Tensor");
   m.def("hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
   m.def("hexplane_decode(Tensor[] spaces, Tensor coordinates, Tensor[] lines, Tensor[] weights, Tensor[] biases) -> Tensor");
+  // The field at `time`, from space features [N, C] of float32 or float16 (row i is Gaussian order[i]): deltas [N, 16]. CUDA
+  // only.
+  m.def(
+      "hexplane_deltas(Tensor[] spaces, Tensor coordinates, Tensor? order, Tensor time, Tensor[] time_planes, Tensor[] weights, "
+      "Tensor[] biases) -> Tensor");
 }
