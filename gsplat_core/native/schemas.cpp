@@ -45,6 +45,12 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "bin_splats(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
       "int tile_size, int tile_width, int tile_height) -> (Tensor tiles_per_gauss, Tensor flatten_ids, Tensor isect_offsets)");
+  // The same in a list of `capacity` entries, without waiting for how many are needed: the unused ones, -1, are in front of the
+  // first tile's, and splats that do not fit, the farthest ones, are in no list. `needed` is int64 [1].
+  m.def(
+      "bin_splats_within(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, "
+      "int images, int tile_size, int tile_width, int tile_height, int capacity) -> (Tensor tiles_per_gauss, "
+      "Tensor flatten_ids, Tensor isect_offsets, Tensor needed)");
   m.def("isect_offset_encode(Tensor isect_ids, int images, int tile_width, int tile_height) -> Tensor");
 
   // Compositing: splats over pixels. `last` is the last blended position of flatten_ids per pixel, -1 where there is none.
@@ -120,4 +126,9 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def("hexplane_space(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz) -> Tensor");
   m.def("hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
   m.def("hexplane_decode(Tensor[] spaces, Tensor coordinates, Tensor[] lines, Tensor[] weights, Tensor[] biases) -> Tensor");
+  // The field at `time`, from space features [N, C] of float32 or float16 (row i is Gaussian order[i]): deltas [N, 16]. CUDA
+  // only.
+  m.def(
+      "hexplane_deltas(Tensor[] spaces, Tensor coordinates, Tensor? order, Tensor time, Tensor[] time_planes, Tensor[] weights, "
+      "Tensor[] biases) -> Tensor");
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import torch
 from torch import Tensor
 
 from gsplat_core.pipeline import Operations
@@ -26,15 +27,25 @@ def bin_splats(
     *,
     conics: Tensor | None = None,
     opacities: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """`isect_tiles` (sorted) and `isect_offset_encode` in one."""
+    capacity: int | None = None,
+) -> tuple[Tensor, Tensor, Tensor] | tuple[Tensor, Tensor, Tensor, Tensor]:
+    """`isect_tiles` (sorted) and `isect_offset_encode` in one; with a capacity, lists of this length, as the compiled op's."""
     tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
         means2d, radii, depths, tile_size, tile_width, tile_height, packed=packed, n_images=n_images,
         image_ids=image_ids, conics=conics, opacities=opacities,
     )  # fmt: skip
     images = math.prod(depths.shape[:-1]) if n_images is None else n_images
-    offsets = isect_offset_encode(isect_ids, images, tile_width, tile_height)
-    return tiles_per_gauss, flatten_ids, offsets
+    if capacity is None:
+        return tiles_per_gauss, flatten_ids, isect_offset_encode(isect_ids, images, tile_width, tile_height)
+    counts = tiles_per_gauss.reshape(-1)
+    nearest_first = torch.argsort(depths.detach().reshape(-1).view(torch.int32).long() & 0xFFFFFFFF, stable=True)
+    fits = torch.empty_like(counts, dtype=torch.bool)
+    fits[nearest_first] = counts[nearest_first].cumsum(0) <= capacity
+    listed = fits[flatten_ids.long()]
+    unused = flatten_ids.new_full((capacity - int(listed.sum()),), -1)
+    offsets = isect_offset_encode(isect_ids[listed], images, tile_width, tile_height) + len(unused)
+    needed = torch.tensor([len(flatten_ids)], device=depths.device)
+    return tiles_per_gauss, torch.cat([unused, flatten_ids[listed]]), offsets, needed
 
 
 rasterization = Operations(

@@ -16,6 +16,7 @@ from gsplat_core.cameras import CAMERA_MODELS
 from gsplat_core.errors import InvalidInput
 from gsplat_core.gaussians import MAX_SH_DEGREE
 from gsplat_core.ops import native
+from gsplat_core.ops.frame import frame_autograd  # noqa: F401  registers the gradient
 from gsplat_core.render_settings import EPS2D, FAR_PLANE, NEAR_PLANE
 
 TILE_SIZE = 16

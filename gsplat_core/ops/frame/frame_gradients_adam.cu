@@ -83,9 +83,11 @@ __device__ inline bool usable_gradient(const float* v) {
 }
 
 template <int kDegree>
-__global__ void __launch_bounds__(kSplatThreads<kDegree>)
+__global__ void __launch_bounds__(kSplatThreads<kDegree>, kDegree < 4 ? 5 : 1)
     update_splats(FrameScene scene, FrameLists lists, const float4* rows, RawGradients to, FrameAdam adam) {
   __shared__ WarpGradients<kDegree> warps[kSplatThreads<kDegree> / 32];
+  __shared__ FrameCamera camera;
+  load_camera(scene, camera);
   const int lane = threadIdx.x & 31;
   const int64_t first = int64_t(blockIdx.x) * kSplatThreads<kDegree> + threadIdx.x / 32 * 32;
   if (first >= scene.count) return;
@@ -96,7 +98,7 @@ __global__ void __launch_bounds__(kSplatThreads<kDegree>)
     prefetch(adam.first[i] + first * columns[i], count * columns[i], lane);
     prefetch(adam.second[i] + first * columns[i], count * columns[i], lane);
   }
-  warp.compute(scene, lists, rows, first, count, lane);
+  warp.compute(scene, camera, lists, rows, first, count, lane);
 
   float raw[kRawColumns], sh[warp.kHarmonics];
   warp.raw.get(lane, raw);

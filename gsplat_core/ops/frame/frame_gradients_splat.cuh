@@ -1,8 +1,8 @@
 // From the sum of a Gaussian's rows to the gradient of its raw parameters, one Gaussian per thread.
 #pragma once
 
-#include "../projection/projection_math.h"
 #include "../spherical_harmonics/spherical_harmonics_bases.h"
+#include "frame_gaussian.cuh"
 #include "frame_gradients_cuda.h"
 
 namespace {
@@ -15,48 +15,18 @@ struct SplatRow {
   float colors[4];   // red, green, blue, z
 };
 
-// A Gaussian as the forward pass saw it, deformed but not yet activated; `color` is what a field adds to its first coefficient.
-struct RawSplat {
-  float mean[3], quat[4], log_scales[3], logit, color[3];
-};
-
-__device__ inline RawSplat raw_splat(const FrameScene& scene, int64_t n) {
-  RawSplat s = {};
-  const float4 q = reinterpret_cast<const float4*>(scene.quats)[n];
-  s.quat[0] = q.x, s.quat[1] = q.y, s.quat[2] = q.z, s.quat[3] = q.w;
-  for (int k = 0; k < 3; ++k) s.mean[k] = scene.means[3 * n + k];
-  for (int k = 0; k < 3; ++k) s.log_scales[k] = scene.log_scales[3 * n + k];
-  s.logit = scene.logit_opacities[n];
-  if (scene.deltas != nullptr) {
-    const float4* const row = reinterpret_cast<const float4*>(scene.deltas) + n * (kRawColumns / 4);
-    const float4 a = row[0], b = row[1], c = row[2], d = row[3];
-    s.mean[0] += a.x, s.mean[1] += a.y, s.mean[2] += a.z;
-    s.quat[0] += a.w, s.quat[1] += b.x, s.quat[2] += b.y, s.quat[3] += b.z;
-    s.log_scales[0] += b.w, s.log_scales[1] += c.x, s.log_scales[2] += c.y;
-    s.color[0] = c.z, s.color[1] = c.w, s.color[2] = d.x;
-    s.logit += d.y;
-  }
-  return s;
-}
-
 // The gradient of a Gaussian's raw parameters, in the order of kRawColumns.
 struct RawGradient {
   float mean[3], quat[4], log_scales[3], color[3], logit;
 };
 
 template <CameraModel model>
-__device__ inline RawGradient projection_gradient(const FrameScene& scene, const RawSplat& splat, const SplatRow& sum) {
-  ProjectionInput in = {};
-  in.viewmat = scene.viewmat;
-  in.intrinsics = scene.intrinsics;
-  in.width = float(scene.width);
-  in.height = float(scene.height);
-  in.eps2d = scene.eps2d;
+__device__ inline RawGradient projection_gradient(const FrameScene& scene, const FrameCamera& camera, const RawGaussian& gaussian,
+                                                  const SplatRow& sum) {
+  const ProjectionInput in = projection_input(scene, camera);
   const View<model> view(in);
-  float scales[3];
-  for (int k = 0; k < 3; ++k) scales[k] = expf(splat.log_scales[k]);
-  const Geometry geometry = geometry_of(splat.quat, scales);
-  const Ellipse e = ellipse_of(view, Projector<model>::forward(view.k, view.to_camera(splat.mean)), geometry.sigma);
+  const Geometry geometry = geometry_of(gaussian);
+  const Ellipse e = ellipse_of(view, Projector<model>::forward(view.k, view.to_camera(gaussian.mean)), geometry.sigma);
   const float a = e.a0 + scene.eps2d, c = e.c0 + scene.eps2d, inverse = 1.0f / (a * c - e.b * e.b);
   const float conic[3] = {c * inverse, -e.b * inverse, a * inverse};
   const float* const m = sum.moments;
@@ -64,20 +34,21 @@ __device__ inline RawGradient projection_gradient(const FrameScene& scene, const
                                sum.colors[3],
                                {-0.5f * m[3], -m[4], -0.5f * m[5]},
                                0};
-  const BackProjected back = project_backward(in, view, splat.mean, geometry, v, false, false);
+  const BackProjected back = project_backward(in, view, gaussian.mean, geometry, v, false, false);
   RawGradient to = {};
   for (int k = 0; k < 3; ++k) to.mean[k] = back.mean[k];
   for (int k = 0; k < 4; ++k) to.quat[k] = back.quat[k];
-  for (int k = 0; k < 3; ++k) to.log_scales[k] = back.scales[k] * scales[k];
-  to.logit = m[0] / (1.0f + expf(splat.logit));  // dL/dlogit = o (1 - o) dL/do, and m[0] is o dL/do
+  for (int k = 0; k < 3; ++k) to.log_scales[k] = back.scales[k] * geometry.scales[k];
+  to.logit = m[0] * (1 - opacity_of(gaussian));  // dL/dlogit = o (1 - o) dL/do, and the first moment is o dL/do
   return to;
 }
 
-__device__ inline RawGradient projection_gradient(const FrameScene& scene, const RawSplat& splat, const SplatRow& sum) {
+__device__ inline RawGradient projection_gradient(const FrameScene& scene, const FrameCamera& camera, const RawGaussian& gaussian,
+                                                  const SplatRow& sum) {
   switch (scene.camera_model) {
-    case kOrtho: return projection_gradient<kOrtho>(scene, splat, sum);
-    case kFisheye: return projection_gradient<kFisheye>(scene, splat, sum);
-    default: return projection_gradient<kPinhole>(scene, splat, sum);
+    case kOrtho: return projection_gradient<kOrtho>(scene, camera, gaussian, sum);
+    case kFisheye: return projection_gradient<kFisheye>(scene, camera, gaussian, sum);
+    default: return projection_gradient<kPinhole>(scene, camera, gaussian, sum);
   }
 }
 
@@ -87,19 +58,15 @@ constexpr int kBasesOf = (kDegree + 1) * (kDegree + 1);
 // The colour's way back: to the direction, and so to the mean, and to the coefficients c, which their gradient replaces. A
 // channel that was raised to zero passes nothing on.
 template <int kDegree>
-__device__ inline void harmonics_gradient(const FrameScene& scene, const RawSplat& splat, const float* v_color,
+__device__ inline void harmonics_gradient(const FrameCamera& camera, const RawGaussian& gaussian, const float* v_color,
                                           float (&c)[3 * kBasesOf<kDegree>], RawGradient& to) {
   constexpr int kBases = kBasesOf<kDegree>;
   float direction[3], b[kBases];
-  for (int k = 0; k < 3; ++k)  // the camera's centre is -R^T t
-    direction[k] = splat.mean[k] + scene.viewmat[k] * scene.viewmat[3] + scene.viewmat[4 + k] * scene.viewmat[7] +
-                   scene.viewmat[8 + k] * scene.viewmat[11];
-  const float inverse = 1.0f / ::sqrtf(direction[0] * direction[0] + direction[1] * direction[1] + direction[2] * direction[2]);
-  for (float& value : direction) value *= inverse;
+  const float inverse = unit_direction(camera, gaussian.mean, direction);
   bases_at<kDegree>(direction[0], direction[1], direction[2], b);
   float v[3];
   for (int j = 0; j < 3; ++j) {
-    float color = 0.5f + b[0] * splat.color[j];
+    float color = 0.5f + b[0] * gaussian.color[j];
 #pragma unroll
     for (int k = 0; k < kBases; ++k) color += b[k] * c[3 * k + j];
     v[j] = color > 0 ? v_color[j] : 0;

@@ -9,12 +9,14 @@ template <int kDegree>
 __global__ void __launch_bounds__(kSplatThreads<kDegree>)
     gradients_of_splats(FrameScene scene, FrameLists lists, const float4* rows, RawGradients to) {
   __shared__ WarpGradients<kDegree> warps[kSplatThreads<kDegree> / 32];
+  __shared__ FrameCamera camera;
+  load_camera(scene, camera);
   const int lane = threadIdx.x & 31;
   const int64_t first = int64_t(blockIdx.x) * kSplatThreads<kDegree> + threadIdx.x / 32 * 32;
   if (first >= scene.count) return;
   const int count = int(scene.count - first < 32 ? scene.count - first : 32);
   WarpGradients<kDegree>& warp = warps[threadIdx.x / 32];
-  warp.compute(scene, lists, rows, first, count, lane);
+  warp.compute(scene, camera, lists, rows, first, count, lane);
   __syncwarp();
   write_rows(warp.raw, to.raw + first * kRawColumns, count, lane);
   if (to.sh != nullptr) write_rows(warp.sh, to.sh + first * warp.kHarmonics, count, lane);

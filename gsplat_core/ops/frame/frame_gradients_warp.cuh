@@ -75,16 +75,19 @@ __device__ inline void copies_done() {
   __syncwarp();
 }
 
-// The rows that `wanted` has a bit for.
+// The rows that `wanted` has a bit for; `aligned`: `from` is at a multiple of 16 bytes.
 template <int kColumns>
-__device__ inline void start_copy(WarpRows<kColumns>& to, const float* from, int rows, unsigned wanted, int lane) {
+__device__ inline void start_copy(WarpRows<kColumns>& to, const float* from, int rows, unsigned wanted, bool aligned, int lane) {
   const auto wants = [&](int value) { return (wanted >> (value / kColumns) & 1) != 0; };
-  each_value<kColumns>(
-      rows, lane,
-      [&](int i) {
-        if (wants(4 * i) || (kColumns % 4 != 0 && wants(4 * i + 3))) start_copy<16>(&to.quad(i), from + 4 * i);
-      },
-      [&](int i) { start_copy<4>(to.values + i, from + i); });
+  const auto quad = [&](int i) {
+    if (wants(4 * i) || (kColumns % 4 != 0 && wants(4 * i + 3))) start_copy<16>(&to.quad(i), from + 4 * i);
+  };
+  const auto single = [&](int i) { start_copy<4>(to.values + to.place(i), from + i); };
+  if (aligned) {
+    each_value<kColumns>(rows, lane, quad, single);
+  } else {
+    for (int i = lane; i < rows * kColumns; i += 32) single(i);
+  }
 }
 
 template <int kColumns>
@@ -162,22 +165,22 @@ struct WarpGradients {
   };
 
   // `rows` Gaussians from `first` on.
-  __device__ void compute(const FrameScene& scene, const FrameLists& lists, const float4* instance_rows, int64_t first, int rows,
-                          int lane) {
+  __device__ void compute(const FrameScene& scene, const FrameCamera& camera, const FrameLists& lists,
+                          const float4* instance_rows, int64_t first, int rows, int lane) {
     const int64_t n = first + min(lane, rows - 1);
     const bool cut = lists.status[kStatusCut] != 0;
     const int start = lists.splat_starts[n], end = lists.splat_starts[n + 1], count = lane < rows && !cut ? end - start : 0;
-    const RawSplat splat = raw_splat(scene, n);
+    const RawGaussian gaussian = load_gaussian(scene, n);
     const unsigned seen = __ballot_sync(kAllLanes, count > 0);
-    start_copy(sh, scene.sh + first * kHarmonics, rows, seen, lane);
+    start_copy(sh, scene.sh + first * kHarmonics, rows, seen, scene.aligned, lane);
     const SplatRow sum = seen != 0 ? sum_rows(instance_rows, start, count, lane, instances) : SplatRow{};
     RawGradient g = {};
-    if (count > 0) g = projection_gradient(scene, splat, sum);
+    if (count > 0) g = projection_gradient(scene, camera, gaussian, sum);
     copies_done();
     float c[kHarmonics] = {};
     if (count > 0) {
       sh.get(lane, c);
-      harmonics_gradient<kDegree>(scene, splat, sum.colors, c, g);
+      harmonics_gradient<kDegree>(camera, gaussian, sum.colors, c, g);
     }
     sh.put(lane, c);
     raw.put(lane, {g.mean[0], g.mean[1], g.mean[2], g.quat[0], g.quat[1], g.quat[2], g.quat[3], g.log_scales[0], g.log_scales[1],

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gsplat_core import fully_fused_projection, spherical_harmonics
+from gsplat_core.ops.frame.frame import Frame, render_frame
 from gsplat_core.ops.frame.frame_gradients import DC, RawGradients, render_frame_backward
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.reference.frame import render_frame as reference_frame
@@ -18,20 +18,6 @@ from gsplat_core.render_settings import FAR_PLANE, NEAR_PLANE
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
 TILE = 16
 COLUMNS = {"means": slice(0, 3), "quats": slice(3, 7), "log_scales": slice(7, 10), "logit_opacities": 13}
-
-
-class Forward(NamedTuple):
-    """What a training forward pass leaves."""
-
-    image: Tensor
-    alphas: Tensor
-    last: Tensor
-    records: Tensor
-    tile_offsets: Tensor
-    sorted: Tensor
-    splat_starts: Tensor
-    instance_splats: Tensor
-    status: Tensor
 
 
 @dataclass(frozen=True)
@@ -137,7 +123,18 @@ def frame_scene(
     )
 
 
-def forward_of_plain_ops(scene: FrameScene) -> Forward:
+def rendered(scene: FrameScene) -> Frame:
+    """The forward pass of a training step; the scene is on the GPU."""
+    tiles = math.ceil(scene.width / TILE) * math.ceil(scene.height / TILE)
+    frame = render_frame(
+        *scene.gaussians, scene.deltas, scene.viewmat, scene.K, scene.background, scene.width, scene.height,
+        1 + tiles * len(scene.means), camera_model=scene.camera_model, training=True,
+    )  # fmt: skip
+    assert not frame.status[2]
+    return frame
+
+
+def forward_of_plain_ops(scene: FrameScene) -> Frame:
     """The lists and records of a scene on the GPU, composed of projection, harmonics, binning and compositing."""
     raw = torch.cat([*scene.gaussians[:3], scene.sh[:, 0], scene.logit_opacities[:, None]], 1)
     if scene.deltas is not None:
@@ -179,7 +176,7 @@ def forward_of_plain_ops(scene: FrameScene) -> Forward:
     records = torch.cat([means2d, coefficients, zero + math.inf, channels, zero], 1)
     end = torch.tensor([len(ids)], dtype=torch.int32, device=ids.device)
     status = torch.tensor([len(ids), 0, 0, 0], dtype=torch.int32, device=ids.device)
-    return Forward(
+    return Frame(
         image[0],
         alphas[0, ..., 0],
         last[0],
@@ -192,7 +189,7 @@ def forward_of_plain_ops(scene: FrameScene) -> Forward:
     )
 
 
-def lists_of(forward: Forward) -> tuple[Tensor, ...]:
+def lists_of(forward: Frame) -> tuple[Tensor, ...]:
     """In the order of the raw ops' arguments."""
     f = forward
     return f.records, f.tile_offsets, f.sorted, f.splat_starts, f.instance_splats, f.status, f.alphas, f.last
@@ -202,11 +199,11 @@ def on_gpu(scene: FrameScene) -> FrameScene:
     return scene.to("cuda")
 
 
-def backward(scene: FrameScene, forward: Forward | None = None, with_alphas: bool = True) -> RawGradients:
+def backward(scene: FrameScene, forward: Frame | None = None, with_alphas: bool = True) -> RawGradients:
     """The gradients of `scene.picture_gradients`; the scene is on the GPU."""
     v_image, v_alphas = scene.picture_gradients(with_alphas)
     return render_frame_backward(
-        scene.gaussians, scene.deltas, scene.viewmat, scene.K, scene.background, forward or forward_of_plain_ops(scene),
+        scene.gaussians, scene.deltas, scene.viewmat, scene.K, scene.background, forward or rendered(scene),
         v_image.cuda(), None if v_alphas is None else v_alphas.cuda(), camera_model=scene.camera_model,
     )  # fmt: skip
 

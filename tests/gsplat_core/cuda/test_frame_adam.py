@@ -9,18 +9,18 @@ import pytest
 import torch
 from torch import Tensor
 
+from gsplat_core.ops.frame.frame import Frame
 from gsplat_core.ops.frame.frame_gradients import render_frame_backward_adam_
 from gsplat_core.reference.adam import adam_step
 from tests.gsplat_core.cuda.frame_scenes import (
     NAMES,
-    Forward,
     FrameScene,
     backward,
     by_name,
-    forward_of_plain_ops,
     frame_scene,
     lists_of,
     on_gpu,
+    rendered,
 )
 
 pytestmark = pytest.mark.cuda
@@ -39,7 +39,7 @@ class AdamState:
 
     def step(
         self,
-        forward: Forward,
+        forward: Frame,
         number: int,
         scale: float = 1.0,
         dtype: torch.dtype = torch.int64,
@@ -62,7 +62,7 @@ def test_fused_adam_is_the_gradient_and_then_adam(degree: int, dtype: torch.dtyp
     scene.logit_opacities[5] = math.nan
     state = AdamState(scene)
     for number in (1, 2, 1000):
-        forward = forward_of_plain_ops(state.scene)
+        forward = rendered(state.scene)
         gradients = backward(state.scene, forward)
         named = by_name(gradients, scene.sh.shape[1])
         expected = [[t.double().cpu() for t in group] for group in (state.scene.gaussians, state.first, state.second)]
@@ -80,7 +80,7 @@ def test_fused_adam_is_the_gradient_and_then_adam(degree: int, dtype: torch.dtyp
 def test_fused_adam_leaves_rows_alone_whose_gradient_is_not_finite() -> None:
     scene = on_gpu(frame_scene(100, degree=1))
     state = AdamState(scene)
-    raw = state.step(forward_of_plain_ops(scene), 1, scale=1e30)
+    raw = state.step(rendered(scene), 1, scale=1e30)
     assert raw is not None
     hidden = ~backward(scene).raw.any(1)
     for tensor, before, first in zip(state.scene.gaussians, scene.gaussians, state.first, strict=True):
@@ -95,7 +95,7 @@ def test_fused_adam_leaves_rows_alone_whose_gradient_is_not_finite() -> None:
 
 def test_fused_adam_without_raw_gradients_and_twice_the_same() -> None:
     scene = on_gpu(frame_scene(1000, 200, 100, degree=3))
-    forward = forward_of_plain_ops(scene)
+    forward = rendered(scene)
     states = [AdamState(scene) for _ in range(2)]
     for state, needs_raw in zip(states, (True, False), strict=True):
         assert (state.step(forward, 1, needs_raw=needs_raw) is None) != needs_raw
@@ -105,7 +105,7 @@ def test_fused_adam_without_raw_gradients_and_twice_the_same() -> None:
 
 def test_fused_adam_reads_rates_and_step_from_the_device_in_a_graph() -> None:
     scene = on_gpu(frame_scene(500, 100, 80, degree=3))
-    forward = forward_of_plain_ops(scene)
+    forward = rendered(scene)
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
     graphed, plain = AdamState(scene), AdamState(scene)
     rates, number = torch.zeros(5, device="cuda"), torch.ones(1, dtype=torch.int32, device="cuda")
@@ -131,7 +131,7 @@ def test_fused_adam_reads_rates_and_step_from_the_device_in_a_graph() -> None:
 
 def test_a_frame_whose_lists_were_cut_changes_nothing() -> None:
     scene = on_gpu(frame_scene(300, degree=1))
-    forward = forward_of_plain_ops(scene)
+    forward = rendered(scene)
     forward.status[2] = 1
     state = AdamState(scene)
     raw = state.step(forward, 1)
@@ -146,7 +146,7 @@ def test_op_passes_opcheck(degree: int) -> None:
     scene = on_gpu(frame_scene(30, 20, 18, degree=degree, deltas=degree > 0))
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
     state = AdamState(scene)
-    lists = lists_of(forward_of_plain_ops(scene))
+    lists = lists_of(rendered(scene))
     inputs = (scene.deltas, scene.viewmat, scene.K, scene.background, *lists, v_image, v_alphas)
     rates, step = torch.full((5,), 0.01, device="cuda"), torch.ones(1, dtype=torch.int64, device="cuda")
     moments = (*state.first, *state.second, rates, step, state.skipped)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core import InvalidInput
+from gsplat_core.ops.frame.frame import render_frame
 from gsplat_core.ops.frame.frame_gradients import DC, RawGradients, render_frame_backward
 from tests.gsplat_core.cuda.frame_scenes import (
     NAMES,
@@ -20,6 +21,7 @@ from tests.gsplat_core.cuda.frame_scenes import (
     frame_scene,
     lists_of,
     on_gpu,
+    rendered,
 )
 
 pytestmark = pytest.mark.cuda
@@ -60,6 +62,30 @@ def test_every_degree_of_spherical_harmonics(degree: int, deltas: bool) -> None:
     check(frame_scene(300, degree=degree, deltas=deltas))
 
 
+@pytest.mark.parametrize("degree", [0, 2])
+def test_autograd_takes_the_same_way(degree: int) -> None:
+    scene = on_gpu(frame_scene(300, degree=degree, deltas=True))
+    wanted = by_name(backward(scene), scene.sh.shape[1])
+    leaves = {name: getattr(scene, name).clone().requires_grad_() for name in (*NAMES, "deltas")}
+    frame = rendered(replace(scene, **leaves))
+    v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
+    ((frame.image * v_image).sum() + (frame.alphas * v_alphas).sum()).backward()
+    for name in NAMES:
+        assert torch.equal(leaves[name].grad.cpu().double(), wanted[name].reshape(leaves[name].shape))
+    assert torch.equal(leaves["deltas"].grad, backward(scene).raw)
+
+
+def test_autograd_refuses_what_has_no_gradient() -> None:
+    scene = on_gpu(frame_scene(30, 20, 18))
+    means = scene.means.clone().requires_grad_()
+    inputs = (means, *scene.gaussians[1:], None, scene.viewmat, scene.K, None, 20, 18, 1000)
+    with pytest.raises(InvalidInput, match="training=True"):
+        render_frame(*inputs).image.sum().backward()
+    camera = scene.viewmat.clone().requires_grad_()
+    with pytest.raises(InvalidInput, match="no gradient for the camera"):
+        render_frame(*inputs[:6], camera, *inputs[7:], training=True).image.sum().backward()
+
+
 @pytest.mark.parametrize("camera_model", MODELS)
 @pytest.mark.parametrize("with_alphas", [True, False])
 def test_every_camera_model(camera_model: str, with_alphas: bool) -> None:
@@ -74,6 +100,13 @@ def test_any_image_size(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize("count", [1, 31, 33, 129])
 def test_any_number_of_gaussians(count: int) -> None:
     check(frame_scene(count, degree=3, median_px=6.0, deltas=True))
+
+
+def test_lists_of_the_plain_ops_serve_as_well() -> None:
+    scene = on_gpu(frame_scene(400, degree=2, deltas=True))
+    seen, wanted = backward(scene, forward_of_plain_ops(scene)), backward(scene)
+    for s, w in zip(seen, wanted, strict=True):
+        assert (s - w).norm() <= 1e-4 * w.norm()
 
 
 def test_no_gaussians_at_all() -> None:
@@ -155,14 +188,14 @@ def test_strided_and_misaligned_inputs_give_the_same_bits() -> None:
 
     for change in (shifted, strided):
         values = {name: change(getattr(scene, name)) for name in (*NAMES, "deltas", "viewmat", "K", "background")}
-        seen = backward(replace(scene, **values), forward_of_plain_ops(scene))
+        seen = backward(replace(scene, **values), rendered(scene))
         assert torch.equal(seen.raw, wanted.raw)
         assert torch.equal(seen.sh, wanted.sh)
 
 
 def test_the_same_bits_every_time_and_in_a_graph() -> None:
     scene = on_gpu(frame_scene(5000, 300, 200, degree=3, deltas=True))
-    forward = forward_of_plain_ops(scene)
+    forward = rendered(scene)
     wanted = backward(scene, forward)
     assert torch.equal(backward(scene, forward).raw, wanted.raw)
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
@@ -188,7 +221,7 @@ def test_the_same_bits_every_time_and_in_a_graph() -> None:
 
 def test_a_frame_whose_lists_were_cut_has_no_gradient() -> None:
     scene = on_gpu(frame_scene(300, degree=1))
-    forward = forward_of_plain_ops(scene)
+    forward = rendered(scene)
     forward.status[2] = 1
     gradients = backward(scene, forward)
     assert not gradients.raw.any()
@@ -197,7 +230,7 @@ def test_a_frame_whose_lists_were_cut_has_no_gradient() -> None:
 
 def test_wrong_arguments_are_refused() -> None:
     scene = on_gpu(frame_scene(20, 20, 18))
-    forward = forward_of_plain_ops(scene)
+    forward = rendered(scene)
     v_image = scene.picture_gradients()[0].cuda()
     camera = (scene.viewmat, scene.K, None, forward)
     with pytest.raises(InvalidInput, match="float32"):
@@ -218,7 +251,7 @@ def test_wrong_arguments_are_refused() -> None:
 def test_op_passes_opcheck(degree: int) -> None:
     scene = on_gpu(frame_scene(30, 20, 18, degree=degree, deltas=degree > 0))
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
-    lists = lists_of(forward_of_plain_ops(scene))
+    lists = lists_of(rendered(scene))
     inputs = (scene.deltas, scene.viewmat, scene.K, scene.background, *lists, v_image, v_alphas)
     sizes = (scene.width, scene.height, 0.3, 0)
     torch.library.opcheck(torch.ops.gsplat_core.render_frame_backward.default, (*scene.gaussians, *inputs, *sizes))
