@@ -77,7 +77,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "render_frame_backward(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_opacities, Tensor sh, Tensor? deltas, "
       "Tensor viewmat, Tensor K, Tensor? background, Tensor records, Tensor tile_offsets, Tensor sorted, Tensor splat_starts, "
       "Tensor instance_splats, Tensor status, Tensor alphas, Tensor last, Tensor v_image, Tensor? v_alphas, int width, "
-      "int height, float eps2d, int camera_model) -> (Tensor v_raw, Tensor v_sh)");
+      "int height, float eps2d, int camera_model, bool deterministic) -> (Tensor v_raw, Tensor v_sh)");
   // The same and one Adam step of the Gaussians, in place; rates [5] and step [1] are read on the device, rows that were left
   // alone are added to skipped [5]. v_raw is empty if not asked for.
   m.def(
@@ -87,7 +87,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor? v_alphas, Tensor(f!) m_means, Tensor(g!) m_quats, Tensor(h!) m_log_scales, Tensor(i!) m_logit_opacities, "
       "Tensor(j!) m_sh, Tensor(k!) v_means, Tensor(l!) v_quats, Tensor(m!) v_log_scales, Tensor(n!) v_logit_opacities, "
       "Tensor(o!) v_sh, Tensor rates, Tensor step, Tensor(p!) skipped, int width, int height, float eps2d, int camera_model, "
-      "float beta1, float beta2, float epsilon, bool needs_raw) -> Tensor v_raw");
+      "float beta1, float beta2, float epsilon, bool needs_raw, bool deterministic) -> Tensor v_raw");
 
   // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
   m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, float tau) -> Tensor");
