@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_shape
@@ -47,15 +46,15 @@ def render(gaussians: Gaussians, camera: Camera, background: Tensor | None = Non
     if background is not None:
         require_shape("background", background, (3,), "[3]")
         background = background[None]
-    device, dtype = gaussians.device, gaussians.dtype
+    viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
     colors, alphas, _ = rasterization(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
         gaussians.opacities,
         gaussians.sh,
-        torch.tensor(camera.world_to_camera, dtype=dtype, device=device)[None],
-        torch.tensor(camera.K, dtype=dtype, device=device)[None],
+        viewmat[None],
+        intrinsics[None],
         camera.width_px,
         camera.height_px,
         sh_degree=gaussians.sh_degree,

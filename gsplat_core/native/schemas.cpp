@@ -65,6 +65,30 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
       "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 
+  // One frame from raw Gaussians (CUDA only): image [H, W, 4] with depth, and what its gradient needs.
+  m.def(
+      "render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_opacities, Tensor sh, Tensor? deltas, "
+      "Tensor viewmat, Tensor K, Tensor? background, int width, int height, float eps2d, float near_plane, float far_plane, "
+      "int camera_model, int capacity, bool training) -> (Tensor image, Tensor alphas, Tensor last, Tensor records, "
+      "Tensor tile_offsets, Tensor sorted, Tensor splat_starts, Tensor instance_splats, Tensor status)");
+  // The gradient of render_frame by what its forward pass left: of the raw parameters in one row per Gaussian (position 3,
+  // rotation 4, log-scale 3, colour coefficient 3, opacity logit 1, 2 unused), and of sh where it has more than one basis.
+  m.def(
+      "render_frame_backward(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_opacities, Tensor sh, Tensor? deltas, "
+      "Tensor viewmat, Tensor K, Tensor? background, Tensor records, Tensor tile_offsets, Tensor sorted, Tensor splat_starts, "
+      "Tensor instance_splats, Tensor status, Tensor alphas, Tensor last, Tensor v_image, Tensor? v_alphas, int width, "
+      "int height, float eps2d, int camera_model) -> (Tensor v_raw, Tensor v_sh)");
+  // The same and one Adam step of the Gaussians, in place; rates [5] and step [1] are read on the device, rows that were left
+  // alone are added to skipped [5]. v_raw is empty if not asked for.
+  m.def(
+      "render_frame_backward_adam_(Tensor(a!) means, Tensor(b!) quats, Tensor(c!) log_scales, Tensor(d!) logit_opacities, "
+      "Tensor(e!) sh, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, Tensor records, Tensor tile_offsets, "
+      "Tensor sorted, Tensor splat_starts, Tensor instance_splats, Tensor status, Tensor alphas, Tensor last, Tensor v_image, "
+      "Tensor? v_alphas, Tensor(f!) m_means, Tensor(g!) m_quats, Tensor(h!) m_log_scales, Tensor(i!) m_logit_opacities, "
+      "Tensor(j!) m_sh, Tensor(k!) v_means, Tensor(l!) v_quats, Tensor(m!) v_log_scales, Tensor(n!) v_logit_opacities, "
+      "Tensor(o!) v_sh, Tensor rates, Tensor step, Tensor(p!) skipped, int width, int height, float eps2d, int camera_model, "
+      "float beta1, float beta2, float epsilon, bool needs_raw) -> Tensor v_raw");
+
   // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
   m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, float tau) -> Tensor");
   m.def(
@@ -85,6 +109,15 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "image_loss(Tensor image, Tensor target, Tensor? mask, Tensor? depth, Tensor? target_depth, float ssim_weight, "
       "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
 
+  // The same of the frame path: image [H, W, 4] with colours and the sum of weight times z, alphas [H, W]; (loss, terms,
+  // dL/dimage, dL/dalphas).
+  m.def(
+      "frame_loss(Tensor image, Tensor alphas, Tensor target, Tensor? mask, Tensor? target_depth, float ssim_weight, "
+      "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
+
+  // Writes up to 32 values, which travel with the launch.
+  m.def("store_scalars_(Tensor(a!) to, float[] values) -> ()");
+
   // HexPlane features of one level: the product of six plane samples [N, C], its gradients, and the parts used for inference.
   m.def("hexplane_features(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
   m.def(
@@ -93,4 +126,9 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def("hexplane_space(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz) -> Tensor");
   m.def("hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Tensor yt, Tensor zt) -> Tensor");
   m.def("hexplane_decode(Tensor[] spaces, Tensor coordinates, Tensor[] lines, Tensor[] weights, Tensor[] biases) -> Tensor");
+  // The field at `time`, from space features [N, C] of float32 or float16 (row i is Gaussian order[i]): deltas [N, 16]. CUDA
+  // only.
+  m.def(
+      "hexplane_deltas(Tensor[] spaces, Tensor coordinates, Tensor? order, Tensor time, Tensor[] time_planes, Tensor[] weights, "
+      "Tensor[] biases) -> Tensor");
 }

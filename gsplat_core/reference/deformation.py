@@ -148,3 +148,35 @@ def hexplane_decode(
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         values = torch.nn.functional.linear(torch.relu(values) if layer else values, weight, bias)
     return values
+
+
+DELTA_COLUMNS = 16
+"""Columns of the frame path's deltas: position 3, rotation 4, log-scale 3, colour 3, opacity logit 1, 2 unused."""
+
+HEAD_COLUMNS = (0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 13)
+"""The column of every output of the HexPlane's head, which has log-scales before the rotation."""
+
+
+def hexplane_deltas(
+    spaces: Sequence[Tensor],
+    coordinates: Tensor,
+    time: Tensor,
+    time_planes: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    order: Tensor | None = None,
+) -> Tensor:
+    """What the field adds to the raw parameters at `time` (a number in [-1, 1]) in the frame path's columns: [N, 16].
+
+    The time planes [V, U, C], three per level, are interpolated into lines, then `hexplane_decode`. With `order`, row i of the inputs is
+    Gaussian order[i].
+    """
+    lines = []
+    for plane in time_planes:
+        at = ((time.reshape(()) + 1) / 2 * (plane.shape[0] - 1)).clamp(0, plane.shape[0] - 1)
+        row = at.detach().nan_to_num().long().clamp(max=max(plane.shape[0] - 2, 0))
+        lines.append(torch.lerp(plane[row], plane[(row + 1).clamp(max=plane.shape[0] - 1)], at - row))
+    outputs = hexplane_decode(spaces, coordinates, lines, weights, biases)
+    deltas = outputs.new_zeros(outputs.shape[0], DELTA_COLUMNS)
+    rows = torch.arange(outputs.shape[0], device=outputs.device) if order is None else order.long()
+    return deltas.index_put((rows[:, None], torch.tensor(HEAD_COLUMNS, device=outputs.device)), outputs)

@@ -4,7 +4,6 @@
 #include "simd.h"
 
 namespace GSPLAT_ISA {
-namespace {
 
 struct LinePosition {
   int64_t cell;    // the left one of two neighbours
@@ -24,5 +23,4 @@ GSPLAT_INLINE LinePosition position_on(float coordinate, int32_t size) {
   return {cell, at - float(cell), unclamped > 0.0f && unclamped < float(size - 1) ? scale : 0.0f};
 }
 
-}  // namespace
 }  // namespace GSPLAT_ISA

@@ -15,7 +15,7 @@ constexpr int kTallRows = 16, kManyTiles = 32;
 
 __device__ int tiles_of(const DeviceBoxes& in, const TileBox& box) {
   int tiles = 0;
-  for_tile_rows(in, box, [&](int, int first, int end) { tiles += end - first; });
+  for_tile_rows(box, float(in.tile_size), [&](int, int first, int end) { tiles += end - first; });
   return tiles;
 }
 
@@ -53,7 +53,7 @@ __global__ void counts_in_order(int64_t count, const uint32_t* splats, const int
 // Writes the tiles of one splat from `at` on: every `step`th of a row from the `lane`th on.
 __device__ void emit_splat(const DeviceBoxes& in, int64_t splat, int64_t at, int lane, int step, const TileInstances& to) {
   const uint32_t first_tile = uint32_t(image_of(in, splat) * in.tile_width * in.tile_height) + to.capacity;
-  for_tile_rows(in, tile_box(in, splat), [&](int row, int first, int end) {
+  for_tile_rows(tile_box(in, splat), float(in.tile_size), [&](int row, int first, int end) {
     for (int column = first + lane; column < end; column += step) {
       to.tiles[0][at + column - first] = first_tile + uint32_t(row * in.tile_width + column);
       to.splats[0][at + column - first] = int32_t(splat);

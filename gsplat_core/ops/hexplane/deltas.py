@@ -1,0 +1,80 @@
+"""The HexPlane field's deltas at one time, from its cached space features: on CUDA, for the fused frame path.
+
+Maths of `gsplat_core.reference.hexplane_deltas`. The time is read from device memory and nothing waits for the host, so a call can be
+captured in a CUDA graph and replayed with another time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+
+DELTA_COLUMNS = 16
+"""Columns of the frame path's deltas: position 3, rotation 4, log-scale 3, colour 3, opacity logit 1, 2 unused."""
+
+
+def hexplane_deltas(
+    spaces: Sequence[Tensor],
+    coordinates: Tensor,
+    time: Tensor,
+    time_planes: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    order: Tensor | None = None,
+) -> Tensor:
+    """What the field adds to every Gaussian's raw parameters at `time`: [N, 16], for inference (not differentiable).
+
+    Args:
+        spaces: per level the product of the space planes [N, C] (`hexplane_space`), all float32, or all float16: half the memory traffic,
+            and features and network rounded to half precision (sums stay float32).
+        coordinates: [N, 4] positions in [-1, 1], float32; the fourth is not read.
+        time: one float32 on the device, in [-1, 1]; clamped to it.
+        time_planes: xt, yt, zt of every level, [V, U, C] float32.
+        weights, biases: the trunk's layers and the head's as of `torch.nn.Linear`: one width, 11 outputs.
+        order: int32 [N]; row i of `spaces` and `coordinates` is Gaussian order[i]. Rows of neighbours side by side are faster.
+
+    Raises:
+        InvalidInput: the tensors are not on a CUDA device, or not of one floating type.
+        RuntimeError: shapes do not fit together, or the layers are larger than the kernel takes (`takes_layers`).
+    """
+    if coordinates.device.type != "cuda":
+        raise InvalidInput(
+            f"hexplane_deltas runs on CUDA and got {coordinates.device}; use hexplane_decode, or gsplat_core.reference"
+        )
+    kinds = {space.dtype for space in spaces}
+    if kinds not in ({torch.float32}, {torch.float16}):
+        raise InvalidInput(f"spaces must be all float32 or all float16, got {sorted(map(str, kinds))}")
+    for tensor in (coordinates, time, *time_planes, *weights, *biases):
+        if tensor.dtype != torch.float32:
+            raise InvalidInput(f"got {tensor.dtype}; this op is float32, gsplat_core.reference has every dtype")
+    return torch.ops.gsplat_core.hexplane_deltas(
+        list(spaces), coordinates, order, time, list(time_planes), list(weights), list(biases)
+    )
+
+
+def takes_layers(channels: int, levels: int, width: int, depth: int, item: int = 4) -> bool:
+    """Whether the kernels take a field of these sizes; `item` is 4 for float32 and 2 for float16 features."""
+    padded = next((size for size in (32, 64, 128) if width <= size), 0)
+    features = channels * levels
+    stride = features if features * item % 128 == 64 else features + 64 // item
+    weights = padded * stride + (padded * (depth - 1) + DELTA_COLUMNS) * (padded + 32 // item)
+    size = weights * item + 4 * (depth * padded + DELTA_COLUMNS)
+    return channels * item % 64 == 0 and padded > 0 and levels <= 16 and depth <= 9 and size <= 200 * 1024
+
+
+@torch.library.register_fake("gsplat_core::hexplane_deltas")
+def _(
+    spaces: list[Tensor],
+    coordinates: Tensor,
+    order: Tensor | None,
+    time: Tensor,
+    time_planes: list[Tensor],
+    weights: list[Tensor],
+    biases: list[Tensor],
+) -> Tensor:
+    return coordinates.new_empty(coordinates.shape[0], DELTA_COLUMNS)

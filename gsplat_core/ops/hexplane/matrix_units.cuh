@@ -1,0 +1,63 @@
+// Matrix products of one warp: 16 rows times 8 columns, in half precision, or in float32 as three products of tf32 parts.
+#pragma once
+
+#include <cuda_fp16.h>
+
+#include <cstdint>
+
+// The lane's place: row `group` (and group + 8) of the operand on the left, `quad` of four along the summed dimension.
+struct WarpPlace {
+  int group, quad;
+  __device__ WarpPlace() {
+    group = int(threadIdx.x) % 32 / 4;
+    quad = int(threadIdx.x) % 4;
+  }
+};
+
+// sums += a b for 16 summed values: a holds (row, k 0..1), (row + 8, k 0..1), (row, k 2..3), (row + 8, k 2..3) of the lane.
+__device__ __forceinline__ void multiply_half(float (&sums)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
+  asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+      : "+f"(sums[0]), "+f"(sums[1]), "+f"(sums[2]), "+f"(sums[3])
+      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+}
+
+__device__ __forceinline__ void multiply_tf32(float (&sums)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
+  asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+      : "+f"(sums[0]), "+f"(sums[1]), "+f"(sums[2]), "+f"(sums[3])
+      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+}
+
+// A float as the sum of two numbers of tf32's 11 bits each; what is left over is below 2^-21 of it.
+struct Split {
+  uint32_t high, low;
+  __device__ explicit Split(float x) {
+    high = __float_as_uint(x) & 0xffffe000u;
+    low = __float_as_uint(x - __uint_as_float(high));
+  }
+};
+
+struct SplitLeft {
+  uint32_t high[4], low[4];
+  // (row, k 0), (row + 8, k 0), (row, k 1), (row + 8, k 1) of the lane
+  __device__ SplitLeft(float a0, float a1, float a2, float a3) {
+    const Split s0(a0), s1(a1), s2(a2), s3(a3);
+    high[0] = s0.high, high[1] = s1.high, high[2] = s2.high, high[3] = s3.high;
+    low[0] = s0.low, low[1] = s1.low, low[2] = s2.low, low[3] = s3.low;
+  }
+};
+
+// sums += a b for 8 summed values, to nearly float32: the product of the two low parts is left out.
+__device__ __forceinline__ void multiply_split(float (&sums)[4], const SplitLeft& a, float b0, float b1) {
+  const Split s0(b0), s1(b1);
+  multiply_tf32(sums, a.low, s0.high, s1.high);
+  multiply_tf32(sums, a.high, s0.low, s1.low);
+  multiply_tf32(sums, a.high, s0.high, s1.high);
+}
+
+__device__ __forceinline__ uint32_t pack_halves(float x, float y) {
+  const __half2 pair = __floats2half2_rn(x, y);
+  return *reinterpret_cast<const uint32_t*>(&pair);
+}
+
+// Not `x > 0`, so that NaN stays and shows.
+__device__ __forceinline__ float rectified(float x) { return x < 0.0f ? 0.0f : x; }

@@ -1,0 +1,80 @@
+// The field's network on CUDA: features of N Gaussians through the trunk (ReLU after each layer) and the head.
+//
+// The head's 11 outputs (position, log-scale, rotation, opacity) are put where the frame path wants them: 16 columns, position 3,
+// rotation 4, log-scale 3, colour 3 (zero), opacity logit 1, 2 zeros. Layers up to 128 wide go through the tensor cores, weights
+// in shared memory; `FieldNetwork::fits` says whether they do. All pointers are to device memory.
+#pragma once
+
+#include <cuda_runtime.h>
+
+#include "cuda_scratch.h"
+
+constexpr int kFieldLevels = 16;
+constexpr int kFieldLayers = 10;   // trunk and head
+constexpr int kDeltaColumns = 16;  // as kRawColumns of the frame path
+constexpr int kHeadOutputs = 11;
+constexpr int kRoomForWeights = 200 * 1024;  // bytes of shared memory that a block may take
+
+// The output of the head that a column of the deltas shows, or -1: the head has log-scales before the rotation.
+__host__ __device__ constexpr int head_output(int column) {
+  if (column < 3) return column;
+  if (column < 7) return column + 3;
+  if (column < 10) return column - 4;
+  return column == 13 ? 10 : -1;
+}
+
+struct FieldNetwork {
+  const float* weights[kFieldLayers];  // [outputs, inputs]
+  const float* biases[kFieldLayers];
+  int32_t layers;    // trunk and head
+  int32_t features;  // inputs of the first
+  int32_t width;     // outputs of every layer of the trunk
+
+  __host__ __device__ int padded_width() const { return width <= 32 ? 32 : width <= 64 ? 64 : 128; }
+  // Rows of weights in shared memory start in banks that do not meet when a warp reads the operand of its matrix product.
+  __host__ __device__ int first_stride(int item) const { return features * item % 128 == 64 ? features : features + 64 / item; }
+  __host__ __device__ int hidden_stride(int item) const { return padded_width() + 32 / item; }
+  __host__ __device__ int hidden_start(int layer, int item) const {  // in items; layer >= 1, the head is the last
+    return padded_width() * (first_stride(item) + (layer - 1) * hidden_stride(item));
+  }
+  __host__ __device__ int weight_items(int item) const { return hidden_start(layers - 1, item) + 16 * hidden_stride(item); }
+  __host__ __device__ int bias_floats() const { return (layers - 1) * padded_width() + 16; }
+  __host__ __device__ size_t packed_bytes(int item) const {
+    return size_t(weight_items(item)) * item + size_t(bias_floats()) * 4;
+  }
+  bool fits(int item) const {
+    return width <= 128 && layers >= 2 && layers <= kFieldLayers && features * item % 64 == 0 &&
+           packed_bytes(item) <= kRoomForWeights;
+  }
+};
+
+// The time planes at one time: lines [U, C] of type float or __half, level by level and axis by axis.
+struct FieldLines {
+  void* values;
+  int64_t starts[kFieldLevels][3];  // of a line, in items
+  int32_t widths[kFieldLevels][3];  // U
+};
+
+struct FieldTimePlanes {
+  const float* values[kFieldLevels][3];  // [V, U, C]
+  int32_t rows[kFieldLevels][3];         // V
+};
+
+struct FieldInput {
+  const void*
+      spaces[kFieldLevels];  // [N, C] float or __half: the product of the space planes, or the features when there are no lines
+  FieldLines lines;          // values null: none
+  const float* coordinates;  // [N, 4] in [-1, 1]; read where there are lines
+  const int32_t* order;      // row i is Gaussian order[i]; null: i
+  int64_t count;
+  int32_t levels, channels;
+};
+
+// Interpolates the time planes at *time in [-1, 1], and packs the network as the next kernel wants it in shared memory. With
+// half, lines and weights are rounded to __half. Either part may be left out with a null pointer.
+void prepare_field(const FieldTimePlanes& planes, const FieldInput& input, const float* time, const FieldNetwork* network,
+                   void* packed, bool half, cudaStream_t stream);
+
+// deltas [N, 16]; `hidden`, if not null, keeps the trunk's outputs [layers - 1, N, width].
+void field_deltas(const FieldInput& input, const FieldNetwork& network, const void* packed, bool half, float* deltas,
+                  float* hidden, cudaStream_t stream);
