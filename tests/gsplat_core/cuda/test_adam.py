@@ -33,3 +33,9 @@ def test_devices_must_agree(gpu):
     on_gpu, here = torch.zeros(4, device=gpu), torch.zeros(4)
     with pytest.raises(InvalidInput, match="one device"):
         adam_step(on_gpu, here, on_gpu.clone(), on_gpu.clone(), 1, 0.1)
+
+
+def test_opcheck(gpu):
+    parameter, gradient, first, second = (torch.rand(6, 3, device=gpu) for _ in range(4))
+    arguments = (parameter, gradient, first, second, 2, 0.1, 0.9, 0.999, 1e-8, 3)
+    torch.library.opcheck(torch.ops.gsplat_core.adam_.default, arguments)
