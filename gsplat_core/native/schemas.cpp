@@ -11,6 +11,12 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "adam_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, int step, "
       "float learning_rate, float beta1, float beta2, float epsilon, int row_size) -> Tensor");
 
+  // The same with learning rate (float32) and step (int64) read on the device; the rows left alone are added to `skipped`
+  // (int64).
+  m.def(
+      "adam_at_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, Tensor rate, "
+      "Tensor step, float beta1, float beta2, float epsilon, int row_size, Tensor(d!) skipped) -> ()");
+
   // Projection to the image: B batches, C cameras, N Gaussians. Covariances as [B, N, 6], or quats and scales.
   m.def(
       "project_gaussians(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
