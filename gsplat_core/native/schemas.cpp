@@ -138,4 +138,19 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "hexplane_deltas(Tensor[] spaces, Tensor coordinates, Tensor? order, Tensor time, Tensor[] time_planes, Tensor[] weights, "
       "Tensor[] biases) -> Tensor");
+  // Training of the whole field without autograd, CUDA only: gsplat_core/ops/hexplane/training.py says what passes between them.
+  m.def(
+      "hexplane_train(Tensor means, Tensor box, Tensor time, Tensor[] planes, Tensor[] weights, Tensor[] biases) -> "
+      "(Tensor deltas, Tensor coordinates, Tensor lines, Tensor features, Tensor hidden)");
+  m.def(
+      "hexplane_train_backward(Tensor(a!) v_raw, Tensor means, Tensor box, Tensor lines, Tensor features, Tensor hidden, "
+      "Tensor[] planes, Tensor[] weights, Tensor[] biases) -> "
+      "(Tensor network, Tensor rows, Tensor items, Tensor starts, Tensor v_lines)");
+  m.def(
+      "hexplane_planes_gradient(Tensor coordinates, Tensor time, Tensor rows, Tensor items, Tensor starts, Tensor v_lines, "
+      "Tensor[] planes) -> Tensor[]");
+  m.def(
+      "hexplane_planes_adam_(Tensor(a!)[] planes, Tensor(b!)[] first, Tensor(c!)[] second, Tensor coordinates, Tensor time, "
+      "Tensor rows, Tensor items, Tensor starts, Tensor v_lines, Tensor rate, Tensor step, Tensor? status, float beta1, "
+      "float beta2, float epsilon, float smoothness, float time_smoothness, float sparsity) -> ()");
 }
