@@ -11,6 +11,12 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "adam_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, int step, "
       "float learning_rate, float beta1, float beta2, float epsilon, int row_size) -> Tensor");
 
+  // The same with learning rate (float32) and step (int64) read on the device; the rows left alone are added to `skipped`
+  // (int64).
+  m.def(
+      "adam_at_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, Tensor rate, "
+      "Tensor step, float beta1, float beta2, float epsilon, int row_size, Tensor(d!) skipped) -> ()");
+
   // Projection to the image: B batches, C cameras, N Gaussians. Covariances as [B, N, 6], or quats and scales.
   m.def(
       "project_gaussians(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
@@ -90,15 +96,16 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "float beta1, float beta2, float epsilon, bool needs_raw) -> Tensor v_raw");
 
   // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
-  m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, float tau) -> Tensor");
+  // tau and the six rates (position, rotation, log-scale, colour, centres, widths) are float32 on the device of the field. Deltas
+  // and gradients may be padded to the frame path's 16 columns.
+  m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, bool padded=False) -> Tensor");
   m.def(
-      "basis_field_backward(Tensor gradient, Tensor centers, Tensor log_widths, Tensor weights, float tau) "
+      "basis_field_backward(Tensor gradient, Tensor centers, Tensor log_widths, Tensor weights, Tensor tau) "
       "-> (Tensor, Tensor, Tensor)");
   m.def(
-      "basis_field_backward_adam_(Tensor gradient, float tau, Tensor(a!) centers, Tensor(b!) log_widths, Tensor(c!) weights, "
+      "basis_field_backward_adam_(Tensor gradient, Tensor tau, Tensor(a!) centers, Tensor(b!) log_widths, Tensor(c!) weights, "
       "Tensor(d!) m_centers, Tensor(e!) m_log_widths, Tensor(f!) m_weights, Tensor(g!) v_centers, Tensor(h!) v_log_widths, "
-      "Tensor(i!) v_weights, Tensor(j!) steps, float position_rate, float rotation_rate, float scale_rate, float colour_rate, "
-      "float center_rate, float width_rate, float beta1, float beta2, float epsilon) -> ()");
+      "Tensor(i!) v_weights, Tensor(j!) steps, Tensor rates, float beta1, float beta2, float epsilon) -> ()");
 
   // Structural similarity of each pixel and channel of [H, W, C] images.
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
