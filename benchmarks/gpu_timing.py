@@ -135,9 +135,7 @@ def report(work: str, **figures: Any) -> None:
     print(json.dumps({name: _rounded(value) for name, value in flat.items()}), flush=True)
 
 
-def compare(
-    work: str, ours: Times, peers: Mapping[str, Times], asked_ms: float | None = None, **more: object
-) -> None:
+def compare(work: str, ours: Times, peers: Mapping[str, Times], asked_ms: float | None = None, **more: object) -> None:
     """Our times beside each peer's, the ratios to the fastest peer, and whether the limit was met."""
     figures: dict[str, Any] = {"ours": ours, **peers}
     if peers:

@@ -3,7 +3,8 @@
 # The compiler is, in this order: CMAKE_CUDA_COMPILER or $CUDACXX, then the one that `make cuda` puts into build/cuda-toolkit
 # (NVIDIA's pip packages), then an nvcc on the PATH. CMake's own FindCUDAToolkit expects a whole toolkit and is not used.
 set(CUDA_PACKAGES ${CMAKE_CURRENT_SOURCE_DIR}/build/cuda-toolkit/nvidia/cu13)
-if(NOT CMAKE_CUDA_COMPILER AND "$ENV{CUDACXX}" STREQUAL "" AND EXISTS ${CUDA_PACKAGES}/bin/nvcc)
+string(STRIP "$ENV{CUDACXX}" COMPILER_ASKED_FOR)  # may be set and empty
+if(NOT CMAKE_CUDA_COMPILER AND COMPILER_ASKED_FOR STREQUAL "" AND EXISTS ${CUDA_PACKAGES}/bin/nvcc)
   set(CMAKE_CUDA_COMPILER ${CUDA_PACKAGES}/bin/nvcc)
 endif()
 if(CMAKE_CUDA_COMPILER MATCHES "^${CUDA_PACKAGES}/")

@@ -272,20 +272,24 @@ def _colors(
         directions = means[..., None, :, :] - camera_centers(viewmats)[..., None, :]
         # The extra dimension is broadcast by the op, which saves one copy of the coefficients per camera.
         coefficients = colors if per_camera or means.dim() == 2 else colors[..., None, :, :, :]
-        return (ops.spherical_harmonics(settings.sh_degree, directions, coefficients, masks=visible) + 0.5).clamp_min(0)
+        return ops.spherical_harmonics(settings.sh_degree, directions, coefficients, masks=visible)
 
-    values = evaluate(visible)
+    def shown(values: Tensor) -> Tensor:
+        return values if settings.sh_degree is None else (values + 0.5).clamp_min(0)
+
+    values = evaluate(visible)  # looked at before they are clamped: minus infinity would be black
     if values.is_cuda and ops.passes_no_zeros_on:
         finite = (values.detach() * 0).sum(-1) == 0  # 0 times a number is 0, unless it is a NaN or an infinity
-        return values, dense._replace(radii=dense.radii * finite.to(dense.radii.dtype)[..., None])
-    # One cheap sum in the common case; it can only miss nothing, as a sum with a NaN or an infinity is not finite.
-    if not torch.isfinite(values.detach().sum()):
+        return shown(values), dense._replace(radii=dense.radii * finite.to(dense.radii.dtype)[..., None])
+    # One cheap sum in the common case; it can only miss nothing, as a sum with a NaN or an infinity is not finite. A compiled
+    # graph cannot branch on it, and always takes the long way.
+    if torch.compiler.is_compiling() or not torch.isfinite(values.detach().sum()):
         finite = values.detach().isfinite().all(-1)
         visible = visible & finite
         values = torch.where(visible[..., None], evaluate(visible), torch.zeros_like(values))
         keep = visible.to(dense.radii.dtype)
         dense = dense._replace(radii=dense.radii * keep[..., None])
-    return values, dense
+    return shown(values), dense
 
 
 def camera_centers(viewmats: Tensor) -> Tensor:

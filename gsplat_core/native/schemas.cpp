@@ -11,6 +11,12 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "adam_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, int step, "
       "float learning_rate, float beta1, float beta2, float epsilon, int row_size) -> Tensor");
 
+  // The same with learning rate (float32) and step (int64) read on the device; the rows left alone are added to `skipped`
+  // (int64).
+  m.def(
+      "adam_at_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, Tensor rate, "
+      "Tensor step, float beta1, float beta2, float epsilon, int row_size, Tensor(d!) skipped) -> ()");
+
   // Projection to the image: B batches, C cameras, N Gaussians. Covariances as [B, N, 6], or quats and scales.
   m.def(
       "project_gaussians(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
@@ -77,7 +83,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "render_frame_backward(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_opacities, Tensor sh, Tensor? deltas, "
       "Tensor viewmat, Tensor K, Tensor? background, Tensor records, Tensor tile_offsets, Tensor sorted, Tensor splat_starts, "
       "Tensor instance_splats, Tensor status, Tensor alphas, Tensor last, Tensor v_image, Tensor? v_alphas, int width, "
-      "int height, float eps2d, int camera_model) -> (Tensor v_raw, Tensor v_sh)");
+      "int height, float eps2d, int camera_model, bool deterministic) -> (Tensor v_raw, Tensor v_sh)");
   // The same and one Adam step of the Gaussians, in place; rates [5] and step [1] are read on the device, rows that were left
   // alone are added to skipped [5]. v_raw is empty if not asked for.
   m.def(
@@ -87,18 +93,19 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor? v_alphas, Tensor(f!) m_means, Tensor(g!) m_quats, Tensor(h!) m_log_scales, Tensor(i!) m_logit_opacities, "
       "Tensor(j!) m_sh, Tensor(k!) v_means, Tensor(l!) v_quats, Tensor(m!) v_log_scales, Tensor(n!) v_logit_opacities, "
       "Tensor(o!) v_sh, Tensor rates, Tensor step, Tensor(p!) skipped, int width, int height, float eps2d, int camera_model, "
-      "float beta1, float beta2, float epsilon, bool needs_raw) -> Tensor v_raw");
+      "float beta1, float beta2, float epsilon, bool needs_raw, bool deterministic) -> Tensor v_raw");
 
   // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
-  m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, float tau) -> Tensor");
+  // tau and the six rates (position, rotation, log-scale, colour, centres, widths) are float32 on the device of the field. Deltas
+  // and gradients may be padded to the frame path's 16 columns.
+  m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, bool padded=False) -> Tensor");
   m.def(
-      "basis_field_backward(Tensor gradient, Tensor centers, Tensor log_widths, Tensor weights, float tau) "
+      "basis_field_backward(Tensor gradient, Tensor centers, Tensor log_widths, Tensor weights, Tensor tau) "
       "-> (Tensor, Tensor, Tensor)");
   m.def(
-      "basis_field_backward_adam_(Tensor gradient, float tau, Tensor(a!) centers, Tensor(b!) log_widths, Tensor(c!) weights, "
+      "basis_field_backward_adam_(Tensor gradient, Tensor tau, Tensor(a!) centers, Tensor(b!) log_widths, Tensor(c!) weights, "
       "Tensor(d!) m_centers, Tensor(e!) m_log_widths, Tensor(f!) m_weights, Tensor(g!) v_centers, Tensor(h!) v_log_widths, "
-      "Tensor(i!) v_weights, Tensor(j!) steps, float position_rate, float rotation_rate, float scale_rate, float colour_rate, "
-      "float center_rate, float width_rate, float beta1, float beta2, float epsilon) -> ()");
+      "Tensor(i!) v_weights, Tensor(j!) steps, Tensor rates, float beta1, float beta2, float epsilon) -> ()");
 
   // Structural similarity of each pixel and channel of [H, W, C] images.
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
@@ -131,4 +138,19 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "hexplane_deltas(Tensor[] spaces, Tensor coordinates, Tensor? order, Tensor time, Tensor[] time_planes, Tensor[] weights, "
       "Tensor[] biases) -> Tensor");
+  // Training of the whole field without autograd, CUDA only: gsplat_core/ops/hexplane/training.py says what passes between them.
+  m.def(
+      "hexplane_train(Tensor means, Tensor box, Tensor time, Tensor[] planes, Tensor[] weights, Tensor[] biases) -> "
+      "(Tensor deltas, Tensor coordinates, Tensor lines, Tensor features, Tensor hidden)");
+  m.def(
+      "hexplane_train_backward(Tensor(a!) v_raw, Tensor means, Tensor box, Tensor lines, Tensor features, Tensor hidden, "
+      "Tensor[] planes, Tensor[] weights, Tensor[] biases) -> "
+      "(Tensor network, Tensor rows, Tensor items, Tensor starts, Tensor v_lines)");
+  m.def(
+      "hexplane_planes_gradient(Tensor coordinates, Tensor time, Tensor rows, Tensor items, Tensor starts, Tensor v_lines, "
+      "Tensor[] planes) -> Tensor[]");
+  m.def(
+      "hexplane_planes_adam_(Tensor(a!)[] planes, Tensor(b!)[] first, Tensor(c!)[] second, Tensor coordinates, Tensor time, "
+      "Tensor rows, Tensor items, Tensor starts, Tensor v_lines, Tensor rate, Tensor step, Tensor? status, float beta1, "
+      "float beta2, float epsilon, float smoothness, float time_smoothness, float sparsity) -> ()");
 }

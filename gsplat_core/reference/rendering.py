@@ -27,22 +27,40 @@ def bin_splats(
     *,
     conics: Tensor | None = None,
     opacities: Tensor | None = None,
-    capacity: int | None = None,
-) -> tuple[Tensor, Tensor, Tensor] | tuple[Tensor, Tensor, Tensor, Tensor]:
-    """`isect_tiles` (sorted) and `isect_offset_encode` in one; with a capacity, lists of this length, as the compiled op's."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`isect_tiles` (sorted) and `isect_offset_encode` in one."""
     tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
         means2d, radii, depths, tile_size, tile_width, tile_height, packed=packed, n_images=n_images,
         image_ids=image_ids, conics=conics, opacities=opacities,
     )  # fmt: skip
     images = math.prod(depths.shape[:-1]) if n_images is None else n_images
-    if capacity is None:
-        return tiles_per_gauss, flatten_ids, isect_offset_encode(isect_ids, images, tile_width, tile_height)
+    offsets = isect_offset_encode(isect_ids, images, tile_width, tile_height)
+    return tiles_per_gauss, flatten_ids, offsets
+
+
+def bin_splats_within(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    capacity: int,
+    *,
+    conics: Tensor | None = None,
+    opacities: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The compiled `bin_splats` with a capacity, of splats that are not packed: the nearest that fit, unused entries first."""
+    tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
+        means2d, radii, depths, tile_size, tile_width, tile_height, conics=conics, opacities=opacities
+    )
     counts = tiles_per_gauss.reshape(-1)
     nearest_first = torch.argsort(depths.detach().reshape(-1).view(torch.int32).long() & 0xFFFFFFFF, stable=True)
     fits = torch.empty_like(counts, dtype=torch.bool)
     fits[nearest_first] = counts[nearest_first].cumsum(0) <= capacity
     listed = fits[flatten_ids.long()]
     unused = flatten_ids.new_full((capacity - int(listed.sum()),), -1)
+    images = math.prod(depths.shape[:-1])
     offsets = isect_offset_encode(isect_ids[listed], images, tile_width, tile_height) + len(unused)
     needed = torch.tensor([len(flatten_ids)], device=depths.device)
     return tiles_per_gauss, torch.cat([unused, flatten_ids[listed]]), offsets, needed

@@ -35,7 +35,7 @@ def _backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: Any
         v_image = alphas.new_zeros(*alphas.shape, 4)
     raw, sh = torch.ops.gsplat_core.render_frame_backward(
         *inputs, records, tile_offsets, sorted, splat_starts, instance_splats, status, alphas, last, v_image, v_alphas,
-        ctx.width, ctx.height, ctx.eps2d, ctx.camera_model,
+        ctx.width, ctx.height, ctx.eps2d, ctx.camera_model, True,
     )  # fmt: skip
     # Copies: autograd may add to what it was given, and these would share their memory.
     columns = raw[:, :3], raw[:, 3:7], raw[:, 7:10], raw[:, 13], raw[:, None, DC] if inputs[4].shape[1] == 1 else sh

@@ -23,6 +23,28 @@ __device__ inline Pixel start_pixel(const FrameScene& scene, const FrameGradient
   return {left, left * v_left, from.last[at]};
 }
 
+// A splat's row, which others add to as well.
+struct SharedRow {
+  float4* row;
+
+  struct Quad {
+    float4* at;
+    __device__ void operator=(const float4& v) const {
+      if (v.x == 0 && v.y == 0 && v.z == 0 && v.w == 0) return;
+#if __CUDA_ARCH__ >= 900
+      asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(at), "f"(v.x), "f"(v.y), "f"(v.z), "f"(v.w) : "memory");
+#else
+      atomicAdd(&at->x, v.x);
+      atomicAdd(&at->y, v.y);
+      atomicAdd(&at->z, v.z);
+      atomicAdd(&at->w, v.w);
+#endif
+    }
+  };
+  __device__ Quad operator[](int q) const { return {row + q}; }
+};
+
+template <bool kByArrival>
 __global__ void __launch_bounds__(kBlockThreads, 8) gradients_of_tiles(FrameScene scene, FrameLists lists, FrameGradients from) {
   __shared__ BackwardStage<kChannels, false> stage;
   if (lists.status[kStatusCut] != 0) return;
@@ -37,14 +59,23 @@ __global__ void __launch_bounds__(kBlockThreads, 8) gradients_of_tiles(FrameScen
   }
   const auto* const records = static_cast<const Record<kChannels>*>(lists.records);
   const auto fetch = [&](int position) { return records[lists.instance_splats[lists.sorted[position]]]; };
-  const auto row = [&](int position) { return from.rows + int64_t(lists.sorted[position]) * kRowQuads; };
-  blend_backward<kChannels, false, false>(w, fetch, pixels, v_color, row, stage);
+  if constexpr (kByArrival) {
+    const auto row = [&](int position) {
+      return SharedRow{from.rows + int64_t(lists.instance_splats[lists.sorted[position]]) * kRowQuads};
+    };
+    blend_backward<kChannels, false, false>(w, fetch, pixels, v_color, row, stage);
+  } else {
+    const auto row = [&](int position) { return from.rows + int64_t(lists.sorted[position]) * kRowQuads; };
+    blend_backward<kChannels, false, false>(w, fetch, pixels, v_color, row, stage);
+  }
 }
 
 }  // namespace
 
 void instance_gradients_on_device(const FrameScene& scene, const FrameLists& lists, const FrameGradients& from,
                                   cudaStream_t stream) {
+  if (from.by_arrival) cudaMemsetAsync(from.rows, 0, size_t(scene.count) * kRowQuads * sizeof(float4), stream);
   if (scene.tiles() == 0) return;
-  gradients_of_tiles<<<unsigned(scene.tiles()), kBlockThreads, 0, stream>>>(scene, lists, from);
+  const auto kernel = from.by_arrival ? gradients_of_tiles<true> : gradients_of_tiles<false>;
+  kernel<<<unsigned(scene.tiles()), kBlockThreads, 0, stream>>>(scene, lists, from);
 }

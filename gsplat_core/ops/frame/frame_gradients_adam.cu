@@ -84,7 +84,7 @@ __device__ inline bool usable_gradient(const float* v) {
 
 template <int kDegree>
 __global__ void __launch_bounds__(kSplatThreads<kDegree>, kDegree < 4 ? 5 : 1)
-    update_splats(FrameScene scene, FrameLists lists, const float4* rows, RawGradients to, FrameAdam adam) {
+    update_splats(FrameScene scene, FrameLists lists, FrameGradients from, RawGradients to, FrameAdam adam) {
   __shared__ WarpGradients<kDegree> warps[kSplatThreads<kDegree> / 32];
   __shared__ FrameCamera camera;
   load_camera(scene, camera);
@@ -98,7 +98,7 @@ __global__ void __launch_bounds__(kSplatThreads<kDegree>, kDegree < 4 ? 5 : 1)
     prefetch(adam.first[i] + first * columns[i], count * columns[i], lane);
     prefetch(adam.second[i] + first * columns[i], count * columns[i], lane);
   }
-  warp.compute(scene, camera, lists, rows, first, count, lane);
+  warp.compute(scene, camera, lists, from, first, count, lane);
 
   float raw[kRawColumns], sh[warp.kHarmonics];
   warp.raw.get(lane, raw);
@@ -139,6 +139,6 @@ void splat_gradients_adam_on_device(const FrameScene& scene, const FrameLists& l
   if (scene.count == 0) return;
   with_degree(scene.bases, [&](auto degree) {
     constexpr int kDegree = decltype(degree)::value, kBlock = kSplatThreads<kDegree>;
-    update_splats<kDegree><<<blocks_for(scene.count, kBlock), kBlock, 0, stream>>>(scene, lists, from.rows, to, adam);
+    update_splats<kDegree><<<blocks_for(scene.count, kBlock), kBlock, 0, stream>>>(scene, lists, from, to, adam);
   });
 }

@@ -12,7 +12,8 @@ struct FrameGradients {
   const float* v_alphas;  // [H, W], or null: zero
   const float* alphas;    // [H, W]
   const int32_t* last;    // [H, W]
-  float4* rows;           // [capacity, kRowQuads], scratch: the gradient of every instance
+  float4* rows;           // scratch: the gradient of every instance, [capacity, kRowQuads]; or, where
+  bool by_arrival;        // this is set, of every splat, [N, kRowQuads], added up as the tiles come
 };
 
 // Where a Gaussian's gradient goes. All zero where the frame's lists were cut: such a picture is not to be learned from.
@@ -32,7 +33,7 @@ struct FrameAdam {
   unsigned long long* skipped;  // [kRateCount], added to: rows that were left alone because their gradient was not finite
 };
 
-// One row per instance; then per Gaussian their sum, taken back to the raw parameters.
+// First the rows; then per Gaussian their sum, taken back to the raw parameters.
 void instance_gradients_on_device(const FrameScene& scene, const FrameLists& lists, const FrameGradients& from,
                                   cudaStream_t stream);
 void splat_gradients_on_device(const FrameScene& scene, const FrameLists& lists, const FrameGradients& from,

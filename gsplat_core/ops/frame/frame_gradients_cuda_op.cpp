@@ -20,7 +20,7 @@ struct FramePass {
 
   FramePass(FrameInputs& inputs, const Tensor& records_in, const Tensor& tile_offsets_in, const Tensor& sorted_in,
             const Tensor& splat_starts_in, const Tensor& instance_splats_in, const Tensor& status_in, const Tensor& alphas_in,
-            const Tensor& last_in, const Tensor& v_image_in, const OptionalTensor& v_alphas_in)
+            const Tensor& last_in, const Tensor& v_image_in, const OptionalTensor& v_alphas_in, bool deterministic)
       : records(floats(inputs, records_in, 4 * kRowQuads * inputs.scene.count, "records")),
         tile_offsets(ints(inputs, tile_offsets_in, inputs.scene.tiles() + 1, "tile_offsets")),
         sorted(ints(inputs, sorted_in, sorted_in.numel(), "sorted")),
@@ -34,8 +34,12 @@ struct FramePass {
     const auto pointer = [](const Tensor& t) { return const_cast<int32_t*>(t.const_data_ptr<int32_t>()); };
     lists = {const_cast<float*>(data(records)), pointer(tile_offsets), nullptr,       pointer(sorted), pointer(splat_starts),
              pointer(instance_splats),          pointer(status),       sorted.numel()};
-    from = {data(v_image), v_alphas ? data(*v_alphas) : nullptr, data(alphas), pointer(last),
-            inputs.call.array<float4>(lists.capacity * kRowQuads)};
+    from = {data(v_image),
+            v_alphas ? data(*v_alphas) : nullptr,
+            data(alphas),
+            pointer(last),
+            inputs.call.array<float4>((deterministic ? lists.capacity : inputs.scene.count) * kRowQuads),
+            !deterministic};
   }
 
   static int64_t pixels(const FrameInputs& inputs) { return int64_t(inputs.scene.width) * inputs.scene.height; }
@@ -70,11 +74,11 @@ std::tuple<Tensor, Tensor> render_frame_backward(Tensor means, Tensor quats, Ten
                                                  OptionalTensor background, Tensor records, Tensor tile_offsets, Tensor sorted,
                                                  Tensor splat_starts, Tensor instance_splats, Tensor status, Tensor alphas,
                                                  Tensor last, Tensor v_image, OptionalTensor v_alphas, int64_t width,
-                                                 int64_t height, double eps2d, int64_t camera_model) {
+                                                 int64_t height, double eps2d, int64_t camera_model, bool deterministic) {
   FrameInputs inputs(means, quats, log_scales, logit_opacities, sh, deltas, viewmat, intrinsics, background, width, height, eps2d,
                      0, 0, camera_model);
   const FramePass pass(inputs, records, tile_offsets, sorted, splat_starts, instance_splats, status, alphas, last, v_image,
-                       v_alphas);
+                       v_alphas, deterministic);
   const CudaCall& call = inputs.call;
   const FrameScene& scene = inputs.scene;
   const int64_t n = scene.count, bases = scene.bases;
@@ -94,11 +98,11 @@ Tensor render_frame_backward_adam_(Tensor means, Tensor quats, Tensor log_scales
                                    Tensor m_logit_opacities, Tensor m_sh, Tensor v_means, Tensor v_quats, Tensor v_log_scales,
                                    Tensor v_logit_opacities, Tensor v_sh, Tensor rates, Tensor step, Tensor skipped,
                                    int64_t width, int64_t height, double eps2d, int64_t camera_model, double beta1, double beta2,
-                                   double epsilon, bool needs_raw) {
+                                   double epsilon, bool needs_raw, bool deterministic) {
   FrameInputs inputs(means, quats, log_scales, logit_opacities, sh, deltas, viewmat, intrinsics, background, width, height, eps2d,
                      0, 0, camera_model);
   const FramePass pass(inputs, records, tile_offsets, sorted, splat_starts, instance_splats, status, alphas, last, v_image,
-                       v_alphas);
+                       v_alphas, deterministic);
   const CudaCall& call = inputs.call;
   const FrameScene& scene = inputs.scene;
   const int64_t n = scene.count;

@@ -7,7 +7,7 @@ namespace {
 
 template <int kDegree>
 __global__ void __launch_bounds__(kSplatThreads<kDegree>)
-    gradients_of_splats(FrameScene scene, FrameLists lists, const float4* rows, RawGradients to) {
+    gradients_of_splats(FrameScene scene, FrameLists lists, FrameGradients from, RawGradients to) {
   __shared__ WarpGradients<kDegree> warps[kSplatThreads<kDegree> / 32];
   __shared__ FrameCamera camera;
   load_camera(scene, camera);
@@ -16,7 +16,7 @@ __global__ void __launch_bounds__(kSplatThreads<kDegree>)
   if (first >= scene.count) return;
   const int count = int(scene.count - first < 32 ? scene.count - first : 32);
   WarpGradients<kDegree>& warp = warps[threadIdx.x / 32];
-  warp.compute(scene, camera, lists, rows, first, count, lane);
+  warp.compute(scene, camera, lists, from, first, count, lane);
   __syncwarp();
   write_rows(warp.raw, to.raw + first * kRawColumns, count, lane);
   if (to.sh != nullptr) write_rows(warp.sh, to.sh + first * warp.kHarmonics, count, lane);
@@ -29,6 +29,6 @@ void splat_gradients_on_device(const FrameScene& scene, const FrameLists& lists,
   if (scene.count == 0) return;
   with_degree(scene.bases, [&](auto degree) {
     constexpr int kDegree = decltype(degree)::value, kBlock = kSplatThreads<kDegree>;
-    gradients_of_splats<kDegree><<<blocks_for(scene.count, kBlock), kBlock, 0, stream>>>(scene, lists, from.rows, to);
+    gradients_of_splats<kDegree><<<blocks_for(scene.count, kBlock), kBlock, 0, stream>>>(scene, lists, from, to);
   });
 }

@@ -165,15 +165,20 @@ struct WarpGradients {
   };
 
   // `rows` Gaussians from `first` on.
-  __device__ void compute(const FrameScene& scene, const FrameCamera& camera, const FrameLists& lists,
-                          const float4* instance_rows, int64_t first, int rows, int lane) {
+  __device__ void compute(const FrameScene& scene, const FrameCamera& camera, const FrameLists& lists, const FrameGradients& from,
+                          int64_t first, int rows, int lane) {
     const int64_t n = first + min(lane, rows - 1);
     const bool cut = lists.status[kStatusCut] != 0;
     const int start = lists.splat_starts[n], end = lists.splat_starts[n + 1], count = lane < rows && !cut ? end - start : 0;
     const RawGaussian gaussian = load_gaussian(scene, n);
     const unsigned seen = __ballot_sync(kAllLanes, count > 0);
     start_copy(sh, scene.sh + first * kHarmonics, rows, seen, scene.aligned, lane);
-    const SplatRow sum = seen != 0 ? sum_rows(instance_rows, start, count, lane, instances) : SplatRow{};
+    SplatRow sum = {};
+    if (from.by_arrival) {
+      if (count > 0) add_row(from.rows + n * kRowQuads, sum);
+    } else if (seen != 0) {
+      sum = sum_rows(from.rows, start, count, lane, instances);
+    }
     RawGradient g = {};
     if (count > 0) g = projection_gradient(scene, camera, gaussian, sum);
     copies_done();

@@ -1,5 +1,6 @@
 #include <array>
 #include <initializer_list>
+#include <tuple>
 #include <vector>
 
 #include "cuda_call.h"
@@ -60,6 +61,25 @@ Tensor hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Tensor yt,
   return features;
 }
 
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_features_backward(Tensor gradient, Tensor coordinates,
+                                                                                              Tensor xy, Tensor xz, Tensor yz,
+                                                                                              Tensor xt, Tensor yt, Tensor zt) {
+  CudaCall call(coordinates);
+  const Level level(call, coordinates, {&xy, &xz, &yz, &xt, &yt, &zt});
+  const Tensor g = call.floats(gradient, "gradient");
+  STD_TORCH_CHECK(g.dim() == 2 && g.size(0) == level.count && g.size(1) == level.raw.channels, "the gradient must be [N, C]");
+  Tensor points = call.empty({level.count, 4});
+  std::array<Tensor, kPlanes> planes;
+  std::array<float*, kPlanes> out;
+  for (int p = 0; p < kPlanes; ++p) {
+    planes[p] = call.empty({level.tensors[p].size(0), level.tensors[p].size(1), level.raw.channels});
+    out[p] = mutable_data(planes[p]);
+  }
+  plane_gradients(level.raw, data(g), mutable_data(points), out.data(), level.count, call, call.stream);
+  check_cuda(cudaGetLastError(), "hexplane_features_backward");
+  return {points, planes[0], planes[1], planes[2], planes[3], planes[4], planes[5]};
+}
+
 Tensor hexplane_decode(std::vector<Tensor> spaces, Tensor coordinates, std::vector<Tensor> lines, std::vector<Tensor> weights,
                        std::vector<Tensor> biases) {
   CudaCall call(coordinates);
@@ -106,6 +126,7 @@ Tensor hexplane_decode(std::vector<Tensor> spaces, Tensor coordinates, std::vect
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
   m.impl("hexplane_features", TORCH_BOX(&hexplane_features));
+  m.impl("hexplane_features_backward", TORCH_BOX(&hexplane_features_backward));
   m.impl("hexplane_space", TORCH_BOX(&hexplane_space));
   m.impl("hexplane_modulate", TORCH_BOX(&hexplane_modulate));
   m.impl("hexplane_decode", TORCH_BOX(&hexplane_decode));

@@ -1,13 +1,10 @@
-#include <type_traits>
-
 #include "hexplane_cuda.h"
 #include "plane_samples.cuh"
+#include "team_launch.h"
 
 using namespace hexplane;
 
 namespace {
-
-__device__ constexpr int kAxes[kPlanes][2] = {{0, 1}, {0, 2}, {1, 2}, {0, 3}, {1, 3}, {2, 3}};
 
 template <int kLane, int kTeam>
 __global__ void __launch_bounds__(kThreads) product(HexPlanes level, int first, int last, float* features, int64_t count) {
@@ -20,7 +17,7 @@ __global__ void __launch_bounds__(kThreads) product(HexPlanes level, int first, 
 #pragma unroll
     for (int p = 0; p < kPlanes; ++p) {
       if (p < first || p >= last) continue;
-      const Corners at(level.planes[p], x[kAxes[p][0]], x[kAxes[p][1]], channels);
+      const Corners at(level.planes[p], x[u_axis(p)], x[v_axis(p)], channels);
       value = value * Sample<kLane>(level.planes[p].values, at, c).value(at);
     }
     value.store(features + n * channels + c);
@@ -51,17 +48,6 @@ bool wide(const HexPlanes& level, int planes, const void* a, const void* b) {
   uintptr_t bits = uintptr_t(level.channels) * 4 | uintptr_t(a) | uintptr_t(b);
   for (int p = 0; p < planes; ++p) bits |= uintptr_t(level.planes[p].values);
   return bits % 16 == 0;
-}
-
-// Calls `run` with the channels of a lane and the lanes of a team as constants.
-template <class Run>
-void with_team(bool wide, int64_t channels, const Run& run) {
-  const auto four = std::integral_constant<int, 4>();
-  const auto one = std::integral_constant<int, 1>();
-  const auto small = std::integral_constant<int, 8>();
-  const auto large = std::integral_constant<int, 16>();
-  if (!wide) return run(one, large);
-  channels <= 32 ? run(four, small) : run(four, large);
 }
 
 }  // namespace

@@ -9,6 +9,10 @@ namespace hexplane {
 using GSPLAT_ISA::LinePosition;
 using GSPLAT_ISA::position_on;
 
+// kPlaneAxes for device code, which cannot index it.
+constexpr int u_axis(int plane) { return plane == 2 || plane == 4 ? 1 : plane == 5 ? 2 : 0; }
+constexpr int v_axis(int plane) { return plane == 0 ? 1 : plane < 3 ? 2 : 3; }
+
 // Neighbouring channels of a lane: 4 where the channels are a multiple of 4 and memory is aligned, otherwise 1.
 template <int kLane>
 struct Channels {

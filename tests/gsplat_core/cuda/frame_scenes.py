@@ -199,12 +199,14 @@ def on_gpu(scene: FrameScene) -> FrameScene:
     return scene.to("cuda")
 
 
-def backward(scene: FrameScene, forward: Frame | None = None, with_alphas: bool = True) -> RawGradients:
+def backward(
+    scene: FrameScene, forward: Frame | None = None, with_alphas: bool = True, deterministic: bool = True
+) -> RawGradients:
     """The gradients of `scene.picture_gradients`; the scene is on the GPU."""
     v_image, v_alphas = scene.picture_gradients(with_alphas)
     return render_frame_backward(
         scene.gaussians, scene.deltas, scene.viewmat, scene.K, scene.background, forward or rendered(scene),
-        v_image.cuda(), None if v_alphas is None else v_alphas.cuda(), camera_model=scene.camera_model,
+        v_image.cuda(), None if v_alphas is None else v_alphas.cuda(), camera_model=scene.camera_model, deterministic=deterministic,
     )  # fmt: skip
 
 

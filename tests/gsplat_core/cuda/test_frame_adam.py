@@ -150,6 +150,6 @@ def test_op_passes_opcheck(degree: int) -> None:
     inputs = (scene.deltas, scene.viewmat, scene.K, scene.background, *lists, v_image, v_alphas)
     rates, step = torch.full((5,), 0.01, device="cuda"), torch.ones(1, dtype=torch.int64, device="cuda")
     moments = (*state.first, *state.second, rates, step, state.skipped)
-    options = (scene.width, scene.height, 0.3, 0, 0.9, 0.999, 1e-8, degree > 0)
+    options = (scene.width, scene.height, 0.3, 0, 0.9, 0.999, 1e-8, degree > 0, True)
     op = torch.ops.gsplat_core.render_frame_backward_adam_.default
     torch.library.opcheck(op, (*state.scene.gaussians, *inputs, *moments, *options))

@@ -60,6 +60,20 @@ def test_features_equal_the_reference(gpu, n, channels):
     )
 
 
+@pytest.mark.parametrize("n", [0, 1, 1300])
+@pytest.mark.parametrize("channels", [1, 5, 32, 40, 64, 100])
+def test_feature_gradients_equal_the_reference(gpu, n, channels):
+    seen = [t.to(gpu).requires_grad_() for t in (points(n), *level(channels))]
+    wanted = [t.double().requires_grad_() for t in (points(n), *level(channels))]
+    gradient = torch.randn(n, channels, generator=random(2))
+    hexplane_features(*seen).backward(gradient.to(gpu))
+    reference.hexplane_features(*wanted).backward(gradient.double())
+    for s, w in zip(seen, wanted, strict=True):
+        assert relative(s.grad, w.grad) < 1e-4
+    again = torch.ops.gsplat_core.hexplane_features_backward(gradient.to(gpu), *(t.detach() for t in seen))
+    assert all(torch.equal(s.grad, a) for s, a in zip(seen, again, strict=True))
+
+
 @pytest.mark.parametrize("sizes", [(2, 2, 2, 2), (1, 1, 1, 1), (1, 3, 2, 1)])
 def test_the_smallest_planes(gpu, sizes):
     x, planes = points(50), level(8, sizes)
@@ -209,6 +223,7 @@ def test_ops_pass_opcheck(gpu):
     x = points(4).to(gpu)
     lines = [plane[0] for plane in planes[3:]]
     torch.library.opcheck(ops.hexplane_features.default, (x, *planes))
+    torch.library.opcheck(ops.hexplane_features_backward.default, (torch.rand(4, 3, device=gpu), x, *planes))
     torch.library.opcheck(ops.hexplane_space.default, (x, *planes[:3]))
     torch.library.opcheck(ops.hexplane_modulate.default, (torch.rand(4, 3, device=gpu), x, *lines))
     torch.library.opcheck(

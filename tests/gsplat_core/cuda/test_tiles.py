@@ -11,7 +11,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.tiles.tiles import bin_splats, isect_offset_encode, isect_tiles
 from gsplat_core.reference import tiles as reference
-from gsplat_core.reference.rendering import bin_splats as reference_bin_splats
+from gsplat_core.reference.rendering import bin_splats_within
 
 pytestmark = pytest.mark.cuda
 WIDTH, HEIGHT = 150, 100
@@ -107,7 +107,7 @@ def test_lists_of_a_capacity_are_those_of_the_reference(image_dims: tuple[int, .
     capacity = int(share * int(isect_tiles(*here, *grid(16))[0].sum()))
     seen = bin_splats(*cuda(here), *grid(16), capacity=capacity)
     assert all(t.is_cuda for t in seen)
-    wanted = list(reference_bin_splats(*here, *grid(16), capacity=capacity))
+    wanted = list(bin_splats_within(*here, *grid(16), capacity=capacity))
     wanted[2] = wanted[2].reshape(seen[2].shape)
     assert_equal(seen, tuple(wanted))
     assert_equal(seen, bin_splats(*here, *grid(16), capacity=capacity))

@@ -12,7 +12,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
 from gsplat_core.ops.tiles.tiles import bin_splats, isect_offset_encode, isect_tiles
 from gsplat_core.reference import tiles as reference
-from gsplat_core.reference.rendering import bin_splats as reference_bin_splats
+from gsplat_core.reference.rendering import bin_splats_within
 
 WIDTH, HEIGHT = 150, 100
 
@@ -198,7 +198,7 @@ def test_lists_of_a_capacity_equal_the_reference(image_dims: tuple[int, ...], sh
     total = exact[1].numel()
     capacity = int(share * total)
     counts, order, offsets, needed = bin_splats(*here, *grid(16), capacity=capacity)
-    wanted = list(reference_bin_splats(*here, *grid(16), capacity=capacity))
+    wanted = list(bin_splats_within(*here, *grid(16), capacity=capacity))
     wanted[2] = wanted[2].reshape(offsets.shape)
     assert_equal((counts, order, offsets, needed), tuple(wanted))
     assert needed.tolist() == [total]

@@ -1,0 +1,56 @@
+// What the passes over the planes share: a node's gradient, and Adam's update (Kingma and Ba 2015, algorithm 1) of its channels.
+#pragma once
+
+#include "node_gradient.cuh"
+#include "planes_adam_cuda.h"
+
+namespace hexplane {
+
+template <int kLane>
+__device__ __forceinline__ void update(const PlaneMoments& plane, int64_t at, const Channels<kLane>& value,
+                                       const Channels<kLane>& gradient, const AdamStep& step) {
+  Channels<kLane> p = value, m = Channels<kLane>::load(plane.first + at), v = Channels<kLane>::load(plane.second + at);
+#pragma unroll
+  for (int i = 0; i < kLane; ++i) {
+    const float g = gradient.v[i];
+    if (!isfinite(g * g)) continue;  // it would poison the moments for good
+    m.v[i] += step.fresh1 * (g - m.v[i]);
+    v.v[i] += step.fresh2 * (g * g - v.v[i]);
+    p.v[i] -= step.rate * m.v[i] / (sqrtf(v.v[i]) * step.inv_bias2 + step.epsilon);
+  }
+  p.store(plane.values + at);
+  m.store(plane.first + at);
+  v.store(plane.second + at);
+}
+
+// Blocks of a launch that visits planes of different sizes, one slot = 3 * level + plane after the other.
+struct Slots {
+  int32_t first_block[3 * kFieldLevels + 1];
+  int32_t count;
+};
+
+__device__ __forceinline__ int slot_of_block(const Slots& slots) {
+  int slot = 0;
+  while (int(blockIdx.x) >= slots.first_block[slot + 1]) ++slot;
+  return slot;
+}
+
+// The gradient of node (major, minor) of a slot's space plane, for the channels from `channel` on.
+template <int kLane>
+__device__ Channels<kLane> space_gradient(const FieldPlanes& planes, const FieldCells& cells, const float* rows, int slot, int u,
+                                          int v, int channel) {
+  const int level = slot / 3, p = slot % 3, major = major_axis(p), minor = minor_axis(p);
+  const bool v_major = v_axis(p) == major;
+  const SortedCells sorted = {cells.starts + cells.first[level][p],
+                              cells.items,
+                              cells.coordinates,
+                              rows + slot * cells.count * planes.channels,
+                              slot * cells.count,
+                              major,
+                              minor,
+                              planes.sizes[level][major],
+                              planes.sizes[level][minor]};
+  return node_gradient<kLane>(sorted, v_major ? v : u, v_major ? u : v, channel, planes.channels);
+}
+
+}  // namespace hexplane

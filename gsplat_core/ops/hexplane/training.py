@@ -1,0 +1,232 @@
+"""Training of the HexPlane field on CUDA without autograd: forward, backward, and Adam over the planes.
+
+    state = hexplane_train(means, box, time, planes, weights, biases)           # state.deltas into the frame
+    gradient = hexplane_train_backward(v_raw, means, box, state, planes, weights, biases)
+    hexplane_planes_adam_(planes, first, second, state, time, gradient, rate, step, ...)
+
+Nothing waits for the host and every call can be captured in a CUDA graph; time, rate and step are read from device memory. The same
+inputs give the same bits: no sum is made by atomic additions. The gradient of the planes stays factored, one row per Gaussian, level
+and plane, until the pass that updates the planes adds up each node's rows; `hexplane_planes_gradient` gives it as tensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.hexplane.deltas import DELTA_COLUMNS
+
+
+class TrainingState(NamedTuple):
+    """What the forward pass leaves for the backward pass."""
+
+    deltas: Tensor
+    """[N, 16] in the columns of the frame path."""
+    coordinates: Tensor
+    """[N, 4]: x, y, z in [-1, 1], and 1; a Gaussian whose position is not finite has zeros and takes no part."""
+    lines: Tensor
+    """The time planes at the time, one after the other: [U, C] each."""
+    features: Tensor
+    """[N, levels * C]."""
+    hidden: Tensor
+    """[depth, N, width]: what leaves each layer of the trunk."""
+
+
+class FieldGradient(NamedTuple):
+    """The gradient of a field, that of its planes factored."""
+
+    network: Tensor
+    """Weight and bias of every layer, one after the other."""
+    rows: Tensor
+    """[2, 3 * levels, N, C]: gradients of the samples of the space planes (xy, xz, yz) and of the lines (x, y, z)."""
+    items: Tensor
+    """int32 [3 * levels * N]: slot * N + Gaussian, sorted by the cell of that slot's space plane."""
+    starts: Tensor
+    """int32 [cells + 1]: where each cell's items start."""
+    v_lines: Tensor
+    """The gradient of the lines."""
+
+
+class Penalties(NamedTuple):
+    """Weights of the penalties of `gsplat_core.deformation.regularisers` in the loss."""
+
+    plane_smoothness: float = 0.0
+    time_smoothness: float = 0.0
+    time_sparsity: float = 0.0
+
+
+def hexplane_train(
+    means: Tensor,
+    box: Tensor,
+    time: Tensor,
+    planes: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+) -> TrainingState:
+    """The field's deltas at `time`, with what the way back needs.
+
+    Args:
+        means: canonical positions [N, 3]; outside the box they are clamped to it.
+        box: [2, 3], the range of the positions.
+        time: one number in [-1, 1].
+        planes: xy, xz, yz, xt, yt, zt of every level, [V, U, C], C a multiple of 16.
+        weights, biases: the trunk's layers and the head's (`takes_layers` says which sizes fit).
+
+    Raises:
+        InvalidInput: a tensor is not float32 on one CUDA device. RuntimeError: sizes do not fit.
+    """
+    _check(means, box, time, *planes, *weights, *biases)
+    state = torch.ops.gsplat_core.hexplane_train(means, box, time, list(planes), list(weights), list(biases))
+    return TrainingState(*state)
+
+
+def hexplane_train_backward(
+    v_raw: Tensor,
+    means: Tensor,
+    box: Tensor,
+    state: TrainingState,
+    planes: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+) -> FieldGradient:
+    """Gradients for dL/d(deltas) `v_raw` [N, 16]; what goes back to the positions through the field is added to its first 3 columns.
+
+    A row of `v_raw` that is not finite counts as zero.
+    """
+    _check(v_raw, means, box, *planes, *weights, *biases)
+    gradient = torch.ops.gsplat_core.hexplane_train_backward(
+        v_raw, means, box, state.lines, state.features, state.hidden, list(planes), list(weights), list(biases)
+    )
+    return FieldGradient(*gradient)
+
+
+def hexplane_planes_gradient(
+    state: TrainingState, time: Tensor, gradient: FieldGradient, planes: Sequence[Tensor]
+) -> list[Tensor]:
+    """The gradient of every plane as a tensor of its size."""
+    return torch.ops.gsplat_core.hexplane_planes_gradient(
+        state.coordinates, time, gradient.rows, gradient.items, gradient.starts, gradient.v_lines, list(planes)
+    )
+
+
+def hexplane_planes_adam_(
+    planes: Sequence[Tensor],
+    first: Sequence[Tensor],
+    second: Sequence[Tensor],
+    state: TrainingState,
+    time: Tensor,
+    gradient: FieldGradient,
+    rate: Tensor,
+    step: Tensor,
+    *,
+    status: Tensor | None = None,
+    penalties: Penalties = Penalties(),
+    betas: tuple[float, float] = (0.9, 0.999),
+    epsilon: float = 1e-8,
+) -> None:
+    """One step of Adam over all planes in place, gradients and penalties computed in the same pass.
+
+    A value whose gradient is not finite, and its moments, are left alone.
+
+    Args:
+        first, second: moments of the planes' shapes.
+        rate: float32 [1]. step: int64 [1], counts from 1.
+        status: int32 [4] of a frame; where status[2] is not 0 (its lists were cut) nothing is changed.
+    """
+    _check(*planes, *first, *second, rate)
+    torch.ops.gsplat_core.hexplane_planes_adam_(
+        list(planes), list(first), list(second), state.coordinates, time, gradient.rows, gradient.items, gradient.starts,
+        gradient.v_lines, rate, step, status, *betas, epsilon, *penalties,
+    )  # fmt: skip
+
+
+def _check(*tensors: Tensor) -> None:
+    for tensor in tensors:
+        if tensor.dtype != torch.float32 or tensor.device.type != "cuda":
+            raise InvalidInput(
+                f"the HexPlane training ops take float32 on CUDA, got {tensor.dtype} on {tensor.device};"
+                " train with autograd, or move it"
+            )
+
+
+def _lines_size(planes: list[Tensor]) -> int:
+    return sum(int(plane.shape[1] * plane.shape[2]) for index, plane in enumerate(planes) if index % 6 >= 3)
+
+
+@torch.library.register_fake("gsplat_core::hexplane_train")
+def _(
+    means: Tensor, box: Tensor, time: Tensor, planes: list[Tensor], weights: list[Tensor], biases: list[Tensor]
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    n, width = means.shape[0], weights[0].shape[0]
+    return (
+        means.new_empty(n, DELTA_COLUMNS),
+        means.new_empty(n, 4),
+        means.new_empty(_lines_size(planes)),
+        means.new_empty(n, weights[0].shape[1]),
+        means.new_empty(len(weights) - 1, n, width),
+    )
+
+
+@torch.library.register_fake("gsplat_core::hexplane_train_backward")
+def _(
+    v_raw: Tensor,
+    means: Tensor,
+    box: Tensor,
+    lines: Tensor,
+    features: Tensor,
+    hidden: Tensor,
+    planes: list[Tensor],
+    weights: list[Tensor],
+    biases: list[Tensor],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    n, slots = means.shape[0], len(planes) // 2
+    cells = sum(int(plane.shape[0] * plane.shape[1]) for index, plane in enumerate(planes) if index % 6 < 3)
+    return (
+        means.new_empty(sum(t.numel() for t in (*weights, *biases))),
+        means.new_empty(2, slots, n, planes[0].shape[2]),
+        means.new_empty(slots * n, dtype=torch.int32),
+        means.new_empty(cells + 1, dtype=torch.int32),
+        means.new_empty(_lines_size(planes)),
+    )
+
+
+@torch.library.register_fake("gsplat_core::hexplane_planes_gradient")
+def _(
+    coordinates: Tensor,
+    time: Tensor,
+    rows: Tensor,
+    items: Tensor,
+    starts: Tensor,
+    v_lines: Tensor,
+    planes: list[Tensor],
+) -> list[Tensor]:
+    return [plane.new_empty(plane.shape) for plane in planes]
+
+
+@torch.library.register_fake("gsplat_core::hexplane_planes_adam_")
+def _(
+    planes: list[Tensor],
+    first: list[Tensor],
+    second: list[Tensor],
+    coordinates: Tensor,
+    time: Tensor,
+    rows: Tensor,
+    items: Tensor,
+    starts: Tensor,
+    v_lines: Tensor,
+    rate: Tensor,
+    step: Tensor,
+    status: Tensor | None,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+    smoothness: float,
+    time_smoothness: float,
+    sparsity: float,
+) -> None:
+    return None

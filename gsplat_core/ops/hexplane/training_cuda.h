@@ -1,0 +1,66 @@
+// Training of the HexPlane field on CUDA without autograd: forward, and gradients of everything. All pointers are to device
+// memory.
+//
+// No sum is made by atomic additions of floats. The backward pass writes one row of gradient per Gaussian, level and plane;
+// Gaussians are sorted by their cell of each space plane, so that whoever needs a node's gradient adds the rows of its four cells
+// in that order: the optimiser does, in the pass in which it updates the node, and no gradient of the planes is ever in memory.
+// The gradient of a time plane lies in the two rows around the time, which share the gradient of the line between them.
+#pragma once
+
+#include "hexplane.h"
+#include "network_cuda.h"
+
+constexpr int kLineParts = 8;  // in which the Gaussians of a line's cell are summed
+
+// Space plane p of a level has cells in the order of its major axis, so that those around a node of the major axis lie together.
+constexpr int major_axis(int p) { return p == 0 ? 1 : p == 1 ? 0 : 2; }  // xy: y, xz: x, yz: z
+constexpr int minor_axis(int p) { return p == 0 ? 0 : p == 1 ? 2 : 1; }
+
+struct FieldPlanes {
+  const float* space[kFieldLevels][3];  // xy, xz, yz: [V, U, C]
+  int32_t sizes[kFieldLevels][3];       // cells along x, y, z
+  int32_t levels, channels;
+
+  __host__ __device__ FeaturePlane plane(int level, int p) const {
+    return {space[level][p], sizes[level][p < 2 ? 0 : 1], sizes[level][p < 1 ? 1 : 2]};
+  }
+};
+
+// Where the Gaussians are: slot = 3 * level + plane, item = slot * N + Gaussian.
+struct FieldCells {
+  float* coordinates;  // [N, 4] in [-1, 1]; the fourth is 0 for a Gaussian that takes no part because its position is not finite
+  int32_t* items;      // [slots * N] by cell, Gaussians in order within one
+  int32_t* starts;     // [cells + 1] of the cell's items
+  int64_t first[kFieldLevels][3];  // a slot's first cell
+  int64_t cells, count;
+};
+
+struct FieldRows {
+  float* space;  // [slots, N, C]: gradient of the plane's sample
+  float* lines;  // [slots, N, C]: of the line's, slot = 3 * level + axis
+};
+
+// Coordinates of `means` [N, 3] in `box` [2, 3], and with `cells.items` the sorted cells.
+void place_gaussians(const FieldPlanes& planes, const float* means, const float* box, FieldCells& cells, CudaScratch& scratch,
+                     cudaStream_t stream);
+
+// features [N, levels * C]: products of the samples of space planes and lines; 0 for Gaussians that take no part.
+void field_features(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, float* features,
+                    cudaStream_t stream);
+
+// From v_raw [N, 16] to the gradient of the features [N, levels * C] and, layer by layer, of the layers' sums: v_hidden
+// [layers - 1, N, width] and v_head [N, 16]. A row of v_raw that is not finite counts as zero.
+void network_backward(const FieldNetwork& net, const float* v_raw, const float* hidden, float* v_features, float* v_hidden,
+                      float* v_head, int64_t count, cudaStream_t stream);
+
+// The gradient of weights and biases, layer by layer: weight [outputs, inputs], then bias.
+void network_weight_gradient(const FieldNetwork& net, const float* features, const float* hidden, const float* v_hidden,
+                             const float* v_head, float* gradient, int64_t count, CudaScratch& scratch, cudaStream_t stream);
+
+// Rows for all planes and lines, and the gradient of the positions, which is added to the first three columns of v_raw.
+void field_rows(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, const float* box,
+                const float* v_features, const FieldRows& rows, float* v_raw, cudaStream_t stream);
+
+// The gradient of the lines, laid out as they are.
+void line_gradient(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, const FieldRows& rows,
+                   float* gradient, CudaScratch& scratch, cudaStream_t stream);
