@@ -106,5 +106,5 @@ __global__ void __launch_bounds__(kBlockThreads) blend(FrameScene in, FrameLists
 void blend_frame(const FrameScene& in, const FrameLists& lists, const FramePixels& out, cudaStream_t stream) {
   if (in.tiles() == 0) return;
   const auto kernel = lists.splat_starts != nullptr ? blend<true> : blend<false>;
-  launch_behind(kernel, unsigned(in.tiles()), kBlockThreads, stream, in, lists, out);
+  launch_behind(kernel, unsigned(in.tiles()), kBlockThreads, stream, 0, in, lists, out);
 }

@@ -49,14 +49,19 @@ struct FrameLists {
   int64_t capacity;
 };
 
-// On the way from one kernel to the next.
+// On the way from one kernel to the next. The Gaussians are in chunks, each a block's when the lists are filled. In a small scene
+// preprocess counts the tiles' instances in `counts` and the fill reserves places at `cursors`; in a large one (chunk_counts is
+// not null) preprocess does not count.
 struct FrameScratch {
-  uint2* footprints;  // [N], see frame_footprint.cuh
-  uint32_t* depths;   // [N], z of visible Gaussians as bits
-  int32_t* counts;    // [tiles], zero before
-  uint32_t* cursors;  // [tiles]
-  int32_t* sums;      // [blocks of Gaussians], training: instances of each block
-  uint32_t* starts;   // [blocks of Gaussians], training: where they start
+  uint2* footprints;       // [N], see frame_footprint.cuh
+  uint32_t* depths;        // [N], z of visible Gaussians as bits
+  int32_t* counts;         // [tiles]; small scene: zero before
+  uint32_t* cursors;       // [tiles], small scene
+  uint32_t* chunk_counts;  // [chunks, tiles], large scene: instances, and then those of the chunks in front
+  int32_t* sums;           // [chunks], training: instances of each chunk
+  uint32_t* starts;        // [chunks], training: where they start
+  int64_t chunk;           // Gaussians
+  int32_t chunks;
 };
 
 struct FramePixels {
@@ -66,6 +71,8 @@ struct FramePixels {
 };
 
 void preprocess_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
+void count_frame_in_chunks(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
 void scan_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
 void fill_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
+void fill_frame_in_chunks(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
 void blend_frame(const FrameScene& in, const FrameLists& lists, const FramePixels& out, cudaStream_t stream);

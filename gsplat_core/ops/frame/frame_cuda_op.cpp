@@ -5,6 +5,7 @@
 namespace {
 
 constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
+constexpr int64_t kLargeScene = 1 << 16;  // Gaussians
 
 using Frame = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
@@ -17,7 +18,7 @@ Frame render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_o
                   capacity);
   CudaCall& call = inputs.call;
   const FrameScene& in = inputs.scene;
-  const int64_t tiles = in.tiles(), blocks = blocks_for(in.count, kFrameThreads);
+  const int64_t tiles = in.tiles();
   const auto ints = [&](int64_t when_training) { return call.empty({training ? when_training : 0}, ScalarType::Int); };
   Tensor image = call.empty({height, width, 4}), alphas = call.empty({height, width});
   Tensor last = call.empty({training ? height : 0, training ? width : 0}, ScalarType::Int);
@@ -32,17 +33,34 @@ Frame render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_o
                             training ? instance_splats.mutable_data_ptr<int32_t>() : nullptr,
                             status.mutable_data_ptr<int32_t>(),
                             capacity};
+  // In a large scene the tiles are counted chunk by chunk, if the counts of all tiles fit into shared memory.
+  int processors = 0, shared_bytes = 0;
+  cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, means.get_device_index());
+  cudaDeviceGetAttribute(&shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, means.get_device_index());
+  const bool large = in.count >= kLargeScene && tiles * int64_t(sizeof(int32_t)) <= shared_bytes - 1024;
+  const int64_t chunk = large ? (in.count + processors * 32 - 1) / (processors * 32) * 32 : kFrameThreads;
+  const int64_t chunks = (in.count + chunk - 1) / chunk;
   const FrameScratch scratch = {call.array<uint2>(in.count),
                                 call.array<uint32_t>(in.count),
                                 call.array<int32_t>(tiles),
-                                call.array<uint32_t>(tiles),
-                                training ? call.array<int32_t>(blocks) : nullptr,
-                                training ? call.array<uint32_t>(blocks) : nullptr};
+                                large ? nullptr : call.array<uint32_t>(tiles),
+                                large ? call.array<uint32_t>(chunks * tiles) : nullptr,
+                                training ? call.array<int32_t>(chunks) : nullptr,
+                                training ? call.array<uint32_t>(chunks) : nullptr,
+                                chunk,
+                                int32_t(chunks)};
   const FramePixels out = {mutable_data(image), mutable_data(alphas), training ? last.mutable_data_ptr<int32_t>() : nullptr};
-  check_cuda(cudaMemsetAsync(scratch.counts, 0, size_t(tiles) * sizeof(int32_t), call.stream), "clearing the tiles' counts");
-  preprocess_frame(in, lists, scratch, call.stream);
-  scan_frame(in, lists, scratch, call.stream);
-  fill_frame(in, lists, scratch, call.stream);
+  if (large) {
+    preprocess_frame(in, lists, scratch, call.stream);
+    count_frame_in_chunks(in, lists, scratch, call.stream);
+    scan_frame(in, lists, scratch, call.stream);
+    fill_frame_in_chunks(in, lists, scratch, call.stream);
+  } else {
+    check_cuda(cudaMemsetAsync(scratch.counts, 0, size_t(tiles) * sizeof(int32_t), call.stream), "clearing the tiles' counts");
+    preprocess_frame(in, lists, scratch, call.stream);
+    scan_frame(in, lists, scratch, call.stream);
+    fill_frame(in, lists, scratch, call.stream);
+  }
   blend_frame(in, lists, out, call.stream);
   check_cuda(cudaGetLastError(), "render_frame");
   return {image, alphas, last, records, tile_offsets, sorted, splat_starts, instance_splats, status};
