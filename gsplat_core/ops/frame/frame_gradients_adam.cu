@@ -20,7 +20,8 @@ __device__ inline double power_of(double base, int64_t exponent) {
 
 // Even lanes compute the first moment's share, odd ones the second's.
 __device__ inline AdamFactors factors_of(const FrameAdam& adam, int lane) {
-  const int64_t step = adam.step_is_long ? *static_cast<const int64_t*>(adam.step) : *static_cast<const int32_t*>(adam.step);
+  const int64_t given = adam.step_is_long ? *static_cast<const int64_t*>(adam.step) : *static_cast<const int32_t*>(adam.step);
+  const int64_t step = given < 1 ? 1 : given;  // there is no correction for a step before the first
   const double bias = 1 - power_of(lane % 2 == 0 ? adam.beta1 : adam.beta2, step);
   const double mine = lane % 2 == 0 ? 1 / bias : ::rsqrt(bias);
   const double over_bias1 = __shfl_sync(kAllLanes, mine, 0);
