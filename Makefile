@@ -5,15 +5,18 @@ OUT ?= out/demo
 # Waiting threads sleep: tests and benchmarks share the machine.
 export OMP_WAIT_POLICY ?= PASSIVE
 CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*.cu' 'gsplat_core/*.cuh')
-# For which GPUs `make cuda` builds, as CMake names them: the one in this machine, or 80-real;90-real;120 for a list.
+# For which GPUs `make cuda` builds: `native`, the one in this machine; `portable`, all from compute capability 8.0 on; or as CMake
+# names them, 80-real;90-real.
 CUDA_ARCHITECTURES ?= native
 CUDA_TOOLKIT := build/cuda-toolkit
 
 .PHONY: demo test lint format bench native cuda lock licences clean
 
+# On the NVIDIA GPU where there is one that torch can use: the CUDA kernels are built for it first. A build that fails ends it.
 demo: native
 	$(BIN)/intrasplat synthesize --out out/recording
-	$(BIN)/intrasplat replay out/recording --out $(OUT)
+	@set -e; if $(BIN)/python -m services.cli.graphics; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
+	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --device $$device
 
 test: native .venv/.development
 	$(BIN)/python -m pytest
@@ -37,7 +40,7 @@ native: .venv/.runtime
 	@$(BIN)/cmake --build build/editable -- --quiet
 
 # The CUDA kernels. The compiler is NVIDIA's from pip, in a folder of its own beside no torch, or the nvcc that CUDACXX names.
-cuda: .venv/.runtime $(if $(CUDACXX),,$(CUDA_TOOLKIT)/.installed)
+cuda: .venv/.runtime $(if $(strip $(CUDACXX)),,$(CUDA_TOOLKIT)/.installed)
 	@$(BIN)/cmake -S . -B build/cuda -G Ninja -DINTRASPLAT_CUDA=ON -DINTRASPLAT_INPLACE=ON \
 	  -DINTRASPLAT_CUDA_ARCHITECTURES="$(CUDA_ARCHITECTURES)" -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
 	  -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja --log-level=WARNING

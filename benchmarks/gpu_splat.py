@@ -1,205 +1,196 @@
-"""How fast one NVIDIA GPU rasterizes the scenes of the peers' measurements, and how that compares with gsplat if it is installed.
+"""How fast one NVIDIA GPU renders the scenes of the peers' measurements, forward and backward, beside gsplat in the same run.
 
     python benchmarks/gpu_splat.py
-    python benchmarks/gpu_splat.py --scenes volume1m_1080p --repetitions 100 --stages-only
+    python benchmarks/gpu_splat.py --scenes volume1m_1080p --repetitions 100
 
-Times are medians over CUDA events, in milliseconds, with the host's part of each call in them; the stages are timed on their own,
-on splats that the CPU projected. Prints one JSON object per line.
+Two ways of ours are timed: the frame path (raw Gaussians in, picture out, captured as a CUDA graph) and `rasterization()`, which
+has gsplat's arguments and is called like it. The picture is RGB and expected depth, the loss the mean absolute difference to a
+noise picture, as in the peers' measurements. Times are explained in gpu_timing.py. Prints one JSON object per line.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
-import json
-import math
-import statistics
 from collections.abc import Callable
 from typing import Any
 
 import torch
+from gpu_scenes import SCENES, Scene
+from gpu_timing import Times, Work, captured, compare, extra_mib, gsplat, measure, report, report_machine
 from torch import Tensor
 
 import gsplat_core
-from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
-from gsplat_core.ops.projection.projection import fully_fused_projection
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.cameras import Camera
+from gsplat_core.frame_renderer import FrameRenderer, capacity_for
+from gsplat_core.gaussians import Gaussians
+from gsplat_core.ops.frame.frame import STATUS_MOST, STATUS_NEEDED, Frame, render_frame
+from gsplat_core.ops.frame.frame_gradients import RATES, render_frame_backward, render_frame_backward_adam_
 
-TILE_SIZE = 16
-PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
-
-
-def surgical(count: int, width: int, height: int, seed: int = 0) -> dict[str, Any]:
-    """Arguments of `rasterization`: a bumpy tissue-like surface, `count` flat and mostly opaque Gaussians of about 1.6 px."""
-    g, focal_px = torch.Generator().manual_seed(seed), 560.0
-    u, v = torch.rand(count, generator=g) * width, torch.rand(count, generator=g) * height
-    z = 60 + 12 * torch.sin(u / 90) * torch.cos(v / 70) + 0.3 * torch.randn(count, generator=g)
-    size_px = 1.6 * torch.exp(0.5 * torch.randn(count, 3, generator=g))
-    quats = torch.tensor([1.0, 0, 0, 0]) + 0.3 * torch.randn(count, 4, generator=g)
-    opacities = torch.sigmoid(1.5 + 1.5 * torch.randn(count, generator=g))
-    sh = 0.1 * torch.randn(count, 16, 3, generator=g)
-    sh[:, 0] += torch.tensor([1.0, -0.4, -0.6])
-    flat = torch.tensor([1.0, 1.0, 0.3])
-    return _scene(u, v, z, focal_px, size_px * flat, quats, opacities, sh, width, height)
-
-
-def volume(count: int, width: int, height: int, seed: int = 1) -> dict[str, Any]:
-    """Arguments of `rasterization`: Gaussians of log-normal screen size (median 1.2 px) through a deep frustum."""
-    g, focal_px = torch.Generator().manual_seed(seed), 1400.0
-    u = torch.rand(count, generator=g) * width * 1.2 - 0.1 * width
-    v = torch.rand(count, generator=g) * height * 1.2 - 0.1 * height
-    z = torch.exp(torch.rand(count, generator=g) * 3.0) * 2
-    size_px = 1.2 * torch.exp(0.9 * torch.randn(count, 3, generator=g)).clamp(max=60)
-    quats = torch.randn(count, 4, generator=g)
-    opacities = torch.sigmoid(2.0 * torch.randn(count, generator=g))
-    sh = 0.1 * torch.randn(count, 16, 3, generator=g)
-    sh[:, 0] += torch.randn(count, 3, generator=g)
-    return _scene(u, v, z, focal_px, size_px, quats, opacities, sh, width, height)
-
-
-def _scene(
-    u: Tensor,
-    v: Tensor,
-    z: Tensor,
-    focal_px: float,
-    size_px: Tensor,
-    quats: Tensor,
-    opacities: Tensor,
-    sh: Tensor,
-    width: int,
-    height: int,
-) -> dict[str, Any]:
-    return {
-        "means": torch.stack([(u - width / 2) / focal_px * z, (v - height / 2) / focal_px * z, z], -1),
-        "quats": torch.nn.functional.normalize(quats, dim=-1),
-        "scales": size_px * (z / focal_px)[:, None],
-        "opacities": opacities,
-        "colors": sh,
-        "viewmats": torch.eye(4)[None],
-        "Ks": torch.tensor([[[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]]]),
-        "width": width,
-        "height": height,
-        "sh_degree": 3,
-        "packed": False,
-        "render_mode": "RGB+ED",
-    }
-
-
-SCENES: dict[str, Callable[[], dict[str, Any]]] = {
-    "surgical50k_640x512": lambda: surgical(50_000, 640, 512),
-    "surgical200k_1280x1024": lambda: surgical(200_000, 1280, 1024),
-    "volume1m_1080p": lambda: volume(1_000_000, 1920, 1080),
+ASKED_MS = {
+    "surgical50k_640x512": (0.06, 0.30),
+    "volume1m_1080p": (0.40, 1.8),
+    "volume4m_4k": (1.5, 7.0),
 }
+"""Forward and forward with backward, where a limit was set."""
+ASKED_MIB = {"volume1m_1080p": 250.0}
+"""Memory beyond what is there before (parameters, Adam's moments) for forward with backward. The gradients themselves are in it where
+they are stored, as the peer's are; a training step of ours, whose Adam is in the same pass, stores none, and is what the limit is for."""
 
 
-def milliseconds(function: Callable[[], object], repetitions: int, warm_up: int = 5) -> float:
-    """Median time between two events around a call."""
-    for _ in range(warm_up):
-        function()
-    torch.cuda.synchronize()
-    times = []
-    for _ in range(repetitions):
-        start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-        start.record()
-        function()
-        end.record()
-        end.synchronize()
-        times.append(start.elapsed_time(end))
-    return statistics.median(times)
+class FramePath:
+    """The frame path on one scene, with as much room as its owner (`FrameRenderer`) would keep for it."""
+
+    def __init__(self, scene: Scene, target: Tensor) -> None:
+        self._gaussians = scene.raw()
+        self._camera, self._size, self._target = scene.camera, scene.size_px, target
+        self._capacity = 1 << 16
+        status = self._render().status.tolist()
+        self.instances, self.most_in_a_tile = status[STATUS_NEEDED], status[STATUS_MOST]
+        self._capacity = capacity_for(self.instances)
+
+    def forward(self) -> Frame:
+        return self._render()
+
+    def step(self) -> None:
+        frame = self._render(training=True)
+        render_frame_backward(
+            self._gaussians, None, *self._camera, None, frame, *l1_gradients(frame.image, frame.alphas, self._target)
+        )
+
+    def learning_step(self) -> Work:
+        """A step whose gradient goes straight into Adam over the Gaussians: no gradient of theirs is ever stored."""
+        gaussians = tuple(tensor.clone() for tensor in self._gaussians)
+        moments = [[torch.zeros_like(tensor) for tensor in gaussians] for _ in range(2)]
+        rates = torch.full((RATES,), 1e-6, device="cuda")
+        step = torch.ones(1, dtype=torch.int64, device="cuda")
+        skipped = torch.zeros(RATES, dtype=torch.int64, device="cuda")
+
+        def work() -> None:
+            frame = self._render(training=True)
+            render_frame_backward_adam_(
+                gaussians, *moments, rates, step, skipped, None, *self._camera, None, frame,
+                *l1_gradients(frame.image, frame.alphas, self._target), needs_raw=False,
+            )  # fmt: skip
+
+        return work
+
+    def _render(self, training: bool = False) -> Frame:
+        return render_frame(*self._gaussians, None, *self._camera, None, *self._size, self._capacity, training=training)
 
 
-def on_gpu(scene: dict[str, Any]) -> dict[str, Any]:
-    return {name: value.cuda() if isinstance(value, Tensor) else value for name, value in scene.items()}
+def l1_gradients(image: Tensor, alphas: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of the mean absolute difference of RGB and expected depth, which is the last channel divided by alpha."""
+    weight = alphas.clamp_min(1e-10)
+    image[..., 3] /= weight
+    difference = image - target
+    difference.abs().mean()  # the loss itself, which the peer takes too
+    v_image = difference.sign_().mul_(1 / difference.numel())
+    v_image[..., 3] /= weight
+    return v_image, -(v_image[..., 3] * image[..., 3])
 
 
-def whole(
-    rasterization: Callable[..., Any], scene: dict[str, Any], repetitions: int
-) -> tuple[dict[str, float], Tensor]:
-    """Forward, forward and backward, and the memory that the latter takes beyond the parameters'; and the image."""
-    scene = on_gpu(scene)
+def called(rasterization: Callable[..., Any], scene: Scene, target: Tensor) -> tuple[Callable[[], Tensor], Work]:
+    """Forward, and forward with backward, of a function with gsplat's arguments."""
 
     def forward() -> Tensor:
         with torch.no_grad():
-            return rasterization(**scene)[0]
+            return rasterization(**scene.arguments)[0]
 
-    times = {"forward_ms": milliseconds(forward, repetitions)}
-    leaves = {name: scene[name].clone().requires_grad_() for name in PARAMETERS}
-    target = torch.rand(1, scene["height"], scene["width"], 4, device="cuda")
+    leaves = scene.leaves()
 
     def step() -> None:
-        image, _, _ = rasterization(**(scene | leaves))
+        image, _, _ = rasterization(**(scene.arguments | leaves))
         (image - target).abs().mean().backward()
         for leaf in leaves.values():
             leaf.grad = None
 
-    torch.cuda.reset_peak_memory_stats()
-    before = torch.cuda.memory_allocated()
-    times["forward_backward_ms"] = milliseconds(step, repetitions)
-    times["extra_mib"] = (torch.cuda.max_memory_allocated() - before) / 2**20
-    return times, forward()
+    return forward, step
 
 
-def stages(scene: dict[str, Any], repetitions: int) -> dict[str, float]:
-    """Tile lists, compositing and its gradient alone: four channels, as colour and depth have."""
-    width, height = scene["width"], scene["height"]
-    rows = fully_fused_projection(
-        scene["means"], None, scene["quats"], scene["scales"], scene["viewmats"], scene["Ks"], width, height,
-        opacities=scene["opacities"],
-    )  # fmt: skip
-    means2d, radii, depths, conics = (t.cuda() for t in (rows.means2d, rows.radii, rows.depths, rows.conics))
-    opacities = scene["opacities"][None].cuda()
-    colors = torch.rand(*depths.shape, 4, device="cuda")
-    grid = (TILE_SIZE, math.ceil(width / TILE_SIZE), math.ceil(height / TILE_SIZE))
+def live(scene: Scene, repetitions: int) -> Times:
+    """`FrameRenderer`: a new camera for every frame."""
+    raw, (width, height) = scene.raw(), scene.size_px
+    pose, intrinsics = (tensor.cpu().double().numpy() for tensor in scene.camera)
+    cameras = []
+    for k in range(16):
+        pose = pose.copy()
+        pose[0, 3] = 0.01 * k
+        cameras.append(Camera(K=intrinsics, world_to_camera=pose, width_px=width, height_px=height))
+    renderer = FrameRenderer(Gaussians(*raw), cameras[0])
+    renderer.render().result()
+    frame = 0
 
-    def lists() -> tuple[Tensor, Tensor, Tensor]:
-        return bin_splats(means2d, radii, depths, *grid, conics=conics, opacities=opacities)
+    def work() -> None:
+        nonlocal frame
+        frame += 1
+        renderer.render(cameras[frame % len(cameras)])
 
-    _, flatten_ids, offsets = lists()
-    splats = (means2d, conics, colors, opacities)
+    return measure(work, repetitions)
 
-    def blend(*inputs: Tensor) -> Tensor:
-        return rasterize_to_pixels(*inputs, width, height, TILE_SIZE, offsets, flatten_ids)[0]
 
-    leaves = [t.detach().requires_grad_() for t in splats]
-    image = blend(*leaves)
-    weights = torch.rand_like(image)
-    return {
-        "instances": flatten_ids.numel(),
-        "bin_splats_ms": milliseconds(lists, repetitions),
-        "composite_ms": milliseconds(lambda: blend(*splats), repetitions),
-        "composite_backward_ms": milliseconds(
-            lambda: torch.autograd.grad(image, leaves, weights, retain_graph=True), repetitions
-        ),
-    }
+def psnr_db(a: Tensor, b: Tensor) -> float:
+    return float(-10 * torch.log10((a - b)[..., :3].square().mean()))
+
+
+def run(name: str, repetitions: int) -> None:
+    """All figures of one scene."""
+    scene = SCENES[name]()
+    width, height = scene.size_px
+    target = torch.rand(height, width, 4, generator=torch.Generator().manual_seed(2)).cuda()
+    asked_forward, asked_step = ASKED_MS.get(name, (None, None))
+    peers: dict[str, tuple[Times, Times, float]] = {}
+    pictures: dict[str, Tensor] = {}
+
+    def time_called(module: str, rasterization: Callable[..., Any]) -> tuple[Times, Times, float]:
+        forward, step = called(rasterization, scene, target)
+        pictures[module] = forward()[0]
+        return measure(forward, repetitions), measure(step, repetitions), extra_mib(step)
+
+    if (peer := gsplat()) is not None:
+        peers["gsplat"] = time_called("gsplat", peer.rasterization)
+    plain = time_called("rasterization", gsplat_core.rasterization)
+    path = FramePath(scene, target)
+    pictures["frame path"] = path.forward().image.clone()
+    forward, step = (measure(captured(work), repetitions) for work in (path.forward, path.step))
+    memory, learning_memory = extra_mib(path.step), extra_mib(learning := path.learning_step())
+    learning_times = measure(captured(learning), repetitions)
+
+    of_peer = lambda k: {module: figures[k] for module, figures in peers.items()}
+    compare(f"{name} forward", forward, of_peer(0), asked_forward)
+    compare(f"{name} forward, rasterization()", plain[0], of_peer(0))
+    compare(f"{name} forward+backward", step, of_peer(1), asked_step)
+    compare(f"{name} forward+backward, rasterization()", plain[1], of_peer(1))
+    report(f"{name} forward+backward+Adam in one", ours=learning_times)
+    report(
+        f"{name} forward+backward extra memory",
+        ours_mib=memory,
+        ours_with_adam_mib=learning_memory,
+        rasterization_mib=plain[2],
+        **{f"{module}_mib": figures[2] for module, figures in peers.items()},
+        **({"asked_mib": ASKED_MIB[name], "met": learning_memory <= ASKED_MIB[name]} if name in ASKED_MIB else {}),
+    )
+    report(f"{name} FrameRenderer, a new camera every frame", ours=live(scene, repetitions))
+    report(
+        f"{name} agreement",
+        instances=path.instances,
+        most_in_a_tile=path.most_in_a_tile,
+        **{
+            f"psnr_to_{module}_db": psnr_db(picture, pictures["frame path"])
+            for module, picture in pictures.items()
+            if module != "frame path"
+        },
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
     parser.add_argument("--repetitions", type=int, default=50)
-    parser.add_argument("--stages-only", action="store_true")
     options = parser.parse_args()
-    machine = {"device": torch.cuda.get_device_name(), "torch": torch.__version__}
-    modules: dict[str, Callable[..., Any]] = {"gsplat_core": gsplat_core.rasterization}
-    if importlib.util.find_spec("gsplat") is not None:
-        modules["gsplat"] = importlib.import_module("gsplat").rasterization
-
-    def report(scene: str, module: str, figures: dict[str, float]) -> None:
-        rounded = {name: round(value, 4) for name, value in figures.items()}
-        print(json.dumps({"scene": scene, "module": module} | rounded | machine), flush=True)
-
+    report_machine()
     for name in options.scenes:
-        scene = SCENES[name]()
-        report(name, "gsplat_core stages", stages(scene, options.repetitions))
-        if options.stages_only:
-            continue
-        images = {}
-        for module, rasterization in modules.items():
-            figures, images[module] = whole(rasterization, scene, options.repetitions)
-            report(name, module, figures)
-        if "gsplat" in images:
-            error = (images["gsplat"] - images["gsplat_core"])[..., :3].square().mean()
-            report(name, "agreement", {"rgb_psnr_db": float(-10 * torch.log10(error))})
+        run(name, options.repetitions)
+        torch.cuda.empty_cache()
 
 
 if __name__ == "__main__":

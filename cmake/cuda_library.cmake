@@ -3,13 +3,22 @@
 # The compiler is, in this order: CMAKE_CUDA_COMPILER or $CUDACXX, then the one that `make cuda` puts into build/cuda-toolkit
 # (NVIDIA's pip packages), then an nvcc on the PATH. CMake's own FindCUDAToolkit expects a whole toolkit and is not used.
 set(CUDA_PACKAGES ${CMAKE_CURRENT_SOURCE_DIR}/build/cuda-toolkit/nvidia/cu13)
-if(NOT CMAKE_CUDA_COMPILER AND NOT DEFINED ENV{CUDACXX} AND EXISTS ${CUDA_PACKAGES}/bin/nvcc)
+string(STRIP "$ENV{CUDACXX}" COMPILER_ASKED_FOR)  # may be set and empty
+if(NOT CMAKE_CUDA_COMPILER AND COMPILER_ASKED_FOR STREQUAL "" AND EXISTS ${CUDA_PACKAGES}/bin/nvcc)
   set(CMAKE_CUDA_COMPILER ${CUDA_PACKAGES}/bin/nvcc)
 endif()
 if(CMAKE_CUDA_COMPILER MATCHES "^${CUDA_PACKAGES}/")
   set(ENV{LIBRARY_PATH} "${CUDA_PACKAGES}/lib:$ENV{LIBRARY_PATH}")  # CMake links a program to try the compiler
 endif()
-set(CMAKE_CUDA_ARCHITECTURES ${INTRASPLAT_CUDA_ARCHITECTURES})
+# portable: what a library for others has, and what CI compiles. The front end runs once for all of compute capability 8.x, whose
+# instructions are the same; the PTX is for GPUs to come.
+if(INTRASPLAT_CUDA_ARCHITECTURES STREQUAL "portable")
+  set(CMAKE_CUDA_ARCHITECTURES OFF)
+  set(PORTABLE_CODE "--generate-code=arch=compute_80,code=[sm_80,sm_86,sm_89]" "--generate-code=arch=compute_90,code=[sm_90]"
+      "--generate-code=arch=compute_100,code=[sm_100]" "--generate-code=arch=compute_120,code=[sm_120,compute_120]")
+else()
+  set(CMAKE_CUDA_ARCHITECTURES ${INTRASPLAT_CUDA_ARCHITECTURES})
+endif()
 enable_language(CUDA)
 set(CMAKE_CUDA_STANDARD 20)
 set(CMAKE_CUDA_STANDARD_REQUIRED ON)
@@ -29,11 +38,14 @@ find_library(CUDA_RUNTIME NAMES libcudart_static.a PATHS ${CUDA_ROOT}/lib ${CUDA
              ${CUDA_ROOT}/targets/x86_64-linux/lib ${CUDA_ROOT}/targets/sbsa-linux/lib REQUIRED NO_DEFAULT_PATH)
 
 file(GLOB CUDA_SOURCES CONFIGURE_DEPENDS gsplat_core/ops/*/*.cu gsplat_core/ops/*/*_cuda_op.cpp)
-add_library(gsplat_core_cuda SHARED ${CUDA_SOURCES})
+add_library(gsplat_core_cuda SHARED ${CUDA_SOURCES} gsplat_core/native/cuda_build.cu)
 target_compile_definitions(gsplat_core_cuda PRIVATE ${CORE_DEFINITIONS} GSPLAT_ISA=device)
 target_compile_options(gsplat_core_cuda PRIVATE
   $<$<COMPILE_LANGUAGE:CXX>:${CORE_FLAGS}>
-  $<$<COMPILE_LANGUAGE:CUDA>:--expt-relaxed-constexpr --extended-lambda -Xcompiler=-fvisibility=hidden,-Wall>)
+  $<$<COMPILE_LANGUAGE:CUDA>:${PORTABLE_CODE} --expt-relaxed-constexpr --extended-lambda -Xcompiler=-fvisibility=hidden,-Wall>)
+# These are bound by the instructions per Gaussian: quotients and roots to 2 units in the last place are enough there.
+set_source_files_properties(gsplat_core/ops/frame/frame_preprocess.cu gsplat_core/ops/frame/frame_lists.cu
+                            PROPERTIES COMPILE_OPTIONS "--prec-div=false;--prec-sqrt=false")
 target_include_directories(gsplat_core_cuda PRIVATE gsplat_core/native)
 target_include_directories(gsplat_core_cuda SYSTEM PRIVATE ${TORCH_ROOT}/include
                            $<$<COMPILE_LANGUAGE:CXX>:${CUDA_INCLUDE}>)

@@ -83,6 +83,13 @@ class Camera:
         """K as a float32 tensor [3, 3]."""
         return torch.tensor(self.K, dtype=torch.float32)
 
+    def matrices(self, device: torch.device, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
+        """World-to-camera [4, 4] and K [3, 3] on `device`; the host does not wait for the copies."""
+        # One copy for both. CUDA takes so few bytes at once, so that they need not stay where they are.
+        both = torch.tensor(np.concatenate([self.world_to_camera.ravel(), self.K.ravel()]), dtype=dtype)
+        both = both.to(device, non_blocking=True)
+        return both[:16].view(4, 4), both[16:].view(3, 3)
+
     @property
     def position(self) -> NDArray[np.float64]:
         """The camera's centre in the world [3]."""

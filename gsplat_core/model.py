@@ -68,6 +68,13 @@ class Model:
         """Numbers in all tensors."""
         return sum(tensor.numel() for tensor in self.tensors().values())
 
+    def to(self, device: torch.device | str) -> Model:
+        """The same version on `device`: itself when it is there, else a copy."""
+        if self.gaussians.device == torch.device(device):
+            return self
+        field = None if self.field is None else self.field.detached_copy().to(device)
+        return dataclasses.replace(self, gaussians=self.gaussians.to(device), field=field)
+
     def at(self, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`, clamped to the window. The last answer is remembered, so asking again is free."""
         if self.field is None:

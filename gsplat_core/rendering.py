@@ -11,10 +11,12 @@ from gsplat_core.argument_checks import require_shape
 from gsplat_core.cameras import Camera
 from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
+from gsplat_core.ops.frame.frame import STATUS_CUT, STATUS_NEEDED, render_frame
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.tiles import bin_splats, isect_tiles
 from gsplat_core.pipeline import Operations
+from gsplat_core.transfers import HostCopy
 
 __all__ = ["RenderOutput", "rasterization", "render"]
 
@@ -24,7 +26,14 @@ rasterization = Operations(
     isect_tiles=isect_tiles,
     bin_splats=bin_splats,
     rasterize_to_pixels=rasterize_to_pixels,
+    passes_no_zeros_on=True,
 ).rasterization
+
+
+INSTANCES_PER_GAUSSIAN = 8
+"""Room in the frame path's lists, in tiles touched by a Gaussian on average. A frame that needs more is rendered again."""
+SMALLEST_SCENE = 1 << 14
+"""Fewer Gaussians get the room of so many: a handful of large ones touches every tile."""
 
 
 class RenderOutput(NamedTuple):
@@ -42,27 +51,49 @@ def render(gaussians: Gaussians, camera: Camera, background: Tensor | None = Non
     """Render the Gaussians from one camera, in front of `background` [3] (black when None).
 
     `depth=False` saves the depth channel, and `RenderOutput.depth` is then 0 (unknown) everywhere.
+
+    Float32 Gaussians on CUDA of which no gradient is wanted take the frame path (`render_frame`), which needs fewer launches.
     """
     if background is not None:
         require_shape("background", background, (3,), "[3]")
-        background = background[None]
-    device, dtype = gaussians.device, gaussians.dtype
+    viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
+    followed = torch.is_grad_enabled() and any(
+        t.requires_grad for t in (*gaussians.tensors().values(), background) if t is not None
+    )
+    if gaussians.device.type == "cuda" and gaussians.dtype == torch.float32 and not followed:
+        return _render_frame(gaussians, camera, viewmat, intrinsics, background, depth)
     colors, alphas, _ = rasterization(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
         gaussians.opacities,
         gaussians.sh,
-        torch.tensor(camera.world_to_camera, dtype=dtype, device=device)[None],
-        torch.tensor(camera.K, dtype=dtype, device=device)[None],
+        viewmat[None],
+        intrinsics[None],
         camera.width_px,
         camera.height_px,
         sh_degree=gaussians.sh_degree,
         packed=False,
-        backgrounds=background,
+        backgrounds=None if background is None else background[None],
         render_mode="RGB+ED" if depth else "RGB",
         camera_model=camera.model,
     )
     alpha = alphas[0, ..., 0]
     z = colors[0, ..., 3] if depth else alpha.new_zeros(alpha.shape)
     return RenderOutput(colors[0, ..., :3], alpha, z)
+
+
+def _render_frame(
+    gaussians: Gaussians, camera: Camera, viewmat: Tensor, intrinsics: Tensor, background: Tensor | None, depth: bool
+) -> RenderOutput:
+    capacity = INSTANCES_PER_GAUSSIAN * max(gaussians.count, SMALLEST_SCENE)
+    while True:
+        frame = render_frame(
+            gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh, None,
+            viewmat, intrinsics, background, camera.width_px, camera.height_px, capacity, camera_model=camera.model,
+        )  # fmt: skip
+        status = HostCopy(frame.status).numpy()
+        if not status[STATUS_CUT]:
+            z = frame.image[..., 3] if depth else torch.zeros_like(frame.alphas)
+            return RenderOutput(frame.image[..., :3], frame.alphas, z)
+        capacity = int(status[STATUS_NEEDED])

@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from gsplat_core.frames import Frame
 from gsplat_core.training.metrics import FrameQuality, QualityTracker, psnr_tissue_db
 from operators.graph import Operator, OperatorSpec
@@ -77,7 +79,7 @@ class MetricsOp(Operator):
         rendered: RenderedFrame = op_input.receive("rendered")
         frame, previous = rendered.frame, self._previous
         self._digest.update(f"{frame.seq} {frame.width_px} {frame.height_px}\n".encode())
-        self._digest.update(rendered.image.tobytes())
+        self._digest.update(np.ascontiguousarray(rendered.image).data)
         tracker = self.live if rendered.trained else self.held_out
         quality = tracker.observe(frame.seq, rendered.image, frame.image, frame.mask)
         comparable = previous is not None and previous.image.shape == frame.image.shape

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
 
 
 @pytest.fixture(scope="session")
@@ -19,6 +20,28 @@ def recordings_dir() -> Path:
             pytest.fail(message)
         pytest.skip(message)
     return folder
+
+
+@pytest.fixture(scope="session")
+def gpu() -> torch.device:
+    """The GPU to test on, where torch sees one and the CUDA kernels are built. Else the test is skipped, saying why, unless
+    FAIL_WITHOUT_CUDA=1 says that there must be one."""
+    from gsplat_core.ops import native
+
+    why = None if torch.cuda.is_available() else f"torch {torch.__version__} sees no GPU"
+    if why is None and native.CUDA_MISSING is not None:
+        why = f"the CUDA kernels are {native.CUDA_MISSING}"
+    if why is not None:
+        if os.environ.get("FAIL_WITHOUT_CUDA") == "1":
+            pytest.fail(why)
+        pytest.skip(why)
+    return torch.device("cuda", 0)
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def device(request: pytest.FixtureRequest) -> torch.device:
+    """The CPU, and again the GPU where there is one."""
+    return request.getfixturevalue("gpu") if request.param == "cuda" else torch.device("cpu")
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from gsplat_core.deformation.field import DeformationField, checked_window, coun
 from gsplat_core.errors import InvalidInput
 from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.basis_field import basis_field as compiled
+from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.reference import deformation as reference
 from gsplat_core.reference.deformation import BUMP_REACH, CHANNEL_GROUPS
 
@@ -143,27 +144,65 @@ class BasisField(DeformationField):
     ) -> None:
         """Lazy Adam of the bumps active at `time_s`, given dL/d(deltas) `gradient` [N, 13]; the others are left alone.
 
-        The moments live in the field, follow `select`, `append` and `extend`, and are not part of a bundle.
+        The moments live in the field, follow `select`, `append` and `extend`, and are not part of a bundle. On CUDA the host does
+        not wait.
         """
-        parameters = (self.centers.data, self.log_widths.data, self.weights.data)
-        if self._moments is None:
-            self._moments = _Moments(
-                [torch.zeros_like(p) for p in parameters],
-                [torch.zeros_like(p) for p in parameters],
-                torch.zeros(self.centers.shape, dtype=torch.int32),
-            )
+        each = (rates.position, rates.rotation, rates.log_scale, rates.colour, rates.centers, rates.widths)
+        self.adam_step_at(self.tau(time_s), gradient, each, beta1, beta2, epsilon)
+
+    def adam_step_at(
+        self,
+        tau: float | Tensor,
+        gradient: Tensor,
+        rates: Sequence[float] | Tensor,
+        beta1: float = 0.9,
+        beta2: float = 0.999,
+        epsilon: float = 1e-8,
+    ) -> None:
+        """As `adam_step`, at a `tau` of `self.tau` and with the six `rates` of `BasisRates` in order.
+
+        Both may be float32 tensors on the field's device ([1] and [6]), which a CUDA graph reads anew at every replay; `gradient`
+        may be [N, 16], the frame path's v_raw.
+        """
+        moments = self._moments_in_use()
         self._ops.basis_field_backward_adam_(
             gradient,
-            self.tau(time_s),
-            *parameters,
-            self._moments.first,
-            self._moments.second,
-            self._moments.steps,
-            (rates.position, rates.rotation, rates.log_scale, rates.colour, rates.centers, rates.widths),
+            tau,
+            *(p.data for p in self._parameters_in_order()),
+            moments.first,
+            moments.second,
+            moments.steps,
+            rates,
             beta1,
             beta2,
             epsilon,
         )
+
+    def frame_time(self, time_s: float) -> float:
+        """What `frame_deltas` takes for a time: its `tau`."""
+        return self.tau(time_s)
+
+    def frame_deltas(self, gaussians: Gaussians) -> Callable[[Tensor], Tensor]:
+        """From the float32 tau [1] on the field's device to what the field adds then, in the frame path's layout [N, 16].
+
+        No autograd graph. The function reads the field's parameters of the moment; they do not depend on `gaussians`.
+        """
+        if gaussians.count != self.count:
+            raise InvalidInput(f"the field holds bumps for {self.count} Gaussians, got {gaussians.count}")
+
+        def at(tau: Tensor) -> Tensor:
+            parameters = (p.data for p in self._parameters_in_order())
+            return cast(Tensor, self._ops.basis_field(*parameters, tau, padded=True))
+
+        return at
+
+    def training_tensors(self) -> tuple[Tensor, ...]:
+        """Everything that `adam_step_at` changes: parameters, both moments of each, updates per bump. Made where they are not yet.
+
+        A recorded CUDA graph is good as long as these are the same tensors.
+        """
+        moments = self._moments_in_use()
+        return *(p.data for p in self._parameters_in_order()), *moments.first, *moments.second, moments.steps
 
     def cached(self, gaussians: Gaussians) -> Callable[[float], Gaussians]:
         """Nothing of this field is the same at all times, so the function is `forward` without a graph."""
@@ -213,7 +252,7 @@ class BasisField(DeformationField):
                 raise InvalidInput(f"parents must be [{count}], one for each new Gaussian, got {list(parents.shape)}")
             new = [p.data[parents] for p in self._parameters_in_order()]
         else:
-            columns = torch.arange(self.bumps, dtype=self.centers.dtype)
+            columns = torch.arange(self.bumps, dtype=self.centers.dtype, device=self.centers.device)
             new = [
                 columns.repeat(count, 1),
                 self.log_widths.new_zeros(count, self.bumps),
@@ -250,7 +289,8 @@ class BasisField(DeformationField):
 
     def _append_columns(self, added: int, held: Tensor | None) -> None:
         centers, log_widths, weights = (p.data for p in self._parameters_in_order())
-        columns = torch.arange(self.bumps, self.bumps + added, dtype=centers.dtype).repeat(self.count, 1)
+        columns = torch.arange(self.bumps, self.bumps + added, dtype=centers.dtype, device=centers.device)
+        columns = columns.repeat(self.count, 1)
         new_weights = weights.new_zeros(self.count, added, CHANNELS)
         if held is not None:
             new_weights += held[:, None] / BUMPS_PER_SPACING
@@ -264,8 +304,19 @@ class BasisField(DeformationField):
     @property
     def _ops(self) -> ModuleType:
         """The compiled ops where they exist, plain torch for other dtypes and devices."""
-        is_native = self.weights.dtype == torch.float32 and self.weights.device.type == "cpu"
-        return compiled if is_native else reference
+        device = self.weights.device.type
+        has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
+        return compiled if has_kernels and self.weights.dtype == torch.float32 else reference
+
+    def _moments_in_use(self) -> _Moments:
+        if self._moments is None:
+            parameters = [p.data for p in self._parameters_in_order()]
+            self._moments = _Moments(
+                [torch.zeros_like(p) for p in parameters],
+                [torch.zeros_like(p) for p in parameters],
+                torch.zeros_like(parameters[0], dtype=torch.int32),
+            )
+        return self._moments
 
     def _parameters_in_order(self) -> tuple[Tensor, Tensor, Tensor]:
         return self.centers, self.log_widths, self.weights

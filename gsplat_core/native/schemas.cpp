@@ -11,6 +11,12 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "adam_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, int step, "
       "float learning_rate, float beta1, float beta2, float epsilon, int row_size) -> Tensor");
 
+  // The same with learning rate (float32) and step (int64) read on the device; the rows left alone are added to `skipped`
+  // (int64).
+  m.def(
+      "adam_at_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, Tensor rate, "
+      "Tensor step, float beta1, float beta2, float epsilon, int row_size, Tensor(d!) skipped) -> ()");
+
   // Projection to the image: B batches, C cameras, N Gaussians. Covariances as [B, N, 6], or quats and scales.
   m.def(
       "project_gaussians(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
@@ -45,6 +51,12 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "bin_splats(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, int images, "
       "int tile_size, int tile_width, int tile_height) -> (Tensor tiles_per_gauss, Tensor flatten_ids, Tensor isect_offsets)");
+  // The same in a list of `capacity` entries, without waiting for how many are needed: the unused ones, -1, are in front of the
+  // first tile's, and splats that do not fit, the farthest ones, are in no list. `needed` is int64 [1].
+  m.def(
+      "bin_splats_within(Tensor means2d, Tensor radii, Tensor depths, Tensor? conics, Tensor? opacities, Tensor? image_ids, "
+      "int images, int tile_size, int tile_width, int tile_height, int capacity) -> (Tensor tiles_per_gauss, "
+      "Tensor flatten_ids, Tensor isect_offsets, Tensor needed)");
   m.def("isect_offset_encode(Tensor isect_ids, int images, int tile_width, int tile_height) -> Tensor");
 
   // Compositing: splats over pixels. `last` is the last blended position of flatten_ids per pixel, -1 where there is none.
@@ -59,16 +71,41 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
       "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 
-  // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
-  m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, float tau) -> Tensor");
+  // One frame from raw Gaussians (CUDA only): image [H, W, 4] with depth, and what its gradient needs.
   m.def(
-      "basis_field_backward(Tensor gradient, Tensor centers, Tensor log_widths, Tensor weights, float tau) "
+      "render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_opacities, Tensor sh, Tensor? deltas, "
+      "Tensor viewmat, Tensor K, Tensor? background, int width, int height, float eps2d, float near_plane, float far_plane, "
+      "int camera_model, int capacity, bool training) -> (Tensor image, Tensor alphas, Tensor last, Tensor records, "
+      "Tensor tile_offsets, Tensor sorted, Tensor splat_starts, Tensor instance_splats, Tensor status)");
+  // The gradient of render_frame by what its forward pass left: of the raw parameters in one row per Gaussian (position 3,
+  // rotation 4, log-scale 3, colour coefficient 3, opacity logit 1, 2 unused), and of sh where it has more than one basis.
+  m.def(
+      "render_frame_backward(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_opacities, Tensor sh, Tensor? deltas, "
+      "Tensor viewmat, Tensor K, Tensor? background, Tensor records, Tensor tile_offsets, Tensor sorted, Tensor splat_starts, "
+      "Tensor instance_splats, Tensor status, Tensor alphas, Tensor last, Tensor v_image, Tensor? v_alphas, int width, "
+      "int height, float eps2d, int camera_model, bool deterministic) -> (Tensor v_raw, Tensor v_sh)");
+  // The same and one Adam step of the Gaussians, in place; rates [5] and step [1] are read on the device, rows that were left
+  // alone are added to skipped [5]. v_raw is empty if not asked for.
+  m.def(
+      "render_frame_backward_adam_(Tensor(a!) means, Tensor(b!) quats, Tensor(c!) log_scales, Tensor(d!) logit_opacities, "
+      "Tensor(e!) sh, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, Tensor records, Tensor tile_offsets, "
+      "Tensor sorted, Tensor splat_starts, Tensor instance_splats, Tensor status, Tensor alphas, Tensor last, Tensor v_image, "
+      "Tensor? v_alphas, Tensor(f!) m_means, Tensor(g!) m_quats, Tensor(h!) m_log_scales, Tensor(i!) m_logit_opacities, "
+      "Tensor(j!) m_sh, Tensor(k!) v_means, Tensor(l!) v_quats, Tensor(m!) v_log_scales, Tensor(n!) v_logit_opacities, "
+      "Tensor(o!) v_sh, Tensor rates, Tensor step, Tensor(p!) skipped, int width, int height, float eps2d, int camera_model, "
+      "float beta1, float beta2, float epsilon, bool needs_raw, bool deterministic) -> Tensor v_raw");
+
+  // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
+  // tau and the six rates (position, rotation, log-scale, colour, centres, widths) are float32 on the device of the field. Deltas
+  // and gradients may be padded to the frame path's 16 columns.
+  m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, bool padded=False) -> Tensor");
+  m.def(
+      "basis_field_backward(Tensor gradient, Tensor centers, Tensor log_widths, Tensor weights, Tensor tau) "
       "-> (Tensor, Tensor, Tensor)");
   m.def(
-      "basis_field_backward_adam_(Tensor gradient, float tau, Tensor(a!) centers, Tensor(b!) log_widths, Tensor(c!) weights, "
+      "basis_field_backward_adam_(Tensor gradient, Tensor tau, Tensor(a!) centers, Tensor(b!) log_widths, Tensor(c!) weights, "
       "Tensor(d!) m_centers, Tensor(e!) m_log_widths, Tensor(f!) m_weights, Tensor(g!) v_centers, Tensor(h!) v_log_widths, "
-      "Tensor(i!) v_weights, Tensor(j!) steps, float position_rate, float rotation_rate, float scale_rate, float colour_rate, "
-      "float center_rate, float width_rate, float beta1, float beta2, float epsilon) -> ()");
+      "Tensor(i!) v_weights, Tensor(j!) steps, Tensor rates, float beta1, float beta2, float epsilon) -> ()");
 
   // Structural similarity of each pixel and channel of [H, W, C] images.
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
@@ -78,6 +115,15 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "image_loss(Tensor image, Tensor target, Tensor? mask, Tensor? depth, Tensor? target_depth, float ssim_weight, "
       "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
+
+  // The same of the frame path: image [H, W, 4] with colours and the sum of weight times z, alphas [H, W]; (loss, terms,
+  // dL/dimage, dL/dalphas).
+  m.def(
+      "frame_loss(Tensor image, Tensor alphas, Tensor target, Tensor? mask, Tensor? target_depth, float ssim_weight, "
+      "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
+
+  // Writes up to 32 values, which travel with the launch.
+  m.def("store_scalars_(Tensor(a!) to, float[] values) -> ()");
 
   // HexPlane features of one level: the product of six plane samples [N, C], its gradients, and the parts used for inference.
   m.def("hexplane_features(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz, Tensor xt, Tensor yt, Tensor zt) -> Tensor");

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from pathlib import Path
 
 import torch
@@ -51,6 +52,24 @@ def load_cuda() -> str | None:
 def instruction_set() -> str:
     """The vector instruction set that the compiled core uses on this machine."""
     return INSTRUCTION_SETS[torch.ops.gsplat_core.active_isa()]
+
+
+def cuda_build() -> str:
+    """Compiler and compute capabilities of the CUDA kernels that were loaded: `nvcc 13.0 for 8.0, 9.0`."""
+    build = ctypes.CDLL(str(CUDA_LIBRARY_PATH)).gsplat_core_cuda_build
+    build.restype = ctypes.c_char_p
+    version, _, architectures = build().decode().partition(";")
+    return f"nvcc {version} for {', '.join(str(int(number) / 100) for number in architectures.split(','))}"
+
+
+def cuda_refusal(device: int = 0) -> str | None:
+    """Why the CUDA kernels that were loaded cannot run on a GPU, as CUDA puts it; None when they can. Starts CUDA there."""
+    refusal = ctypes.CDLL(str(CUDA_LIBRARY_PATH)).gsplat_core_cuda_refusal
+    refusal.restype = ctypes.c_char_p
+    with torch.cuda.device(device):
+        torch.cuda.synchronize()
+        said = refusal()
+    return None if said is None else str(said.decode())
 
 
 load_native()

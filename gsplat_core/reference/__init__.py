@@ -13,7 +13,8 @@ from gsplat_core.reference.deformation import (
     hexplane_modulate,
     hexplane_space,
 )
-from gsplat_core.reference.image_loss import image_loss
+from gsplat_core.reference.frame import render_frame
+from gsplat_core.reference.image_loss import frame_loss, image_loss
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
@@ -25,6 +26,7 @@ __all__ = [
     "basis_field",
     "basis_field_backward",
     "basis_field_backward_adam_",
+    "frame_loss",
     "fully_fused_projection",
     "hexplane_decode",
     "hexplane_deltas",
@@ -37,6 +39,7 @@ __all__ = [
     "quat_scale_to_covar_preci",
     "rasterization",
     "rasterize_to_pixels",
+    "render_frame",
     "spherical_harmonics",
     "ssim_map",
 ]

@@ -121,3 +121,21 @@ def image_loss(
     return ImageLoss(
         loss if differentiable else loss.detach(), terms, gradients[0], gradients[1] if z is not None else None
     )
+
+
+def frame_loss(
+    image: Tensor,
+    alphas: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    target_depth: Tensor | None = None,
+    ssim_weight: float = 0.0,
+    depth_weight: float = 0.0,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """As `gsplat_core.ops.image_loss.frame_loss`, which documents it: loss, terms, dL/dimage and dL/dalphas, of any floating type."""
+    with torch.enable_grad():
+        x, alpha = image.detach().requires_grad_(), alphas.detach().requires_grad_()
+        depth = None if target_depth is None else x[..., 3] / alpha.clamp(min=1e-10)
+        result = image_loss(x[..., :3], target, mask, depth, target_depth, ssim_weight, depth_weight)
+        v_image, v_alphas = torch.autograd.grad(result.loss, [x, alpha], materialize_grads=True)
+    return result.loss.detach(), result.terms, v_image, v_alphas

@@ -6,6 +6,7 @@ import math
 
 import cv2
 import numpy as np
+import torch
 
 from gsplat_core.frames import Frame
 from gsplat_core.gaussians import Gaussians
@@ -13,6 +14,7 @@ from gsplat_core.rendering import render
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.initialisation import gaussians_at_pixels, tissue_colours, tissue_depth
 from gsplat_core.training.observations import Observation
+from gsplat_core.transfers import HostCopy
 
 UNCOVERED_ALPHA = 0.5
 """A pixel whose accumulated opacity is below this shows nothing of the model."""
@@ -27,13 +29,17 @@ def gaussians_for_uncovered_tissue(
 
     At most `room`, as dense as the first frame's. Their depth is measured where the frame has depth, else that of the nearest covered
     pixel. None when there is nothing worth adding.
+
+    They are on the device of `current`, which also looks for uncovered pixels; a frame that has few costs the host one number.
     """
     camera = observation.camera
-    output = render(current, camera)
+    with torch.no_grad():
+        output = render(current, camera, depth=frame.depth is None)
+        uncovered = (output.alpha < UNCOVERED_ALPHA) & (observation.mask > 0)
     height, width = frame.image.shape[:2]
-    bare = (output.alpha.numpy() < UNCOVERED_ALPHA) & (observation.mask.numpy() > 0)
-    if bare.sum() < SMALLEST_SHARE * height * width:
+    if HostCopy(torch.count_nonzero(uncovered)).item() < SMALLEST_SHARE * height * width:
         return None
+    bare = HostCopy(uncovered).numpy()
     spacing = math.sqrt(height * width / config.gaussians)
     columns = np.arange(spacing / 2, width, spacing)
     rows = np.arange(spacing / 2, height, spacing)
@@ -43,8 +49,10 @@ def gaussians_for_uncovered_tissue(
         return None
     wanted = wanted[:: math.ceil(len(wanted) / room)]
     if frame.depth is None:
-        covered = np.where(output.alpha.numpy() >= UNCOVERED_ALPHA, output.depth.numpy(), 0).astype(np.float32)
-        depth = tissue_depth(frame.with_fields(depth=cv2.medianBlur(covered, 5)), config.default_depth_mm)
+        covered = torch.where(output.alpha >= UNCOVERED_ALPHA, output.depth, 0)
+        covered_mm = cv2.medianBlur(HostCopy(covered).numpy(), 5)
+        depth = tissue_depth(frame.with_fields(depth=covered_mm), config.default_depth_mm)
     else:
         depth = tissue_depth(frame, config.default_depth_mm)
-    return gaussians_at_pixels(wanted, spacing, tissue_colours(frame), depth, camera, sh_degree=config.sh_degree)
+    added = gaussians_at_pixels(wanted, spacing, tissue_colours(frame), depth, camera, sh_degree=config.sh_degree)
+    return added.to(current.device)

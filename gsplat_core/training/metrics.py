@@ -29,44 +29,54 @@ PSNR_CAP_DB = 100.0
 """PSNR of equal images, and the highest that is reported (a mean squared error of 1e-10)."""
 
 
-def _unit_image(image: ImageLike, name: str) -> Tensor:
-    """The image as float32 [H, W, 3] in 0..1 on the CPU."""
-    tensor = image.detach().cpu() if isinstance(image, Tensor) else torch.from_numpy(np.ascontiguousarray(image))
+def _image(image: ImageLike, name: str) -> Tensor:
+    """The image [H, W, 3] on the CPU, uint8 or floating point."""
+    tensor = _host_tensor(image)
     if tensor.ndim != 3 or tensor.shape[2] != 3:
         raise InvalidInput(f"{name} must be RGB [H, W, 3], got {list(tensor.shape)}")
-    if tensor.dtype == torch.uint8:
-        return tensor.to(torch.float32) / 255
-    if not tensor.is_floating_point():
+    if tensor.dtype != torch.uint8 and not tensor.is_floating_point():
         raise InvalidInput(f"{name} must be uint8 (0..255) or floating point (0..1), got {tensor.dtype}")
-    return tensor.to(torch.float32).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    return tensor
+
+
+def _host_tensor(values: ImageLike) -> Tensor:
+    if isinstance(values, Tensor):
+        return values.detach().cpu()
+    return torch.from_numpy(np.ascontiguousarray(values))
+
+
+def _unit(image: Tensor, tissue: Tensor | None) -> Tensor:
+    """The image as float32 in 0..1, 0 where there is no tissue."""
+    if tissue is not None:  # while it is still as small as it came
+        image = torch.where(tissue[..., None], image, torch.zeros((), dtype=image.dtype))
+    if image.dtype == torch.uint8:
+        return image.to(torch.float32).div_(255)
+    return image.to(torch.float32).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _masked_pair(image: ImageLike, target: ImageLike, mask: ImageLike | None) -> tuple[Tensor, Tensor, int]:
     """Both images as floats, 0 where there is no tissue, and the number of tissue pixels."""
-    x, y = _unit_image(image, "image"), _unit_image(target, "target")
+    x, y = _image(image, "image"), _image(target, "target")
     if x.shape != y.shape:
         raise InvalidInput(f"image {list(x.shape)} and target {list(y.shape)} must have one size")
     if mask is None:
-        return x, y, x.shape[0] * x.shape[1]
-    values = mask.detach().cpu() if isinstance(mask, Tensor) else torch.from_numpy(np.ascontiguousarray(mask))
+        return _unit(x, None), _unit(y, None), x.shape[0] * x.shape[1]
+    values = _host_tensor(mask)
     if values.shape != x.shape[:2]:
         raise InvalidInput(f"mask must be [H, W] = {list(x.shape[:2])}, got {list(values.shape)}")
     tissue = values != 0
-    black = torch.zeros(())
-    return (
-        torch.where(tissue[..., None], x, black),
-        torch.where(tissue[..., None], y, black),
-        int(torch.count_nonzero(tissue)),
-    )
+    return _unit(x, tissue), _unit(y, tissue), int(torch.count_nonzero(tissue))
 
 
-def _psnr_db(x: Tensor, y: Tensor, pixels: int) -> float:
-    """PSNR of the squared error shared out over `pixels`; NaN over none."""
-    if not pixels:
-        return math.nan
+def _squared_error(x: Tensor, y: Tensor) -> float:
     error = x - y
     # Summed in float64: a frame has a million terms.
-    return _decibels(float((error * error).sum(dtype=torch.float64)) / (3 * pixels))
+    return float(error.mul_(error).sum(dtype=torch.float64))
+
+
+def _psnr_db(squared_error: float, pixels: int) -> float:
+    """PSNR of the squared error shared out over `pixels`; NaN over none."""
+    return _decibels(squared_error / (3 * pixels)) if pixels else math.nan
 
 
 def _mean_ssim(x: Tensor, y: Tensor) -> float:
@@ -90,7 +100,8 @@ def psnr_tissue_db(image: ImageLike, target: ImageLike, mask: ImageLike | None =
     Returns:
         At most PSNR_CAP_DB; NaN when the mask has no tissue.
     """
-    return _psnr_db(*_masked_pair(image, target, mask))
+    x, y, pixels = _masked_pair(image, target, mask)
+    return _psnr_db(_squared_error(x, y), pixels)
 
 
 def psnr_frame_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
@@ -100,7 +111,7 @@ def psnr_frame_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = 
     Arguments and return as there.
     """
     x, y, pixels = _masked_pair(image, target, mask)
-    return _psnr_db(x, y, x.shape[0] * x.shape[1] if pixels else 0)
+    return _psnr_db(_squared_error(x, y), x.shape[0] * x.shape[1] if pixels else 0)
 
 
 def ssim(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
@@ -135,10 +146,11 @@ class QualityTracker:
     def observe(self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> FrameQuality:
         """Score one frame and keep the result; arguments as in `psnr_tissue_db`."""
         x, y, pixels = _masked_pair(image, target, mask)
+        squared_error = _squared_error(x, y)
         quality = FrameQuality(
             seq,
-            psnr_tissue_db=_psnr_db(x, y, pixels),
-            psnr_frame_db=_psnr_db(x, y, x.shape[0] * x.shape[1] if pixels else 0),
+            psnr_tissue_db=_psnr_db(squared_error, pixels),
+            psnr_frame_db=_psnr_db(squared_error, x.shape[0] * x.shape[1] if pixels else 0),
             ssim=_mean_ssim(x, y) if pixels else math.nan,
         )
         self.frames.append(quality)

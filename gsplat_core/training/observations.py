@@ -13,11 +13,12 @@ from torch import Tensor
 from gsplat_core.cameras import Camera
 from gsplat_core.errors import InvalidInput
 from gsplat_core.frames import Frame
+from gsplat_core.transfers import tensor_of
 
 
 @dataclass(frozen=True)
 class Observation:
-    """One frame as the training step wants it."""
+    """One frame as the training step wants it, on the device that trains."""
 
     seq: int
     time_s: float
@@ -30,8 +31,11 @@ class Observation:
     """float32 [H, W] in millimetres; 0 = unknown."""
 
     @staticmethod
-    def of(frame: Frame, camera: Camera) -> Observation:
-        """A frame seen by `camera`, which has the frame's size; the frame's own pose wins over the camera's."""
+    def of(frame: Frame, camera: Camera, device: torch.device | str = "cpu") -> Observation:
+        """A frame seen by `camera`, which has the frame's size; the frame's own pose wins over the camera's.
+
+        The copy to another `device` than the CPU is queued on its current stream.
+        """
         if (frame.width_px, frame.height_px) != (camera.width_px, camera.height_px):
             raise InvalidInput(
                 f"frame {frame.seq} is {frame.width_px}x{frame.height_px}, its camera {camera.width_px}x{camera.height_px};"
@@ -42,9 +46,9 @@ class Observation:
             seq=frame.seq,
             time_s=frame.time_s,
             camera=camera if frame.pose is None else camera.with_pose(frame.pose),
-            image=tensor_of(frame.image),
-            mask=tensor_of(mask.astype(np.uint8, copy=False)),
-            depth=None if frame.depth is None else tensor_of(known_depth(frame.depth)),
+            image=tensor_of(frame.image, device),
+            mask=tensor_of(mask.astype(np.uint8, copy=False), device),
+            depth=None if frame.depth is None else tensor_of(known_depth(frame.depth), device),
         )
 
 
@@ -52,12 +56,6 @@ def known_depth(depth_mm: NDArray[np.floating]) -> NDArray[np.float32]:
     """The depth map with 0 (unknown) where it holds no positive finite number."""
     known = np.isfinite(depth_mm) & (depth_mm > 0)
     return np.where(known, depth_mm, 0).astype(np.float32)
-
-
-def tensor_of(array: NDArray) -> Tensor:
-    """A tensor that shares the array's memory when torch allows it."""
-    array = np.ascontiguousarray(array)
-    return torch.from_numpy(array if array.flags.writeable else array.copy())
 
 
 class ObservationWindow:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.adam.adam import adam_step
+from gsplat_core.ops.adam.adam import adam_step_queued
 
 
 class FusedAdam:
@@ -21,7 +21,7 @@ class FusedAdam:
     leaves its whole row of that tensor as it was, with `rows=False` (planes, weights) just its element; `skipped` counts them.
 
     Args:
-        parameters: the tensors to be updated, float32 on the CPU; only their shapes are kept.
+        parameters: the tensors to be updated, float32; only their shapes and devices are kept.
         learning_rates: one per name, which `step` can replace at any time; None: the first step brings them.
         betas: decay of the first and second moment.
         epsilon: added to the denominator.
@@ -45,8 +45,7 @@ class FusedAdam:
         self.rows = rows
         self.steps = 0
         """Steps taken."""
-        self.skipped = 0
-        """Rows (or elements) left alone so far because their gradient was not finite."""
+        self._skipped: int | Tensor = 0
         self.first_moments = {name: _zeros(tensor) for name, tensor in parameters.items()}
         self.second_moments = {name: _zeros(tensor) for name, tensor in parameters.items()}
         self.learning_rates = self._checked_rates(learning_rates) if learning_rates is not None else {}
@@ -55,6 +54,11 @@ class FusedAdam:
             raise InvalidInput(
                 f"every tensor needs one row per Gaussian, got {counts}; pass rows=False for planes and weights"
             )
+
+    @property
+    def skipped(self) -> int:
+        """Rows (or elements) left alone so far because their gradient was not finite. On CUDA the host waits for it."""
+        return int(self._skipped)
 
     def _checked_rates(self, learning_rates: Mapping[str, float]) -> dict[str, float]:
         if set(learning_rates) != set(self.first_moments):
@@ -68,8 +72,8 @@ class FusedAdam:
         parameters: Mapping[str, Tensor],
         gradients: Mapping[str, Tensor | None] | None = None,
         learning_rates: Mapping[str, float] | None = None,
-    ) -> int:
-        """Update the parameters in place.
+    ) -> int | Tensor:
+        """Update the parameters in place; on CUDA the host does not wait.
 
         Args:
             parameters: every named tensor, contiguous, of the moments' shapes.
@@ -77,7 +81,8 @@ class FusedAdam:
             learning_rates: replace those in use, from this step on; some names or all.
 
         Returns:
-            Rows (or elements) left alone in this step because their gradient was not finite.
+            Rows (or elements) left alone in this step because their gradient was not finite: a number, but on CUDA an int64 []
+            there, which the host only waits for when it is read.
 
         Raises:
             InvalidInput: a tensor or its rate is missing, or its shape is not that of its moments.
@@ -90,14 +95,14 @@ class FusedAdam:
                     f"{name} must be {list(moment.shape)}, got {shape}; call select or append when Gaussians are removed or added"
                 )
         self.steps += 1
-        skipped = 0
+        counts: list[Tensor] = []
         for name, first in self.first_moments.items():
             parameter = parameters[name]
             gradient = parameter.grad if gradients is None else gradients.get(name)
             if gradient is None or first.numel() == 0:
                 continue
             row_size = first.numel() // first.shape[0] if self.rows else 1
-            skipped += adam_step(
+            count = adam_step_queued(
                 parameter.detach(),
                 gradient,
                 first,
@@ -108,7 +113,11 @@ class FusedAdam:
                 self.epsilon,
                 row_size,
             )
-        self.skipped += skipped
+            counts.append(count)
+        skipped: int | Tensor = sum(counts, start=counts[0].new_zeros(())) if counts else 0
+        if isinstance(skipped, Tensor) and skipped.device.type == "cpu":
+            skipped = int(skipped)
+        self._skipped = self._skipped + skipped
         return skipped
 
     @property

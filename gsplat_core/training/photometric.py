@@ -24,16 +24,16 @@ class LossWeights:
 
 def loss_and_gradients(
     gaussians: Gaussians, observation: Observation, weights: LossWeights
-) -> tuple[float, dict[str, Tensor]]:
-    """Loss against `observation`, and its gradient for each of the Gaussians' five raw tensors, by name.
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Loss [] against `observation`, and its gradient for each of the Gaussians' five raw tensors, by name.
 
-    The same as `render`, `image_loss` and `backward()`, without building a graph: this is the inner loop of training.
+    The loss stays on the device: whoever wants the number waits for it. The same as `render`, `image_loss` and `backward()`, without building a graph: this is the inner loop of training.
     """
     ops = torch.ops.gsplat_core
     camera = observation.camera
     width, height = camera.width_px, camera.height_px
     model = CAMERA_MODELS.index(camera.model)
-    viewmat, intrinsics = camera.viewmat[None, None], camera.intrinsics[None, None]
+    viewmat, intrinsics = (matrix[None, None] for matrix in camera.matrices(gaussians.device))
     means, quats = gaussians.means[None], gaussians.quats[None]
     scales, opacities = gaussians.scales, gaussians.opacities
     use_depth = weights.depth > 0 and observation.depth is not None
@@ -79,7 +79,7 @@ def loss_and_gradients(
             gaussians.sh_degree, directions[None], gaussians.sh, None, v_colours.contiguous()[None], True
         )
         v_means = v_means + v_directions[0]
-    return float(result.loss), {
+    return result.loss, {
         "means": v_means,
         "quats": v_quats[0],
         "log_scales": v_scales[0] * scales,
@@ -92,6 +92,7 @@ def _colours(gaussians: Gaussians, position: object) -> tuple[Tensor, Tensor | N
     """Colours [N, 3] before they are clamped at 0, and the viewing directions [N, 3] that they depend on, if they do."""
     if gaussians.sh_degree == 0:
         return gaussians.sh[:, 0] * SH_C0 + 0.5, None
-    directions = gaussians.means - torch.as_tensor(position, dtype=torch.float32)
+    centre = torch.as_tensor(position, dtype=torch.float32).to(gaussians.device, non_blocking=True)
+    directions = gaussians.means - centre
     colours = torch.ops.gsplat_core.spherical_harmonics(gaussians.sh_degree, directions[None], gaussians.sh, None)[0]
     return colours + 0.5, directions

@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gsplat_core.cameras import Camera
 from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
@@ -21,6 +22,7 @@ from gsplat_core.training.growth import gaussians_for_uncovered_tissue
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.step import TrainingStep
+from gsplat_core.transfers import HostCopy
 
 EXTEND_AHEAD_BUMPS = 1
 """Window that the online basis field keeps ahead of the newest frame, in bumps; beyond it lies one more column."""
@@ -45,13 +47,23 @@ class Reconstructor:
     Online: `observe` each frame in order, `snapshot` whenever the result is to be shown. Offline: `fit`. Deterministic: the same frames,
     settings and seed give the same model. With the basis field that holds for any number of threads; the HexPlane's network is
     trained by torch's matrix products, which round differently with another number.
+
+    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares what follows; the host waits for
+    it where a frame is searched for uncovered tissue, and for the frame's losses.
     """
 
     def __init__(
-        self, config: ReconstructorConfig, camera: Camera, *, seed: int = 0, recording_digest: str | None = None
+        self,
+        config: ReconstructorConfig,
+        camera: Camera,
+        *,
+        seed: int = 0,
+        recording_digest: str | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.config = config
         self.camera = camera
+        self.device = torch.device(device)
         self._seed = seed
         self._recording_digest = recording_digest
         self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
@@ -74,7 +86,7 @@ class Reconstructor:
         """
         if steps is not None and steps < 0:
             raise InvalidInput(f"steps is {steps}; it must be at least 0")
-        observation = Observation.of(frame, self.camera)
+        observation = Observation.of(frame, self.camera, self.device)
         first = self._step is None
         if first:
             if not train:
@@ -96,26 +108,32 @@ class Reconstructor:
         count = steps if steps is not None else self.config.first_frame_steps if first else self.config.steps_per_frame
         if count == 0:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
-        surprise = self._step(observation)
+        loss = self._step(observation)
+        arriving = HostCopy(loss)
         schedule = self._window.schedule(count - 1)
-        if not first and surprise > self.config.jump_ratio * self._usual_surprise:
-            schedule += [observation] * (count * self.config.jump_extra)
-        loss = surprise
         for chosen in schedule:
             loss = self._step(chosen)
+        # Asked for only now: whether the frame is a jump decides about extra steps after its own.
+        surprise = arriving.item()
+        extra = 0
+        if not first and surprise > self.config.jump_ratio * self._usual_surprise:
+            extra = count * self.config.jump_extra
+        for _ in range(extra):
+            loss = self._step(observation)
         if not first:
             known = self._usual_surprise if self._usual_surprise < math.inf else surprise
             self._usual_surprise = known + USUAL_DECAY * (min(surprise, self.config.jump_ratio * known) - known)
-        return ObserveReport(frame.seq, 1 + len(schedule), loss, self.gaussians)
+        return ObserveReport(frame.seq, 1 + len(schedule) + extra, HostCopy(loss).item(), self.gaussians)
 
     def fit(
-        self, frames: Iterable[Frame], steps: int, progress: Callable[[int, float], None] | None = None
+        self, frames: Iterable[Frame], steps: int, progress: Callable[[int, Tensor], None] | None = None
     ) -> ObserveReport:
         """Train offline on all of `frames`, in random order, the rates decaying exponentially to a tenth.
 
-        `progress(step, loss)` is called after each step. All frames are held in memory (1 byte per channel).
+        `progress(step, loss)` is called after each step; on a GPU reading the loss, a tensor [] on the device, waits for the step. All
+        frames are held in the device's memory (1 byte per channel).
         """
-        observations = [(frame, Observation.of(frame, self.camera)) for frame in frames]
+        observations = [(frame, Observation.of(frame, self.camera, self.device)) for frame in frames]
         if not observations:
             raise InvalidInput("there are no frames to train on")
         if steps < 1:
@@ -134,14 +152,14 @@ class Reconstructor:
             self._grow(frame, observation)
         random = np.random.default_rng(self._seed)
         order: list[int] = []
-        loss = 0.0
+        loss = torch.zeros(())
         for step in range(steps):
             if not order:
                 order = random.permutation(len(observations)).tolist()
             loss = self._step(observations[order.pop()][1], rate_scale=0.1 ** (step / steps))
             if progress is not None:
                 progress(step + 1, loss)
-        return ObserveReport(observations[-1][0].seq, steps, loss, self.gaussians)
+        return ObserveReport(observations[-1][0].seq, steps, HostCopy(loss).item(), self.gaussians)
 
     def snapshot(self) -> Model:
         """An immutable copy of the model as it is now; each one has the next version number."""
@@ -166,10 +184,11 @@ class Reconstructor:
             sh_degree=self.config.sh_degree,
             default_depth_mm=self.config.default_depth_mm,
             seed=self._seed,
-        )
+        ).to(self.device)
         self._first_time_s = observation.time_s
         self.camera = observation.camera
-        self._step = TrainingStep(gaussians, self._new_field(gaussians, end_s), self.config, self.camera)
+        field = self._new_field(gaussians, end_s).to(self.device)
+        self._step = TrainingStep(gaussians, field, self.config, self.camera)
 
     def _new_field(self, gaussians: Gaussians, end_s: float | None) -> DeformationField:
         start = self._first_time_s

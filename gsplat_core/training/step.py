@@ -31,7 +31,7 @@ class TrainingStep:
         self._config = config
         self._weights = LossWeights(config.ssim_weight, config.depth_weight)
         # World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres.
-        centre = camera.viewmat
+        centre = camera.viewmat.to(gaussians.device)
         distance = (
             (gaussians.means @ centre[2, :3] + centre[2, 3]).abs().median() if gaussians.count else torch.ones(())
         )
@@ -40,8 +40,8 @@ class TrainingStep:
         network = {} if isinstance(field, BasisField) else dict(field.named_parameters())
         self._network_adam = FusedAdam(network, rows=False)
 
-    def __call__(self, observation: Observation, rate_scale: float = 1.0) -> float:
-        """Train on one observation; returns its loss before the update."""
+    def __call__(self, observation: Observation, rate_scale: float = 1.0) -> Tensor:
+        """Train on one observation; returns its loss [] before the update, on the device."""
         if isinstance(self.field, BasisField):
             return self._basis_step(self.field, observation, rate_scale)
         return self._network_step(observation, rate_scale)
@@ -61,7 +61,7 @@ class TrainingStep:
         self.field.append(added)
         self._adam.append(added.count)
 
-    def _basis_step(self, field: BasisField, observation: Observation, rate_scale: float) -> float:
+    def _basis_step(self, field: BasisField, observation: Observation, rate_scale: float) -> Tensor:
         deformed = self.at(observation.time_s)
         loss, gradients = loss_and_gradients(deformed, observation, self._weights)
         rates = self._config.rates
@@ -85,7 +85,7 @@ class TrainingStep:
         self._update_gaussians(gradients, rate_scale)
         return loss
 
-    def _network_step(self, observation: Observation, rate_scale: float) -> float:
+    def _network_step(self, observation: Observation, rate_scale: float) -> Tensor:
         canonical = self.gaussians.detach().requires_grad_()
         with torch.enable_grad():
             deformed = self.field(canonical, observation.time_s)

@@ -10,14 +10,13 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Literal
 
-import torch
-
 from gsplat_core.errors import CoreError
 from gsplat_core.frames import Frame
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.recordings import Recording
 from gsplat_core.model import Model
 from gsplat_core.training.baselines import Baselines, measure_baselines
+from operators.applications.device import seeded
 from operators.applications.result import RunOutcome, peak_memory_bytes
 from operators.errors import OperatorsError, RunFailed
 from operators.graph import run
@@ -74,8 +73,7 @@ class Execution:
         """
         self.app.announce()
         # The caller's random numbers are not ours to move.
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.settings.seed)
+        with seeded(self.settings.seed, self.settings.device):
             self._attempt(lambda: run(self.app, self.settings.engine))
         wall_s = perf_counter() - self.start.s
         if self.app.video.displayed and self.app.video_path.exists():

@@ -9,13 +9,14 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 
-import torch
+from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.frames import Frame
 from gsplat_core.io.recordings import Recording, is_heldout
 from gsplat_core.model import Model
 from gsplat_core.training.reconstructor import ObserveReport, Reconstructor
+from operators.applications.device import seeded
 from operators.applications.execution import Execution, Start
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplayApplication, ReplaySettings, prepare
@@ -59,8 +60,10 @@ def reconstruct(
     recording, notes = prepare(settings, "reconstruct")
     start = Start.now()
     config = settings.reconstructor_config(recording.width_px * recording.height_px)
-    learning = Reconstructor(config, recording.camera, seed=settings.seed, recording_digest=recording.digest)
-    done = _fit(learning, recording, settings.seed, steps, progress, stop_requested)
+    learning = Reconstructor(
+        config, recording.camera, seed=settings.seed, recording_digest=recording.digest, device=settings.device
+    )
+    done = _fit(learning, recording, settings, steps, progress, stop_requested)
     if done < steps:
         notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
     model = learning.snapshot()
@@ -79,7 +82,7 @@ def reconstruct(
 def _fit(
     learning: Reconstructor,
     recording: Recording,
-    seed: int,
+    settings: ReplaySettings,
     steps: int,
     progress: ProgressCallback | None,
     stop_requested: Callable[[], bool],
@@ -87,7 +90,7 @@ def _fit(
     """Train; returns how many steps were made."""
     done = 0
 
-    def after_step(step: int, loss: float) -> None:
+    def after_step(step: int, loss: Tensor) -> None:
         nonlocal done
         done = step
         if progress is not None:
@@ -95,8 +98,6 @@ def _fit(
         if stop_requested():
             raise _StopFitting
 
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        with contextlib.suppress(_StopFitting):
-            learning.fit((frame for frame in recording if not is_heldout(frame.seq)), steps, after_step)
+    with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
+        learning.fit((frame for frame in recording if not is_heldout(frame.seq)), steps, after_step)
     return done

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.bundle import load_bundle
+from operators.applications.device import check_device
 from operators.applications.progress import Progress, ProgressCallback
 from operators.display import write_png
 from operators.errors import OutputError
@@ -26,6 +27,7 @@ def render_model(
     *,
     fps: float = 30.0,
     scale: float = 1.0,
+    device: str = "cpu",
     progress: ProgressCallback | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> int:
@@ -33,11 +35,12 @@ def render_model(
 
     Returns the number of frames written; what was written before a stop is complete.
 
-    Raises BundleError, InvalidInput, OutputFolderInUse, OutputError, StorageFull.
+    Raises BundleError, DeviceMissing, InvalidInput, OutputFolderInUse, OutputError, StorageFull.
     """
     if not (math.isfinite(fps) and 0 < fps <= 1000):
         raise InvalidInput(f"fps is {fps}; it must be above 0 and at most 1000")
-    model = load_bundle(bundle)
+    check_device(device)
+    model = load_bundle(bundle).to(device)
     camera = model.camera.scaled(scale)
     start_s, end_s = model.time_window_s
     count = math.floor((end_s - start_s) * fps + 1e-6) + 1

@@ -4,8 +4,9 @@
                                                           → metrics → keyframes
                                                                     → progress
 
-Deterministic: one thread (greedy scheduler), time from the recording (manual clock), work per frame is a count, every edge blocks. The same
-recording, settings and device give the same `frames_sha256`, on either engine.
+Deterministic: each operator takes its frames in order and shares nothing with the others but messages, time comes from the recording, work
+per frame is a count, every edge blocks. The same recording, settings and device give the same `frames_sha256`, on either engine and with
+any number of threads (`scheduler_for`).
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from gsplat_core.frames import Frame
 from gsplat_core.io.recordings import Recording, is_heldout, open_recording
 from gsplat_core.training.config import FieldChoice, ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
-from operators.applications.device import check_device
+from operators.applications.device import check_device, scheduler_for
 from operators.applications.execution import Execution
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.result import RunOutcome
 from operators.deform import DeformOp
 from operators.display import CallbackSinkOp, VideoSinkOp
-from operators.graph import Application, Engine, GreedyScheduler, ManualClock
+from operators.graph import Application, Engine
 from operators.ingest import SourceOp
 from operators.keyframes import KeyframesOp
 from operators.metrics import MetricsOp, ScoredFrame
@@ -93,7 +94,7 @@ class ReplayApplication(Application):
         stage: str = "replay",
     ) -> None:
         super().__init__(name="replay", track=True)
-        self.scheduler(GreedyScheduler(self, clock=ManualClock()))
+        self.scheduler(scheduler_for(settings.device, self))
         self.recording = recording
         self.settings = settings
         self.video_path = video
@@ -137,6 +138,7 @@ class ReplayApplication(Application):
             self.recording.camera,
             seed=self.settings.seed,
             recording_digest=self.recording.digest,
+            device=self.settings.device,
         )
 
     def _held_out(self, frame: Frame) -> bool:

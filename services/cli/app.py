@@ -142,12 +142,13 @@ def render(
     out: Annotated[Path, typer.Option("--out", help="A video (name.mp4) or a folder of images.", show_default=False)],
     fps: Annotated[float, typer.Option(help="Frames per second of the model's time.")] = 30.0,
     scale: ScaleOption = 1.0,
+    device: DeviceOption = "cpu",
     json: JsonOption = False,
 ) -> int:
     """Render a model over its time window to a video or to images."""
     from services.cli.render import render_command
 
-    return render_command(model, out, fps, scale, as_json=json)
+    return render_command(model, out, fps, scale, device, as_json=json)
 
 
 @app.command()

@@ -43,7 +43,7 @@ class Check:
 
 def doctor_command(*, as_json: bool) -> int:
     """Print all checks; 2 when something that is needed is missing."""
-    checks = [*_versions(), *_processor(), *_core(), *_graphics(), *_video(), *_holoscan()]
+    checks = [*_versions(), *_processor(), *_core(), *_video(), *_holoscan()]
     broken = [check for check in checks if check.needed and not check.ok]
     if as_json:
         typer.echo(json.dumps({"ok": not broken, "checks": [asdict(check) for check in checks]}, indent=2))
@@ -97,7 +97,7 @@ def _core() -> list[Check]:
     from gsplat_core.errors import NativeLibraryMissing
 
     try:
-        from gsplat_core.ops.native import CUDA_MISSING, LIBRARY_PATH, instruction_set
+        from gsplat_core.ops.native import LIBRARY_PATH, instruction_set
     except NativeLibraryMissing as error:
         return [Check("compiled core", "missing", False, str(error))]
     names = sorted(
@@ -114,32 +114,34 @@ def _core() -> list[Check]:
         Check("compiled core", str(LIBRARY_PATH)),
         Check("instruction set in use", instruction_set()),
         Check("ops on the CPU", f"{len(where['CPU'])}: {', '.join(where['CPU'])}"),
-        Check(
-            "ops on the GPU",
-            f"{len(where['CUDA'])}: {', '.join(where['CUDA'])}" if CUDA_MISSING is None else CUDA_MISSING,
-            CUDA_MISSING is None,
-            "" if CUDA_MISSING is None else "everything runs on the CPU; use --device cpu",
-            needed=False,
-        ),
+        *_cuda(where["CUDA"]),
     ]
 
 
-def _graphics() -> list[Check]:
-    import torch
+def _cuda(ops: list[str]) -> list[Check]:
+    """The GPU, the kernels that were built for one, and whether the two fit together."""
+    from gsplat_core.ops.native import CUDA_MISSING, cuda_build, cuda_refusal
+    from services.cli.graphics import look
 
-    if torch.cuda.is_available():
-        names = ", ".join(torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count()))
-        return [Check("GPU", names, needed=False)]
-    built = f"torch was built for CUDA {torch.version.cuda}" if torch.version.cuda else "this torch has no CUDA"
-    return [
-        Check(
-            "GPU",
-            f"none seen ({built})",
-            False,
-            "not needed; to use one: an NVIDIA driver on this machine, and in a container `--gpus all`",
-            needed=False,
+    graphics = look()
+    gpu = Check("GPU", graphics.found, graphics.usable, graphics.advice, needed=False)
+    if CUDA_MISSING is not None:
+        advice = (
+            "`make cuda` builds them for this GPU; until then everything runs on the CPU"
+            if graphics.usable
+            else "not needed: everything runs on the CPU"
         )
-    ]
+        return [gpu, Check("CUDA kernels", CUDA_MISSING, False, advice, needed=False)]
+    refusal = cuda_refusal() if graphics.usable else None
+    built = Check(
+        "CUDA kernels",
+        f"built by {cuda_build().replace('for', 'for compute capability')}"
+        + (f", which this GPU refuses: {refusal}" if refusal else ""),
+        refusal is None,
+        "" if refusal is None else "`make cuda` builds them for this GPU; until then use --device cpu",
+        needed=False,
+    )
+    return [gpu, built, Check("ops on the GPU", f"{len(ops)}: {', '.join(ops)}", needed=False)]
 
 
 def _video() -> list[Check]:

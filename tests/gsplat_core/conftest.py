@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import pytest
 import torch
@@ -96,6 +97,28 @@ def assert_near() -> Callable[..., None]:
             )
 
     return check
+
+
+@pytest.fixture
+def assert_compiled_equal() -> Iterator[Callable[..., None]]:
+    """Assert that `torch.compile` of a function of some leaves gives its values and gradients."""
+
+    def check(function: Callable[..., tuple[Tensor, ...]], leaves: list[Tensor], **options: Any) -> None:
+        def run(render: Callable[..., tuple[Tensor, ...]]) -> list[Tensor]:
+            outputs = render(*leaves)
+            weights = [torch.linspace(-1, 1, t.numel()).view(t.shape).to(t) for t in outputs]
+            total = torch.stack([(t * w).sum() for t, w in zip(outputs, weights, strict=True)]).sum()
+            return [*outputs, *torch.autograd.grad(total, leaves)]
+
+        wanted = run(function)
+        assert any(w.any() for w in wanted)
+        for seen, w in zip(run(torch.compile(function, **options)), wanted, strict=True):
+            largest = float(w.detach().abs().max()) if w.numel() else 0.0
+            torch.testing.assert_close(seen, w, rtol=1e-4, atol=1e-5 * largest)
+
+    torch.compiler.reset()
+    yield check
+    torch.compiler.reset()
 
 
 @pytest.fixture

@@ -193,6 +193,15 @@ def test_one_bad_gaussian_changes_nothing_but_itself(make_scene, what, value, mo
     assert results[0][2][5].isfinite().all()
 
 
+@pytest.mark.parametrize("module", [gsplat, reference])
+@pytest.mark.parametrize("value", [math.inf, -math.inf])
+def test_one_infinite_coefficient_culls_and_does_not_show_black(make_scene, module, value):
+    scene = make_scene(10).to(torch.float32)
+    scene.sh[0, 0] = value  # the sum is infinite, of this sign
+    _, _, meta = rasterize(scene, module, packed=False)
+    assert meta["radii"][0, 0].tolist() == [0, 0]
+
+
 def test_plain_colors_that_are_not_finite_are_culled(scene):
     colors = torch.rand(50, 3)
     colors[4, 1] = math.nan

@@ -109,3 +109,17 @@ def test_what_cannot_be_published_is_refused(make_gaussians):
 def test_a_model_is_frozen(make_gaussians):
     with pytest.raises(dataclasses.FrozenInstanceError):
         make_model(make_gaussians(2)).version = 3
+
+
+@KINDS
+@pytest.mark.cuda
+def test_another_device_has_the_same_model(gpu, kind, make_gaussians):
+    model = make_model(make_gaussians(60), kind)
+    there = model.to(gpu)
+    assert model.to("cpu") is model and there.to(gpu) is there
+    assert {tensor.device for tensor in there.tensors().values()} == {gpu}
+    assert {tensor.device.type for tensor in model.tensors().values()} == {"cpu"}
+    assert there.sha256() == there.to("cpu").sha256() == model.sha256()
+    seen, expected = there.render(2.0), model.render(2.0)
+    assert seen.image.device == gpu
+    torch.testing.assert_close(seen.image.cpu(), expected.image, rtol=0, atol=5e-3)

@@ -6,10 +6,28 @@ namespace {
 constexpr int kMostRows = 1024;           // of a block
 constexpr int64_t kChunk = 4 * kThreads;  // values of a block, unless a row is longer
 
+// The step as it is told by the host.
+__device__ __forceinline__ AdamStep step_of(const AdamStep& told) { return told; }
+
+// The step as the device has it. One thread of a block takes the powers, in double: -expm1 keeps 1 - beta^t accurate for a beta
+// near 1 and a small t. Ends in a barrier.
+__device__ __forceinline__ AdamStep step_of(const AdamAt& at) {
+  __shared__ float rate, inv_bias2;
+  if (threadIdx.x == 0) {
+    const double t = double(*at.step);
+    rate = float(double(*at.rate) / -expm1(t * at.log_beta1));
+    inv_bias2 = float(1.0 / sqrt(-expm1(t * at.log_beta2)));
+  }
+  __syncthreads();
+  return {rate, inv_bias2, at.fresh1, at.fresh2, at.epsilon, at.row_size};
+}
+
 // A block looks through all values of its rows for one whose square is not finite, and then updates the rows that have none.
+template <class Step>
 __global__ void __launch_bounds__(kThreads)
     adam_rows(float* __restrict__ p, const float* __restrict__ g, float* __restrict__ m, float* __restrict__ v, int64_t rows,
-              int rows_per_block, AdamStep step, unsigned long long* skipped) {
+              int rows_per_block, Step told, unsigned long long* skipped) {
+  const AdamStep step = step_of(told);
   __shared__ int poisoned[kMostRows];
   const int64_t first = int64_t(blockIdx.x) * rows_per_block;
   const int count = int(rows - first < rows_per_block ? rows - first : rows_per_block);
@@ -34,12 +52,22 @@ __global__ void __launch_bounds__(kThreads)
     if (poisoned[r]) atomicAdd(skipped, 1ULL);  // whole numbers: their sum does not depend on the order
 }
 
-}  // namespace
-
-void adam_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step, int64_t* skipped,
-                    cudaStream_t stream) {
+template <class Step>
+void launch(float* p, const float* g, float* m, float* v, int64_t rows, const Step& step, int64_t* skipped, cudaStream_t stream) {
   if (rows == 0) return;
   const int64_t fit = kChunk / step.row_size, per_block = fit < 1 ? 1 : fit < kMostRows ? fit : kMostRows;
   adam_rows<<<blocks_for(rows, per_block), kThreads, 0, stream>>>(p, g, m, v, rows, int(per_block), step,
                                                                   reinterpret_cast<unsigned long long*>(skipped));
+}
+
+}  // namespace
+
+void adam_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step, int64_t* skipped,
+                    cudaStream_t stream) {
+  launch(p, g, m, v, rows, step, skipped, stream);
+}
+
+void adam_at_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamAt& at, int64_t* skipped,
+                       cudaStream_t stream) {
+  launch(p, g, m, v, rows, at, skipped, stream);
 }

@@ -22,7 +22,27 @@ def adam_step(
     epsilon: float = 1e-8,
     row_size: int = 1,
 ) -> int:
-    """Update `parameter` and its moments in place as torch.optim.Adam does.
+    """`adam_step_queued`, and the number of rows left alone read at once: on CUDA the host waits for it."""
+    return int(
+        adam_step_queued(
+            parameter, gradient, first_moment, second_moment, step, learning_rate, beta1, beta2, epsilon, row_size
+        )
+    )
+
+
+def adam_step_queued(
+    parameter: Tensor,
+    gradient: Tensor,
+    first_moment: Tensor,
+    second_moment: Tensor,
+    step: int,
+    learning_rate: float,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-8,
+    row_size: int = 1,
+) -> Tensor:
+    """Update `parameter` and its moments in place as torch.optim.Adam does; on CUDA the host does not wait.
 
     A gradient that is NaN or infinite (or so large that its square is) would poison the moments for good, so it leaves its row of
     `row_size` consecutive values, parameter and moments, as it was.
@@ -34,13 +54,56 @@ def adam_step(
         row_size: values that share their fate; 1 = each for itself. It divides the number of values.
 
     Returns:
-        How many rows were left alone. On CUDA the host waits for this number; `torch.ops.gsplat_core.adam_` gives it as a tensor
-        on the device and does not wait.
+        How many rows were left alone, int64 [] on the device.
 
     Raises:
         InvalidInput: shapes or devices differ, a tensor is not float32 or not contiguous, or step is below 1;
             `gsplat_core.reference.adam` takes any floating type.
     """
+    _check(parameter, gradient, first_moment, second_moment, row_size)
+    if step < 1:
+        raise InvalidInput(f"step counts from 1, got step {step}")
+    return torch.ops.gsplat_core.adam_(
+        parameter.detach(), gradient, first_moment, second_moment, step, learning_rate, beta1, beta2, epsilon, row_size
+    )
+
+
+def adam_step_at_(
+    parameter: Tensor,
+    gradient: Tensor,
+    first_moment: Tensor,
+    second_moment: Tensor,
+    rate: Tensor,
+    step: Tensor,
+    skipped: Tensor,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-8,
+    row_size: int = 1,
+) -> None:
+    """As `adam_step_queued`, with what changes from step to step on the device, so that a CUDA graph can repeat it.
+
+    Args:
+        rate: learning rate, float32 [1].
+        step: counts from 1, int64 [1].
+        skipped: the number of rows left alone is added to it, int64 [1].
+    """
+    _check(parameter, gradient, first_moment, second_moment, row_size)
+    for name, tensor, dtype in (
+        ("rate", rate, torch.float32),
+        ("step", step, torch.int64),
+        ("skipped", skipped, torch.int64),
+    ):
+        if tensor.dtype != dtype or tensor.numel() != 1 or tensor.device != parameter.device:
+            raise InvalidInput(
+                f"{name} must be one {dtype} on {parameter.device}, got {tensor.dtype} {list(tensor.shape)} on {tensor.device}"
+            )
+    torch.ops.gsplat_core.adam_at_(
+        parameter.detach(), gradient, first_moment, second_moment, rate, step, beta1, beta2, epsilon, row_size, skipped
+    )
+
+
+def _check(parameter: Tensor, gradient: Tensor, first_moment: Tensor, second_moment: Tensor, row_size: int) -> None:
     for name, tensor in (("parameter", parameter), ("first_moment", first_moment), ("second_moment", second_moment)):
         if tensor.shape != gradient.shape or not tensor.is_contiguous():
             raise InvalidInput(
@@ -50,14 +113,8 @@ def adam_step(
     require_float32(
         "adam_step", parameter=parameter, gradient=gradient, first_moment=first_moment, second_moment=second_moment
     )
-    if step < 1 or row_size < 1 or gradient.numel() % row_size:
-        raise InvalidInput(
-            f"step counts from 1 and row_size divides {gradient.numel()} values, got step {step}, row_size {row_size}"
-        )
-    skipped = torch.ops.gsplat_core.adam_(
-        parameter.detach(), gradient, first_moment, second_moment, step, learning_rate, beta1, beta2, epsilon, row_size
-    )
-    return int(skipped)
+    if row_size < 1 or gradient.numel() % row_size:
+        raise InvalidInput(f"row_size divides {gradient.numel()} values, got row_size {row_size}")
 
 
 @torch.library.register_fake("gsplat_core::adam_")
@@ -74,3 +131,20 @@ def _(
     row_size: int,
 ) -> Tensor:
     return gradient.new_empty((), dtype=torch.int64)
+
+
+@torch.library.register_fake("gsplat_core::adam_at_")
+def _(
+    parameter: Tensor,
+    gradient: Tensor,
+    first_moment: Tensor,
+    second_moment: Tensor,
+    rate: Tensor,
+    step: Tensor,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+    row_size: int,
+    skipped: Tensor,
+) -> None:
+    return None

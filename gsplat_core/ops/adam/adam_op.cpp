@@ -26,5 +26,20 @@ static Tensor adam_(Tensor parameter, Tensor gradient, Tensor first_moment, Tens
   return result;
 }
 
+static void adam_at_(Tensor parameter, Tensor gradient, Tensor first_moment, Tensor second_moment, Tensor rate, Tensor step,
+                     double beta1, double beta2, double epsilon, int64_t row_size, Tensor skipped) {
+  const Tensor learning_rate = floats(rate, "rate");
+  for (const Tensor* t : {&step, &skipped})
+    STD_TORCH_CHECK(t->is_cpu() && t->scalar_type() == ScalarType::Long && t->numel() == 1,
+                    "step and skipped must be one int64 each, on the CPU for this implementation");
+  STD_TORCH_CHECK(learning_rate.numel() == 1, "rate must be one float32");
+  const Tensor count = adam_(parameter, gradient, first_moment, second_moment, *step.const_data_ptr<int64_t>(),
+                             double(*data(learning_rate)), beta1, beta2, epsilon, row_size);
+  *skipped.mutable_data_ptr<int64_t>() += *count.const_data_ptr<int64_t>();
+}
+
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CompositeExplicitAutograd, m) { m.impl("active_isa", TORCH_BOX(&active_isa_op)); }
-STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) { m.impl("adam_", TORCH_BOX(&adam_)); }
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) {
+  m.impl("adam_", TORCH_BOX(&adam_));
+  m.impl("adam_at_", TORCH_BOX(&adam_at_));
+}

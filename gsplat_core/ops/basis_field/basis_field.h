@@ -6,12 +6,19 @@
 #include "isa.h"
 
 constexpr int64_t kBasisChannels = 13;
+constexpr int64_t kBasisPadded = 16;  // columns of deltas and gradients in the frame path's layout; the last three are not ours
+constexpr float kBasisReach = 4.0f;   // widths; a bump further away is left out (BUMP_REACH of the reference)
+
+// Learning rates in their order: position, rotation, log-scale, colour; centres, widths.
+constexpr int kBasisRates = 6, kBasisCenterRate = 4, kBasisWidthRate = 5;
+constexpr int basis_rate_of(int64_t channel) { return channel < 3 ? 0 : channel < 7 ? 1 : channel < 10 ? 2 : 3; }
 
 // One field at one time: centres and log-widths [N, B], weights [N, B, 13].
 struct BasisBumps {
   const float *centers, *log_widths, *weights;
   int64_t bumps;
   float tau;
+  int64_t row;  // columns of deltas and gradients: kBasisChannels or kBasisPadded
 };
 
 // The same, updated in place by Adam, with moments of the same shapes and the updates counted per bump.
@@ -21,6 +28,7 @@ struct BasisAdam {
   int32_t* steps;
   int64_t bumps;
   float tau;
+  int64_t row;              // columns of the gradient
   float channel_rates[16];  // by channel; the last three are unused
   float center_rate, width_rate, beta1, beta2, epsilon;
   // Bias corrections after k updates, k < table_size: 1 / (1 - beta1^k) and 1 / sqrt(1 - beta2^k); later ones are the last.

@@ -1,6 +1,9 @@
 """Basis-function deformation: bumps in time to per-Gaussian deltas, their gradients, and gradients fused with lazy Adam.
 
-The maths, shapes and truncation are those of `gsplat_core.reference.basis_field`; float32 on the CPU.
+The maths, shapes and truncation are those of `gsplat_core.reference.basis_field`; float32, on the CPU and on CUDA.
+
+On CUDA nothing waits for the device, and where `tau` and the learning rates are tensors there, a captured launch reads them anew whenever
+it is replayed.
 """
 
 from __future__ import annotations
@@ -11,48 +14,63 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsplat_core.argument_checks import require_float32
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.scalars.scalars import store_scalars_
 from gsplat_core.reference.deformation import CHANNEL_GROUPS
 
 CHANNELS = sum(CHANNEL_GROUPS)
+PADDED_CHANNELS = 16
+"""Columns of deltas and gradients in the frame path's layout: our 13, and three that are not ours."""
+RATES = 6
+"""Learning rates: position, rotation, log-scale, colour, centres, widths."""
 
 
-def basis_field(centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float) -> Tensor:
+def basis_field(
+    centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, padded: bool = False
+) -> Tensor:
     """Deltas [N, 13] at `tau` of bumps with `centers`, `log_widths` [N, B] and `weights` [N, B, 13]; differentiable.
 
-    A bump more than 4 widths away contributes nothing and gets no gradient.
+    A bump more than 4 widths away contributes nothing and gets no gradient. `tau` is a number, or one float32 on the field's
+    device. With `padded` the deltas are [N, 16], the frame path's layout; the last three columns are 0.
     """
     _check(centers, log_widths, weights)
-    return torch.ops.gsplat_core.basis_field(centers, log_widths, weights, tau)
+    return torch.ops.gsplat_core.basis_field(centers, log_widths, weights, _scalars("tau", tau, centers, 1), padded)
 
 
 def basis_field_backward(
-    gradient: Tensor, centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float
+    gradient: Tensor, centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of (centers, log_widths, weights) for dL/d(delta) `gradient` [N, 13]; exactly zero for inactive bumps."""
+    """Gradients of (centers, log_widths, weights) for dL/d(delta) `gradient`; exactly zero for inactive bumps.
+
+    `gradient` is [N, 13], or [N, 16] of which the last three columns are not looked at.
+    """
     _check(centers, log_widths, weights)
     _check_gradient(gradient, centers)
-    return torch.ops.gsplat_core.basis_field_backward(gradient, centers, log_widths, weights, tau)
+    return torch.ops.gsplat_core.basis_field_backward(
+        gradient, centers, log_widths, weights, _scalars("tau", tau, centers, 1)
+    )
 
 
 def basis_field_backward_adam_(
     gradient: Tensor,
-    tau: float,
+    tau: float | Tensor,
     centers: Tensor,
     log_widths: Tensor,
     weights: Tensor,
     first_moments: Sequence[Tensor],
     second_moments: Sequence[Tensor],
     steps: Tensor,
-    learning_rates: Sequence[float],
+    learning_rates: Sequence[float] | Tensor,
     beta1: float = 0.9,
     beta2: float = 0.999,
     epsilon: float = 1e-8,
 ) -> None:
     """Gradients and one lazy Adam step of every bump active at `tau`, in place and in one pass.
 
-    Arguments as `gsplat_core.reference.basis_field_backward_adam_`; every tensor that is updated must be contiguous.
+    Arguments as `gsplat_core.reference.basis_field_backward_adam_`; every tensor that is updated must be contiguous. `gradient`
+    may be [N, 16] as in `basis_field_backward`; `tau` and `learning_rates` may be float32 tensors on the field's device.
     """
     _check(centers, log_widths, weights)
     _check(*first_moments)
@@ -63,9 +81,27 @@ def basis_field_backward_adam_(
     if first_moments[0].shape != centers.shape or second_moments[0].shape != centers.shape:
         raise InvalidInput(f"moments must have the shapes of the field's tensors, {list(centers.shape)} and one of 13")
     torch.ops.gsplat_core.basis_field_backward_adam_(
-        gradient, tau, centers, log_widths, weights, *first_moments, *second_moments, steps, *learning_rates,
-        beta1, beta2, epsilon,
+        gradient, _scalars("tau", tau, centers, 1), centers, log_widths, weights, *first_moments, *second_moments, steps,
+        _scalars("learning_rates", learning_rates, centers, RATES), beta1, beta2, epsilon,
     )  # fmt: skip
+
+
+def _scalars(name: str, values: float | Sequence[float] | Tensor, like: Tensor, count: int) -> Tensor:
+    """`count` float32 on the device of `like`. Numbers travel in a launch's arguments, so that the host does not wait."""
+    if not isinstance(values, Tensor):
+        numbers = [float(v) for v in values] if isinstance(values, Sequence) else [float(values)]
+        if len(numbers) != count:
+            raise InvalidInput(f"{name} must be {count} numbers, got {len(numbers)}")
+        if like.device.type == "cpu":
+            return torch.tensor(numbers, dtype=torch.float32)
+        to = torch.empty(count, dtype=torch.float32, device=like.device)
+        store_scalars_(to, numbers)
+        return to
+    if values.dtype != torch.float32 or values.numel() != count or values.device != like.device:
+        raise InvalidInput(
+            f"{name} must be {count} float32 on {like.device}, got {values.dtype} {list(values.shape)} on {values.device}"
+        )
+    return values
 
 
 def _check(centers: Tensor, log_widths: Tensor, weights: Tensor) -> None:
@@ -75,26 +111,26 @@ def _check(centers: Tensor, log_widths: Tensor, weights: Tensor) -> None:
             f"expected centers [N, B], log_widths [N, B] and weights [N, B, {CHANNELS}], got {list(shape)},"
             f" {list(log_widths.shape)} and {list(weights.shape)}"
         )
-    for name, tensor in (("centers", centers), ("log_widths", log_widths), ("weights", weights)):
-        if tensor.dtype != torch.float32:
-            raise InvalidInput(f"{name} is {tensor.dtype}; this op is float32, gsplat_core.reference has every dtype")
+    require_float32("basis_field", centers=centers, log_widths=log_widths, weights=weights)
 
 
 def _check_gradient(gradient: Tensor, centers: Tensor) -> None:
-    if gradient.shape != (centers.shape[0], CHANNELS) or gradient.dtype != torch.float32:
+    shapes = [(centers.shape[0], columns) for columns in (CHANNELS, PADDED_CHANNELS)]
+    if gradient.shape not in shapes or gradient.dtype != torch.float32:
         raise InvalidInput(
-            f"gradient must be float32 [{centers.shape[0]}, {CHANNELS}], got {gradient.dtype} {list(gradient.shape)}"
+            f"gradient must be float32 {list(shapes[0])} or {list(shapes[1])}, got {gradient.dtype} {list(gradient.shape)}"
         )
+    require_float32("basis_field", centers=centers, gradient=gradient)
 
 
 @torch.library.register_fake("gsplat_core::basis_field")
-def _(centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float) -> Tensor:
-    return centers.new_empty(centers.shape[0], CHANNELS)
+def _(centers: Tensor, log_widths: Tensor, weights: Tensor, tau: Tensor, padded: bool = False) -> Tensor:
+    return centers.new_empty(centers.shape[0], PADDED_CHANNELS if padded else CHANNELS)
 
 
 @torch.library.register_fake("gsplat_core::basis_field_backward")
 def _(
-    gradient: Tensor, centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float
+    gradient: Tensor, centers: Tensor, log_widths: Tensor, weights: Tensor, tau: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     return tuple(t.new_empty(t.shape) for t in (centers, log_widths, weights))  # type: ignore[return-value]
 
@@ -105,12 +141,11 @@ def _(*arguments: Any) -> None:
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    *tensors, ctx.tau = inputs
-    ctx.save_for_backward(*tensors)
+    ctx.save_for_backward(*inputs[:4])
 
 
-def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
-    return *torch.ops.gsplat_core.basis_field_backward(gradient, *ctx.saved_tensors, ctx.tau), None
+def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, None, None]:
+    return *torch.ops.gsplat_core.basis_field_backward(gradient, *ctx.saved_tensors), None, None
 
 
 torch.library.register_autograd("gsplat_core::basis_field", _backward, setup_context=_setup_context)

@@ -6,7 +6,6 @@ namespace GSPLAT_ISA {
 namespace {
 
 constexpr int kRowVectors = 16 / kLanes;
-constexpr float kReach = 4.0f;  // widths; a bump further away is left out (BUMP_REACH of the reference)
 constexpr float kLog2e = 1.44269504f;
 
 // 13 channels in as few vectors as hold 16; the last three lanes are zero.
@@ -41,6 +40,13 @@ GSPLAT_INLINE bool is_zero(const Row& r) {
   return set == 0;
 }
 
+// Whether every square is finite: an infinite second moment would stop its parameter for good.
+GSPLAT_INLINE bool is_usable(const Row& r) {
+  vfloat poison = r.v[0] * r.v[0] * 0.0f;
+  for (int i = 1; i < kRowVectors; ++i) poison += r.v[i] * r.v[i] * 0.0f;
+  return sum(poison) == 0.0f;
+}
+
 // A vector of neighbouring bumps of one Gaussian at one time.
 struct Bumps {
   vfloat u, inverse_width, height;  // height is exp(-u^2), zero where inactive
@@ -55,7 +61,7 @@ GSPLAT_INLINE Bumps bumps_at(const float* centers, const float* log_widths, int6
   const vfloat exponent = min(max(log_width * -kLog2e, splat(-126.0f)), splat(126.0f));
   b.inverse_width = select(log_width == log_width, exp2(exponent), log_width);
   b.u = (tau - load_first(centers, count)) * b.inverse_width;
-  b.active = ~((b.u > kReach) | (b.u < -kReach)) & first_lanes(count);
+  b.active = ~((b.u > kBasisReach) | (b.u < -kBasisReach)) & first_lanes(count);
   const vfloat height = exp2(max(b.u * b.u * -kLog2e, splat(-126.0f)));
   b.height = select(b.active, select(b.u == b.u, height, b.u), vfloat{});
   b.mask = bits(b.active);
@@ -92,14 +98,16 @@ void forward(const BasisBumps& field, float* deltas, int64_t begin, int64_t end)
         for (int i = 0; i < kRowVectors; ++i) total.v[i] += heights[lane] * w.v[i];
       }
     }
-    store_row(deltas + n * kBasisChannels, total);
+    float* to = deltas + n * field.row;
+    store_row(to, total);
+    for (int64_t c = kBasisChannels; c < field.row; ++c) to[c] = 0;
   }
 }
 
 void backward(const BasisBumps& field, const float* gradient, float* centers, float* log_widths, float* weights, int64_t begin,
               int64_t end) {
   for (int64_t n = begin; n < end; ++n) {
-    const Row g = load_row(gradient + n * kBasisChannels);
+    const Row g = load_row(gradient + n * field.row);
     const int64_t first = n * field.bumps;
     __builtin_memset(weights + first * kBasisChannels, 0, size_t(field.bumps * kBasisChannels) * sizeof(float));
     for (int64_t from = 0; from < field.bumps; from += kLanes) {
@@ -144,8 +152,8 @@ void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t 
   Row rates;
   for (int i = 0; i < kRowVectors; ++i) rates.v[i] = load(field.channel_rates + i * kLanes);
   for (int64_t n = begin; n < end; ++n) {
-    const Row g = load_row(gradient + n * kBasisChannels);
-    if (is_zero(g)) continue;  // the frame does not show this Gaussian
+    const Row g = load_row(gradient + n * field.row);
+    if (is_zero(g) || !is_usable(g)) continue;  // the frame does not show this Gaussian, or says nothing of use about it
     const int64_t first = n * field.bumps;
     for (int64_t from = 0; from < field.bumps; from += kLanes) {
       const int64_t at = first + from, count = lanes_left(from, field.bumps);

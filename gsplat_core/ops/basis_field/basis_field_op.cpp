@@ -5,27 +5,22 @@
 #include <vector>
 
 #include "basis_field.h"
-#include "tensor_checks.h"
+#include "basis_field_checks.h"
 
 static constexpr int64_t kGrain = 1024;
 
-static void check_shapes(const Tensor& centers, const Tensor& log_widths, const Tensor& weights) {
-  STD_TORCH_CHECK(centers.dim() == 2 && log_widths.dim() == 2 && weights.dim() == 3 && weights.size(2) == kBasisChannels &&
-                      centers.size(0) == weights.size(0) && centers.size(1) == weights.size(1) &&
-                      log_widths.size(0) == centers.size(0) && log_widths.size(1) == centers.size(1),
-                  "basis_field takes centers [N, B], log_widths [N, B] and weights [N, B, 13]");
+static float value_of(const Tensor& tau) {
+  const Tensor t = floats(tau, "tau");
+  STD_TORCH_CHECK(t.numel() == 1, "tau must be one float32");
+  return data(t)[0];
 }
 
-static void check_gradient(const Tensor& gradient, const Tensor& centers) {
-  STD_TORCH_CHECK(gradient.dim() == 2 && gradient.size(0) == centers.size(0) && gradient.size(1) == kBasisChannels,
-                  "the gradient must be [N, 13] with N = ", centers.size(0));
-}
-
-static Tensor basis_field(Tensor centers, Tensor log_widths, Tensor weights, double tau) {
+static Tensor basis_field(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, bool padded) {
   check_shapes(centers, log_widths, weights);
   const Tensor c = floats(centers, "centers"), l = floats(log_widths, "log_widths"), w = floats(weights, "weights");
-  Tensor deltas = empty_floats({c.size(0), kBasisChannels});
-  const BasisBumps field = {data(c), data(l), data(w), c.size(1), float(tau)};
+  const int64_t row = padded ? kBasisPadded : kBasisChannels;
+  Tensor deltas = empty_floats({c.size(0), row});
+  const BasisBumps field = {data(c), data(l), data(w), c.size(1), value_of(tau), row};
   float* out = mutable_data(deltas);
   torch::stable::parallel_for(0, c.size(0), kGrain,
                               [&](int64_t begin, int64_t end) { basis_field_kernels().forward(field, out, begin, end); });
@@ -33,14 +28,14 @@ static Tensor basis_field(Tensor centers, Tensor log_widths, Tensor weights, dou
 }
 
 static std::tuple<Tensor, Tensor, Tensor> basis_field_backward(Tensor gradient, Tensor centers, Tensor log_widths, Tensor weights,
-                                                               double tau) {
+                                                               Tensor tau) {
   check_shapes(centers, log_widths, weights);
   check_gradient(gradient, centers);
   const Tensor g = floats(gradient, "gradient"), c = floats(centers, "centers"), l = floats(log_widths, "log_widths"),
                w = floats(weights, "weights");
   const int64_t n = c.size(0), bumps = c.size(1);
   Tensor gc = empty_floats({n, bumps}), gl = empty_floats({n, bumps}), gw = empty_floats({n, bumps, kBasisChannels});
-  const BasisBumps field = {data(c), data(l), data(w), bumps, float(tau)};
+  const BasisBumps field = {data(c), data(l), data(w), bumps, value_of(tau), g.size(1)};
   const float* gp = data(g);
   float *gcp = mutable_data(gc), *glp = mutable_data(gl), *gwp = mutable_data(gw);
   torch::stable::parallel_for(
@@ -73,24 +68,21 @@ static std::shared_ptr<const BiasTable> bias_table(double beta1, double beta2) {
   return last;
 }
 
-static void basis_field_backward_adam_(Tensor gradient, double tau, Tensor centers, Tensor log_widths, Tensor weights,
+static void basis_field_backward_adam_(Tensor gradient, Tensor tau, Tensor centers, Tensor log_widths, Tensor weights,
                                        Tensor m_centers, Tensor m_log_widths, Tensor m_weights, Tensor v_centers,
-                                       Tensor v_log_widths, Tensor v_weights, Tensor steps, double position_rate,
-                                       double rotation_rate, double scale_rate, double colour_rate, double center_rate,
-                                       double width_rate, double beta1, double beta2, double epsilon) {
+                                       Tensor v_log_widths, Tensor v_weights, Tensor steps, Tensor rates, double beta1,
+                                       double beta2, double epsilon) {
   check_shapes(centers, log_widths, weights);
   check_shapes(m_centers, m_log_widths, m_weights);
   check_shapes(v_centers, v_log_widths, v_weights);
   check_gradient(gradient, centers);
-  for (const Tensor* t :
-       {&centers, &log_widths, &weights, &m_centers, &m_log_widths, &m_weights, &v_centers, &v_log_widths, &v_weights})
-    STD_TORCH_CHECK(t->is_cpu() && t->is_contiguous() && t->scalar_type() == ScalarType::Float,
-                    "basis_field_backward_adam_ updates contiguous float32 CPU tensors in place");
-  for (const Tensor* t : {&m_centers, &v_centers, &steps})
-    STD_TORCH_CHECK(t->numel() == centers.numel(), "moments and steps must have the field's number of Gaussians and bumps");
-  STD_TORCH_CHECK(steps.is_cpu() && steps.is_contiguous() && steps.scalar_type() == ScalarType::Int,
-                  "steps must be a contiguous int32 CPU tensor");
+  check_state({&centers, &log_widths, &weights, &m_centers, &m_log_widths, &m_weights, &v_centers, &v_log_widths, &v_weights},
+              steps);
+  STD_TORCH_CHECK(centers.is_cpu() && steps.is_cpu(), "basis_field_backward_adam_ updates CPU tensors in this implementation");
   const Tensor g = floats(gradient, "gradient");
+  const Tensor learning_rates = floats(rates, "rates");
+  STD_TORCH_CHECK(learning_rates.numel() == kBasisRates, "rates must be float32 [6]");
+  const float* rate = data(learning_rates);
   const std::shared_ptr<const BiasTable> table = bias_table(beta1, beta2);
   BasisAdam field = {};
   field.centers = mutable_data(centers), field.log_widths = mutable_data(log_widths), field.weights = mutable_data(weights);
@@ -98,12 +90,9 @@ static void basis_field_backward_adam_(Tensor gradient, double tau, Tensor cente
   field.m_weights = mutable_data(m_weights), field.v_centers = mutable_data(v_centers);
   field.v_log_widths = mutable_data(v_log_widths), field.v_weights = mutable_data(v_weights);
   field.steps = steps.mutable_data_ptr<int32_t>();
-  field.bumps = centers.size(1), field.tau = float(tau);
-  const double groups[4] = {position_rate, rotation_rate, scale_rate, colour_rate};
-  const int sizes[4] = {3, 4, 3, 3};
-  for (int group = 0, channel = 0; group < 4; ++group)
-    for (int i = 0; i < sizes[group]; ++i) field.channel_rates[channel++] = float(groups[group]);
-  field.center_rate = float(center_rate), field.width_rate = float(width_rate);
+  field.bumps = centers.size(1), field.tau = value_of(tau), field.row = g.size(1);
+  for (int channel = 0; channel < kBasisChannels; ++channel) field.channel_rates[channel] = rate[basis_rate_of(channel)];
+  field.center_rate = rate[kBasisCenterRate], field.width_rate = rate[kBasisWidthRate];
   field.beta1 = float(beta1), field.beta2 = float(beta2), field.epsilon = float(epsilon);
   field.inverse_bias1 = table->inverse_bias1.data(), field.inverse_root_bias2 = table->inverse_root_bias2.data();
   field.table_size = int64_t(table->inverse_bias1.size());

@@ -9,8 +9,7 @@
 
 #include "cuda_scratch.h"
 
-constexpr int kWindowSize = 16;   // pixels on a side
-constexpr int kShapeMoments = 6;  // sum over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
+constexpr int kWindowSize = 16;  // pixels on a side
 
 struct DeviceCompositing {
   const float* means2d;    // [count, 2]

@@ -70,17 +70,21 @@ struct Call {
         0, count, 2048, [&](int64_t begin, int64_t end) { compositing_kernels().records(in, begin, end, records.get()); });
   }
 
+  // What lies in front of the first tile's list is unused: lists of a fixed capacity fill up from the end.
+  int64_t first_listed() const { return tiles > 0 ? offsets.const_data_ptr<int32_t>()[0] : flatten_ids.numel(); }
+
   // The lists come from the caller, and a wrong index would read foreign memory.
   void check_lists() const {
     const int32_t *starts = offsets.const_data_ptr<int32_t>(), *ids = flatten_ids.const_data_ptr<int32_t>();
     const int64_t instances = flatten_ids.numel();
     int32_t before = 0;
-    bool ordered = tiles > 0 ? starts[0] == 0 : instances == 0;  // every instance is in some tile
+    bool ordered = true;
     for (int64_t i = 0; i < tiles; ++i) ordered &= starts[i] >= before, before = starts[i];
     STD_TORCH_CHECK(ordered && before <= instances, "isect_offsets must rise from 0 to at most the length of flatten_ids");
     uint32_t most = 0;
-    for (int64_t i = 0; i < instances; ++i) most = std::max(most, uint32_t(ids[i]));
-    STD_TORCH_CHECK(instances == 0 || most < count, "flatten_ids must be in [0, ", count, "), found ", int32_t(most));
+    for (int64_t i = first_listed(); i < instances; ++i) most = std::max(most, uint32_t(ids[i]));
+    STD_TORCH_CHECK(first_listed() == instances || most < count, "flatten_ids must be in [0, ", count, "), found ",
+                    int32_t(most));
   }
 
   // run(tile, scratch) for all tiles: threads take the next free one, and no result depends on which takes which.
@@ -128,17 +132,18 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
 
   // A row for every instance, those of one splat next to each other in the order of the lists.
   auto first = uninitialised<int32_t>(count + 1), slots = uninitialised<int32_t>(instances);
-  const int32_t* const ids = call.in.flatten_ids;
+  const int64_t unused = call.first_listed(), listed = instances - unused;
+  const int32_t* const ids = call.in.flatten_ids + unused;
   const auto add = [&](int64_t begin, int64_t end, int32_t* counters) {
     for (int64_t i = begin; i < end; ++i) ++counters[ids[i]];
   };
-  counting_sort(instances, 1 << 15, count, first.get(), add, [&](int64_t begin, int64_t end, int32_t* cursors) {
-    for (int64_t i = begin; i < end; ++i) slots[i] = cursors[ids[i]]++;
+  counting_sort(listed, 1 << 15, count, first.get(), add, [&](int64_t begin, int64_t end, int32_t* cursors) {
+    for (int64_t i = begin; i < end; ++i) slots[unused + i] = cursors[ids[i]]++;
   });
-  first[count] = int32_t(instances);
+  first[count] = int32_t(listed);
 
   const int64_t lines_per_row = (kMoments + channels + (absgrad ? 2 : 0) + 15) / 16;
-  const auto rows = uninitialised<Line>(instances * lines_per_row);
+  const auto rows = uninitialised<Line>(listed * lines_per_row);
   std::vector<float> background_parts(backgrounds ? size_t(call.tiles * channels) : 0, 0.0f);
   const CompositingGradients gradients = {data(alphas_),
                                           last_.const_data_ptr<int32_t>(),

@@ -10,12 +10,14 @@
 
 #include "cuda_scratch.h"
 
-constexpr int kFrameTile = 16;    // pixels on a side
-constexpr int kRawColumns = 16;   // position 3, rotation 4, log-scale 3, colour 3, opacity logit 1, 2 unused
-constexpr int kRowQuads = 3;      // float4s of an instance's gradient row: 6 moments, 4 channels, 2 unused
-constexpr int kStatusNeeded = 0;  // instances that the frame needs
-constexpr int kStatusMost = 1;    // most instances in one tile
-constexpr int kStatusCut = 2;     // 1 where they did not fit and some were left out
+constexpr int kFrameTile = 16;      // pixels on a side
+constexpr int kFrameThreads = 128;  // of a block that does one Gaussian per thread
+constexpr int kRawColumns = 16;     // position 3, rotation 4, log-scale 3, colour 3, opacity logit 1, 2 unused
+constexpr int kRowQuads = 3;        // float4s of an instance's gradient row: 6 moments, 4 channels, 2 unused
+constexpr int kStatusNeeded = 0;    // instances that the frame needs
+constexpr int kStatusMost = 1;      // most instances in one tile
+constexpr int kStatusCut = 2;       // 1 where they did not fit and some were left out
+constexpr int kMostTilesAcross = 1 << 13;
 
 // One camera's view of N Gaussians.
 struct FrameScene {
@@ -29,18 +31,41 @@ struct FrameScene {
   int32_t width, height, tile_width, tile_height;
   float eps2d, near_plane, far_plane;
   int32_t camera_model;
+  bool aligned;  // quats, sh and deltas begin at a multiple of 16 bytes
 
-  int64_t tiles() const { return int64_t(tile_width) * tile_height; }
+  constexpr int64_t tiles() const { return int64_t(tile_width) * tile_height; }
 };
 
-// What the forward pass leaves behind: records, and for every tile its instances in depth order.
+// What the forward pass leaves behind: records, and for every tile its instances in depth order. A list that was cut may hold
+// -1: no instance.
 struct FrameLists {
-  void* records;             // Record<4> [N]: colours are red, green, blue, z
+  void* records;             // Record<4> [N]: colours are red, green, blue, z; of culled Gaussians not written
   int32_t* tile_offsets;     // [tiles + 1]
   uint64_t* keys;            // [capacity], scratch: depth bits << 32 | splat, or instance when training
   int32_t* sorted;           // [capacity], training: instances by tile and depth
-  int32_t* splat_starts;     // [N + 1], training: where each splat's instances start
+  int32_t* splat_starts;     // [N + 1], training: where each splat's instances start; otherwise null
   int32_t* instance_splats;  // [capacity], training: the splat of every instance
   int32_t* status;           // [4]
   int64_t capacity;
 };
+
+// On the way from one kernel to the next.
+struct FrameScratch {
+  uint2* footprints;  // [N], see frame_footprint.cuh
+  uint32_t* depths;   // [N], z of visible Gaussians as bits
+  int32_t* counts;    // [tiles], zero before
+  uint32_t* cursors;  // [tiles]
+  int32_t* sums;      // [blocks of Gaussians], training: instances of each block
+  uint32_t* starts;   // [blocks of Gaussians], training: where they start
+};
+
+struct FramePixels {
+  float* image;   // [H, W, 4]: colours, and the sum of z (training) or its mean over the splats, weighted by their contribution
+  float* alphas;  // [H, W]
+  int32_t* last;  // [H, W], training: the position in `sorted` of the last instance that was blended, or -1
+};
+
+void preprocess_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
+void scan_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
+void fill_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
+void blend_frame(const FrameScene& in, const FrameLists& lists, const FramePixels& out, cudaStream_t stream);

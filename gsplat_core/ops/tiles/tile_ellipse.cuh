@@ -17,10 +17,22 @@ struct TileBox {
 };
 
 __device__ inline TileEllipse tile_ellipse(float x, float y, float a, float b, float c, float k) {
-  const float ac = a * c, det = fmaf(-b, b, ac) - 5e-7f * ac, inverse = 1.0f / a;  // rounding of det only widens the ellipse
+  const float ac = a * c, inverse = 1.0f / a;
+  const float det = fmaf(-5e-7f, ac, fmaf(-b, b, ac));  // rounding of det only widens the ellipse
   const float top = -b * sqrtf(k / (c * det));
   const bool proper = a > 0 && c > 0 && det > 1e-6f * ac && fabsf(top) <= 1e30f;
   return {x, y, -b * inverse, k * inverse, det * inverse * inverse, top, proper};
+}
+
+// The tiles of the grid within (rx, ry) of (x, y), in pixels.
+__device__ inline TileBox box_around(float x, float y, float rx, float ry, float size, int grid_width, int grid_height) {
+  const float width = float(grid_width), height = float(grid_height);
+  TileBox box = {};
+  box.left = int(fminf(fmaxf((x - rx) / size, 0.0f), width));
+  box.top = int(fminf(fmaxf((y - ry) / size, 0.0f), height));
+  box.right = int(ceilf(fminf(fmaxf((x + rx) / size, 0.0f), width)));
+  box.bottom = int(ceilf(fminf(fmaxf((y + ry) / size, 0.0f), height)));
+  return box;
 }
 
 __device__ inline TileBox tile_box(const DeviceBoxes& in, int64_t i) {
@@ -29,13 +41,7 @@ __device__ inline TileBox tile_box(const DeviceBoxes& in, int64_t i) {
   const TileBox none = {};
   if (!(rx > 0 && ry > 0 && isfinite(x) && isfinite(y) && isfinite(in.depths[i]))) return none;
   if (in.image_ids != nullptr && (in.image_ids[i] < 0 || in.image_ids[i] >= in.images)) return none;
-  const float size = float(in.tile_size), width = float(in.tile_width), height = float(in.tile_height);
-  TileBox box;
-  box.left = int(fminf(fmaxf((x - rx) / size, 0.0f), width));
-  box.top = int(fminf(fmaxf((y - ry) / size, 0.0f), height));
-  box.right = int(ceilf(fminf(fmaxf((x + rx) / size, 0.0f), width)));
-  box.bottom = int(ceilf(fminf(fmaxf((y + ry) / size, 0.0f), height)));
-  box.ellipse = {};
+  TileBox box = box_around(x, y, rx, ry, float(in.tile_size), in.tile_width, in.tile_height);
   if (in.conics == nullptr) return box;
   const float a = in.conics[3 * i], b = in.conics[3 * i + 1], c = in.conics[3 * i + 2], opacity = in.opacities[i];
   if (!(opacity > 0 && opacity <= 3e38f && isfinite(a) && isfinite(b) && isfinite(c))) return none;
@@ -45,30 +51,38 @@ __device__ inline TileBox tile_box(const DeviceBoxes& in, int64_t i) {
   return box;
 }
 
-// visit(row, first, end) for every row of tiles that the splat touches, with its run of columns [first, end).
-template <class Visit>
-__device__ inline void for_tile_rows(const DeviceBoxes& in, const TileBox& box, const Visit& visit) {
+// The columns [first, end) of a row of tiles; none where first >= end.
+struct TileRun {
+  int first, end;
+};
+
+// The run of tiles of `row` that the splat touches. Every sum of a product is written as one fmaf, so that the same splat has the
+// same runs in every kernel.
+__device__ inline TileRun tile_run(const TileBox& box, int row, float size) {
   constexpr float kSlack = 2e-3f;  // pixels, against rounding
   const TileEllipse& e = box.ellipse;
-  const float size = float(in.tile_size), inverse = 1.0f / size;
-  const float box_first = float(box.left), box_end = float(box.right);
+  if (!e.proper) return {box.left, box.right};
+  const float inverse = 1.0f / size, box_first = float(box.left), box_end = float(box.right);
+  const float low = fmaf(float(row), size, 0.5f - e.y), high = low + (size - 1);
+  const float at_right = fminf(fmaxf(e.top, low), high), at_left = fminf(fmaxf(-e.top, low), high);
+  const float right_square = fmaf(-e.curve * at_right, at_right, e.offset);
+  const float left_square = fmaf(-e.curve * at_left, at_left, e.offset);
+  if (!(fminf(right_square, left_square) >= 0)) return {0, 0};
+  const float right = fmaf(e.slope, at_right, e.x) + sqrtf(right_square) + kSlack;
+  const float left = fmaf(e.slope, at_left, e.x) - sqrtf(left_square) - kSlack;
+  // Tile t holds the pixel centres t size + 0.5 ... t size + size - 0.5; a gap between two tiles' centres is in neither.
+  int first = int(fminf(fmaxf((left + 0.5f) * inverse, box_first), box_end));
+  if (left > fmaf(float(first + 1), size, -0.5f)) ++first;
+  const int end = int(fminf(fmaxf(fmaf(right - 0.5f, inverse, 1.0f), box_first), box_end));
+  return {first, end};
+}
+
+// visit(row, first, end) for every row of tiles that the splat touches, with its run of columns [first, end).
+template <class Visit>
+__device__ inline void for_tile_rows(const TileBox& box, float size, const Visit& visit) {
   if (box.right <= box.left) return;
   for (int row = box.top; row < box.bottom; ++row) {
-    if (!e.proper) {
-      visit(row, box.left, box.right);
-      continue;
-    }
-    const float low = fmaf(float(row), size, 0.5f - e.y), high = low + (size - 1);
-    const float at_right = fminf(fmaxf(e.top, low), high), at_left = fminf(fmaxf(-e.top, low), high);
-    const float right_square = fmaf(-e.curve * at_right, at_right, e.offset);
-    const float left_square = fmaf(-e.curve * at_left, at_left, e.offset);
-    if (!(fminf(right_square, left_square) >= 0)) continue;
-    const float right = fmaf(e.slope, at_right, e.x) + sqrtf(right_square) + kSlack;
-    const float left = fmaf(e.slope, at_left, e.x) - sqrtf(left_square) - kSlack;
-    // Tile t holds the pixel centres t size + 0.5 ... t size + size - 0.5; a gap between two tiles' centres is in neither.
-    int first = int(fminf(fmaxf((left + 0.5f) * inverse, box_first), box_end));
-    if (left > fmaf(float(first + 1), size, -0.5f)) ++first;
-    const int end = int(fminf(fmaxf((right - 0.5f) * inverse + 1.0f, box_first), box_end));
-    if (first < end) visit(row, first, end);
+    const TileRun run = tile_run(box, row, size);
+    if (run.first < run.end) visit(row, run.first, run.end);
   }
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import overload
 
 import torch
 from torch import Tensor
@@ -54,6 +55,22 @@ def isect_tiles(
     return tiles_per_gauss.reshape(depths.shape), isect_ids, flatten_ids
 
 
+@overload
+def bin_splats(
+    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int,
+    packed: bool = ..., n_images: int | None = ..., image_ids: Tensor | None = ...,
+    *, conics: Tensor | None = ..., opacities: Tensor | None = ..., capacity: None = ...,
+) -> tuple[Tensor, Tensor, Tensor]: ...  # fmt: skip
+
+
+@overload
+def bin_splats(
+    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int,
+    packed: bool = ..., n_images: int | None = ..., image_ids: Tensor | None = ...,
+    *, conics: Tensor | None = ..., opacities: Tensor | None = ..., capacity: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]: ...  # fmt: skip
+
+
 def bin_splats(
     means2d: Tensor,
     radii: Tensor,
@@ -67,17 +84,36 @@ def bin_splats(
     *,
     conics: Tensor | None = None,
     opacities: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+    capacity: int | None = None,
+) -> tuple[Tensor, Tensor, Tensor] | tuple[Tensor, Tensor, Tensor, Tensor]:
     """`isect_tiles` (sorted) and `isect_offset_encode` in one, without the 64-bit ids that only they need.
 
-    Returns tiles_per_gauss int32 [..., N], flatten_ids int32 [M], isect_offsets int32 [..., tile_height, tile_width].
+    Args:
+        capacity: None makes the lists exactly as long as they must be, for which the host waits on CUDA. A number makes
+            them this long on any device: nothing waits, and the call can be captured in a CUDA graph. Entries that are
+            not used are -1 and lie in front of the first tile's list, so no offset refers to them. When `needed` is
+            larger than the capacity, the lists hold the nearest splats of all images whose tiles fit in whole, and the
+            caller is to call again with more. 0 to 2^31 - 1.
+
+    Returns:
+        tiles_per_gauss int32 [..., N], flatten_ids int32 [M] or [capacity], isect_offsets int32
+        [..., tile_height, tile_width]; and with a capacity `needed`, int64 [1] on the device of the splats: how many entries
+        all splats together have. Compositing takes the lists of either kind.
     """
     images, chosen = _check(means2d, radii, depths, packed, n_images, image_ids, conics, opacities)
-    tiles_per_gauss, flatten_ids, offsets = torch.ops.gsplat_core.bin_splats(
-        *_flat(means2d, radii, depths, conics, opacities), chosen, images, tile_size, tile_width, tile_height
-    )
+    splats = (*_flat(means2d, radii, depths, conics, opacities), chosen)
+    grid = (images, tile_size, tile_width, tile_height)
+    ops = torch.ops.gsplat_core
+    if capacity is None:
+        tiles_per_gauss, flatten_ids, offsets = ops.bin_splats(*splats, *grid)
+        needed = None
+    else:
+        if not 0 <= capacity < 2**31:
+            raise InvalidInput(f"capacity must be 0 to 2^31 - 1 entries, or None for exactly as many, got {capacity}")
+        tiles_per_gauss, flatten_ids, offsets, needed = ops.bin_splats_within(*splats, *grid, capacity)
     image_dims = (images,) if packed else depths.shape[:-1]
-    return tiles_per_gauss.reshape(depths.shape), flatten_ids, offsets.reshape(*image_dims, tile_height, tile_width)
+    lists = (tiles_per_gauss.reshape(depths.shape), flatten_ids, offsets.reshape(*image_dims, tile_height, tile_width))
+    return lists if needed is None else (*lists, needed)
 
 
 def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
@@ -172,6 +208,26 @@ def _bin_splats_fake(
     counts = depths.new_empty(depths.numel(), dtype=torch.int32)
     offsets = depths.new_empty(images, tile_height, tile_width, dtype=torch.int32)
     return counts, depths.new_empty(found, dtype=torch.int32), offsets
+
+
+@torch.library.register_fake("gsplat_core::bin_splats_within")
+def _bin_splats_within_fake(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    conics: Tensor | None,
+    opacities: Tensor | None,
+    image_ids: Tensor | None,
+    images: int,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    capacity: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    counts = depths.new_empty(depths.numel(), dtype=torch.int32)
+    offsets = depths.new_empty(images, tile_height, tile_width, dtype=torch.int32)
+    lists = depths.new_empty(capacity, dtype=torch.int32)
+    return counts, lists, offsets, depths.new_empty(1, dtype=torch.int64)
 
 
 @torch.library.register_fake("gsplat_core::isect_offset_encode")

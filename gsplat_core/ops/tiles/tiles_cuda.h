@@ -29,11 +29,14 @@ struct TileOrder {
 // Fills tile_counts [count] and puts the splats in order.
 TileOrder order_splats(const DeviceBoxes& in, bool by_depth, int32_t* tile_counts, CudaScratch& scratch, cudaStream_t stream);
 
-// The instances, as two pairs of buffers to sort between; `current` says which of a pair holds the result.
+// The instances, as two pairs of buffers to sort between; `current` says which of a pair holds the result. Where `count` is a
+// capacity, entries that nothing is written to have the key 0 and the splat -1, and every tile's key is one more: the sort puts
+// what is unused in front of the first tile. Splats that do not fit in whole, the last ones in the order, are left out.
 struct TileInstances {
-  uint32_t* tiles[2];  // image * tiles + tile
+  uint32_t* tiles[2];  // image * tiles + tile, and 1 where `count` is a capacity
   int32_t* splats[2];
   int64_t count;
+  bool capacity;
   int current;
 };
 void emit_instances(const DeviceBoxes& in, const TileOrder& order, TileInstances& instances, cudaStream_t stream);

@@ -16,12 +16,12 @@ struct Binning {
   std::optional<Tensor> conics, opacities, image_ids;
   DeviceBoxes boxes;
   int64_t tiles;
-  Tensor tile_counts, splats[2];
+  Tensor tile_counts, splats[2], needed;
   TileInstances instances = {};
 
   Binning(const Tensor& means2d_, const Tensor& radii_, const Tensor& depths_, const std::optional<Tensor>& conics_,
           const std::optional<Tensor>& opacities_, const std::optional<Tensor>& image_ids_, int64_t images, int64_t tile_size,
-          int64_t tile_width, int64_t tile_height, bool sort)
+          int64_t tile_width, int64_t tile_height, bool sort, std::optional<int64_t> capacity = std::nullopt)
       : call(depths_),
         means2d(call.floats(means2d_, "means2d")),
         radii(call.ints(radii_, "radii")),
@@ -48,8 +48,17 @@ struct Binning {
              int32_t(tile_height)};
     tile_counts = call.empty({count}, ScalarType::Int);
     TileOrder order = {};
-    if (count > 0) {
-      order = order_splats(boxes, sort, tile_counts.mutable_data_ptr<int32_t>(), call, call.stream);
+    if (count > 0) order = order_splats(boxes, sort, tile_counts.mutable_data_ptr<int32_t>(), call, call.stream);
+    if (capacity) {
+      STD_TORCH_CHECK(*capacity >= 0 && *capacity <= kMostInts, "bin_splats: capacity must be 0 to 2^31 - 1, got ", *capacity);
+      instances.capacity = true;
+      instances.count = *capacity;
+      needed = call.empty({1}, ScalarType::Long);
+      int64_t* const out = needed.mutable_data_ptr<int64_t>();
+      check_cuda(count > 0 ? cudaMemcpyAsync(out, order.starts + count, sizeof(int64_t), cudaMemcpyDeviceToDevice, call.stream)
+                           : cudaMemsetAsync(out, 0, sizeof(int64_t), call.stream),
+                 "keeping the number of instances");
+    } else if (count > 0) {
       // The host waits here, once, for the number of instances: the lists that are returned are exactly as long.
       check_cuda(cudaMemcpyAsync(&instances.count, order.starts + count, sizeof(int64_t), cudaMemcpyDeviceToHost, call.stream),
                  "reading the number of instances");
@@ -79,14 +88,30 @@ std::tuple<Tensor, Tensor, Tensor> isect_tiles(Tensor means2d, Tensor radii, Ten
   return {binning.tile_counts, ids, binning.flatten_ids()};
 }
 
+Tensor offsets_of(const Binning& binning, int64_t images, int64_t tile_height, int64_t tile_width) {
+  Tensor offsets = binning.call.empty({images, tile_height, tile_width}, ScalarType::Int);
+  encode_offsets(binning.instances, binning.tiles, offsets.mutable_data_ptr<int32_t>(), binning.call.stream);
+  return offsets;
+}
+
 std::tuple<Tensor, Tensor, Tensor> bin_splats(Tensor means2d, Tensor radii, Tensor depths, std::optional<Tensor> conics,
                                               std::optional<Tensor> opacities, std::optional<Tensor> image_ids, int64_t images,
                                               int64_t tile_size, int64_t tile_width, int64_t tile_height) {
   Binning binning(means2d, radii, depths, conics, opacities, image_ids, images, tile_size, tile_width, tile_height, true);
-  Tensor offsets = binning.call.empty({images, tile_height, tile_width}, ScalarType::Int);
-  encode_offsets(binning.instances, binning.tiles, offsets.mutable_data_ptr<int32_t>(), binning.call.stream);
+  Tensor offsets = offsets_of(binning, images, tile_height, tile_width);
   check_cuda(cudaGetLastError(), "bin_splats");
   return {binning.tile_counts, binning.flatten_ids(), offsets};
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> bin_splats_within(Tensor means2d, Tensor radii, Tensor depths,
+                                                             std::optional<Tensor> conics, std::optional<Tensor> opacities,
+                                                             std::optional<Tensor> image_ids, int64_t images, int64_t tile_size,
+                                                             int64_t tile_width, int64_t tile_height, int64_t capacity) {
+  Binning binning(means2d, radii, depths, conics, opacities, image_ids, images, tile_size, tile_width, tile_height, true,
+                  capacity);
+  Tensor offsets = offsets_of(binning, images, tile_height, tile_width);
+  check_cuda(cudaGetLastError(), "bin_splats");
+  return {binning.tile_counts, binning.flatten_ids(), offsets, binning.needed};
 }
 
 Tensor isect_offset_encode(Tensor isect_ids, int64_t images, int64_t tile_width, int64_t tile_height) {
@@ -106,5 +131,6 @@ Tensor isect_offset_encode(Tensor isect_ids, int64_t images, int64_t tile_width,
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
   m.impl("isect_tiles", TORCH_BOX(&isect_tiles));
   m.impl("bin_splats", TORCH_BOX(&bin_splats));
+  m.impl("bin_splats_within", TORCH_BOX(&bin_splats_within));
   m.impl("isect_offset_encode", TORCH_BOX(&isect_offset_encode));
 }

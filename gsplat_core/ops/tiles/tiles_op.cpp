@@ -115,12 +115,21 @@ struct Binning {
     return order;
   }
 
-  // Every tile's splats in depth order; `offsets` receives where each tile starts.
-  Tensor sorted(int32_t* offsets, int64_t* keys) const {
-    Tensor flatten_ids = empty_ints({total});
-    int32_t* const ids = flatten_ids.mutable_data_ptr<int32_t>();
-    int64_t visible;
+  // Every tile's splats in depth order; `offsets` receives where each tile starts. With a capacity the list is of this length:
+  // the nearest splats whose tiles fit in whole, behind entries of -1 that are in no tile.
+  Tensor sorted(int32_t* offsets, int64_t* keys, std::optional<int64_t> capacity = std::nullopt) const {
+    int64_t visible, listed = total;
     const auto order = depth_order(visible);
+    if (capacity && total > *capacity) {
+      const int32_t* const counts = tile_counts.const_data_ptr<int32_t>();
+      int64_t fitting = 0;
+      for (listed = 0; listed + counts[order[fitting]] <= *capacity; ++fitting) listed += counts[order[fitting]];
+      visible = fitting;
+    }
+    const int64_t unused = capacity ? *capacity - listed : 0;
+    Tensor flatten_ids = empty_ints({unused + listed});
+    int32_t* const ids = flatten_ids.mutable_data_ptr<int32_t>() + unused;
+    std::fill(ids - unused, ids, -1);
     const TilesKernels& kernels = tiles_kernels();
     const auto add = [&](int64_t begin, int64_t end, int32_t* counters) {
       kernels.count(boxes, spans.get(), order.get(), begin, end, counters);
@@ -128,6 +137,7 @@ struct Binning {
     counting_sort(visible, kTilesChunk, tiles, offsets, add, [&](int64_t begin, int64_t end, int32_t* cursors) {
       kernels.emit(boxes, spans.get(), order.get(), begin, end, cursors, ids, keys);
     });
+    for (int64_t i = 0; unused > 0 && i < tiles; ++i) offsets[i] += int32_t(unused);
     return flatten_ids;
   }
 };
@@ -157,6 +167,18 @@ std::tuple<Tensor, Tensor, Tensor> bin_splats(Tensor means2d, Tensor radii, Tens
   return {binning.tile_counts, flatten_ids, offsets};
 }
 
+std::tuple<Tensor, Tensor, Tensor, Tensor> bin_splats_within(Tensor means2d, Tensor radii, Tensor depths,
+                                                             std::optional<Tensor> conics, std::optional<Tensor> opacities,
+                                                             std::optional<Tensor> image_ids, int64_t images, int64_t tile_size,
+                                                             int64_t tile_width, int64_t tile_height, int64_t capacity) {
+  STD_TORCH_CHECK(capacity >= 0 && capacity <= kMostInts, "bin_splats: capacity must be 0 to 2^31 - 1, got ", capacity);
+  const Binning binning(means2d, radii, depths, conics, opacities, image_ids, images, tile_size, tile_width, tile_height);
+  Tensor offsets = empty_ints({images, tile_height, tile_width}), needed = empty_longs(1);
+  *needed.mutable_data_ptr<int64_t>() = binning.total;
+  Tensor flatten_ids = binning.sorted(offsets.mutable_data_ptr<int32_t>(), nullptr, capacity);
+  return {binning.tile_counts, flatten_ids, offsets, needed};
+}
+
 Tensor isect_offset_encode(Tensor isect_ids, int64_t images, int64_t tile_width, int64_t tile_height) {
   STD_TORCH_CHECK(isect_ids.is_cpu() && isect_ids.scalar_type() == ScalarType::Long, "isect_ids must be int64 on the CPU");
   const Tensor sorted = isect_ids.is_contiguous() ? isect_ids : torch::stable::contiguous(isect_ids);
@@ -182,5 +204,6 @@ Tensor isect_offset_encode(Tensor isect_ids, int64_t images, int64_t tile_width,
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) {
   m.impl("isect_tiles", TORCH_BOX(&isect_tiles));
   m.impl("bin_splats", TORCH_BOX(&bin_splats));
+  m.impl("bin_splats_within", TORCH_BOX(&bin_splats_within));
   m.impl("isect_offset_encode", TORCH_BOX(&isect_offset_encode));
 }

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.adam.adam import adam_step
+from gsplat_core.ops.adam.adam import adam_step, adam_step_at_
 from gsplat_core.reference.adam import adam_step as reference_adam_step
+from gsplat_core.training.optimiser import FusedAdam
 
 pytestmark = pytest.mark.cuda
 
@@ -33,3 +34,59 @@ def test_devices_must_agree(gpu):
     on_gpu, here = torch.zeros(4, device=gpu), torch.zeros(4)
     with pytest.raises(InvalidInput, match="one device"):
         adam_step(on_gpu, here, on_gpu.clone(), on_gpu.clone(), 1, 0.1)
+
+
+@pytest.mark.parametrize("row_size", [1, 3, 5000])
+def test_a_captured_step_reads_rate_and_step_anew(gpu, row_size):
+    generator = torch.Generator().manual_seed(0)
+    parameter = torch.randn(41, row_size, generator=generator).to(gpu)
+    first, second = torch.zeros_like(parameter), torch.zeros_like(parameter)
+    exact = [t.double().cpu() for t in (parameter, first, second)]
+    rate, step = torch.zeros(3, device=gpu)[1:2], torch.ones(1, dtype=torch.int64, device=gpu)
+    skipped = torch.zeros(1, dtype=torch.int64, device=gpu)
+    gradient = torch.zeros_like(parameter)
+    arguments = (parameter, gradient, first, second, rate, step, skipped)
+    adam_step_at_(*arguments, row_size=row_size)  # changes nothing: rate and gradient are 0
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        adam_step_at_(*arguments, row_size=row_size)
+    left_alone = 0
+    for number, learning_rate in ((1, 0.1), (2, 0.05), (1000, 0.1), (10_000_000, 0.2)):
+        now = torch.randn(41, row_size, generator=generator)
+        now[::9, 0] = torch.nan
+        gradient.copy_(now)
+        rate.fill_(learning_rate)
+        step.fill_(number)
+        graph.replay()
+        left_alone += reference_adam_step(exact[0], now.double(), *exact[1:], number, learning_rate, row_size=row_size)
+    assert skipped.item() == left_alone
+    for actual, wanted in zip((parameter, first, second), exact, strict=True):
+        torch.testing.assert_close(actual.cpu().double(), wanted, rtol=1e-5, atol=2e-6)
+
+
+def test_opcheck(gpu):
+    parameter, gradient, first, second = (torch.ones(10, 3, device=gpu) for _ in range(4))
+    rate, step, skipped = torch.ones(1, device=gpu), *torch.ones(2, 1, dtype=torch.int64, device=gpu).unbind()
+    torch.library.opcheck(
+        torch.ops.gsplat_core.adam_.default, (parameter, gradient, first, second, 2, 0.1, 0.9, 0.999, 1e-8, 3)
+    )
+    torch.library.opcheck(
+        torch.ops.gsplat_core.adam_at_,
+        (parameter, gradient, first, second, rate, step.clone(), 0.9, 0.999, 1e-8, 3, skipped.clone()),
+    )
+
+
+def test_the_optimiser_does_not_wait(gpu):
+    values = {"means": torch.zeros(5, 3, device=gpu), "sh": torch.zeros(5, 4, 3, device=gpu)}
+    optimiser = FusedAdam(values, {"means": 0.1, "sh": 0.1})
+    gradients = {name: torch.ones_like(t) for name, t in values.items()}
+    gradients["means"][2, 1] = torch.nan
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(2):
+            skipped = optimiser.step(values, gradients)
+        optimiser.append(2)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert skipped == 1 and optimiser.skipped == 2
+    assert all(moment.device == gpu and moment.shape[0] == 7 for moment in optimiser.first_moments.values())

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gsplat_core import quat_scale_to_covar_preci, reference
+from gsplat_core import InvalidInput, quat_scale_to_covar_preci, reference
 
 pytestmark = pytest.mark.cuda
 
@@ -26,3 +26,29 @@ def test_values_and_gradients_equal_the_reference(gpu, assert_near, count, triu)
     exact = run(reference.quat_scale_to_covar_preci, lambda t: t.double())
     for actual, wanted in zip(ours, exact, strict=True):
         assert_near(actual.cpu(), wanted)
+
+
+@pytest.mark.parametrize("triu", [True, False])
+def test_opcheck(gpu, triu):
+    quats, scales = (torch.rand(9, n, device=gpu, requires_grad=True) for n in (4, 3))
+    ops = torch.ops.gsplat_core
+    torch.library.opcheck(ops.quat_scale_to_covar_preci.default, (quats, scales, True, True, triu))
+    plain = [t.detach() for t in (quats, scales)]
+    matrices = ops.quat_scale_to_covar_preci(*plain, True, True, triu)
+    for given in (matrices, (matrices[0], None), (None, matrices[1])):
+        torch.library.opcheck(ops.quat_scale_to_covar_preci_backward.default, (*plain, *given, triu))
+
+
+def test_values_of_any_layout_give_the_same_bits(gpu):
+    quats, scales = (torch.rand(1000, n, device=gpu) for n in (4, 3))
+    wanted = quat_scale_to_covar_preci(quats, scales)
+    shifted = [torch.empty(t.numel() + 1, device=gpu)[1:].view(t.shape).copy_(t) for t in (quats, scales)]
+    turned = [t.T.contiguous().T for t in (quats, scales)]
+    for seen in (quat_scale_to_covar_preci(*shifted), quat_scale_to_covar_preci(*turned)):
+        assert all(torch.equal(a, b) for a, b in zip(seen, wanted, strict=True))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_other_types_are_refused(gpu, dtype):
+    with pytest.raises(InvalidInput, match="must be float32"):
+        quat_scale_to_covar_preci(*(torch.rand(5, n, device=gpu, dtype=dtype) for n in (4, 3)))

@@ -129,3 +129,15 @@ def test_opcheck(gpu, make_scene):
         torch.ops.gsplat_core.project_gaussians,
         (leaves[0], None, leaves[1], leaves[2], None, leaves[3], scene.Ks[None], 52, 37, 0.3, 0.01, 1e10, 0.0, True, 0),
     )
+    means, quats, scales, viewmats = (t.detach() for t in leaves)
+    ops, size = torch.ops.gsplat_core, (52, 37, 0.3)
+    seen = ops.project_gaussians(
+        means, None, quats, scales, None, viewmats, scene.Ks[None], *size, 0.01, 1e10, 0.0, True, 0
+    )
+    covars = reference.quat_scale_to_covar_preci(quats, scales, compute_preci=False, triu=True)[0]
+    for geometry in ((None, quats, scales), (covars, None, None)):
+        inputs = (means, *geometry, viewmats, scene.Ks[None], seen[4])
+        torch.library.opcheck(ops.project_gaussians_backward.default, (*inputs, *seen[:4], *size, 0, True))
+        torch.library.opcheck(
+            ops.project_gaussians_backward.default, (*inputs, seen[0], None, None, None, *size, 1, False)
+        )

@@ -32,6 +32,80 @@ def test_values_and_gradients_equal_the_reference(gpu, assert_near, degree, came
         assert_near(actual.cpu(), torch.zeros_like(actual.cpu()).double() if wanted is None else wanted)
 
 
+@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize("bases", ["all", "more"])
+@pytest.mark.parametrize("rows", [1, 3])
+def test_sets_are_copied_in_runs_of_any_length_and_place(gpu, assert_near, degree, bases, rows):
+    """Sets per warp and block that are not full, coefficients that are not used, and tensors that start anywhere."""
+    generator = torch.Generator().manual_seed(degree)
+    count = (degree + 1) ** 2 + (2 if bases == "more" else 0)
+    for sets in (31, 33, 128, 130):
+        dirs, weights = (torch.randn(rows, sets, 3, generator=generator) for _ in range(2))
+        coeffs = torch.randn(sets, count, 3, generator=generator)
+        masks = torch.rand(rows, sets, generator=generator) < 0.2
+        weights[..., ::5, :] = 0
+        results = []
+        for function, convert in ((spherical_harmonics, shifted), (reference.spherical_harmonics, torch.Tensor.double)):
+            leaves = [convert(t).requires_grad_() for t in (dirs, coeffs)]
+            out = function(degree, *leaves, masks.to(leaves[0].device))
+            (convert(weights) * out).sum().backward()
+            results.append([out, *(torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves)])
+        for actual, wanted in zip(*results, strict=True):
+            assert_near(actual.cpu(), wanted)
+
+
+def shifted(tensor):
+    """A copy on the GPU that starts four bytes behind where its storage does."""
+    storage = torch.empty(tensor.numel() + 1, device="cuda")
+    return storage[1:].view(tensor.shape).copy_(tensor)
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_what_is_not_finite_gets_no_gradient_where_the_colour_has_none(gpu, rows):
+    coeffs = torch.randn(40, 16, 3, device=gpu)
+    dirs = torch.randn(rows, 40, 3, device=gpu)
+    coeffs[3, 5, 1], coeffs[4, 0, 0], dirs[:, 6, 1], dirs[:, 7] = torch.nan, torch.inf, torch.nan, 0
+    weights = torch.ones(rows, 40, 3, device=gpu)
+    weights[:, 3:8] = 0
+    leaves = [t.requires_grad_() for t in (dirs, coeffs)]
+    torch.autograd.backward(spherical_harmonics(3, *leaves), weights)
+    for leaf in leaves:
+        assert leaf.grad.isfinite().all()
+    assert not leaves[0].grad[:, 3:8].any() and not leaves[1].grad[3:8].any()
+    assert leaves[0].grad[:, :3].any() and leaves[1].grad[8:].any()
+
+
+def test_the_same_bits_twice_and_in_a_graph(gpu):
+    generator = torch.Generator().manual_seed(0)
+    dirs, weights = (torch.randn(2, 1000, 3, generator=generator).to(gpu) for _ in range(2))
+    coeffs = torch.randn(1000, 16, 3, generator=generator).to(gpu)
+
+    def gradients():
+        leaves = [t.detach().requires_grad_() for t in (dirs, coeffs)]
+        out = spherical_harmonics(3, *leaves)
+        return [out.detach(), *torch.autograd.grad(out, leaves, weights)]
+
+    first, second = gradients(), gradients()
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        replayed = gradients()
+    dirs += 0.1
+    graph.replay()
+    moved = gradients()
+    assert not torch.equal(moved[0], first[0])
+    assert all(torch.equal(a, b) for a, b in zip(replayed, moved, strict=True))
+
+
+def test_opcheck(gpu):
+    dirs, coeffs = (torch.randn(*shape, device=gpu, requires_grad=True) for shape in ((2, 9, 3), (9, 16, 3)))
+    masks = torch.rand(2, 9, device=gpu) < 0.7
+    ops = torch.ops.gsplat_core
+    torch.library.opcheck(ops.spherical_harmonics.default, (3, dirs, coeffs, masks))
+    plain = [t.detach() for t in (dirs, coeffs)]
+    torch.library.opcheck(ops.spherical_harmonics_backward.default, (3, *plain, masks, plain[0], True))
+
+
 def test_coefficients_that_are_not_contiguous(gpu):
     generator = torch.Generator().manual_seed(0)
     coeffs = torch.randn(3, 16, 100, generator=generator).to(gpu).permute(2, 1, 0)

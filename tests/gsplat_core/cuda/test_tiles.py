@@ -8,8 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.tiles.tiles import bin_splats, isect_offset_encode, isect_tiles
 from gsplat_core.reference import tiles as reference
+from gsplat_core.reference.rendering import bin_splats_within
 
 pytestmark = pytest.mark.cuda
 WIDTH, HEIGHT = 150, 100
@@ -98,6 +100,72 @@ def test_bin_splats_is_isect_tiles_and_offsets_in_one(exact: bool) -> None:
     assert_equal(bin_splats(means2d, radii, depths, size, across, down, **options), wanted)
 
 
+@pytest.mark.parametrize("image_dims", [(1,), (2, 3)])
+@pytest.mark.parametrize("share", [1.3, 1.0, 0.6, 0.001, 0.0])
+def test_lists_of_a_capacity_are_those_of_the_reference(image_dims: tuple[int, ...], share: float) -> None:
+    here = splats(400, image_dims, median_px=8.0)[:3]
+    capacity = int(share * int(isect_tiles(*here, *grid(16))[0].sum()))
+    seen = bin_splats(*cuda(here), *grid(16), capacity=capacity)
+    assert all(t.is_cuda for t in seen)
+    wanted = list(bin_splats_within(*here, *grid(16), capacity=capacity))
+    wanted[2] = wanted[2].reshape(seen[2].shape)
+    assert_equal(seen, tuple(wanted))
+    assert_equal(seen, bin_splats(*here, *grid(16), capacity=capacity))
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_lists_of_a_capacity_without_any_splats(count: int) -> None:
+    means2d, radii, depths, conics, opacities = cuda(splats(count))
+    exact = {"conics": conics, "opacities": opacities}
+    _, order, offsets, needed = bin_splats(means2d, radii * 0, depths, *grid(16), **exact, capacity=9)
+    assert order.tolist() == [-1] * 9
+    assert (offsets == 9).all()
+    assert needed.tolist() == [0]
+
+
+def test_a_capacity_out_of_range_is_refused() -> None:
+    for capacity in (-1, 2**31):
+        with pytest.raises(InvalidInput, match=f"got {capacity}"):
+            bin_splats(*cuda(splats(5))[:3], *grid(16), capacity=capacity)
+
+
+def test_lists_of_a_capacity_are_made_in_a_graph_and_say_when_it_is_too_small() -> None:
+    means2d, radii, depths, conics, opacities = cuda(splats(600))
+    exact = {"conics": conics, "opacities": opacities}
+    small = means2d.clone()
+    small[:, 60:] = -1e4  # most are out of sight at first
+    needed = int(bin_splats(means2d, radii, depths, *grid(16), **exact, capacity=0)[3])
+    where = small.clone()
+    bin_splats(where, radii, depths, *grid(16), **exact, capacity=needed)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):  # a host that waited would be refused here
+        lists = bin_splats(where, radii, depths, *grid(16), **exact, capacity=needed // 2)
+    for means in (small, means2d, small):
+        where.copy_(means)
+        graph.replay()
+        assert_equal(lists, bin_splats(means, radii, depths, *grid(16), **exact, capacity=needed // 2))
+        assert (int(lists[3]) > needed // 2) == (means is means2d)
+
+
+def test_large_splats_are_written_by_their_warp_as_small_ones_by_a_thread() -> None:
+    """All sizes next to each other, from one tile to the whole image, and none: 256 rows of tiles, 40 columns."""
+    random = torch.Generator().manual_seed(4)
+    where = [torch.rand(1, 300, n, generator=random) for n in (2, 2)]
+    means2d = where[0] * torch.tensor([160.0, 1024.0])
+    radii = torch.exp(7 * where[1]).int()
+    depths = torch.rand(1, 300, generator=random)
+    seen = isect_tiles(*cuda([means2d, radii, depths]), 4, 40, 256)
+    assert_equal(seen, reference.isect_tiles(means2d, radii, depths, 4, 40, 256))
+    axes = radii.float().clamp(min=1)
+    conics = torch.stack([9 / axes[..., 0] ** 2, 1 / axes.prod(-1), 9 / axes[..., 1] ** 2], -1)
+    opacities = torch.ones(1, 300)
+    exact = {"conics": conics, "opacities": opacities}
+    on_cpu = pairs(isect_tiles(means2d, radii, depths, 4, 40, 256, **exact))
+    gpu = {name: t.cuda() for name, t in exact.items()}
+    on_gpu = pairs(isect_tiles(*cuda([means2d, radii, depths]), 4, 40, 256, **gpu))
+    assert len(on_gpu ^ on_cpu) <= 1e-3 * len(on_cpu)
+
+
 def test_packed_splats_give_the_lists_of_their_images() -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(300, (3,)))
     visible = (radii > 0).all(-1)
@@ -179,5 +247,6 @@ def test_ops_pass_opcheck() -> None:
     args = (means2d, radii, depths, conics, opacities, None, 1, *grid(16))
     torch.library.opcheck(ops.isect_tiles.default, (*args, True))
     torch.library.opcheck(ops.bin_splats.default, args)
+    torch.library.opcheck(ops.bin_splats_within.default, (*args, 30))
     ids = isect_tiles(means2d, radii, depths, *grid(16))[1]
     torch.library.opcheck(ops.isect_offset_encode.default, (ids, 1, *grid(16)[1:]))

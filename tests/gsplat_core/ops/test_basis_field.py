@@ -62,14 +62,16 @@ def test_autograd_goes_through_the_compiled_backward():
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
 def test_ops_pass_opcheck():
     field = tuple(t.requires_grad_() for t in bumps(5, 7))
-    torch.library.opcheck(torch.ops.gsplat_core.basis_field.default, (*field, 3.0))
+    tau, rates = torch.tensor([3.0]), torch.tensor(RATES)
+    for padded in (False, True):
+        torch.library.opcheck(torch.ops.gsplat_core.basis_field.default, (*field, tau, padded))
     plain = bumps(5, 7)
-    torch.library.opcheck(torch.ops.gsplat_core.basis_field_backward.default, (gradient_of(5), *plain, 3.0))
+    torch.library.opcheck(torch.ops.gsplat_core.basis_field_backward.default, (gradient_of(5), *plain, tau))
     moments = [torch.zeros_like(t) for t in (*plain, *plain)]
     steps = torch.zeros(5, 7, dtype=torch.int32)
     torch.library.opcheck(
         torch.ops.gsplat_core.basis_field_backward_adam_.default,
-        (gradient_of(5), 3.0, *plain, *moments, steps, *RATES, 0.9, 0.999, 1e-8),
+        (gradient_of(5), tau, *plain, *moments, steps, rates, 0.9, 0.999, 1e-8),
     )
 
 
@@ -148,6 +150,42 @@ def test_nan_shows_in_its_own_gaussian_only_and_only_while_active():
     assert basis_field(*field, 18.0).isfinite().all(), "the NaN weight is of a bump far from this time"
 
 
+def test_padded_rows_give_the_same_and_their_padding_is_not_looked_at():
+    field = bumps(50, 26)
+    padded = basis_field(*field, 3.0, padded=True)
+    assert torch.equal(padded[:, :13], basis_field(*field, 3.0)) and (padded[:, 13:] == 0).all()
+    assert torch.equal(reference.basis_field(*field, 3.0, padded=True)[:, 13:], torch.zeros(50, 3))
+    gradient = gradient_of(50)
+    wide = torch.cat([gradient, torch.full((50, 3), torch.nan)], 1)
+    tau = torch.tensor([3.0])
+    for function in (basis_field_backward, reference.basis_field_backward):
+        for narrow, same in zip(function(gradient, *field, 3.0), function(wide, *field, tau), strict=True):
+            assert torch.equal(narrow, same)
+    for function in (basis_field_backward_adam_, reference.basis_field_backward_adam_):
+        results = []
+        for g, time, rates in ((gradient, 3.0, RATES), (wide, tau, torch.tensor(RATES))):
+            state, m, v = training_state(50, 26)
+            steps = torch.zeros(50, 26, dtype=torch.int32)
+            function(g, time, *state, m, v, steps, rates)
+            results.append((*state, *m, *v, steps))
+        assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("-inf"), 1e30])
+@pytest.mark.parametrize("function", [basis_field_backward_adam_, reference.basis_field_backward_adam_])
+def test_a_gradient_that_is_not_finite_leaves_its_gaussian_alone(function, bad):
+    field, m, v = training_state(20, 7)
+    steps = torch.zeros(20, 7, dtype=torch.int32)
+    function(gradient_of(20), 3.0, *field, m, v, steps, RATES)
+    before = [t.clone() for t in (*field, *m, *v, steps)]
+    gradient = gradient_of(20, 1)
+    gradient[::3, 5] = bad  # 1e30 is finite, and its square is not
+    function(gradient, 3.0, *field, m, v, steps, RATES)
+    for now, old in zip((*field, *m, *v, steps), before, strict=True):
+        assert torch.equal(now[::3], old[::3]) and now.isfinite().all()
+        assert not torch.equal(now[1::3], old[1::3])
+
+
 def test_extreme_widths_do_not_overflow():
     field = bumps(3, 4)
     field[1][0, :] = 500.0
@@ -177,9 +215,23 @@ def test_wrong_input_is_refused_with_its_value():
         basis_field(centers, log_widths, weights[..., :12], 0.0)
     with pytest.raises(InvalidInput, match=r"float64.*gsplat_core\.reference"):
         basis_field(centers.double(), log_widths, weights, 0.0)
-    with pytest.raises(InvalidInput, match=r"\[3, 13\]"):
+    with pytest.raises(InvalidInput, match=r"\[3, 13\] or \[3, 16\]"):
         basis_field_backward(gradient_of(2), centers, log_widths, weights, 0.0)
+    with pytest.raises(InvalidInput, match=r"tau must be 1 float32 .*\[2\]"):
+        basis_field(centers, log_widths, weights, torch.zeros(2))
     moments = [torch.zeros_like(t) for t in (centers, log_widths, weights)]
+    with pytest.raises(InvalidInput, match="6 numbers, got 5"):
+        basis_field_backward_adam_(
+            gradient_of(3),
+            0.0,
+            centers,
+            log_widths,
+            weights,
+            moments,
+            moments,
+            torch.zeros(3, 4, dtype=torch.int32),
+            RATES[:5],
+        )
     with pytest.raises(InvalidInput, match="int32"):
         basis_field_backward_adam_(
             gradient_of(3), 0.0, centers, log_widths, weights, moments, moments, torch.zeros(3, 4), RATES

@@ -12,6 +12,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
 from gsplat_core.ops.tiles.tiles import bin_splats, isect_offset_encode, isect_tiles
 from gsplat_core.reference import tiles as reference
+from gsplat_core.reference.rendering import bin_splats_within
 
 WIDTH, HEIGHT = 150, 100
 
@@ -188,6 +189,37 @@ def test_lists_do_not_depend_on_the_number_of_threads() -> None:
     )
 
 
+@pytest.mark.parametrize("image_dims", [(1,), (), (2, 3)])
+@pytest.mark.parametrize("share", [1.3, 1.0, 0.6, 0.001, 0.0])
+def test_lists_of_a_capacity_equal_the_reference(image_dims: tuple[int, ...], share: float) -> None:
+    """Unused entries in front; what does not fit is what is farthest, whole splats at a time."""
+    here = splats(400, image_dims, median_px=8.0)[:3]
+    exact = bin_splats(*here, *grid(16))
+    total = exact[1].numel()
+    capacity = int(share * total)
+    counts, order, offsets, needed = bin_splats(*here, *grid(16), capacity=capacity)
+    wanted = list(bin_splats_within(*here, *grid(16), capacity=capacity))
+    wanted[2] = wanted[2].reshape(offsets.shape)
+    assert_equal((counts, order, offsets, needed), tuple(wanted))
+    assert needed.tolist() == [total]
+    if share >= 1:
+        unused = capacity - total
+        assert_equal((counts, order[unused:], offsets - unused), exact)
+
+
+def test_lists_of_a_capacity_blend_to_the_same_image_and_gradients() -> None:
+    means2d, radii, depths, conics, opacities = splats(200, (2,))
+    colors = torch.rand(2, 200, 3, generator=torch.Generator().manual_seed(1))
+    results = []
+    for capacity in (None, 20_000):
+        lists = bin_splats(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities, capacity=capacity)
+        leaves = [t.clone().requires_grad_() for t in (means2d, conics, colors, opacities)]
+        image, _ = rasterize_to_pixels(*leaves, WIDTH, HEIGHT, 16, lists[2], lists[1])
+        results.append((image, *torch.autograd.grad(image.square().sum(), leaves)))
+    assert results[0][0].max() > 0.5
+    assert_equal(*results)
+
+
 def test_wrong_arguments_are_named() -> None:
     means2d, radii, depths, conics, _ = splats(5)
     with pytest.raises(InvalidInput, match=r"float64; gsplat_core\.reference"):
@@ -202,6 +234,9 @@ def test_wrong_arguments_are_named() -> None:
         isect_tiles(means2d[0], radii[0], depths[0], *grid(16), packed=True)
     with pytest.raises(RuntimeError, match="image_ids"):
         isect_tiles(means2d[0], radii[0], depths[0], *grid(16), packed=True, n_images=1, image_ids=torch.full((5,), 7))
+    for capacity in (-1, 2**31):
+        with pytest.raises(InvalidInput, match=f"got {capacity}"):
+            bin_splats(means2d, radii, depths, *grid(16), capacity=capacity)
     with pytest.raises(RuntimeError, match="for image 5"):
         isect_offset_encode(torch.tensor([5 << 40]), 1, 10, 20)
 
@@ -213,5 +248,6 @@ def test_ops_pass_opcheck() -> None:
         args = (means2d, radii, depths, *exact, None, 1, *grid(16))
         torch.library.opcheck(ops.isect_tiles.default, (*args, True))
         torch.library.opcheck(ops.bin_splats.default, args)
+        torch.library.opcheck(ops.bin_splats_within.default, (*args, 30))
     ids = isect_tiles(means2d, radii, depths, *grid(16))[1]
     torch.library.opcheck(ops.isect_offset_encode.default, (ids, 1, *grid(16)[1:]))

@@ -21,7 +21,8 @@ def left_part(frame, camera, width_px=30, depth_mm=60.0):
 
 
 def grown(frame, camera, current, room=10_000, config=CONFIG):
-    return gaussians_for_uncovered_tissue(frame, Observation.of(frame, camera), current, config, room)
+    observation = Observation.of(frame, camera, current.device)
+    return gaussians_for_uncovered_tissue(frame, observation, current, config, room)
 
 
 def columns_of(gaussians):
@@ -101,3 +102,15 @@ def test_colours_are_the_pictures(make_frame, camera):
     picture = render(current.append(grown(frame, camera, current)), camera).image[:, 32:]
     target = torch.from_numpy(frame.image[:, 32:]).float() / 255
     assert float((picture - target).abs().mean()) < 0.1
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("depth_mm", [None, 47.0])
+def test_a_gpu_finds_the_same_places(gpu, make_frame, camera, depth_mm):
+    frame = make_frame(depth=None if depth_mm is None else np.full((40, 48), depth_mm, np.float32))
+    current = left_part(frame, camera, depth_mm=85.0)
+    expected, added = grown(frame, camera, current), grown(frame, camera, current.to(gpu))
+    assert added.device == gpu
+    for name, tensor in added.tensors().items():
+        torch.testing.assert_close(tensor.cpu(), expected.tensors()[name], rtol=1e-3, atol=1e-3)
+    assert grown(frame, camera, current.append(expected).to(gpu)) is None

@@ -31,6 +31,16 @@ def test_an_observation_holds_what_the_frame_holds(make_frame, camera):
     assert np.array_equal(seen.depth.numpy(), depth)
 
 
+@pytest.mark.cuda
+def test_a_gpu_holds_the_same(gpu, make_frame, camera):
+    frame = make_frame(depth=np.full((40, 48), 55.0), mask=np.eye(40, 48, dtype=np.uint8))
+    here, there = Observation.of(frame, camera), Observation.of(frame, camera, gpu)
+    for name in ("image", "mask", "depth"):
+        tensor = getattr(there, name)
+        assert tensor.device == gpu
+        assert torch.equal(tensor.cpu(), getattr(here, name))
+
+
 def test_without_mask_and_depth_all_is_tissue_of_unknown_depth(make_frame, camera):
     seen = Observation.of(make_frame(), camera)
     assert seen.mask.shape == (40, 48)

@@ -35,8 +35,8 @@ def psnr_db(model, frame):
     return psnr_tissue_db(image.clamp(0, 1), target, None if frame.mask is None else torch.from_numpy(frame.mask))
 
 
-def learn(frames, camera, config=CONFIG, seed=0):
-    learning = Reconstructor(config, camera, seed=seed)
+def learn(frames, camera, config=CONFIG, seed=0, device="cpu"):
+    learning = Reconstructor(config, camera, seed=seed, device=device)
     for frame in frames:
         learning.observe(frame)
     return learning
@@ -58,16 +58,16 @@ def with_threads():
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_learns_a_moving_scene_as_it_arrives(small_hexplane, tissue_video, camera, field):
+def test_learns_a_moving_scene_as_it_arrives(small_hexplane, tissue_video, camera, field, device):
     frames = tissue_video(17)
-    learning = Reconstructor(dataclasses.replace(CONFIG, field=field), camera)
+    learning = Reconstructor(dataclasses.replace(CONFIG, field=field), camera, device=device)
     live = []
     for frame in frames:
         report = learning.observe(frame)
         live.append(psnr_db(learning.snapshot(), frame))
     assert (report.seq, report.steps, report.gaussians) == (16, 6, learning.gaussians)
     assert 0 < report.loss < 0.1
-    still = Reconstructor(CONFIG, camera)
+    still = Reconstructor(CONFIG, camera, device=device)
     still.observe(frames[0])
     untrained = psnr_db(still.snapshot(), frames[-1])  # 4 px away by now
     assert np.mean(live[4:]) > untrained + 10
@@ -75,11 +75,11 @@ def test_learns_a_moving_scene_as_it_arrives(small_hexplane, tissue_video, camer
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_offline_beats_one_picture_for_all_times(small_hexplane, tissue_video, camera, field):
+def test_offline_beats_one_picture_for_all_times(small_hexplane, tissue_video, camera, field, device):
     frames = tissue_video(9, amplitude_px=6)
     config = dataclasses.replace(CONFIG, field=field)
     done = []
-    learning = Reconstructor(config, camera)
+    learning = Reconstructor(config, camera, device=device)
     report = learning.fit(frames, 200, progress=lambda step, loss: done.append((step, loss)))
     assert [step for step, _ in done] == list(range(1, 201))
     assert (report.seq, report.steps, report.loss) == (8, 200, done[-1][1])
@@ -87,13 +87,13 @@ def test_offline_beats_one_picture_for_all_times(small_hexplane, tissue_video, c
     assert model.time_window_s == (0.0, frames[-1].time_s)
 
     no_motion = {name: 0.0 for name in vars(LearningRates()) if name.startswith(("basis", "hexplane"))}
-    static = Reconstructor(dataclasses.replace(config, rates=LearningRates(**no_motion)), camera)
+    static = Reconstructor(dataclasses.replace(config, rates=LearningRates(**no_motion)), camera, device=device)
     static.fit(frames, 200)
     mean = lambda fitted: np.mean([psnr_db(fitted, frame) for frame in frames])
     assert mean(model) > mean(static.snapshot()) + 2.5
 
 
-def test_learns_what_a_moving_camera_sees():
+def test_learns_what_a_moving_camera_sees(device):
     scene = SyntheticScene.from_seed(0, 48, 40, 2.0, moving=True)
     frames = []
     for seq in range(10):
@@ -109,7 +109,7 @@ def test_learns_what_a_moving_camera_sees():
                 pose=scene.camera_at(seq / 5).world_to_camera,
             )
         )
-    learning = Reconstructor(CONFIG, scene.camera)
+    learning = Reconstructor(CONFIG, scene.camera, device=device)
     live = []
     for frame in frames:
         learning.observe(frame)
@@ -118,7 +118,7 @@ def test_learns_what_a_moving_camera_sees():
     assert min(live) > 24
     astray = psnr_db(model, frames[-1].with_fields(pose=frames[0].pose))
     assert live[-1] > astray + 1
-    depth = model.render(frames[-1].time_s, scene.camera.with_pose(frames[-1].pose)).depth.numpy()
+    depth = model.render(frames[-1].time_s, scene.camera.with_pose(frames[-1].pose)).depth.cpu().numpy()
     tissue = frames[-1].mask > 0
     assert np.abs(depth - frames[-1].depth)[tissue].mean() < 4
 
@@ -145,9 +145,9 @@ def test_making_a_field_leaves_torchs_random_numbers_alone(make_frame, camera):
     assert torch.equal(torch.rand(3), expected)
 
 
-def test_fitting_is_deterministic(tissue_video, camera):
+def test_fitting_is_deterministic(tissue_video, camera, device):
     def digest(seed):
-        learning = Reconstructor(CONFIG, camera, seed=seed)
+        learning = Reconstructor(CONFIG, camera, seed=seed, device=device)
         learning.fit(tissue_video(4), 10)
         return learning.snapshot().sha256()
 
@@ -156,10 +156,10 @@ def test_fitting_is_deterministic(tissue_video, camera):
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_a_held_out_frame_teaches_nothing(tissue_video, camera, field, small_hexplane):
+def test_a_held_out_frame_teaches_nothing(tissue_video, camera, field, small_hexplane, device):
     frames = tissue_video(4)
     config = dataclasses.replace(CONFIG, field=field, first_frame_steps=5)
-    learning = learn(frames[:2], camera, config)
+    learning = learn(frames[:2], camera, config, device=device)
     before = learning.snapshot()
     # Its picture is a lie and half the frame is not covered: nothing of it may be seen.
     held = frames[2].with_fields(image=255 - frames[2].image)
@@ -170,15 +170,15 @@ def test_a_held_out_frame_teaches_nothing(tissue_video, camera, field, small_hex
         assert torch.equal(tensor, after.gaussians.tensors()[name])
     assert after.time_window_s[1] == held.time_s
     learning.observe(frames[3])
-    other = learn(frames[:2], camera, config)
+    other = learn(frames[:2], camera, config, device=device)
     other.observe(frames[2], train=False)
     other.observe(frames[3])
     assert learning.snapshot().sha256() == other.snapshot().sha256()
 
 
-def test_snapshots_count_up_and_never_change(tissue_video, camera):
+def test_snapshots_count_up_and_never_change(tissue_video, camera, device):
     frames = tissue_video(6)
-    learning = Reconstructor(CONFIG, camera, recording_digest="ab" * 32)
+    learning = Reconstructor(CONFIG, camera, recording_digest="ab" * 32, device=device)
     published = []
     for frame in frames:
         learning.observe(frame)
@@ -194,9 +194,9 @@ def test_snapshots_count_up_and_never_change(tissue_video, camera):
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_tissue_that_comes_into_view_is_added(make_frame, camera, field):
+def test_tissue_that_comes_into_view_is_added(make_frame, camera, field, device):
     config = dataclasses.replace(CONFIG, field=field, first_frame_steps=4, max_gaussians=450)
-    learning = Reconstructor(config, camera)
+    learning = Reconstructor(config, camera, device=device)
     learning.observe(make_frame(0))
     start = learning.gaussians
     for seq in range(1, 5):
@@ -210,9 +210,9 @@ def test_tissue_that_comes_into_view_is_added(make_frame, camera, field):
 
 
 @pytest.mark.parametrize("window_frames", [1, 30])
-def test_tissue_that_a_tool_hides_stays_as_it_was_last_seen(tissue_video, make_frame, camera, window_frames):
+def test_tissue_that_a_tool_hides_stays_as_it_was_last_seen(tissue_video, make_frame, camera, window_frames, device):
     frames = tissue_video(9)  # 2 px to the right in 0.4 s
-    learning = learn(frames, camera, dataclasses.replace(CONFIG, window_frames=window_frames))
+    learning = learn(frames, camera, dataclasses.replace(CONFIG, window_frames=window_frames), device=device)
     last_s = frames[-1].time_s
     mask = np.ones((40, 48), np.uint8)
     mask[:, 24:] = 0
@@ -263,20 +263,20 @@ def test_what_cannot_be_fitted_is_refused(make_frame, camera, seqs, steps, messa
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_depth_that_is_not_finite_is_harmless(tissue_video, camera, field):
+def test_depth_that_is_not_finite_is_harmless(tissue_video, camera, field, device):
     depth = np.full((40, 48), 60.0, np.float32)
     depth[::3] = np.nan
     depth[::5] = np.inf
     depth[:, ::7] = -np.inf
     config = dataclasses.replace(CONFIG, field=field, depth_weight=1.0)
     frames = tissue_video(3, depth=depth)
-    model = learn(frames, camera, config).snapshot()
+    model = learn(frames, camera, config, device=device).snapshot()
     assert all(bool(tensor.isfinite().all()) for tensor in model.tensors().values())
     assert psnr_db(model, frames[-1]) > 20
 
 
-def test_no_steps_only_grow_the_model(make_frame, camera):
-    learning = Reconstructor(dataclasses.replace(CONFIG, first_frame_steps=2), camera)
+def test_no_steps_only_grow_the_model(make_frame, camera, device):
+    learning = Reconstructor(dataclasses.replace(CONFIG, first_frame_steps=2), camera, device=device)
     learning.observe(make_frame(0))
     means = learning.snapshot().gaussians.means
     report = learning.observe(make_frame(1, shift_px=3), steps=0)
@@ -298,12 +298,12 @@ def test_the_models_camera_is_the_first_frames(make_frame, camera):
     assert float(moved.median()) < 5 * 0.05 * 60 / 50
 
 
-def test_one_frame_is_enough_for_both_ways(make_frame):
+def test_one_frame_is_enough_for_both_ways(make_frame, device):
     small = Camera.from_focal(8.0, 5, 3)
     frame = make_frame(width=5, height=3)
     config = ReconstructorConfig(gaussians=6, first_frame_steps=2)
     for field in FIELDS:
-        learning = Reconstructor(dataclasses.replace(config, field=field), small)
+        learning = Reconstructor(dataclasses.replace(config, field=field), small, device=device)
         learning.fit([frame], 2)
         learning.observe(frame)
         assert bool(learning.snapshot().render(0.0).image.isfinite().all())

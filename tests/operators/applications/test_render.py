@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 
+import cv2
+import numpy as np
 import pytest
+import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.bundle import save_bundle
 from operators.applications.render import render_model
-from operators.errors import OutputError, OutputFolderInUse
+from operators.errors import DeviceMissing, OutputError, OutputFolderInUse
 
 
 @pytest.fixture
@@ -31,6 +34,22 @@ def test_a_stop_leaves_whole_frames(bundle, tmp_path):
         bundle, tmp_path / "v.mp4", fps=10, progress=shown.append, stop_requested=lambda: len(shown) == 3
     )
     assert written == 3 and (tmp_path / "v.mp4").stat().st_size > 0
+
+
+@pytest.mark.cuda
+def test_a_gpu_renders_the_same_pictures(gpu, bundle, tmp_path):
+    for device in ("cpu", "cuda"):
+        assert render_model(bundle, tmp_path / device, fps=4, device=device) == 5
+    for name in (path.name for path in (tmp_path / "cpu").glob("*.png")):
+        expected, seen = (cv2.imread(str(tmp_path / device / name)).astype(int) for device in ("cpu", "cuda"))
+        assert np.abs(seen - expected).max() <= 1
+
+
+def test_a_device_that_is_not_there_is_refused_before_anything_is_written(bundle, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(DeviceMissing, match="sees no GPU"):
+        render_model(bundle, tmp_path / "images", device="cuda")
+    assert not (tmp_path / "images").exists()
 
 
 @pytest.mark.parametrize("fps", [0, -1, math.nan, math.inf, 1e6])

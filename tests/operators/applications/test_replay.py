@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput, RecordingMissing
+from gsplat_core.io.bundle import load_bundle
+from operators.applications import replay as replay_module
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.result import RunOutcome
 from operators.errors import DeviceMissing, OutputFolderInUse, RunFailed, StorageFull
+from operators.graph import MultiThreadScheduler
 
 
 @pytest.fixture
@@ -51,6 +56,47 @@ def test_a_failure_carries_what_was_reached(settings):
     assert isinstance(outcome, RunOutcome)
     assert outcome.displayed == 3 and outcome.model.version == 3
     assert (settings.out / "reconstruction.mp4").exists() and (settings.out / "model").is_dir()
+
+
+def test_threads_give_the_same_bytes_as_one(settings, monkeypatch):
+    expected = replay(settings)
+    monkeypatch.setattr(replay_module, "scheduler_for", lambda device, app: MultiThreadScheduler(app))
+    events = []
+    outcome = replay(settings, events.append)
+    assert [e.done for e in events] == [0, 1, 2, 3, 4]
+    assert (outcome.displayed, outcome.dropped) == (4, 0)
+    assert outcome.frames_sha256 == expected.frames_sha256
+    assert outcome.model.sha256() == expected.model.sha256()
+    assert outcome.series == expected.series
+    assert outcome.worst_seq == expected.worst_seq
+    assert [k.rendered.frame.seq for k in outcome.keyframes] == [k.rendered.frame.seq for k in expected.keyframes]
+
+
+def test_with_threads_a_failure_still_carries_what_was_reached(settings, monkeypatch):
+    monkeypatch.setattr(replay_module, "scheduler_for", lambda device, app: MultiThreadScheduler(app))
+
+    def fail_on_the_second(progress):
+        if progress.done == 2:
+            raise StorageFull("no room for progress")
+
+    with pytest.raises(RunFailed, match="operator 'progress' failed in compute on frame 1") as caught:
+        replay(settings, fail_on_the_second)
+    outcome = caught.value.result
+    assert len(outcome.series) >= 2 and outcome.displayed >= 1 and outcome.model.version >= 2
+    assert (settings.out / "reconstruction.mp4").exists() and (settings.out / "model").is_dir()
+
+
+@pytest.mark.cuda
+def test_a_gpu_gives_the_same_bytes_twice_and_what_the_cpu_sees(gpu, settings):
+    on_cpu = replay(settings)
+    first, second = (replay(replace(settings, device="cuda", out=settings.out / name)) for name in "ab")
+    assert first.frames_sha256 == second.frames_sha256
+    assert first.model.sha256() == second.model.sha256()
+    assert first.model.gaussians.device.type == "cuda"
+    assert (first.displayed, first.dropped, first.model.version) == (4, 0, 4)
+    assert load_bundle(settings.out / "a" / "model").sha256() == first.model.sha256()
+    expected = on_cpu.live.means()["psnr_tissue_db"]
+    assert first.live.means()["psnr_tissue_db"] == pytest.approx(expected, abs=0.3)
 
 
 def test_the_callers_random_numbers_are_untouched(settings):

@@ -1,0 +1,53 @@
+#include <tuple>
+
+#include "frame_scene.h"
+
+namespace {
+
+constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
+
+using Frame = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+Frame render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_opacities, Tensor sh, std::optional<Tensor> deltas,
+                   Tensor viewmat, Tensor intrinsics, std::optional<Tensor> background, int64_t width, int64_t height,
+                   double eps2d, double near_plane, double far_plane, int64_t camera_model, int64_t capacity, bool training) {
+  FrameInputs inputs(means, quats, log_scales, logit_opacities, sh, deltas, viewmat, intrinsics, background, width, height, eps2d,
+                     near_plane, far_plane, camera_model);
+  STD_TORCH_CHECK(capacity > 0 && capacity <= kMostInts, "render_frame: capacity must be 1 to 2^31 - 1 instances, got ",
+                  capacity);
+  CudaCall& call = inputs.call;
+  const FrameScene& in = inputs.scene;
+  const int64_t tiles = in.tiles(), blocks = blocks_for(in.count, kFrameThreads);
+  const auto ints = [&](int64_t when_training) { return call.empty({training ? when_training : 0}, ScalarType::Int); };
+  Tensor image = call.empty({height, width, 4}), alphas = call.empty({height, width});
+  Tensor last = call.empty({training ? height : 0, training ? width : 0}, ScalarType::Int);
+  Tensor records = call.empty({in.count, 12}), tile_offsets = call.empty({tiles + 1}, ScalarType::Int);
+  Tensor sorted = ints(capacity), splat_starts = ints(in.count + 1), instance_splats = ints(capacity);
+  Tensor status = call.empty({4}, ScalarType::Int);
+  const FrameLists lists = {records.mutable_data_ptr<float>(),
+                            tile_offsets.mutable_data_ptr<int32_t>(),
+                            call.array<uint64_t>(capacity),
+                            training ? sorted.mutable_data_ptr<int32_t>() : nullptr,
+                            training ? splat_starts.mutable_data_ptr<int32_t>() : nullptr,
+                            training ? instance_splats.mutable_data_ptr<int32_t>() : nullptr,
+                            status.mutable_data_ptr<int32_t>(),
+                            capacity};
+  const FrameScratch scratch = {call.array<uint2>(in.count),
+                                call.array<uint32_t>(in.count),
+                                call.array<int32_t>(tiles),
+                                call.array<uint32_t>(tiles),
+                                training ? call.array<int32_t>(blocks) : nullptr,
+                                training ? call.array<uint32_t>(blocks) : nullptr};
+  const FramePixels out = {mutable_data(image), mutable_data(alphas), training ? last.mutable_data_ptr<int32_t>() : nullptr};
+  check_cuda(cudaMemsetAsync(scratch.counts, 0, size_t(tiles) * sizeof(int32_t), call.stream), "clearing the tiles' counts");
+  preprocess_frame(in, lists, scratch, call.stream);
+  scan_frame(in, lists, scratch, call.stream);
+  fill_frame(in, lists, scratch, call.stream);
+  blend_frame(in, lists, out, call.stream);
+  check_cuda(cudaGetLastError(), "render_frame");
+  return {image, alphas, last, records, tile_offsets, sorted, splat_starts, instance_splats, status};
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) { m.impl("render_frame", TORCH_BOX(&render_frame)); }

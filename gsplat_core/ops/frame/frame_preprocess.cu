@@ -1,0 +1,162 @@
+#include "../spherical_harmonics/spherical_harmonics_bases.h"
+#include "frame_footprint.cuh"
+#include "frame_gaussian.cuh"
+#include "frame_launch.cuh"
+
+using namespace GSPLAT_ISA;
+
+namespace {
+
+template <int bytes>
+__device__ inline void copy_async(float* to, const float* from) {
+  const unsigned at = unsigned(__cvta_generic_to_shared(to));
+  if constexpr (bytes == 16) {
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(at), "l"(from));
+  } else {
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(at), "l"(from));
+  }
+}
+
+// Coefficients of 32 Gaussians in shared memory. A Gaussian's row is an odd number of float4s apart from the next, so that eight
+// lanes reading theirs meet in no bank.
+template <int degree>
+struct StagedHarmonics {
+  static constexpr int kBases = (degree + 1) * (degree + 1), kRow = 3 * kBases, kQuads = (kRow + 3) / 4;
+  static constexpr int kStride = 4 * (kQuads | 1);
+  float4 rows[32 * kStride / 4];
+
+  // By a warp, those of the Gaussians in `shown` alone: what is culled is not read. They are there after `wait`.
+  __device__ void load(const float* from, unsigned shown, bool aligned) {
+    const int lane = threadIdx.x & 31;
+    float* const to = reinterpret_cast<float*>(rows);
+    if (kRow % 4 == 0 && aligned) {
+#pragma unroll 4
+      for (int i = lane; i < 32 * kQuads; i += 32) {
+        const int row = i / kQuads;
+        if (shown >> row & 1) copy_async<16>(to + row * kStride + 4 * (i % kQuads), from + 4 * i);
+      }
+    } else {
+#pragma unroll 4
+      for (int i = lane; i < 32 * kRow; i += 32) {
+        const int row = i / kRow;
+        if (shown >> row & 1) copy_async<4>(to + row * kStride + i % kRow, from + i);
+      }
+    }
+  }
+
+  __device__ static void wait() {
+    asm volatile("cp.async.wait_all;" ::: "memory");
+    __syncwarp();
+  }
+
+  __device__ void color_at(const float direction[3], float color[3]) const {
+    float bases[kBases], values[4 * kQuads];
+    bases_at<degree>(direction[0], direction[1], direction[2], bases);
+    const float4* const row = rows + (threadIdx.x & 31) * kStride / 4;
+#pragma unroll
+    for (int i = 0; i < kQuads; ++i) {
+      const float4 quad = row[i];
+      values[4 * i] = quad.x, values[4 * i + 1] = quad.y, values[4 * i + 2] = quad.z, values[4 * i + 3] = quad.w;
+    }
+#pragma unroll
+    for (int k = 0; k < kBases; ++k)
+      for (int j = 0; j < 3; ++j) color[j] = fmaf(bases[k], values[3 * k + j], color[j]);
+  }
+};
+
+__device__ inline Projected project_with(const FrameScene& in, const ProjectionInput& settings, const float mean[3],
+                                         const Geometry& geometry, float opacity) {
+  switch (in.camera_model) {
+    case kOrtho: return project(settings, View<kOrtho>(settings), mean, geometry, &opacity, false);
+    case kFisheye: return project(settings, View<kFisheye>(settings), mean, geometry, &opacity, false);
+    default: return project(settings, View<kPinhole>(settings), mean, geometry, &opacity, false);
+  }
+}
+
+constexpr float kConstantBase = 0.28209479177387814f;
+
+template <int degree>
+__global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
+    preprocess(FrameScene in, FrameLists lists, FrameScratch scratch) {
+  let_kernel_behind_come();
+  __shared__ FrameCamera camera;
+  __shared__ StagedHarmonics<degree> harmonics[kFrameThreads / 32];
+  const int64_t n = int64_t(blockIdx.x) * kFrameThreads + threadIdx.x;
+  const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
+  Record<4>* const records = static_cast<Record<4>*>(lists.records);
+
+  RawGaussian g;
+  g.usable = false;
+  if (n < in.count) g = load_gaussian(in, n);
+  load_camera(in, camera);
+  Projected p;
+  p.valid = 0;
+  float opacity = 0;
+  if (g.usable) {
+    opacity = opacity_of(g);
+    p = project_with(in, projection_input(in, camera), g.mean, geometry_of(g), opacity);
+  }
+  const unsigned shown = __ballot_sync(kAll, p.valid);
+  if constexpr (degree > 0)
+    harmonics[warp].load(in.sh + (n - lane) * StagedHarmonics<degree>::kRow, shown, in.aligned);  // on their way meanwhile
+
+  Record<4> r = {};
+  Footprint footprint = {0, 0};
+  if (p.valid) {
+    r.xyab = make_float4(p.u, p.v, -0.5f * kLog2E * p.conic[0], -kLog2E * p.conic[1]);
+    r.c = -0.5f * kLog2E * p.conic[2];
+    r.l = log2f(opacity);
+    r.cap = INFINITY;  // the conic is definite
+    TileBox box = box_around(p.u, p.v, p.radius_x, p.radius_y, kFrameTile, in.tile_width, in.tile_height);
+    box.ellipse = ellipse_of_record(r.xyab, r.c, r.l);
+    footprint = footprint_of(box);
+  }
+  if constexpr (degree > 0) StagedHarmonics<degree>::wait();
+  if (footprint.y != 0) {
+    float color[3], direction[3];
+    for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, g.color[j], 0.5f);
+    if constexpr (degree > 0) {
+      unit_direction(camera, g.mean, direction);
+      harmonics[warp].color_at(direction, color);
+    } else {
+      for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, in.sh[3 * n + j], color[j]);
+    }
+    if (0 * color[0] + 0 * color[1] + 0 * color[2] == 0) {
+      for (int j = 0; j < 3; ++j) r.colors[j] = fmaxf(color[j], 0.0f);
+      r.colors[3] = p.depth;
+      records[n] = r;
+      scratch.depths[n] = __float_as_uint(p.depth);
+    } else {
+      footprint = {0, 0};
+    }
+  }
+  if (n < in.count) scratch.footprints[n] = make_uint2(footprint.x, footprint.y);
+
+  for_small_tiles(footprint, in.tile_width, [&](int tile, int) { atomicAdd(scratch.counts + tile, 1); });
+  int tiles = footprint.small_count();
+  __syncwarp();  // the records of large footprints are written
+  for (unsigned large = __ballot_sync(kAll, footprint.large()); large != 0; large &= large - 1) {
+    const int owner = __ffs(int(large)) - 1;
+    const int count =
+        for_large_tiles(footprint, records, n, owner, in.tile_width, [&](int tile, int) { atomicAdd(scratch.counts + tile, 1); });
+    if (lane == owner) tiles = count;
+  }
+  if (scratch.sums == nullptr) return;
+  __shared__ int of_warps[kFrameThreads / 32];
+  const int of_warp = __reduce_add_sync(kAll, tiles);
+  if (lane == 0) of_warps[warp] = of_warp;
+  __syncthreads();
+  if (threadIdx.x == 0) {
+    int sum = 0;
+    for (int w = 0; w < kFrameThreads / 32; ++w) sum += of_warps[w];
+    scratch.sums[blockIdx.x] = sum;
+  }
+}
+
+}  // namespace
+
+void preprocess_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream) {
+  if (in.count == 0) return;
+  constexpr decltype(&preprocess<0>) by_degree[] = {preprocess<0>, preprocess<1>, preprocess<2>, preprocess<3>, preprocess<4>};
+  by_degree[in.sh_degree]<<<blocks_for(in.count, kFrameThreads), kFrameThreads, 0, stream>>>(in, lists, scratch);
+}

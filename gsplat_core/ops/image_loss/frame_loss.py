@@ -1,0 +1,85 @@
+"""The training loss of a frame of the fused path, with its gradients, on CUDA."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops import native  # noqa: F401  registers the compiled op
+
+
+class FrameLoss(NamedTuple):
+    """A loss with its gradients, ready for `render_frame_backward`."""
+
+    loss: Tensor
+    """Scalar."""
+    terms: Tensor
+    """[3]: L1, 1 - SSIM (0 when its weight is 0) and inverse-depth L1, each before its weight."""
+    grad_image: Tensor
+    """dL/dimage [H, W, 4]."""
+    grad_alphas: Tensor
+    """dL/dalphas [H, W]; not 0 where the depth term is."""
+
+
+def frame_loss(
+    image: Tensor,
+    alphas: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    target_depth: Tensor | None = None,
+    ssim_weight: float = 0.0,
+    depth_weight: float = 0.0,
+) -> FrameLoss:
+    """`image_loss` of colours and expected depth as `render_frame(training=True)` leaves them, without a wait for the device.
+
+    The expected depth is the last channel over max(alpha, 1e-10). Nothing is differentiable: the gradients are results.
+
+    Args:
+        image: [H, W, 4] float32 on CUDA: red, green, blue, sum of weight times z.
+        alphas: [H, W] float32.
+        target: [H, W, 3] uint8.
+        mask: [H, W] uint8, non-zero = tissue; None = all tissue.
+        target_depth: [H, W] float32 in mm, 0 = unknown; None = no depth term.
+        ssim_weight: 0..1. With 0 the SSIM is not computed at all.
+        depth_weight: at least 0.
+
+    Raises:
+        InvalidInput: shapes, types, device or weights are not as said; `gsplat_core.reference.frame_loss` takes any device and float64.
+    """
+    if image.ndim != 3 or image.shape[2] != 4 or image.dtype != torch.float32 or not image.is_cuda:
+        raise InvalidInput(
+            f"image must be float32 [H, W, 4] on a CUDA device, got {image.dtype} {list(image.shape)} on {image.device}"
+        )
+    size = image.shape[:2]
+    wanted = {
+        "alphas": (alphas, (*size,), torch.float32),
+        "target": (target, (*size, 3), torch.uint8),
+        "mask": (mask, (*size,), torch.uint8),
+        "target_depth": (target_depth, (*size,), torch.float32),
+    }
+    for name, (tensor, shape, dtype) in wanted.items():
+        if tensor is not None and (tuple(tensor.shape) != shape or tensor.dtype != dtype):
+            raise InvalidInput(f"{name} must be {dtype} {list(shape)}, got {tensor.dtype} {list(tensor.shape)}")
+    if not 0 <= ssim_weight <= 1 or not 0 <= depth_weight < float("inf"):
+        raise InvalidInput(
+            f"ssim_weight must be in 0..1 and depth_weight at least 0, got {ssim_weight} and {depth_weight}"
+        )
+    return FrameLoss(
+        *torch.ops.gsplat_core.frame_loss(image, alphas, target, mask, target_depth, ssim_weight, depth_weight)
+    )
+
+
+@torch.library.register_fake("gsplat_core::frame_loss")
+def _(
+    image: Tensor,
+    alphas: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    target_depth: Tensor | None,
+    ssim_weight: float,
+    depth_weight: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    return image.new_empty(()), image.new_empty(3), image.new_empty(image.shape), image.new_empty(image.shape[:2])

@@ -1,0 +1,143 @@
+// The image loss with its gradients: count the pixels that each mean is over, then one pass for L1 and inverse depth, two more
+// for the similarity where it has a weight. Sums are per block, in double, added up in the order of the blocks.
+#include "../ssim/ssim_cuda.h"
+#include "image_loss_cuda.h"
+
+namespace {
+
+constexpr float kLeastAlpha = 1e-10f;  // what a pixel's depth is divided by at least
+
+enum Count { kTissue, kKnownDepth, kCounts };
+enum Sum { kColour, kDepth, kSums };
+
+__device__ inline bool is_tissue(const DeviceImageLoss& in, int64_t pixel) { return in.mask == nullptr || in.mask[pixel] != 0; }
+
+// Expected depth of a pixel; 0 without depth.
+__device__ inline float depth_at(const DeviceImageLoss& in, int64_t pixel) {
+  if (in.target_depth == nullptr) return 0;
+  if (in.alphas == nullptr) return in.depth[pixel];
+  return in.image[pixel * in.stride + in.channels] / fmaxf(in.alphas[pixel], kLeastAlpha);
+}
+
+__device__ inline bool knows_depth(const DeviceImageLoss& in, int64_t pixel, float depth) {
+  return in.target_depth != nullptr && depth > 0 && in.target_depth[pixel] > 0 && is_tissue(in, pixel);
+}
+
+__global__ void __launch_bounds__(kThreads) count_pixels(DeviceImageLoss in, int64_t* counts) {
+  int tissue = 0, known = 0;
+  for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < in.pixels; i += int64_t(gridDim.x) * kThreads) {
+    tissue += is_tissue(in, i);
+    known += knows_depth(in, i, depth_at(in, i));
+  }
+  tissue = __reduce_add_sync(0xffffffffu, tissue);
+  known = __reduce_add_sync(0xffffffffu, known);
+  if (threadIdx.x % 32 != 0) return;
+  // Whole numbers: their sum does not depend on the order.
+  auto* const to = reinterpret_cast<unsigned long long*>(counts);
+  atomicAdd(to + kTissue, static_cast<unsigned long long>(tissue));
+  atomicAdd(to + kKnownDepth, static_cast<unsigned long long>(known));
+}
+
+__device__ inline double warp_total(double value) {
+  for (int offset = 16; offset > 0; offset /= 2) value += __shfl_xor_sync(0xffffffffu, value, offset);
+  return value;
+}
+
+// Adds up both sums over the block; thread 0 has them.
+__device__ inline void block_totals(double (&sums)[kSums]) {
+  constexpr int kWarps = kThreads / 32;
+  __shared__ double parts[kSums][kWarps];
+  for (int s = 0; s < kSums; ++s) {
+    const double sum = warp_total(sums[s]);
+    if (threadIdx.x % 32 == 0) parts[s][threadIdx.x / 32] = sum;
+  }
+  __syncthreads();
+  for (int s = 0; s < kSums; ++s) {
+    sums[s] = 0;
+    for (int warp = 0; warp < kWarps; ++warp) sums[s] += parts[s][warp];
+  }
+}
+
+// |x - y| and its derivative times `slope`. Zero has no slope; a NaN in tissue is passed on to both.
+struct Difference {
+  float value, slope;
+};
+__device__ inline Difference difference(float d, float slope) {
+  return {fabsf(d), d > 0 ? slope : d < 0 ? -slope : d == d ? 0 : d};
+}
+
+__global__ void __launch_bounds__(kThreads) differences(DeviceImageLoss in, const int64_t* counts, double* block_sums) {
+  const double values = double(counts[kTissue]) * in.channels, known = double(counts[kKnownDepth]);
+  const float slope = values > 0 ? float((1 - double(in.ssim_weight)) / values) : 0;
+  const float depth_slope = known > 0 ? float(double(in.depth_weight) / known) : 0;
+  double sums[kSums] = {};
+  for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < in.pixels; i += int64_t(gridDim.x) * kThreads) {
+    const bool tissue = is_tissue(in, i);
+    for (int c = 0; c < in.channels; ++c) {
+      Difference d = {};
+      if (tissue) {
+        const int64_t value = i * in.channels + c;
+        const float y = in.target_bytes != nullptr ? float(in.target_bytes[value]) / 255.0f : in.target[value];
+        d = difference(in.image[i * in.stride + c] - y, slope);
+      }
+      in.v_image[i * in.stride + c] = d.slope;
+      sums[kColour] += double(d.value);
+    }
+    float v_depth = 0;
+    const float depth = depth_at(in, i);
+    if (knows_depth(in, i, depth)) {
+      const float inverse = 1.0f / depth;
+      const Difference d = difference(inverse - 1.0f / in.target_depth[i], -depth_slope * inverse * inverse);
+      v_depth = d.slope;
+      sums[kDepth] += double(d.value);
+    }
+    if (in.v_depth != nullptr) in.v_depth[i] = v_depth;
+    if (in.alphas != nullptr) {
+      const float v = v_depth / fmaxf(in.alphas[i], kLeastAlpha);
+      in.v_image[i * in.stride + in.channels] = v;
+      in.v_alphas[i] = -depth * v;
+    }
+  }
+  block_totals(sums);
+  if (threadIdx.x < kSums) block_sums[int64_t(blockIdx.x) * kSums + threadIdx.x] = sums[threadIdx.x];
+}
+
+// The three means and their weighted sum, by one block.
+__global__ void __launch_bounds__(kThreads) finish(DeviceImageLoss in, const int64_t* counts, const double* block_sums,
+                                                   int64_t blocks, const double* ssim_sums, int64_t ssim_blocks) {
+  double sums[kSums] = {};
+  for (int64_t i = threadIdx.x; i < blocks; i += kThreads)
+    for (int s = 0; s < kSums; ++s) sums[s] += block_sums[i * kSums + s];
+  block_totals(sums);
+  double ssim[kSums] = {};
+  for (int64_t i = threadIdx.x; i < ssim_blocks; i += kThreads) ssim[0] += ssim_sums[i];
+  __syncthreads();
+  block_totals(ssim);
+  if (threadIdx.x != 0) return;
+  const double values = double(counts[kTissue]) * in.channels, known = double(counts[kKnownDepth]);
+  const double colour = values > 0 ? sums[kColour] / values : 0, depth = known > 0 ? sums[kDepth] / known : 0;
+  const double dissimilar = values > 0 ? ssim[0] / values : 0;
+  in.terms[0] = float(colour), in.terms[1] = float(dissimilar), in.terms[2] = float(depth);
+  *in.loss = float((1 - double(in.ssim_weight)) * colour + double(in.ssim_weight) * dissimilar + double(in.depth_weight) * depth);
+}
+
+}  // namespace
+
+void image_loss_on_device(const DeviceImageLoss& in, CudaScratch& scratch, cudaStream_t stream) {
+  constexpr int64_t kMostBlocks = 1024;  // of a few pixels per thread each: fewer sums to add up in the end
+  const int64_t wanted = blocks_for(in.pixels), blocks = wanted < 1 ? 1 : wanted < kMostBlocks ? wanted : kMostBlocks;
+  int64_t* const counts = scratch.array<int64_t>(kCounts);
+  double* const block_sums = scratch.array<double>(blocks * kSums);
+  cudaMemsetAsync(counts, 0, kCounts * sizeof(int64_t), stream);
+  count_pixels<<<unsigned(blocks), kThreads, 0, stream>>>(in, counts);
+  differences<<<unsigned(blocks), kThreads, 0, stream>>>(in, counts, block_sums);
+  DeviceSsim ssim = {};
+  if (in.ssim_weight != 0) {
+    ssim.image = in.image, ssim.target = in.target, ssim.target_bytes = in.target_bytes, ssim.mask = in.mask;
+    ssim.tissue = counts + kTissue, ssim.scale = -in.ssim_weight;
+    ssim.height = in.height, ssim.width = in.width, ssim.channels = in.channels, ssim.stride = in.stride;
+    ssim.gradient = in.v_image, ssim.sums = scratch.array<double>(ssim.blocks());
+    ssim_on_device(ssim, scratch, stream);
+  }
+  finish<<<1, kThreads, 0, stream>>>(in, counts, block_sums, blocks, ssim.sums, in.ssim_weight != 0 ? ssim.blocks() : 0);
+}

@@ -1,0 +1,36 @@
+"""Numbers that change from frame to frame, from the host to device memory that captured launches read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_float32
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops import native  # noqa: F401  registers the compiled op
+
+MOST_SCALARS = 32
+
+
+def store_scalars_(to: Tensor, values: Sequence[float]) -> None:
+    """Write `values`, at most 32, into `to`: float32, contiguous, as many elements.
+
+    On CUDA they travel in the arguments of a launch on the current stream, so that the host neither waits nor keeps them.
+
+    Raises:
+        InvalidInput: type, layout or number are not as said.
+    """
+    require_float32("store_scalars_", to=to)
+    if not to.is_contiguous() or to.numel() != len(values) or len(values) > MOST_SCALARS:
+        raise InvalidInput(
+            f"store_scalars_ fills a contiguous tensor of at most {MOST_SCALARS} elements, got {len(values)} values"
+            f" for {list(to.shape)} with strides {list(to.stride())}"
+        )
+    torch.ops.gsplat_core.store_scalars_(to, list(values))
+
+
+@torch.library.register_fake("gsplat_core::store_scalars_")
+def _(to: Tensor, values: list[float]) -> None:
+    return None

@@ -1,0 +1,74 @@
+"""One frame from raw Gaussians and their deformation, in plain torch: the oracle of the fused frame path."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_same_kind, require_shape
+from gsplat_core.errors import InvalidInput
+from gsplat_core.reference.rendering import rasterization
+from gsplat_core.render_settings import EPS2D, FAR_PLANE, NEAR_PLANE, RenderMode
+
+RAW_COLUMNS = 16
+"""Columns of a Gaussian's row of deltas: position 3, rotation 4 (wxyz), log-scale 3, colour 3, opacity logit, 2 unused."""
+
+
+def render_frame(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    logit_opacities: Tensor,
+    sh: Tensor,
+    deltas: Tensor | None,
+    viewmat: Tensor,
+    K: Tensor,
+    background: Tensor | None,
+    width: int,
+    height: int,
+    eps2d: float = EPS2D,
+    near_plane: float = NEAR_PLANE,
+    far_plane: float = FAR_PLANE,
+    camera_model: str = "pinhole",
+    expected_depth: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Deform, activate and render N Gaussians for one camera (Kerbl et al. 2023), differentiable in all of them.
+
+    Args:
+        means [N, 3], quats [N, 4] (wxyz, any length but zero), log_scales [N, 3], logit_opacities [N], sh [N, B, 3] with B a
+            square: raw parameters.
+        deltas: [N, 16], added to them (see `RAW_COLUMNS`; the colour's to the first coefficient), or None.
+        viewmat: [4, 4] world to camera. K: [3, 3] in pixels. background: [3], black where None.
+        expected_depth: the fourth channel is the weighted mean of z over the splats and not the weighted sum.
+
+    Returns:
+        Image [H, W, 4] (red, green, blue, depth) and alphas [H, W].
+
+    A Gaussian with a value that is not finite, in its parameters or its deltas, is left out and gets zero gradients.
+    Any floating-point dtype. Raises InvalidInput for wrong shapes.
+    """
+    n, bases = len(means), sh.shape[1] if sh.dim() == 3 else 0
+    require_shape("quats", quats, (n, 4), "[N, 4]")
+    require_shape("log_scales", log_scales, (n, 3), "[N, 3]")
+    require_shape("logit_opacities", logit_opacities, (n,), "[N]")
+    degree = math.isqrt(bases) - 1
+    if bases < 1 or (degree + 1) ** 2 != bases or tuple(sh.shape) != (n, bases, 3):
+        raise InvalidInput(f"sh must be [N, B, 3] with N = {n} and B a square, got {list(sh.shape)}")
+    raw = torch.cat([means, quats, log_scales, sh[:, 0], logit_opacities[:, None]], 1)
+    if deltas is not None:
+        require_shape("deltas", deltas, (n, RAW_COLUMNS), "[N, 16]")
+        require_same_kind(means=means, deltas=deltas)
+        raw = raw + deltas[:, : raw.shape[1]]
+    # Picked before any arithmetic: a NaN behind a mask would still be a NaN in the gradient.
+    usable = (raw.isfinite().all(1) & sh.isfinite().flatten(1).all(1)).nonzero()[:, 0]
+    mean, quat, log_scale, dc, logit = raw[usable].split([3, 4, 3, 3, 1], 1)
+    mode: RenderMode = "RGB+ED" if expected_depth else "RGB+D"
+    image, alphas, _ = rasterization(
+        mean, quat, log_scale.exp(), torch.sigmoid(logit[:, 0]), torch.cat([dc[:, None], sh[usable, 1:]], 1),
+        viewmat[None], K[None], width, height, near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, sh_degree=degree,
+        packed=False, backgrounds=None if background is None else background[None], render_mode=mode,
+        camera_model=camera_model,
+    )  # fmt: skip
+    return image[0], alphas[0, ..., 0]

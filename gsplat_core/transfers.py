@@ -1,0 +1,54 @@
+"""Between the host's memory and a device's, without making either wait for the other. On the CPU nothing is copied."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+def tensor_of(array: NDArray, device: torch.device | str = "cpu") -> Tensor:
+    """The array as a tensor on `device`.
+
+    On the CPU it shares the array's memory when torch allows it. To a GPU it goes by way of page-locked memory, queued on the current
+    stream; the array may be changed as soon as this returns.
+    """
+    array = np.ascontiguousarray(array)
+    device = torch.device(device)
+    if device.type == "cpu":
+        return torch.from_numpy(array if array.flags.writeable else array.copy())
+    staged = torch.empty(array.shape, dtype=_torch_type(array.dtype), device="cpu", pin_memory=True)
+    np.copyto(staged.numpy(), array)
+    return staged.to(device, non_blocking=True)
+
+
+def _torch_type(dtype: np.dtype[Any]) -> torch.dtype:
+    return torch.from_numpy(np.empty(0, dtype)).dtype
+
+
+class HostCopy:
+    """A tensor's values on their way to the host: queued behind what computes them, waited for when they are asked for."""
+
+    def __init__(self, tensor: Tensor) -> None:
+        tensor = tensor.detach()
+        self._arrived: torch.cuda.Event | None = None
+        if tensor.device.type == "cuda":
+            # Into page-locked memory, which torch keeps for later copies.
+            self._values = tensor.contiguous().to("cpu", non_blocking=True)
+            self._arrived = torch.cuda.Event()
+            self._arrived.record(torch.cuda.current_stream(tensor.device))
+        else:
+            self._values = tensor
+
+    def numpy(self) -> NDArray[Any]:
+        """The values; waits until they are there. On the CPU they share the tensor's memory."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        return self._values.numpy()
+
+    def item(self) -> float:
+        """The one value of a tensor that has one; waits until it is there."""
+        return float(self.numpy().item())

@@ -1,0 +1,155 @@
+"""The gradient of the fused frame path with Adam in the same pass, on CUDA, against the gradient and then the reference's Adam."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsplat_core.ops.frame.frame import Frame
+from gsplat_core.ops.frame.frame_gradients import render_frame_backward_adam_
+from gsplat_core.reference.adam import adam_step
+from tests.gsplat_core.cuda.frame_scenes import (
+    NAMES,
+    FrameScene,
+    backward,
+    by_name,
+    frame_scene,
+    lists_of,
+    on_gpu,
+    rendered,
+)
+
+pytestmark = pytest.mark.cuda
+
+
+class AdamState:
+    """Gaussians that the fused step updates."""
+
+    rates = (0.01, 0.02, 0.03, 0.04, 0.05)
+
+    def __init__(self, scene: FrameScene) -> None:
+        self.scene = replace(scene, **{name: getattr(scene, name).clone() for name in NAMES})
+        self.first = [torch.zeros_like(t) for t in scene.gaussians]
+        self.second = [torch.zeros_like(t) for t in scene.gaussians]
+        self.skipped = torch.zeros(5, dtype=torch.int64, device="cuda")
+
+    def step(
+        self,
+        forward: Frame,
+        number: int,
+        scale: float = 1.0,
+        dtype: torch.dtype = torch.int64,
+        needs_raw: bool = True,
+    ) -> Tensor | None:
+        s = self.scene
+        v_image, v_alphas = s.picture_gradients()
+        controls = torch.tensor([0.0, *self.rates], device="cuda")  # a view that starts between 16 bytes
+        return render_frame_backward_adam_(
+            s.gaussians, self.first, self.second, controls[1:], torch.tensor([number], dtype=dtype, device="cuda"),
+            self.skipped, s.deltas, s.viewmat, s.K, s.background, forward, scale * v_image.cuda(), scale * v_alphas.cuda(),
+            camera_model=s.camera_model, needs_raw=needs_raw,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_fused_adam_is_the_gradient_and_then_adam(degree: int, dtype: torch.dtype) -> None:
+    scene = on_gpu(frame_scene(333, degree=degree, deltas=True))
+    scene.logit_opacities[5] = math.nan
+    state = AdamState(scene)
+    for number in (1, 2, 1000):
+        forward = rendered(state.scene)
+        gradients = backward(state.scene, forward)
+        named = by_name(gradients, scene.sh.shape[1])
+        expected = [[t.double().cpu() for t in group] for group in (state.scene.gaussians, state.first, state.second)]
+        for rate, name, p, m, v in zip(state.rates, NAMES, *expected, strict=True):
+            adam_step(p, named[name], m, v, number, rate, row_size=max(1, p[0].numel()))
+        raw = state.step(forward, number, dtype=dtype)
+        assert raw is not None
+        assert torch.equal(raw, gradients.raw)
+        for group, wanted in zip((state.scene.gaussians, state.first, state.second), expected, strict=True):
+            for actual, exact in zip(group, wanted, strict=True):
+                torch.testing.assert_close(actual.cpu().double(), exact, rtol=1e-5, atol=2e-6, equal_nan=True)
+    assert not state.skipped.any()
+
+
+def test_fused_adam_leaves_rows_alone_whose_gradient_is_not_finite() -> None:
+    scene = on_gpu(frame_scene(100, degree=1))
+    state = AdamState(scene)
+    raw = state.step(rendered(scene), 1, scale=1e30)
+    assert raw is not None
+    hidden = ~backward(scene).raw.any(1)
+    for tensor, before, first in zip(state.scene.gaussians, scene.gaussians, state.first, strict=True):
+        changed = (tensor != before).reshape(100, -1).any(1)
+        assert tensor.isfinite().all()
+        assert torch.equal(first.reshape(100, -1).any(1), changed)
+    sh = (state.scene.sh != scene.sh).flatten(1).any(1)
+    assert not sh.any()
+    assert int(state.skipped[4]) == 100 - int(hidden.sum())
+    assert raw.isfinite().all()
+
+
+def test_fused_adam_without_raw_gradients_and_twice_the_same() -> None:
+    scene = on_gpu(frame_scene(1000, 200, 100, degree=3))
+    forward = rendered(scene)
+    states = [AdamState(scene) for _ in range(2)]
+    for state, needs_raw in zip(states, (True, False), strict=True):
+        assert (state.step(forward, 1, needs_raw=needs_raw) is None) != needs_raw
+    for a, b in zip(states[0].scene.gaussians, states[1].scene.gaussians, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_fused_adam_reads_rates_and_step_from_the_device_in_a_graph() -> None:
+    scene = on_gpu(frame_scene(500, 100, 80, degree=3))
+    forward = rendered(scene)
+    v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
+    graphed, plain = AdamState(scene), AdamState(scene)
+    rates, number = torch.zeros(5, device="cuda"), torch.ones(1, dtype=torch.int32, device="cuda")
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, stream=stream):
+            render_frame_backward_adam_(
+                graphed.scene.gaussians, graphed.first, graphed.second, rates, number, graphed.skipped, None, scene.viewmat,
+                scene.K, scene.background, forward, v_image, v_alphas,
+            )  # fmt: skip
+    torch.cuda.synchronize()
+    for step in (1, 2, 3):
+        rates.copy_(torch.tensor(AdamState.rates))
+        number.fill_(step)
+        graph.replay()
+        torch.cuda.synchronize()
+        plain.step(forward, step)
+    for group in ("first", "second"):
+        assert all(torch.equal(a, b) for a, b in zip(getattr(graphed, group), getattr(plain, group), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(graphed.scene.gaussians, plain.scene.gaussians, strict=True))
+
+
+def test_a_frame_whose_lists_were_cut_changes_nothing() -> None:
+    scene = on_gpu(frame_scene(300, degree=1))
+    forward = rendered(scene)
+    forward.status[2] = 1
+    state = AdamState(scene)
+    raw = state.step(forward, 1)
+    assert raw is not None
+    assert not raw.any()
+    assert all(torch.equal(a, b) for a, b in zip(state.scene.gaussians, scene.gaussians, strict=True))
+    assert not any(t.any() for t in state.first)
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_op_passes_opcheck(degree: int) -> None:
+    scene = on_gpu(frame_scene(30, 20, 18, degree=degree, deltas=degree > 0))
+    v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
+    state = AdamState(scene)
+    lists = lists_of(rendered(scene))
+    inputs = (scene.deltas, scene.viewmat, scene.K, scene.background, *lists, v_image, v_alphas)
+    rates, step = torch.full((5,), 0.01, device="cuda"), torch.ones(1, dtype=torch.int64, device="cuda")
+    moments = (*state.first, *state.second, rates, step, state.skipped)
+    options = (scene.width, scene.height, 0.3, 0, 0.9, 0.999, 1e-8, degree > 0, True)
+    op = torch.ops.gsplat_core.render_frame_backward_adam_.default
+    torch.library.opcheck(op, (*state.scene.gaussians, *inputs, *moments, *options))

@@ -1,0 +1,158 @@
+"""The CUDA kernels on a machine that may have no GPU: every op that the sources implement is registered, and shapes can be traced."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from torch._subclasses import FakeTensorMode
+from torch.fx.experimental.symbolic_shapes import ShapeEnv
+
+import gsplat_core.ops
+from gsplat_core.ops import native
+from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
+from gsplat_core.ops.frame.frame import render_frame
+from gsplat_core.ops.frame.frame_gradients import render_frame_backward, render_frame_backward_adam_
+from gsplat_core.ops.image_loss.frame_loss import frame_loss
+from gsplat_core.ops.projection.projection import fully_fused_projection
+from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
+from gsplat_core.ops.tiles.tiles import bin_splats
+
+N = 10
+
+ROOT = Path(native.__file__).resolve().parent
+SCHEMAS = re.findall(r"\bm\.def\(\s*\"(\w+)\(", (ROOT.parent / "native" / "schemas.cpp").read_text())
+WITHOUT_CUDA = {
+    "active_isa", "basis_field", "basis_field_backward", "basis_field_backward_adam_", "hexplane_decode", "hexplane_features",
+    "hexplane_features_backward", "hexplane_modulate", "hexplane_space",
+}  # fmt: skip
+"""Ops that may be without a CUDA kernel; another one that is, was forgotten."""
+
+
+def implemented(pattern: str, key: str) -> set[str]:
+    """Names that the sources register kernels for under a key."""
+    blocks = (
+        block
+        for path in sorted(ROOT.glob(pattern))
+        for block in re.findall(
+            rf"STABLE_TORCH_LIBRARY_IMPL\(gsplat_core, {key}, m\) {{(.*?)}}", path.read_text(), re.S
+        )
+    )
+    return {name for block in blocks for name in re.findall(r"m\.impl\(\"(\w+)\"", block)}
+
+
+def has_kernel(name: str, key: str) -> bool:
+    return torch._C._dispatch_has_kernel_for_dispatch_key(f"gsplat_core::{name}", key)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def all_ops_imported() -> None:
+    """The fake kernels are registered by the ops' Python modules."""
+    for module in pkgutil.walk_packages(gsplat_core.ops.__path__, "gsplat_core.ops."):
+        importlib.import_module(module.name)
+
+
+@pytest.fixture
+def cuda_library() -> None:
+    """The library, with or without a GPU: skipped where it was not built, unless CI says that it must be."""
+    if native.CUDA_MISSING is None:
+        return
+    if os.environ.get("INTRASPLAT_REQUIRE_CUDA_BUILD") == "1":
+        pytest.fail(f"the CUDA kernels are required here and are {native.CUDA_MISSING}")
+    pytest.skip(f"the CUDA kernels are {native.CUDA_MISSING}")
+
+
+def test_the_sources_implement_what_has_a_schema():
+    on_cuda = implemented("*/*_cuda_op.cpp", "CUDA")
+    assert len(on_cuda) >= 12
+    assert on_cuda <= set(SCHEMAS)
+    assert set(SCHEMAS) - on_cuda <= WITHOUT_CUDA
+
+
+def test_every_kernel_in_the_sources_is_registered(cuda_library):
+    missing = {name for name in implemented("*/*_cuda_op.cpp", "CUDA") if not has_kernel(name, "CUDA")}
+    assert not missing
+
+
+def test_the_library_says_what_it_was_built_for(cuda_library):
+    assert re.fullmatch(r"nvcc \d+\.\d+ for \d+\.\d(, \d+\.\d)*", native.cuda_build())
+
+
+def test_ci_builds_for_every_gpu(cuda_library):
+    if os.environ.get("INTRASPLAT_REQUIRE_CUDA_BUILD") != "1":
+        pytest.skip("only where CI has built it: others build for the GPU at hand")
+    assert native.cuda_build().endswith(" for 8.0, 9.0, 10.0, 12.0")
+
+
+@pytest.mark.parametrize("name", [name for name in SCHEMAS if name != "active_isa"])
+def test_every_op_has_a_fake_kernel(name):
+    assert has_kernel(name, "Meta")
+
+
+def test_a_picture_is_traced_on_cuda_without_a_gpu(cuda_library):
+    """The ops of a plain render, forward and backward: shapes and devices from the fake kernels alone."""
+    with FakeTensorMode(shape_env=ShapeEnv()):
+        means, quats, scales, opacities, sh = gaussians(9)
+        view = (floats(1, 4, 4), floats(1, 3, 3), 64, 48)
+        rows = fully_fused_projection(means, None, quats, scales, *view, opacities=opacities)
+        colors = spherical_harmonics(2, means[None], sh)
+        splats = (rows.means2d, rows.conics, colors, opacities[None])
+        _, flatten_ids, offsets = bin_splats(
+            rows.means2d, rows.radii, rows.depths, 16, 4, 3, conics=rows.conics, opacities=splats[3]
+        )
+        assert flatten_ids.is_cuda and offsets.shape == (1, 3, 4)
+        image, alphas = rasterize_to_pixels(*splats, 64, 48, 16, offsets, flatten_ids)
+        assert image.shape == (1, 48, 64, 3) and alphas.is_cuda
+        # Their gradients, by the ops: autograd's engine itself needs the device.
+        ops = torch.ops.gsplat_core
+        flat = [tensor.reshape(N, *tensor.shape[2:]) for tensor in splats]
+        last = floats(1, 48, 64, dtype=torch.int32)
+        gradients = ops.composite_backward(
+            *flat, offsets, flatten_ids, None, None, 64, 48, 16, alphas[..., 0], last, image, alphas[..., 0], False
+        )
+        assert [gradient.shape for gradient in gradients[:4]] == [tensor.shape for tensor in flat]
+        v_dirs, v_sh = ops.spherical_harmonics_backward(2, means[None], sh, None, colors, True)
+        assert v_dirs.shape == (1, N, 3) and v_sh.shape == sh.shape and v_sh.is_cuda
+        v_means, _, v_quats, v_scales, _ = ops.project_gaussians_backward(
+            means[None], None, quats[None], scales[None], view[0][None], view[1][None], rows.radii[None], *gradients[:1],
+            rows.depths[None], gradients[1], None, 64, 48, 0.3, 0, False,
+        )  # fmt: skip
+        assert (v_means.shape, v_quats.shape, v_scales.shape) == ((1, N, 3), (1, N, 4), (1, N, 3)) and v_means.is_cuda
+
+
+def test_a_frame_and_its_gradient_are_traced_on_cuda_without_a_gpu(cuda_library):
+    with FakeTensorMode():
+        raw = gaussians(16)
+        view = (floats(N, 16), floats(4, 4), floats(3, 3), None)
+        frame = render_frame(*raw, *view, 64, 48, 1000, training=True)
+        assert frame.image.shape == (48, 64, 4) and frame.records.shape == (N, 12) and frame.sorted.shape == (1000,)
+        loss = frame_loss(frame.image, frame.alphas, floats(48, 64, 3, dtype=torch.uint8), None, None, 0.2, 0.0)
+        assert loss.loss.shape == () and loss.grad_image.shape == frame.image.shape
+        gradients = render_frame_backward(raw, *view, frame, loss.grad_image, loss.grad_alphas)
+        assert gradients.raw.shape == (N, 16) and gradients.sh.shape == (N, 16, 3) and gradients.sh.is_cuda
+
+
+@pytest.mark.parametrize("bases", [1, 4])
+def test_adam_in_the_gradient_is_traced_on_cuda_without_a_gpu(cuda_library, bases):
+    with FakeTensorMode():
+        raw, first, second = gaussians(bases), gaussians(bases), gaussians(bases)
+        view = (None, floats(4, 4), floats(3, 3), floats(3))
+        frame = render_frame(*raw, *view, 64, 48, 1000, training=True)
+        numbers = (floats(5), floats(1, dtype=torch.int64), floats(5, dtype=torch.int64))
+        raw_gradient = render_frame_backward_adam_(
+            raw, first, second, *numbers, *view, frame, frame.image, frame.alphas
+        )
+        assert raw_gradient is not None and raw_gradient.shape == (N, 16)
+
+
+def floats(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    return torch.empty(shape, dtype=dtype, device="cuda")
+
+
+def gaussians(bases: int) -> tuple[torch.Tensor, ...]:
+    return floats(N, 3), floats(N, 4), floats(N, 3), floats(N), floats(N, bases, 3)

@@ -1,0 +1,69 @@
+"""Whether there is a GPU to use, and what is in the way: what torch says counts, the driver's files give the reason."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from services.cli import graphics
+
+
+@pytest.fixture
+def machine(monkeypatch, tmp_path):
+    """A machine with these files of NVIDIA's driver, on which torch sees these compute capabilities."""
+
+    def make(files: str = "", capabilities: tuple[tuple[int, int], ...] = (), cuda: str | None = "13.0") -> None:
+        for name in ("DRIVER", "DEVICE", "WSL"):
+            path = tmp_path / name
+            if name in files.split():
+                path.touch()
+            monkeypatch.setattr(graphics, name, path)
+        monkeypatch.setattr(torch.version, "cuda", cuda)
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: bool(capabilities))
+        monkeypatch.setattr(torch.cuda, "device_count", lambda: len(capabilities))
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda k: capabilities[k])
+        monkeypatch.setattr(torch.cuda, "get_device_name", lambda k: f"GPU {k}")
+
+    return make
+
+
+def test_a_gpu_that_torch_sees_is_used(machine, capsys):
+    machine("DRIVER DEVICE", ((9, 0), (8, 6)))
+    assert graphics.look() == graphics.Graphics(True, "GPU 0 (compute capability 9.0), GPU 1 (compute capability 8.6)")
+    assert graphics.main() == 0
+    assert "GPU 0" in capsys.readouterr().out
+
+
+def test_a_gpu_that_is_too_old_is_named(machine):
+    machine("DRIVER DEVICE", ((7, 5),))
+    assert not graphics.look().usable
+    assert "7.5" in graphics.look().found and "8.0" in graphics.look().advice
+
+
+@pytest.mark.parametrize(
+    ("files", "cuda", "found", "advice"),
+    [
+        ("", "13.0", "no NVIDIA driver", "not needed"),
+        ("DRIVER", "13.0", "none here", "--gpus all"),
+        ("DRIVER", None, "built without CUDA", ""),
+    ],
+)
+def test_without_a_gpu_the_reason_is_given(machine, capsys, files, cuda, found, advice):
+    machine(files, cuda=cuda)
+    seen = graphics.look()
+    assert not seen.usable and found in seen.found and advice in seen.advice
+    assert graphics.main() == 1
+    assert found in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("files", ["DRIVER DEVICE", "WSL"])
+def test_a_gpu_that_torch_cannot_start_is_told_with_what_torch_says(machine, monkeypatch, files):
+    machine(files)
+
+    def refuse() -> None:
+        raise RuntimeError("The NVIDIA driver on your system is too old (found version 12040). Please update.\nMore")
+
+    monkeypatch.setattr(torch.cuda, "init", refuse)
+    seen = graphics.look()
+    assert not seen.usable and "too old (found version 12040)" in seen.found and "More" not in seen.found
+    assert "CUDA 13.0 or later" in seen.advice
