@@ -11,7 +11,8 @@ using namespace GSPLAT_ISA;
 namespace {
 
 constexpr int kRowsPerWarp = 16;
-constexpr int kRowsPerBlock = kRowsPerWarp * kThreads / 32;
+constexpr int kWarps = 4;  // of a block
+constexpr int kRowsPerBlock = kRowsPerWarp * kWarps;
 
 // 16 bytes of features, and what is done to all of them.
 template <class T>
@@ -24,7 +25,6 @@ struct Piece<float> {
     const float4 x = *reinterpret_cast<const float4*>(p);
     return {{x.x, x.y, x.z, x.w}};
   }
-  __device__ static Piece zero() { return {}; }
   __device__ void modulate(const Piece& a, const Piece& b, float fraction) {
 #pragma unroll
     for (int i = 0; i < 4; ++i) v[i] *= a.v[i] + fraction * (b.v[i] - a.v[i]);
@@ -38,11 +38,6 @@ struct Piece<__half> {
     const uint4 x = *reinterpret_cast<const uint4*>(p);
     Piece out;
     *reinterpret_cast<uint4*>(out.v) = x;
-    return out;
-  }
-  __device__ static Piece zero() {
-    Piece out;
-    for (__half2& x : out.v) x = __half2half2(__ushort_as_half(0));
     return out;
   }
   __device__ void modulate(const Piece& a, const Piece& b, float fraction) {
@@ -117,70 +112,114 @@ __device__ __forceinline__ void start_with_bias(float (&sums)[kBlocks][4], const
 
 __device__ __forceinline__ void copy_to_shared(void* to, const void* from, int pieces) {
   const uint32_t base = uint32_t(__cvta_generic_to_shared(to));
-  for (int i = int(threadIdx.x); i < pieces; i += kThreads)
+  for (int i = int(threadIdx.x); i < pieces; i += 32 * kWarps)
     asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(base + 16 * i), "l"(static_cast<const char*>(from) + 16 * i));
   asm volatile("cp.async.commit_group;");
 }
 
-// Blocks that a multiprocessor should hold at once, by the registers that the layers need.
-constexpr int blocks_of(int item, int width) { return width == 32 ? (item == 2 ? 3 : 2) : width == 64 ? 2 : 1; }
+// Where a lane's two rows fall on the three lines of a level. Each of the four lanes of a row works out one axis and tells the
+// others.
+struct LinePlaces {
+  int offset[2][3];  // of the left node, in items
+  float fraction[2][3];
 
-template <class T, int kWidth, bool kLines>
-__global__ void __launch_bounds__(kThreads, blocks_of(int(sizeof(T)), kWidth))
+  // x: the coordinates of the rows along axis `quad`
+  __device__ LinePlaces(const FieldLines& lines, int level, const float (&x)[2], const WarpPlace& place, int channels) {
+    const int32_t* widths = lines.widths[level];
+    const int32_t width = place.quad == 0 ? widths[0] : place.quad == 1 ? widths[1] : widths[2];
+#pragma unroll
+    for (int r = 0; r < 2; ++r) {
+      const LinePosition at = position_on(x[r], width);
+      const int own = int(at.cell) * channels;
+#pragma unroll
+      for (int axis = 0; axis < 3; ++axis) {
+        offset[r][axis] = __shfl_sync(0xffffffffu, own, 4 * place.group + axis);
+        fraction[r][axis] = __shfl_sync(0xffffffffu, at.fraction, 4 * place.group + axis);
+      }
+    }
+  }
+};
+
+template <class T>
+__device__ __forceinline__ void swap_pieces(Piece<T>& a, Piece<T>& b, bool swap) {
+#pragma unroll
+  for (int i = 0; i < 4; ++i) {
+    const auto x = a.v[i], y = b.v[i];
+    a.v[i] = swap ? y : x;
+    b.v[i] = swap ? x : y;
+  }
+}
+
+// Blocks that a multiprocessor should hold at once, by the registers that the layers need.
+constexpr int blocks_of(int item, int width) { return width == 32 ? (item == 2 ? 6 : 4) : width == 64 ? 4 : 2; }
+
+// kChannels: channels where they are known and every line has two nodes or more; 0: read from the input.
+template <class T, int kWidth, bool kLines, int kChannels>
+__global__ void __launch_bounds__(32 * kWarps, blocks_of(int(sizeof(T)), kWidth))
     deltas_kernel(FieldInput in, FieldNetwork net, const void* packed, float* deltas, float* hidden) {
   extern __shared__ uint4 shared[];
-  constexpr int kItem = int(sizeof(T)), kPiece = 16 / kItem, kBlocks = kWidth / 8;
+  constexpr int kItem = int(sizeof(T)), kPiece = 16 / kItem, kQuad = 4 * kPiece, kBlocks = kWidth / 8;
+  constexpr int kParts = kChannels * kItem % 128 == 0 && kChannels > 0 ? 2 : 1;  // of 64 bytes that are loaded together
   copy_to_shared(shared, packed, int(net.packed_bytes(kItem) / 16));
   const T* weights = reinterpret_cast<const T*>(shared);
   const float* biases = reinterpret_cast<const float*>(weights + net.weight_items(kItem));
   const WarpPlace place;
-  const int64_t first = int64_t(blockIdx.x) * kRowsPerBlock + threadIdx.x / 32 * kRowsPerWarp;
-  int64_t rows[2];
-  float x[2][3] = {};
+  const int channels = kChannels > 0 ? kChannels : in.channels;
+  const int count = int(in.count), first = int(blockIdx.x) * kRowsPerBlock + int(threadIdx.x) / 32 * kRowsPerWarp;
+  int rows[2];
+  float x[2] = {};
   for (int r = 0; r < 2; ++r) {
     rows[r] = first + place.group + 8 * r;
-    if (!kLines || rows[r] >= in.count) continue;
-    const float4 c = *reinterpret_cast<const float4*>(in.coordinates + 4 * rows[r]);
-    x[r][0] = c.x, x[r][1] = c.y, x[r][2] = c.z;
+    if (kLines && rows[r] < count) x[r] = in.coordinates[int64_t(4) * rows[r] + min(place.quad, 2)];
   }
   asm volatile("cp.async.wait_all;");
   __syncthreads();
-  if (first >= in.count) return;
+  if (first >= count) return;
 
   float sums[kBlocks][4];
   start_with_bias(sums, biases, place.quad);
   const int stride = net.first_stride(kItem);
   const T* w = weights + place.group * stride + place.quad * kPiece;
+  // Rows of 128 bytes: neighbouring rows start with different halves, so that the lanes that load together meet in no bank.
+  const int odd = kParts == 2 ? place.group % 2 : 0;
+  const int lane_at = place.quad * kPiece;
   for (int level = 0; level < in.levels; ++level) {
-    const T* left[2][3];
-    int right[3] = {};
-    float fraction[2][3];
+    const T *left[2][3] = {}, *space[2];
+    float fraction[2][3] = {};
+    int right[3] = {kChannels, kChannels, kChannels};
+    for (int r = 0; r < 2; ++r)
+      space[r] = static_cast<const T*>(in.spaces[level]) + int64_t(min(rows[r], count - 1)) * channels + lane_at + odd * kQuad;
     if constexpr (kLines) {
+      const LinePlaces places(in.lines, level, x, place, channels);
+#pragma unroll
       for (int axis = 0; axis < 3; ++axis) {
-        const int32_t width = in.lines.widths[level][axis];
-        const T* line = static_cast<const T*>(in.lines.values) + in.lines.starts[level][axis] + place.quad * kPiece;
-        right[axis] = width > 1 ? in.channels : 0;
-        for (int r = 0; r < 2; ++r) {
-          const LinePosition at = position_on(x[r][axis], width);
-          left[r][axis] = line + int(at.cell) * in.channels;
-          fraction[r][axis] = at.fraction;
-        }
+        const T* line = static_cast<const T*>(in.lines.values) + in.lines.starts[level][axis] + lane_at + odd * kQuad;
+        if (kChannels == 0) right[axis] = in.lines.widths[level][axis] > 1 ? channels : 0;
+#pragma unroll
+        for (int r = 0; r < 2; ++r) left[r][axis] = line + places.offset[r][axis], fraction[r][axis] = places.fraction[r][axis];
       }
     }
-    const T* space = static_cast<const T*>(in.spaces[level]) + place.quad * kPiece;
-    for (int c = 0; c < in.channels; c += 4 * kPiece, w += 4 * kPiece) {
-      Piece<T> value[2];
+    const int other = kQuad - 2 * odd * kQuad;  // from the half that a lane starts with to the other one
+    for (int c = 0; c < channels; c += kParts * kQuad, w += kParts * kQuad) {
+      Piece<T> value[kParts][2];
 #pragma unroll
-      for (int r = 0; r < 2; ++r) {
-        value[r] = rows[r] < in.count ? Piece<T>::load(space + rows[r] * in.channels + c) : Piece<T>::zero();
-        if constexpr (kLines) {
+      for (int part = 0; part < kParts; ++part)
 #pragma unroll
-          for (int axis = 0; axis < 3; ++axis)
-            value[r].modulate(Piece<T>::load(left[r][axis] + c), Piece<T>::load(left[r][axis] + right[axis] + c),
-                              fraction[r][axis]);
+        for (int r = 0; r < 2; ++r) {
+          const int at = c + part * other;
+          Piece<T>& piece = value[part][r];
+          piece = Piece<T>::load(space[r] + at);
+          if constexpr (kLines) {
+#pragma unroll
+            for (int axis = 0; axis < 3; ++axis)
+              piece.modulate(Piece<T>::load(left[r][axis] + at), Piece<T>::load(left[r][axis] + at + right[axis]),
+                             fraction[r][axis]);
+          }
         }
-      }
-      first_layer(sums, value, w, stride);
+      if constexpr (kParts == 2)
+        for (int r = 0; r < 2; ++r) swap_pieces(value[0][r], value[1][r], odd != 0);
+#pragma unroll
+      for (int part = 0; part < kParts; ++part) first_layer(sums, value[part], w + part * kQuad, stride);
     }
   }
 
@@ -192,7 +231,7 @@ __global__ void __launch_bounds__(kThreads, blocks_of(int(sizeof(T)), kWidth))
       for (int i = 0; i < 4; ++i) {
         sums[t][i] = rectified(sums[t][i]);
         const int column = 8 * t + 2 * place.quad + i % 2;
-        if (hidden != nullptr && rows[i / 2] < in.count && column < net.width)
+        if (hidden != nullptr && rows[i / 2] < count && column < net.width)
           hidden[((layer - 1) * in.count + rows[i / 2]) * net.width + column] = sums[t][i];
       }
     const T* next = weights + net.hidden_start(layer, kItem) + place.group * hidden_stride + place.quad * (8 / kItem);
@@ -211,8 +250,8 @@ __global__ void __launch_bounds__(kThreads, blocks_of(int(sizeof(T)), kWidth))
     start_with_bias(out, bias, place.quad);
     next_layer(sums, out, next, hidden_stride);
     for (int r = 0; r < 2; ++r) {
-      if (rows[r] >= in.count) continue;
-      float* to = deltas + (in.order != nullptr ? int64_t(in.order[rows[r]]) : rows[r]) * kDeltaColumns + 2 * place.quad;
+      if (rows[r] >= count) continue;
+      float* to = deltas + (in.order != nullptr ? in.order[rows[r]] : rows[r]) * int64_t(kDeltaColumns) + 2 * place.quad;
       *reinterpret_cast<float2*>(to) = make_float2(out[0][2 * r], out[0][2 * r + 1]);
       *reinterpret_cast<float2*>(to + 8) = make_float2(out[1][2 * r], out[1][2 * r + 1]);
     }
@@ -222,10 +261,18 @@ __global__ void __launch_bounds__(kThreads, blocks_of(int(sizeof(T)), kWidth))
 template <class T, int kWidth>
 void launch(const FieldInput& in, const FieldNetwork& net, const void* packed, float* deltas, float* hidden,
             cudaStream_t stream) {
-  const auto kernel = in.lines.values != nullptr ? deltas_kernel<T, kWidth, true> : deltas_kernel<T, kWidth, false>;
+  auto kernel = deltas_kernel<T, kWidth, false, 0>;
+  if (in.lines.values != nullptr) {
+    bool wide = true;
+    for (int level = 0; level < in.levels; ++level)
+      for (const int32_t width : in.lines.widths[level]) wide = wide && width > 1;
+    kernel = wide && in.channels == 64   ? deltas_kernel<T, kWidth, true, 64>
+             : wide && in.channels == 32 ? deltas_kernel<T, kWidth, true, 32>
+                                         : deltas_kernel<T, kWidth, true, 0>;
+  }
   const int bytes = int(net.packed_bytes(int(sizeof(T))));
   cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
-  kernel<<<blocks_for(in.count, kRowsPerBlock), kThreads, bytes, stream>>>(in, net, packed, deltas, hidden);
+  kernel<<<blocks_for(in.count, kRowsPerBlock), 32 * kWarps, bytes, stream>>>(in, net, packed, deltas, hidden);
 }
 
 template <class T>
