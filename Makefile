@@ -46,10 +46,9 @@ cuda: .venv/.runtime $(if $(strip $(CUDACXX)),,$(CUDA_TOOLKIT)/.installed)
 	  -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja --log-level=WARNING
 	@$(BIN)/cmake --build build/cuda --target gsplat_core_cuda
 
-$(CUDA_TOOLKIT)/.installed: pyproject.toml .venv/.runtime
+$(CUDA_TOOLKIT)/.installed: requirements-cuda.lock | .venv/.runtime
 	rm -rf $(CUDA_TOOLKIT)
-	$(BIN)/python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['optional-dependencies']['cuda-build'])" \
-	  | xargs $(BIN)/pip install --quiet --no-deps --target $(CUDA_TOOLKIT)
+	$(BIN)/pip install --quiet --require-hashes --no-deps --target $(CUDA_TOOLKIT) -r requirements-cuda.lock
 	touch $@
 
 # The build tools come first, so that the install builds against the torch that it will run with.
@@ -66,6 +65,9 @@ $(CUDA_TOOLKIT)/.installed: pyproject.toml .venv/.runtime
 lock: .venv/.development
 	$(BIN)/uv pip compile pyproject.toml --extra build --universal --generate-hashes --quiet --no-emit-index-url -o requirements.lock
 	$(BIN)/uv pip compile pyproject.toml --extra build --extra dev --extra holoscan --universal --generate-hashes --quiet --no-emit-index-url -c requirements.lock -o requirements-dev.lock
+	$(BIN)/python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['optional-dependencies']['cuda-build'], sep='\n')" \
+	  | $(BIN)/uv pip compile - --no-deps --universal --generate-hashes --quiet --no-emit-index-url --no-annotate \
+	    --custom-compile-command "make lock (the compiler of make cuda, installed without dependencies)" -o requirements-cuda.lock
 
 licences: .venv/.development
 	$(BIN)/python deploy/third_party_licences.py

@@ -43,9 +43,6 @@ target_compile_definitions(gsplat_core_cuda PRIVATE ${CORE_DEFINITIONS} GSPLAT_I
 target_compile_options(gsplat_core_cuda PRIVATE
   $<$<COMPILE_LANGUAGE:CXX>:${CORE_FLAGS}>
   $<$<COMPILE_LANGUAGE:CUDA>:${PORTABLE_CODE} --expt-relaxed-constexpr --extended-lambda -Xcompiler=-fvisibility=hidden,-Wall>)
-# These are bound by the instructions per Gaussian: quotients and roots to 2 units in the last place are enough there.
-set_source_files_properties(gsplat_core/ops/frame/frame_preprocess.cu gsplat_core/ops/frame/frame_lists.cu
-                            PROPERTIES COMPILE_OPTIONS "--prec-div=false;--prec-sqrt=false")
 target_include_directories(gsplat_core_cuda PRIVATE gsplat_core/native)
 target_include_directories(gsplat_core_cuda SYSTEM PRIVATE ${TORCH_ROOT}/include
                            $<$<COMPILE_LANGUAGE:CXX>:${CUDA_INCLUDE}>)

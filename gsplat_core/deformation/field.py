@@ -51,6 +51,15 @@ class DeformationField(torch.nn.Module):
         """
         raise NotImplementedError
 
+    def frame_time(self, time_s: float) -> float:
+        """`time_s` as `frame_deltas` counts it."""
+        raise NotImplementedError(f"a {self.kind} field has no fused frame path")
+
+    def frame_deltas(self, gaussians: Gaussians) -> Callable[[Tensor], Tensor]:
+        """From a time ([1] on the field's device, see `frame_time`) to what the field adds then: [N, 16], the columns of
+        `gsplat_core.ops.frame`. No autograd graph and no wait, so a CUDA graph can hold it."""
+        raise NotImplementedError(f"a {self.kind} field has no fused frame path")
+
     def config(self) -> dict[str, Any]:
         """All that `field_from_config` needs to rebuild the architecture, as JSON-able values."""
         raise NotImplementedError

@@ -120,6 +120,7 @@ class Reconstructor:
             extra = count * self.config.jump_extra
         for _ in range(extra):
             loss = self._step(observation)
+        self._step.settle(observation)
         if not first:
             known = self._usual_surprise if self._usual_surprise < math.inf else surprise
             self._usual_surprise = known + USUAL_DECAY * (min(surprise, self.config.jump_ratio * known) - known)
@@ -159,6 +160,7 @@ class Reconstructor:
             loss = self._step(observations[order.pop()][1], rate_scale=0.1 ** (step / steps))
             if progress is not None:
                 progress(step + 1, loss)
+        self._step.settle(observations[-1][1], rate_scale=0.1)
         return ObserveReport(observations[-1][0].seq, steps, HostCopy(loss).item(), self.gaussians)
 
     def snapshot(self) -> Model:

@@ -11,9 +11,14 @@ from gsplat_core.cameras import Camera
 from gsplat_core.deformation import BasisField, BasisRates, DeformationField
 from gsplat_core.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.field_training import training_of
+from gsplat_core.training.fused_step import FusedStep
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
 from gsplat_core.training.photometric import LossWeights, loss_and_gradients
+
+SETTLE_EVERY = 32
+"""Steps on a GPU after which they are waited for, so that lists that are too short are noticed before long; the first one, too."""
 
 
 class TrainingStep:
@@ -37,14 +42,29 @@ class TrainingStep:
         )
         self._pixel_mm = float(distance) / float(camera.K[0, 0])
         self._adam = FusedAdam(gaussians.tensors())
+        self._fused: FusedStep | None = None
+        self._queued = 0
+        if gaussians.device.type == "cuda":
+            self._fused = FusedStep(gaussians, training_of(field), self._adam, self._weights, camera)
         network = {} if isinstance(field, BasisField) else dict(field.named_parameters())
         self._network_adam = FusedAdam(network, rows=False)
 
     def __call__(self, observation: Observation, rate_scale: float = 1.0) -> Tensor:
-        """Train on one observation; returns its loss [] before the update, on the device."""
+        """Train on one observation; returns its loss before the update, [] on the Gaussians' device.
+
+        On a GPU this only queues the step: ask for the loss's value, or `settle`, to wait for it.
+        """
+        if self._fused is not None:
+            return self._fused_step(self._fused, observation, rate_scale)
         if isinstance(self.field, BasisField):
             return self._basis_step(self.field, observation, rate_scale)
         return self._network_step(observation, rate_scale)
+
+    def settle(self, observation: Observation, rate_scale: float = 1.0) -> None:
+        """Wait for the queued steps. Those that a GPU had to leave out, because its lists were too short, are taken again on `observation`."""
+        while self._fused is not None and (lost := self._fused.settle()):
+            for _ in range(lost):
+                self._fused_step(self._fused, observation, rate_scale)
 
     def at(self, time_s: float) -> Gaussians:
         """The scene at a time, as it is now."""
@@ -61,27 +81,28 @@ class TrainingStep:
         self.field.append(added)
         self._adam.append(added.count)
 
+    def _fused_step(self, fused: FusedStep, observation: Observation, rate_scale: float) -> Tensor:
+        if isinstance(self.field, BasisField):
+            field_rates = list(vars(self._basis_rates(rate_scale)).values())
+        else:
+            rates = self._config.rates
+            field_rates = [rates.hexplane_planes * rate_scale, rates.hexplane_network * rate_scale]
+        time = self.field.frame_time(observation.time_s)
+        loss = fused(self.gaussians, observation, time, self._gaussian_rates(rate_scale), field_rates)
+        self._queued += 1
+        if self._queued % SETTLE_EVERY == 1:
+            self.settle(observation, rate_scale)
+        return loss
+
     def _basis_step(self, field: BasisField, observation: Observation, rate_scale: float) -> Tensor:
         deformed = self.at(observation.time_s)
         loss, gradients = loss_and_gradients(deformed, observation, self._weights)
-        rates = self._config.rates
         deltas = torch.cat(
             [gradients["means"], gradients["quats"], gradients["log_scales"], gradients["sh"][:, 0]], dim=1
         )
         if not torch.isfinite(deltas.sum()):  # such a Gaussian is left alone, as `FusedAdam` does
             deltas[~deltas.isfinite().all(1)] = 0
-        field.adam_step(
-            observation.time_s,
-            deltas,
-            BasisRates(
-                position=rates.basis_means_px * self._pixel_mm * rate_scale,
-                rotation=rates.basis_quats * rate_scale,
-                log_scale=rates.basis_log_scales * rate_scale,
-                colour=rates.basis_sh * rate_scale,
-                centers=rates.basis_timing * rate_scale,
-                widths=rates.basis_timing * rate_scale,
-            ),
-        )
+        field.adam_step(observation.time_s, deltas, self._basis_rates(rate_scale))
         self._update_gaussians(gradients, rate_scale)
         return loss
 
@@ -108,15 +129,25 @@ class TrainingStep:
         return loss
 
     def _update_gaussians(self, gradients: Mapping[str, Tensor | None], rate_scale: float) -> None:
+        self._adam.step(self.gaussians.tensors(), gradients, self._gaussian_rates(rate_scale))
+
+    def _gaussian_rates(self, rate_scale: float) -> dict[str, float]:
         rates = self._config.rates
-        self._adam.step(
-            self.gaussians.tensors(),
-            gradients,
-            {
-                "means": rates.means_px * self._pixel_mm * rate_scale,
-                "quats": rates.quats * rate_scale,
-                "log_scales": rates.log_scales * rate_scale,
-                "logit_opacities": rates.logit_opacities * rate_scale,
-                "sh": rates.sh * rate_scale,
-            },
+        return {
+            "means": rates.means_px * self._pixel_mm * rate_scale,
+            "quats": rates.quats * rate_scale,
+            "log_scales": rates.log_scales * rate_scale,
+            "logit_opacities": rates.logit_opacities * rate_scale,
+            "sh": rates.sh * rate_scale,
+        }
+
+    def _basis_rates(self, rate_scale: float) -> BasisRates:
+        rates = self._config.rates
+        return BasisRates(
+            position=rates.basis_means_px * self._pixel_mm * rate_scale,
+            rotation=rates.basis_quats * rate_scale,
+            log_scale=rates.basis_log_scales * rate_scale,
+            colour=rates.basis_sh * rate_scale,
+            centers=rates.basis_timing * rate_scale,
+            widths=rates.basis_timing * rate_scale,
         )

@@ -9,26 +9,31 @@ constexpr int kFlight = 5;  // pairs of rows that a warp reads at once: bumps of
 __global__ void __launch_bounds__(kBlock) forward(DeviceBumps field, float* __restrict__ deltas) {
   const Place at;
   if (at.gaussian >= field.count) return;
-  const float tau = *field.tau;
   const int64_t first = at.gaussian * field.bumps;
+  Timing next = timing_at(field.centers, field.log_widths, first, at.lane, field.bumps);
+  const float tau = *field.tau;
   float total = 0;
-  for (int64_t from = 0; from < field.bumps; from += 32) {
-    const bool exists = from + at.lane < field.bumps;
-    const int64_t own = first + from + (exists ? at.lane : 0);
-    const Bump b = bump_at(field.centers[own], field.log_widths[own], tau, exists);
-    const float* weights = field.weights + (first + from) * kBasisChannels + at.channel;
-    for (unsigned left = __ballot_sync(kAll, b.active); left != 0;) {
-      float w[kFlight], height[kFlight];
+  for (int from = 0; from < field.bumps; from += 32) {
+    const Bump b = bump_at(next.center, next.log_width, tau, from + at.lane < field.bumps);
+    if (from + 32 < field.bumps) next = timing_at(field.centers, field.log_widths, first, from + 32 + at.lane, field.bumps);
+    const unsigned active = __ballot_sync(kAll, b.active);
+    if (active == 0) continue;
+    const Span span = span_of(active);
+    for (int pair = span.first; pair <= span.last; pair += 2 * kFlight) {
+      const float* row = field.weights + (first + from + pair + at.half) * kBasisChannels + at.channel;
+      float w[kFlight];
 #pragma unroll
       for (int i = 0; i < kFlight; ++i) {
-        const int row = left != 0 ? next_row(left, at.half) : -1;
-        const bool reads = row >= 0 && at.has_channel;
-        w[i] = reads ? weights[row * kBasisChannels] : 0.0f;
-        const float h = __shfl_sync(kAll, b.height, row & 31);
-        height[i] = reads ? h : 0.0f;
+        const int bump = pair + 2 * i + at.half;
+        w[i] = bump <= span.last && is_set(active, bump) && at.has_channel ? row[2 * i * kBasisChannels] : 0.0f;
       }
 #pragma unroll
-      for (int i = 0; i < kFlight; ++i) total += height[i] * w[i];
+      for (int i = 0; i < kFlight; ++i) {
+        if (pair + 2 * i > span.last) break;
+        const int bump = pair + 2 * i + at.half;
+        const float height = __shfl_sync(kAll, b.height, bump & 31);
+        if (bump <= span.last && at.has_channel) total += height * w[i];
+      }
     }
   }
   total += __shfl_xor_sync(kAll, total, 16);

@@ -4,17 +4,29 @@ namespace {
 
 using namespace basis_warp;
 
-constexpr int kFlight = 3;  // pairs of rows that a warp reads at once, of parameters and of both moments
+constexpr int kFlight = 5;  // pairs of rows that a warp reads at once, of parameters and of both moments
 
 struct Update {
   float parameter, first, second;
 };
 
+// To 1 and 2 units in the last place; Adam's step needs no more.
+__device__ __forceinline__ float root(float x) {
+  float y;
+  asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+__device__ __forceinline__ float reciprocal(float x) {
+  float y;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+
 // One Adam update; `rate` is the learning rate / (1 - beta1^k), `inverse_root_bias2` 1 / sqrt(1 - beta2^k).
 __device__ __forceinline__ Update adam_update(Update old, float g, float rate, float inverse_root_bias2,
                                               const DeviceBasisAdam& a) {
   const float m = old.first + a.fresh1 * (g - old.first), v = old.second + a.fresh2 * (g * g - old.second);
-  return {old.parameter - rate * m / (sqrtf(v) * inverse_root_bias2 + a.epsilon), m, v};
+  return {old.parameter - rate * m * reciprocal(root(v) * inverse_root_bias2 + a.epsilon), m, v};
 }
 
 // The same for a lane's own bump: a centre or a log-width.
@@ -26,63 +38,66 @@ __device__ __forceinline__ void update_own(float* p, float* m, float* v, int64_t
   v[own] = now.second;
 }
 
-// -expm1 keeps 1 - beta^k accurate for a beta near 1 and few updates.
+// 1 - beta^k; -expm1 keeps it accurate for a beta near 1 and few updates.
 __device__ __forceinline__ float bias(float log_beta, int updates) { return -expm1f(float(updates) * log_beta); }
 
-__global__ void __launch_bounds__(kBlock) adam(DeviceBasisAdam field, const float* __restrict__ gradient) {
+__global__ void __launch_bounds__(kBlock, 4) adam(DeviceBasisAdam field, const float* __restrict__ gradient) {
   const Place at;
   if (at.gaussian >= field.count) return;
+  // All that does not depend on another read is asked for at once.
   const float g = at.has_channel ? gradient[at.gaussian * field.row + at.channel] : 0.0f;
+  const int64_t first = at.gaussian * field.bumps;
+  Timing next = timing_at(field.centers, field.log_widths, first, at.lane, field.bumps);
+  const float tau = *field.tau, channel_rate = field.rates[basis_rate_of(at.channel)];
   // The frame does not show this Gaussian, or says nothing of use about it.
   if (!__any_sync(kAll, g != 0.0f) || __any_sync(kAll, !isfinite(g * g))) return;
-  const float tau = *field.tau;
-  const float channel_rate = field.rates[basis_rate_of(at.channel)];
-  const int64_t first = at.gaussian * field.bumps;
-  for (int64_t from = 0; from < field.bumps; from += 32) {
+  for (int from = 0; from < field.bumps; from += 32) {
     const bool exists = from + at.lane < field.bumps;
-    const int64_t own = first + from + (exists ? at.lane : 0);
-    const float center = field.centers[own], log_width = field.log_widths[own];
-    const Bump b = bump_at(center, log_width, tau, exists);
-    unsigned left = __ballot_sync(kAll, b.active);
-    if (left == 0) continue;
+    const int64_t own = first + from + at.lane;
+    Update own_center = {next.center, 0, 0}, own_width = {next.log_width, 0, 0};
+    const Bump b = bump_at(next.center, next.log_width, tau, exists);
+    if (from + 32 < field.bumps) next = timing_at(field.centers, field.log_widths, first, from + 32 + at.lane, field.bumps);
+    const unsigned active = __ballot_sync(kAll, b.active);
+    if (active == 0) continue;
+    const Span span = span_of(active);
     int updates = 1;
-    Update own_center = {center, 0, 0}, own_width = {log_width, 0, 0};
-    if (b.active) {  // asked for now, so that they come with the rows
-      updates = field.steps[own] + 1;
-      own_center.first = field.m_centers[own], own_center.second = field.v_centers[own];
-      own_width.first = field.m_log_widths[own], own_width.second = field.v_log_widths[own];
-    }
-    const int64_t rows = (first + from) * kBasisChannels + at.channel;
-    const float bias1 = 1.0f / bias(field.log_beta1, updates), bias2 = 1.0f / sqrtf(bias(field.log_beta2, updates));
-    float along = 0;  // g . w before the update
-    while (left != 0) {
+    float bias1 = 1, bias2 = 1;  // 1 / (1 - beta1^k), 1 / sqrt(1 - beta2^k)
+    float along = 0;             // g . w before the update
+    for (int pair = span.first; pair <= span.last; pair += 2 * kFlight) {
+      const int64_t place = (first + from + pair + at.half) * kBasisChannels + at.channel;
+      float *weights = field.weights + place, *firsts = field.m_weights + place, *seconds = field.v_weights + place;
       Update old[kFlight];
-      int row[kFlight];
 #pragma unroll
       for (int i = 0; i < kFlight; ++i) {
-        row[i] = left != 0 ? next_row(left, at.half) : -1;
-        const int64_t place = rows + row[i] * kBasisChannels;
-        const bool reads = row[i] >= 0 && at.has_channel;
-        old[i].parameter = reads ? field.weights[place] : 0.0f;
-        old[i].first = reads ? field.m_weights[place] : 0.0f;
-        old[i].second = reads ? field.v_weights[place] : 0.0f;
+        const int bump = pair + 2 * i + at.half;
+        const bool reads = bump <= span.last && is_set(active, bump) && at.has_channel;
+        old[i].parameter = reads ? weights[2 * i * kBasisChannels] : 0.0f;
+        old[i].first = reads ? firsts[2 * i * kBasisChannels] : 0.0f;
+        old[i].second = reads ? seconds[2 * i * kBasisChannels] : 0.0f;
+      }
+      if (pair == span.first && b.active) {  // comes with the rows
+        updates = field.steps[own] + 1;
+        own_center.first = field.m_centers[own], own_center.second = field.v_centers[own];
+        own_width.first = field.m_log_widths[own], own_width.second = field.v_log_widths[own];
+        bias1 = reciprocal(bias(field.log_beta1, updates));
+        bias2 = reciprocal(root(bias(field.log_beta2, updates)));
       }
 #pragma unroll
       for (int i = 0; i < kFlight; ++i) {
-        const int source = row[i] & 31;
+        const int bump = pair + 2 * i + at.half;
+        if (pair + 2 * i > span.last) break;  // for the whole warp
         const float dot = sum_of_half(g * old[i].parameter);
-        const float height = __shfl_sync(kAll, b.height, source);
-        const float by1 = __shfl_sync(kAll, bias1, source), by2 = __shfl_sync(kAll, bias2, source);
-        const float of_first = __shfl_sync(kAll, dot, 0), of_second = __shfl_sync(kAll, dot, 16);
-        const int row_first = __shfl_sync(kAll, row[i], 0), row_second = __shfl_sync(kAll, row[i], 16);
-        if (at.lane == row_first) along = of_first;
-        if (at.lane == row_second) along = of_second;
-        if (row[i] < 0 || !at.has_channel) continue;
-        const Update now = adam_update(old[i], height * g, channel_rate * by1, by2, field);
-        const int64_t place = rows + row[i] * kBasisChannels;
-        field.weights[place] = now.parameter;
-        field.m_weights[place] = now.first;
-        field.v_weights[place] = now.second;
+        const float height = __shfl_sync(kAll, b.height, bump & 31);
+        const float by1 = __shfl_sync(kAll, bias1, bump & 31), by2 = __shfl_sync(kAll, bias2, bump & 31);
+        const float of_own = __shfl_sync(kAll, dot, (at.lane - pair) & 1 ? 16 : 0);
+        if ((at.lane - pair) >> 1 == i) along = of_own;
+        if (bump <= span.last && is_set(active, bump) && at.has_channel) {
+          const Update now = adam_update(old[i], height * g, channel_rate * by1, by2, field);
+          weights[2 * i * kBasisChannels] = now.parameter;
+          firsts[2 * i * kBasisChannels] = now.first;
+          seconds[2 * i * kBasisChannels] = now.second;
+        }
+        __syncwarp();
       }
     }
     if (!b.active) continue;

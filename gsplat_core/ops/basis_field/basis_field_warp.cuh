@@ -1,5 +1,6 @@
-// A warp and the bumps of its Gaussian: 32 bumps side by side to find the active ones, then two active bumps at a time, each a
-// row of 13 channels for a half of the warp. Neighbouring active bumps' rows lie side by side, so the halves read one stretch.
+// A warp and the bumps of its Gaussian: 32 bumps side by side to find the active ones, then two neighbouring rows of 13 channels
+// at a time, one for each half of the warp. Active bumps are nearly always neighbours, so all rows from the first active one to
+// the last are gone through, and those between that are not active are not read.
 #pragma once
 
 #include "basis_field_cuda.h"
@@ -16,15 +17,33 @@ struct Bump {
   bool active;
 };
 
+// 2^x to 2 units in the last place, for x of -126 to 126.
+__device__ __forceinline__ float power_of_two(float x) {
+  float y;
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+
 // NaN in a centre or width is active, so that it shows in the result.
 __device__ __forceinline__ Bump bump_at(float center, float log_width, float tau, bool exists) {
   Bump b;
-  const float exponent = fminf(fmaxf(log_width * -kLog2e, -126.0f), 126.0f);
-  b.inverse_width = log_width == log_width ? exp2f(exponent) : log_width;
+  b.inverse_width = power_of_two(fminf(fmaxf(log_width * -kLog2e, -126.0f), 126.0f));
+  if (log_width != log_width) b.inverse_width = log_width;
   b.u = (tau - center) * b.inverse_width;
   b.active = exists && !(fabsf(b.u) > kBasisReach);
-  b.height = !b.active ? 0.0f : b.u == b.u ? exp2f(b.u * b.u * -kLog2e) : b.u;
+  b.height = b.active ? power_of_two(b.u * b.u * -kLog2e) : 0.0f;  // of a NaN it is one
   return b;
+}
+
+// Centre and log-width of the lane's bump of 32; asked for ahead of their use.
+struct Timing {
+  float center, log_width;
+};
+
+__device__ __forceinline__ Timing timing_at(const float* centers, const float* log_widths, int64_t first, int bump,
+                                            int64_t bumps) {
+  if (bump >= bumps) return {0, 0};
+  return {centers[first + bump], log_widths[first + bump]};
 }
 
 // This warp's Gaussian, and the part of a row that a lane has.
@@ -41,14 +60,14 @@ struct Place {
         has_channel(channel < int(kBasisChannels)) {}
 };
 
-// Takes the next two set bits of `left`: the bump of the lane's half, or -1 where the second half has none.
-__device__ __forceinline__ int next_row(unsigned& left, int half) {
-  const int first = __ffs(int(left)) - 1;
-  left &= left - 1;
-  const int second = __ffs(int(left)) - 1;
-  left &= left - 1;
-  return half ? second : first;
-}
+// The rows from the first active bump to the last.
+struct Span {
+  int first, last;
+};
+
+__device__ __forceinline__ Span span_of(unsigned active) { return {__ffs(int(active)) - 1, 31 - __clz(int(active))}; }
+
+__device__ __forceinline__ bool is_set(unsigned mask, int bit) { return (mask >> (bit & 31)) & 1u; }
 
 // Sum over the channels of a row, for all lanes of its half.
 __device__ __forceinline__ float sum_of_half(float x) {

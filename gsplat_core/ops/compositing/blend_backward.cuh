@@ -1,34 +1,17 @@
 // Back-to-front gradient of blending one window, by one block of kBlockThreads threads, by the formulas of backward_cpu.cpp.
 #pragma once
 
-#include "blend_window.cuh"
+#include "quadrant_sums.cuh"
+#include "staged_splats.cuh"
 
 namespace {
 
 constexpr int kShapeMoments = 6;    // sum over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
 constexpr int kBackwardBatch = 64;  // splats that are staged at once
-constexpr int kValues = 16;         // that a warp sums at once
 
 // A row: the moments, |dL/dx| and |dL/dy| (with absgrad, or for any number of channels), colours; in whole float4s.
 constexpr int shape_size(int D, bool absgrad) { return kShapeMoments + (D == 0 || absgrad ? 2 : 0); }
 constexpr int quads_of(int shape, int channels) { return (shape + channels + 3) / 4; }
-
-// Sums 2 kHalf values over groups of 4 kHalf lanes with one exchange per value: a lane gives half of its values away, then half
-// of the rest. For 16 values lane i of the warp returns the sum of value i / 2.
-template <int kHalf>
-__device__ inline float warp_sums(float* v, int lane) {
-  if constexpr (kHalf == 0) {
-    return v[0] + __shfl_xor_sync(kAll, v[0], 1);
-  } else {
-    const bool upper = (lane & 2 * kHalf) != 0;
-#pragma unroll
-    for (int i = 0; i < kHalf; ++i) {
-      const float low = v[i], high = v[i + kHalf];
-      v[i] = (upper ? high : low) + __shfl_xor_sync(kAll, upper ? low : high, 2 * kHalf);
-    }
-    return warp_sums<kHalf / 2>(v, lane);
-  }
-}
 
 // A pixel on the way from the back to the front.
 struct Pixel {
@@ -36,39 +19,6 @@ struct Pixel {
   float behind;   // sum of w g of what is behind, g = <dL/dcolour, colour>; at first -through dL/dalpha, and the background's
   int last;       // position of the last splat that was blended, -1 where there is none
 };
-
-// What a splat's gradient needs of a pixel.
-struct Blend {
-  float alpha, through, widen, weight;
-};
-__device__ inline Blend blend(const Pixel& pixel, float power) {
-  Blend b;
-  b.alpha = exp2_fast(fminf(power, kOpaque));
-  b.widen = reciprocal(1 - b.alpha);
-  b.through = pixel.through * b.widen;
-  b.weight = b.alpha * b.through;
-  return b;
-}
-
-// Adds a pixel's part of the moments and moves the pixel in front of the splat.
-template <bool kAbs, int D>
-__device__ inline void add_moments(const Record<D>& r, const Falloff& f, const Blend& b, float g, Pixel& pixel, float* v) {
-  const float v_alpha = fmaf(b.through, g, -(pixel.behind * b.widen));
-  pixel.through = b.through;
-  pixel.behind = fmaf(b.weight, g, pixel.behind);
-  // A splat at the ceiling of 0.99 passes nothing on to its opacity and shape.
-  const float s = f.power <= kOpaque ? b.alpha * v_alpha : 0, sx = s * f.dx, sy = s * f.dy;
-  v[0] += s;
-  v[1] += sx;
-  v[2] += sy;
-  v[3] = fmaf(sx, f.dx, v[3]);
-  v[4] = fmaf(sx, f.dy, v[4]);
-  v[5] = fmaf(sy, f.dy, v[5]);
-  if constexpr (kAbs) {
-    v[kShapeMoments] += fabsf(-kLn2 * fmaf(2 * r.xyab.z, sx, r.xyab.w * sy));
-    v[kShapeMoments + 1] += fabsf(-kLn2 * fmaf(r.xyab.w, sx, 2 * r.c * sy));
-  }
-}
 
 __device__ inline int block_furthest(int warp_furthest) {
   __shared__ int most[kWarps];
@@ -83,18 +33,86 @@ __device__ inline int block_furthest(int warp_furthest) {
 template <int D, bool kAbs>
 struct BackwardStage {
   static constexpr int kQuads = quads_of(shape_size(D, kAbs), D);
-  Record<D> splats[kBackwardBatch];
-  float4 sums[kWarps][kBackwardBatch][kQuads];
-  unsigned touched[kWarps][kBackwardBatch / 32];
+  static constexpr int kSums = (shape_size(D, kAbs) + D + 1) / 2 * 2;
+  StagedSplat<D> splats[kBackwardBatch + 1];  // the last one reaches no pixel
+  uint4 reached[kWarps];                      // by quadrant: bits of the batch's splats
+  SplatShares shares[kWarps];
+  float sums[kWarps][kBackwardBatch][kSums];  // of the quadrants, about their middles: the moments, |.| with absgrad, colours
+  alignas(16) uint32_t hits[kWarps][kBackwardBatch + kSlots];  // where the splats lie that reach the warp's quadrant, in bytes
 };
+
+// Lists the splats of the batch that reach this warp's pixels, the hindmost first; returns how many. Eight more can be read.
+template <int D>
+__device__ inline int list_hits_backward(unsigned (&groups)[kBackwardBatch / 32], uint32_t* hits) {
+  const int lane = threadIdx.x & 31;
+  const unsigned behind = ~1u << lane;
+  int count = 0;
+#pragma unroll
+  for (int g = kBackwardBatch / 32 - 1; g >= 0; --g) {
+    if (groups[g] >> lane & 1) hits[count + __popc(groups[g] & behind)] = uint32_t((32 * g + lane) * sizeof(StagedSplat<D>));
+    count += __popc(groups[g]);
+  }
+  if (lane < kSlots) hits[count + lane] = uint32_t(kBackwardBatch * sizeof(StagedSplat<D>));
+  __syncwarp();
+  return count;
+}
+
+// A pixel's part in a splat's gradient, of which the pixel then is in front.
+struct Share {
+  float s, w;  // both of 1 / 0.99
+};
+struct PixelState {
+  float through;  // transmittance in front of the splats seen so far
+  float behind;   // <dL/dcolour, what is seen behind the splats in front>
+};
+template <int D>
+__device__ inline Share share_of(const StagedSplat<D>& r, float power, bool drawn, const float (&v_color)[D], PixelState& pixel) {
+  const float alpha = drawn ? __saturatef(exp2_fast(power)) : 0;  // of 1 / 0.99
+  const float lets_through = fmaf(alpha, -0.99f, 1.0f);
+  float g = v_color[0] * r.colors[0];
+#pragma unroll
+  for (int d = 1; d < D; ++d) g = fmaf(v_color[d], r.colors[d], g);
+  pixel.through *= reciprocal(lets_through);
+  const float w = alpha * pixel.through, gain = g - pixel.behind;
+  pixel.behind = fmaf(-lets_through, gain, g);
+  // A splat at the ceiling of 0.99 passes nothing on to its opacity and shape.
+  return {power <= 0 ? w * gain : 0, w};
+}
+
+// The sums over the window of one of the batch's splats whose mean is (x, y), from those of the quadrants, into its row.
+template <int D, bool kAbs, class Row>
+__device__ inline void write_row(const BackwardStage<D, kAbs>& stage, const Window& w, int i, float x, float y, const Row& row) {
+  constexpr int kShape = shape_size(D, kAbs), kQuads = BackwardStage<D, kAbs>::kQuads;
+  float v[4 * kQuads] = {};
+#pragma unroll
+  for (int q = 0; q < kWarps; ++q) {
+    if ((reinterpret_cast<const unsigned*>(&stage.reached[q])[i / 32] >> (i % 32) & 1) == 0) continue;
+    const float* const sums = stage.sums[q][i];
+    const float dx = float(w.left + q % 2 * kQuadrant + kQuadrant / 2) - x;
+    const float dy = float(w.top + q / 2 * kQuadrant + kQuadrant / 2) - y;
+    const float s = sums[0], sx = fmaf(dx, s, sums[1]), sy = fmaf(dy, s, sums[2]);
+    v[0] += s;
+    v[1] += sx;
+    v[2] += sy;
+    v[3] += fmaf(dx, sx + sums[1], sums[3]);
+    v[4] += fmaf(dx, sy, fmaf(dy, sums[1], sums[4]));
+    v[5] += fmaf(dy, sy + sums[2], sums[5]);
+#pragma unroll
+    for (int d = kShapeMoments; d < kShape + D; ++d) v[d] += sums[d];
+  }
+#pragma unroll
+  for (int quad = 0; quad < kQuads; ++quad)
+    row[quad] = make_float4(0.99f * v[4 * quad], 0.99f * v[4 * quad + 1], 0.99f * v[4 * quad + 2], 0.99f * v[4 * quad + 3]);
+}
 
 // `fetch(position)` gives the splat at a position in [w.begin, w.end), `row(position)` where its row goes: the sums over the
 // window's pixels, in quads_of(shape_size(D, kAbs), D) float4s. Every row of the window is written, in a fixed order of
 // additions. `v_color` is dL/dcolour of the thread's pixels, 0 outside of the image.
 template <int D, bool kAbs, bool kCapped, class Fetch, class Row>
-__device__ inline void blend_backward(const Window& w, const Fetch& fetch, Pixel (&pixels)[kPixelsEach],
+__device__ inline void blend_backward(const Window& w, const Fetch& fetch, const Pixel (&pixels)[kPixelsEach],
                                       const float (&v_color)[kPixelsEach][D], const Row& row, BackwardStage<D, kAbs>& stage) {
   constexpr int kBatch = kBackwardBatch, kShape = shape_size(D, kAbs), kQuads = BackwardStage<D, kAbs>::kQuads;
+  constexpr int kUnrolled = 4;
   const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
   const int warp_furthest = __reduce_max_sync(kAll, max(pixels[0].last, pixels[1].last));
   const int furthest = block_furthest(warp_furthest);
@@ -103,64 +121,90 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, Pixel
     row(end + int(e / kQuads))[e % kQuads] = make_float4(0, 0, 0, 0);
   if (end == w.begin) return;
 
-  const float center_x = float(w.x) + 0.5f, quadrant_x = float(w.quadrant_x) + 0.5f, quadrant_y = float(w.quadrant_y) + 0.5f;
-  float center_y[kPixelsEach];
-  for (int p = 0; p < kPixelsEach; ++p) center_y[p] = float(w.y[p]) + 0.5f;
+  const float middle_x = float(w.left + kQuadrant), middle_y = float(w.top + kQuadrant), x = float(w.x) + 0.5f - middle_x;
+  const uint32_t first_address = shared_address(stage.splats);
+  const PixelFactors<D> factors(v_color);
+  float y[kPixelsEach];
+  PixelState states[kPixelsEach];
+  for (int p = 0; p < kPixelsEach; ++p) {
+    y[p] = float(w.y[p]) + 0.5f - middle_y;
+    states[p] = {pixels[p].through, pixels[p].behind / pixels[p].through};
+  }
   const auto fetch_ahead = [&](int first) {
     const int position = first + int(threadIdx.x);
     return threadIdx.x < kBatch && position >= w.begin && position < end ? fetch(position) : faint_record<D>();
   };
+  if (threadIdx.x == kBlockThreads - 1) stage.splats[kBatch] = staged(faint_record<D>(), middle_x, middle_y);
   int first = w.begin + (end - 1 - w.begin) / kBatch * kBatch;
   Record<D> next = fetch_ahead(first);
   for (; first >= w.begin; first -= kBatch) {
-    if (threadIdx.x < kBatch) stage.splats[threadIdx.x] = next;
+    const float mean_x = next.xyab.x, mean_y = next.xyab.y;
+    if (threadIdx.x < kBatch) put_staged<kQuadrant>(first + 32 * warp < end, next, w, stage.splats, stage.reached);
     __syncthreads();
     next = fetch_ahead(first - kBatch);  // on its way meanwhile
-    for (int group = kBatch - 32; group >= 0; group -= 32) {
-      const bool needed = first + group + lane <= warp_furthest && reaches(stage.splats[group + lane], quadrant_x, quadrant_y);
-      unsigned hits = __ballot_sync(kAll, needed), used = 0;
-      while (hits != 0) {
-        const int bit = 31 - __clz(int(hits)), i = group + bit;
-        hits ^= 1u << bit;
-        const Record<D>& r = stage.splats[i];
-        Falloff f[kPixelsEach];
-        bool valid[kPixelsEach], any = false;
-        for (int p = 0; p < kPixelsEach; ++p) {
-          f[p] = falloff(r, center_x, center_y[p]);
-          valid[p] = f[p].power >= kFaintest && (!kCapped || f[p].power <= r.cap) && first + i <= pixels[p].last;
-          any |= valid[p];
-        }
-        if (!__any_sync(kAll, any)) continue;
-        float v[kValues] = {};
+    unsigned groups[kBatch / 32];
+    uint32_t limits[kPixelsEach];  // pixels blended nothing that lies at these offsets or beyond
 #pragma unroll
-        for (int p = 0; p < kPixelsEach; ++p) {
-          if (!valid[p]) continue;
-          const Blend b = blend(pixels[p], f[p].power);
-          float g = 0;
-          for (int d = 0; d < D; ++d) {
-            g = fmaf(v_color[p][d], r.colors[d], g);
-            v[kShape + d] = fmaf(b.weight, v_color[p][d], v[kShape + d]);
+    for (int g = 0; g < kBatch / 32; ++g) {
+      const int most = warp_furthest - first - 32 * g;  // the last of the group's splats that any of the warp's pixels blended
+      groups[g] = reinterpret_cast<const unsigned*>(&stage.reached[warp])[g] & (most < 0     ? 0
+                                                                                : most >= 31 ? ~0u
+                                                                                             : (2u << most) - 1);
+    }
+    __syncwarp();
+    if (lane == 0)
+      for (int g = 0; g < kBatch / 32; ++g) reinterpret_cast<unsigned*>(&stage.reached[warp])[g] = groups[g];
+    for (int p = 0; p < kPixelsEach; ++p)
+      limits[p] = uint32_t(max(0, min(pixels[p].last - first + 1, kBatch)) * int(sizeof(StagedSplat<D>)));
+    const int count = list_hits_backward<D>(groups, stage.hits[warp]);
+    for (int begin = 0; begin < count; begin += kSlots) {
+#pragma unroll 1
+      for (int slot = 0; slot < kSlots && begin + slot < count; slot += kUnrolled) {
+        uint32_t offset[kUnrolled];
+#pragma unroll
+        for (int n = 0; n < kUnrolled; ++n) offset[n] = stage.hits[warp][begin + slot + n];
+#pragma unroll
+        for (int n = 0; n < kUnrolled; ++n) {
+          const StagedSplat<D> r = staged_at<D, kCapped>(first_address + offset[n]);
+          const float constant = fmaf(fmaf(r.by_xx, x, r.by_x), x, r.k), by_y = fmaf(r.by_xy, x, r.by_y);
+          Share shares[kPixelsEach];
+          float absolute[2] = {};
+#pragma unroll
+          for (int p = 0; p < kPixelsEach; ++p) {
+            const float power = fmaf(fmaf(r.by_yy, y[p], by_y), y[p], constant);
+            const bool drawn = power >= kFaintestStaged && offset[n] < limits[p] && (!kCapped || power <= r.cap);
+            shares[p] = share_of<D>(r, power, drawn, v_color[p], states[p]);
+            if constexpr (kAbs) {
+              const float s = kLn2 * fabsf(shares[p].s);
+              absolute[0] = fmaf(s, fabsf(fmaf(2 * r.by_xx, x, fmaf(r.by_xy, y[p], r.by_x))), absolute[0]);
+              absolute[1] = fmaf(s, fabsf(fmaf(2 * r.by_yy, y[p], by_y)), absolute[1]);
+            }
           }
-          add_moments<kAbs>(r, f[p], b, g, pixels[p], v);
+          stage.shares[warp][slot + n][lane] = make_float4(shares[0].s, shares[1].s, shares[0].w, shares[1].w);
+          if constexpr (kAbs) {
+            for (int mask = 16; mask > 0; mask /= 2)
+              for (float& a : absolute) a += __shfl_xor_sync(kAll, a, mask);
+            if (lane < 2 && begin + slot + n < count)
+              stage.sums[warp][offset[n] / sizeof(StagedSplat<D>)][kShapeMoments + lane] = absolute[lane];
+          }
         }
-        const float sum = warp_sums<kValues / 2>(v, lane);
-        if ((lane & 1) == 0 && lane / 2 < 4 * kQuads) reinterpret_cast<float*>(stage.sums[warp][i])[lane / 2] = sum;
-        used |= 1u << bit;
       }
-      if (lane == 0) stage.touched[warp][group / 32] = used;
+      __syncwarp();
+      float moments[2], colors[PixelFactors<D>::kColorTiles];
+      sum_shares<D>(stage.shares[warp], factors, moments, colors);
+      const int slot = lane / 4, column = lane % 4;
+      if (begin + slot < count) {
+        float* const sums = stage.sums[warp][stage.hits[warp][begin + slot] / sizeof(StagedSplat<D>)];
+        if (column < 3) *reinterpret_cast<float2*>(sums + 2 * column) = make_float2(moments[0], moments[1]);
+#pragma unroll
+        for (int tile = 0; tile < PixelFactors<D>::kColorTiles; ++tile)
+          if (4 * tile + column < D) sums[kShape + 4 * tile + column] = colors[tile];
+      }
+      __syncwarp();
     }
     __syncthreads();
-    const int count = min(end - first, kBatch);
-    for (int e = threadIdx.x; e < count * kQuads; e += kBlockThreads) {
-      const int i = e / kQuads, q = e % kQuads;
-      float4 sum = make_float4(0, 0, 0, 0);
-      for (int from = 0; from < kWarps; ++from) {
-        if ((stage.touched[from][i / 32] >> (i % 32) & 1) == 0) continue;
-        const float4 part = stage.sums[from][i][q];
-        sum = make_float4(sum.x + part.x, sum.y + part.y, sum.z + part.z, sum.w + part.w);
-      }
-      row(first + i)[q] = sum;
-    }
+    if (threadIdx.x < kBatch && first + int(threadIdx.x) < end)
+      write_row(stage, w, int(threadIdx.x), mean_x, mean_y, row(first + int(threadIdx.x)));
   }
 }
 

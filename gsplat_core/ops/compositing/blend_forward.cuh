@@ -1,14 +1,19 @@
 // Front-to-back blending of one window by one block of kBlockThreads threads.
 #pragma once
 
-#include "blend_window.cuh"
+#include "staged_splats.cuh"
 
 namespace {
 
-// Shared memory that blend_forward works in.
+constexpr int kForwardBatch = kBlockThreads;  // splats that are staged at once, one per thread
+constexpr int kAhead = 4;                     // splats that a warp goes through between two looks at whether all is closed
+
+// Shared memory that blend_forward works in, two batches in turn.
 template <int D>
 struct ForwardStage {
-  Record<D> splats[kBlockThreads];
+  StagedSplat<D> splats[2][kForwardBatch + 1];  // the last one reaches no pixel
+  uint4 reached[2][2 * kWarps];                 // by half of a quadrant: bits of the batch's splats
+  uint4 hits[2 * kWarps][kForwardBatch / 4];    // where the splats lie that reach the half: addresses in shared memory
 };
 
 // A thread's pixels: what shines through behind the last splat, the sums of the channels, and the position of the last splat
@@ -19,58 +24,97 @@ struct BlendedPixels {
   int last[kPixelsEach];
 };
 
-// `fetch(position)` gives the splat at a position in [w.begin, w.end), which are in the order of depth. kCapped: there may be
-// splats with a finite `cap` (an indefinite conic). All threads of the block take part.
-template <int D, bool kCapped, class Fetch>
-__device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& fetch, ForwardStage<D>& stage) {
-  constexpr int kBatch = kBlockThreads;  // splats that are staged at once, one per thread
+// Lists, for both halves of this warp's quadrant, the splats that reach it. Returns how many of the longer list, to which the
+// other is filled up, and both to a multiple of kAhead, with the splat that reaches no pixel.
+template <int D>
+__device__ inline int list_hits(const uint4* reached, const StagedSplat<D>* splats, uint4* hits) {
   const int lane = threadIdx.x & 31;
-  const float center_x = float(w.x) + 0.5f, quadrant_x = float(w.quadrant_x) + 0.5f, quadrant_y = float(w.quadrant_y) + 0.5f;
+  const unsigned below = (1u << lane) - 1;
+  const uint32_t first = shared_address(splats);
+  uint32_t* const lists[2] = {reinterpret_cast<uint32_t*>(hits), reinterpret_cast<uint32_t*>(hits + kForwardBatch / 4)};
+  int counts[2] = {};
+#pragma unroll
+  for (int half = 0; half < 2; ++half) {
+    const uint4 bits = reached[2 * half];
+    const unsigned groups[4] = {bits.x, bits.y, bits.z, bits.w};
+#pragma unroll
+    for (int g = 0; g < kForwardBatch / 32; ++g) {
+      if (groups[g] >> lane & 1)
+        lists[half][counts[half] + __popc(groups[g] & below)] = first + uint32_t((32 * g + lane) * sizeof(StagedSplat<D>));
+      counts[half] += __popc(groups[g]);
+    }
+  }
+  const int most = (max(counts[0], counts[1]) + kAhead - 1) / kAhead * kAhead;
+#pragma unroll
+  for (int half = 0; half < 2; ++half)
+    for (int i = counts[half] + lane; i < most; i += 32)
+      lists[half][i] = first + uint32_t(kForwardBatch * sizeof(StagedSplat<D>));
+  __syncwarp();
+  return most;
+}
+
+// `fetch(position)` gives the splat at a position in [w.begin, w.end), which are in the order of depth. kCapped:
+// there may be splats with a finite `cap` (an indefinite conic). kLast: `last` is wanted. All threads of the block take part.
+template <int D, bool kCapped, bool kLast = true, class Fetch>
+__device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& fetch, ForwardStage<D>& stage) {
+  constexpr int kBatch = kForwardBatch;
+  constexpr uint32_t kNone = ~0u;
+  const int lane = threadIdx.x & 31, warp = threadIdx.x / 32, first_part = warp / 2 * 4 + warp % 2;
+  const uint4* const hits = stage.hits[2 * warp + lane / 16];
+  const float middle_x = float(w.left + kQuadrant), middle_y = float(w.top + kQuadrant);
+  const float x = float(w.x) + 0.5f - middle_x;
   BlendedPixels<D> out;
-  float center_y[kPixelsEach];
-  bool open[kPixelsEach];
+  float y[kPixelsEach];
+  float front[kPixelsEach];  // transmittance behind all splats so far, the one included that closed the pixel: then <= kStop
   for (int p = 0; p < kPixelsEach; ++p) {
-    center_y[p] = float(w.y[p]) + 0.5f;
+    y[p] = float(w.y[p]) + 0.5f - middle_y;
+    front[p] = w.inside[p] ? 1 : 0;
     out.through[p] = 1;
     out.last[p] = -1;
-    open[p] = w.inside[p];
     for (int d = 0; d < D; ++d) out.sum[p][d] = 0;
   }
 
-  const auto fetch_ahead = [&](int left) {  // the splat of this thread in the batch that has `left` more and what follows it
+  const auto fetch_ahead = [&](int left) {  // this thread's splat in the batch that has `left` more and what follows it
     return int(threadIdx.x) < left ? fetch(w.end - left + int(threadIdx.x)) : faint_record<D>();
   };
-  bool warp_open = __any_sync(kAll, open[0] || open[1]);
+  if (threadIdx.x < 2) stage.splats[threadIdx.x][kBatch] = staged(faint_record<D>(), middle_x, middle_y);
   Record<D> next = fetch_ahead(w.end - w.begin);
-  for (int left = w.end - w.begin; left > 0; left -= kBatch) {
-    // Also keeps the staged splats until every warp is done with them.
+  int now = 0;
+  for (int left = w.end - w.begin; left > 0; left -= kBatch, now ^= 1) {
+    put_staged<kQuadrant / 2>(32 * warp < left, next, w, stage.splats[now], stage.reached[now]);
+    bool warp_open = __any_sync(kAll, front[0] > kStop || front[1] > kStop);
     if (!__syncthreads_or(warp_open)) break;
-    stage.splats[threadIdx.x] = next;
-    __syncthreads();
     next = fetch_ahead(left - kBatch);  // on its way meanwhile
-    for (int group = 0; group < kBatch && warp_open; group += 32) {
-      unsigned hits = __ballot_sync(kAll, reaches(stage.splats[group + lane], quadrant_x, quadrant_y));
-      for (; hits != 0; hits &= hits - 1) {
-        const int i = group + __ffs(int(hits)) - 1;
-        const Record<D>& r = stage.splats[i];
+    const int count = warp_open ? list_hits<D>(&stage.reached[now][first_part], stage.splats[now], stage.hits[2 * warp]) : 0;
+    uint32_t last[kPixelsEach] = {kNone, kNone};
+    for (int j = 0; j < count && warp_open; j += kAhead) {
+      const uint4 four = hits[j / 4];
+      const uint32_t addresses[kAhead] = {four.x, four.y, four.z, four.w};
+#pragma unroll
+      for (int n = 0; n < kAhead; ++n) {
+        const StagedSplat<D> r = staged_at<D, kCapped>(addresses[n]);
+        const float constant = fmaf(fmaf(r.by_xx, x, r.by_x), x, r.k), by_y = fmaf(r.by_xy, x, r.by_y);
 #pragma unroll
         for (int p = 0; p < kPixelsEach; ++p) {
-          const float power = falloff(r, center_x, center_y[p]).power;
-          if (!(open[p] && power >= kFaintest && (!kCapped || power <= r.cap))) continue;
-          const float alpha = exp2_fast(fminf(power, kOpaque)), through = fmaf(-alpha, out.through[p], out.through[p]);
-          if (!(through > kStop)) {
-            open[p] = false;
-            continue;
+          const float power = fmaf(fmaf(r.by_yy, y[p], by_y), y[p], constant);
+          const bool drawn = power >= kFaintestStaged && (!kCapped || power <= r.cap);
+          const float weight = drawn ? __saturatef(exp2_fast(power)) * front[p] : 0;  // of 1 / 0.99
+          front[p] = fmaf(weight, -0.99f, front[p]);
+          if (front[p] > kStop) {
+            out.through[p] = front[p];
+            for (int d = 0; d < D; ++d) out.sum[p][d] = fmaf(weight, r.colors[d], out.sum[p][d]);
+            if (kLast && drawn) last[p] = addresses[n];
           }
-          const float weight = alpha * out.through[p];
-          for (int d = 0; d < D; ++d) out.sum[p][d] = fmaf(weight, r.colors[d], out.sum[p][d]);
-          out.through[p] = through;
-          out.last[p] = w.end - left + i;
         }
       }
-      warp_open = __any_sync(kAll, open[0] || open[1]);
+      warp_open = __any_sync(kAll, front[0] > kStop || front[1] > kStop);
     }
+    for (int p = 0; p < kPixelsEach; ++p)
+      if (last[p] != kNone)
+        out.last[p] = w.end - left + int((last[p] - shared_address(stage.splats[now])) / sizeof(StagedSplat<D>));
   }
+  for (int p = 0; p < kPixelsEach; ++p)
+    for (int d = 0; d < D; ++d) out.sum[p][d] *= 0.99f;
   return out;
 }
 

@@ -12,21 +12,26 @@ constexpr int kQuadrant = 8;  // pixels on a side
 constexpr int kPixelsEach = 2;
 constexpr unsigned kAll = 0xffffffffu;
 
+// Lane i has column i % 8 of its warp's quadrant, and two rows: the lower 16 lanes have the upper half of the quadrant.
+__device__ constexpr int row_of_lane(int lane, int p) { return lane / 16 * 4 + lane / 8 % 2 + 2 * p; }
+
 // A block's window of 16x16 pixels: the positions of its splats in the caller's lists, and where its warps and threads are.
 struct Window {
   int begin, end;
+  int left, top;               // first pixel of the window
   int quadrant_x, quadrant_y;  // first pixel of the warp's quadrant
   int x, y[kPixelsEach];       // this thread's pixels
   bool inside[kPixelsEach];
 
   // The window starts at pixel (left, top); pixels at or beyond (right, bottom) are outside.
-  __device__ Window(int begin_, int end_, int left, int top, int right, int bottom) : begin(begin_), end(end_) {
+  __device__ Window(int begin_, int end_, int left_, int top_, int right, int bottom)
+      : begin(begin_), end(end_), left(left_), top(top_) {
     const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
     quadrant_x = left + warp % 2 * kQuadrant;
     quadrant_y = top + warp / 2 * kQuadrant;
     x = quadrant_x + lane % kQuadrant;
     for (int p = 0; p < kPixelsEach; ++p) {
-      y[p] = quadrant_y + lane / kQuadrant + p * (kQuadrant / kPixelsEach);
+      y[p] = quadrant_y + row_of_lane(lane, p);
       inside[p] = x < right && y[p] < bottom;
     }
   }

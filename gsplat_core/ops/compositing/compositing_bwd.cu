@@ -6,6 +6,25 @@
 
 namespace {
 
+constexpr int kValues = 16;  // that a warp sums at once
+
+// Sums 2 kHalf values over groups of 4 kHalf lanes with one exchange per value: a lane gives half of its values away, then half
+// of the rest. For 16 values lane i of the warp returns the sum of value i / 2.
+template <int kHalf>
+__device__ inline float warp_sums(float* v, int lane) {
+  if constexpr (kHalf == 0) {
+    return v[0] + __shfl_xor_sync(kAll, v[0], 1);
+  } else {
+    const bool upper = (lane & 2 * kHalf) != 0;
+#pragma unroll
+    for (int i = 0; i < kHalf; ++i) {
+      const float low = v[i], high = v[i + kHalf];
+      v[i] = (upper ? high : low) + __shfl_xor_sync(kAll, upper ? low : high, 2 * kHalf);
+    }
+    return warp_sums<kHalf / 2>(v, lane);
+  }
+}
+
 __device__ inline float block_sum(float value) {
   __shared__ float parts[kWarps];
   for (int offset = 16; offset > 0; offset /= 2) value += __shfl_xor_sync(kAll, value, offset);
@@ -49,7 +68,7 @@ __device__ inline int64_t row_of(const DeviceCompositing& in, int64_t position) 
 }
 
 template <int D, bool kAbs>
-__global__ void __launch_bounds__(kBlockThreads, 8)
+__global__ void __launch_bounds__(kBlockThreads, 5)
     backward_windows(DeviceCompositing in, const Record<D>* records, DeviceGradients out, float4* rows, float* background_parts) {
   __shared__ BackwardStage<D, kAbs> stage;
   const Place place(in);
@@ -62,6 +81,39 @@ __global__ void __launch_bounds__(kBlockThreads, 8)
   const auto fetch = [&](int position) { return record_at(in, records, position); };
   const auto row = [&](int position) { return rows + row_of(in, position) * stage.kQuads; };
   blend_backward<D, kAbs, true>(w, fetch, pixels, v_color, row, stage);
+}
+
+// What a splat's gradient needs of a pixel.
+struct Blend {
+  float alpha, through, widen, weight;
+};
+__device__ inline Blend blend(const Pixel& pixel, float power) {
+  Blend b;
+  b.alpha = exp2_fast(fminf(power, kOpaque));
+  b.widen = reciprocal(1 - b.alpha);
+  b.through = pixel.through * b.widen;
+  b.weight = b.alpha * b.through;
+  return b;
+}
+
+// Adds a pixel's part of the moments and moves the pixel in front of the splat.
+template <bool kAbs, int D>
+__device__ inline void add_moments(const Record<D>& r, const Falloff& f, const Blend& b, float g, Pixel& pixel, float* v) {
+  const float v_alpha = fmaf(b.through, g, -(pixel.behind * b.widen));
+  pixel.through = b.through;
+  pixel.behind = fmaf(b.weight, g, pixel.behind);
+  // A splat at the ceiling of 0.99 passes nothing on to its opacity and shape.
+  const float s = f.power <= kOpaque ? b.alpha * v_alpha : 0, sx = s * f.dx, sy = s * f.dy;
+  v[0] += s;
+  v[1] += sx;
+  v[2] += sy;
+  v[3] = fmaf(sx, f.dx, v[3]);
+  v[4] = fmaf(sx, f.dy, v[4]);
+  v[5] = fmaf(sy, f.dy, v[5]);
+  if constexpr (kAbs) {
+    v[kShapeMoments] += fabsf(-kLn2 * fmaf(2 * r.xyab.z, sx, r.xyab.w * sy));
+    v[kShapeMoments + 1] += fabsf(-kLn2 * fmaf(r.xyab.w, sx, 2 * r.c * sy));
+  }
 }
 
 // Any number of channels: the whole block takes one splat at a time, and 16 values of its row at a time.

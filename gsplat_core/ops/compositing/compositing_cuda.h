@@ -1,8 +1,8 @@
 // Compositing on CUDA: what the op's host code asks of the kernels. All pointers are to device memory.
 //
 // A block of four warps composites a window of 16x16 pixels (a tile, where tiles have that size), each warp a quadrant of 8x8
-// with two pixels per thread. Splats are staged in shared memory; a warp then tests 32 of them at once against its quadrant and
-// goes through those alone that reach it.
+// with two pixels per thread. Splats are staged in shared memory as polynomials about the window's centre, with a note which
+// parts of the window they reach; a warp then goes through those alone that reach its own part.
 #pragma once
 
 #include <cuda_runtime.h>

@@ -25,7 +25,7 @@ __device__ inline void write_pixels(const DeviceCompositing& in, const Place& pl
 }
 
 template <int D>
-__global__ void __launch_bounds__(kBlockThreads)
+__global__ void __launch_bounds__(kBlockThreads, 8)
     composite_windows(DeviceCompositing in, const Record<D>* records, DevicePixels out) {
   __shared__ ForwardStage<D> stage;
   const Place place(in);

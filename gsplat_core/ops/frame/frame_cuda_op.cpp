@@ -5,6 +5,7 @@
 namespace {
 
 constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
+constexpr int64_t kFewTiles = 4096;  // for so many a slot may have 128 bytes
 
 using Frame = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
@@ -17,7 +18,7 @@ Frame render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_o
                   capacity);
   CudaCall& call = inputs.call;
   const FrameScene& in = inputs.scene;
-  const int64_t tiles = in.tiles(), blocks = blocks_for(in.count, kFrameThreads);
+  const int64_t tiles = in.tiles();
   const auto ints = [&](int64_t when_training) { return call.empty({training ? when_training : 0}, ScalarType::Int); };
   Tensor image = call.empty({height, width, 4}), alphas = call.empty({height, width});
   Tensor last = call.empty({training ? height : 0, training ? width : 0}, ScalarType::Int);
@@ -32,14 +33,19 @@ Frame render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_o
                             training ? instance_splats.mutable_data_ptr<int32_t>() : nullptr,
                             status.mutable_data_ptr<int32_t>(),
                             capacity};
+  const int64_t blocks = blocks_for(in.count, kFrameThreads), states = scan_states(tiles, blocks);
+  const int32_t stride = tiles <= kFewTiles ? 32 : 8;
+  uint64_t* const zeros = call.array<uint64_t>(states + tiles * stride / 2);
   const FrameScratch scratch = {call.array<uint2>(in.count),
                                 call.array<uint32_t>(in.count),
-                                call.array<int32_t>(tiles),
-                                call.array<uint32_t>(tiles),
-                                training ? call.array<int32_t>(blocks) : nullptr,
-                                training ? call.array<uint32_t>(blocks) : nullptr};
+                                reinterpret_cast<uint32_t*>(zeros + states),
+                                zeros,
+                                training ? call.array<uint32_t>(blocks) : nullptr,
+                                training ? call.array<uint32_t>(blocks) : nullptr,
+                                stride};
   const FramePixels out = {mutable_data(image), mutable_data(alphas), training ? last.mutable_data_ptr<int32_t>() : nullptr};
-  check_cuda(cudaMemsetAsync(scratch.counts, 0, size_t(tiles) * sizeof(int32_t), call.stream), "clearing the tiles' counts");
+  check_cuda(cudaMemsetAsync(zeros, 0, size_t(states + tiles * stride / 2) * sizeof(uint64_t), call.stream),
+             "clearing the counts");
   preprocess_frame(in, lists, scratch, call.stream);
   scan_frame(in, lists, scratch, call.stream);
   fill_frame(in, lists, scratch, call.stream);

@@ -119,8 +119,8 @@ def render_frame_backward_adam_(
 
     Args:
         gaussians, first_moments, second_moments: five tensors each, contiguous, of memory of their own.
-        rates: float32 [5], the learning rates in the order of the tensors; step: int64 or int32 [1], counted from 1. Both are
-            read on the device, so that a captured graph sees new values.
+        rates: float32 [5], the learning rates in the order of the tensors; step: int64 or int32 [1], counted from 1 (less
+            is taken for 1). Both are read on the device, so that a captured graph sees new values.
         skipped: int64 [5]; the rows that were left alone are added to it.
         needs_raw: whether the raw gradients are wanted.
 

@@ -20,7 +20,8 @@ __device__ inline double power_of(double base, int64_t exponent) {
 
 // Even lanes compute the first moment's share, odd ones the second's.
 __device__ inline AdamFactors factors_of(const FrameAdam& adam, int lane) {
-  const int64_t step = adam.step_is_long ? *static_cast<const int64_t*>(adam.step) : *static_cast<const int32_t*>(adam.step);
+  const int64_t given = adam.step_is_long ? *static_cast<const int64_t*>(adam.step) : *static_cast<const int32_t*>(adam.step);
+  const int64_t step = given < 1 ? 1 : given;  // there is no correction for a step before the first
   const double bias = 1 - power_of(lane % 2 == 0 ? adam.beta1 : adam.beta2, step);
   const double mine = lane % 2 == 0 ? 1 / bias : ::rsqrt(bias);
   const double over_bias1 = __shfl_sync(kAllLanes, mine, 0);
@@ -45,32 +46,87 @@ __device__ inline void update(float& p, float g, float& m, float& v, float rate,
   p -= __fdividef(rate * m, fmaf(square_root(v), f.inv_bias2, f.epsilon));
 }
 
-// One tensor's share of the warp: gradient(value of the share); rows with a bit in `poisoned` stay as they are.
-template <int kColumns, class Gradient>
-__device__ inline void update_rows(const FrameAdam& adam, int tensor, int64_t first, int rows, unsigned poisoned,
-                                   const AdamFactors& factors, int lane, const Gradient& gradient) {
-  const int64_t at = first * kColumns;
-  float *const p = adam.parameters[tensor] + at, *const m = adam.first[tensor] + at, *const v = adam.second[tensor] + at;
-  const float rate = factors.rates[tensor];
-  const auto single = [&](int i) {
-    if ((poisoned >> (i / kColumns) & 1) == 0) update(p[i], gradient(i), m[i], v[i], rate, factors);
-  };
-  const auto quad = [&](int i) {
-    float4 &parameter = reinterpret_cast<float4*>(p)[i], &mean = reinterpret_cast<float4*>(m)[i],
-           &square = reinterpret_cast<float4*>(v)[i];
-    float4 new_parameter = parameter, new_mean = mean, new_square = square;
-    update(new_parameter.x, gradient(4 * i), new_mean.x, new_square.x, rate, factors);
-    update(new_parameter.y, gradient(4 * i + 1), new_mean.y, new_square.y, rate, factors);
-    update(new_parameter.z, gradient(4 * i + 2), new_mean.z, new_square.z, rate, factors);
-    update(new_parameter.w, gradient(4 * i + 3), new_mean.w, new_square.w, rate, factors);
-    parameter = new_parameter, mean = new_mean, square = new_square;
-  };
-  if (poisoned == 0) {
-    each_value<kColumns>(rows, lane, quad, single);
-    return;
+// Four values of a tensor and of its moments. They are read in batches before any is written: the compiler cannot know that the
+// tensors are apart, and one after the other each would wait for the memory. None is needed again soon.
+struct AdamQuad {
+  float4 p, m, v;
+};
+__device__ inline AdamQuad load_quad(const FrameAdam& adam, int tensor, int64_t quad) {
+  return {__ldcs(reinterpret_cast<const float4*>(adam.parameters[tensor]) + quad),
+          __ldcs(reinterpret_cast<const float4*>(adam.first[tensor]) + quad),
+          __ldcs(reinterpret_cast<const float4*>(adam.second[tensor]) + quad)};
+}
+__device__ inline void store_quad(const FrameAdam& adam, int tensor, int64_t quad, const AdamQuad& q) {
+  __stcs(reinterpret_cast<float4*>(adam.parameters[tensor]) + quad, q.p);
+  __stcs(reinterpret_cast<float4*>(adam.first[tensor]) + quad, q.m);
+  __stcs(reinterpret_cast<float4*>(adam.second[tensor]) + quad, q.v);
+}
+__device__ inline void update(AdamQuad& q, const float4& g, float rate, const AdamFactors& f) {
+  update(q.p.x, g.x, q.m.x, q.v.x, rate, f);
+  update(q.p.y, g.y, q.m.y, q.v.y, rate, f);
+  update(q.p.z, g.z, q.m.z, q.v.z, rate, f);
+  update(q.p.w, g.w, q.m.w, q.v.w, rate, f);
+}
+__device__ inline void update_value(const FrameAdam& adam, int tensor, int64_t at, float g, const AdamFactors& f) {
+  update(adam.parameters[tensor][at], g, adam.first[tensor][at], adam.second[tensor][at], f.rates[tensor], f);
+}
+
+// The tensors but the last, and where their columns are in a raw row.
+constexpr int kSmall = kRateCount - 1;
+constexpr int small_columns(int tensor) { return tensor == 1 ? 4 : tensor == 3 ? 1 : 3; }
+constexpr int small_offset(int tensor) { return tensor == 0 ? 0 : tensor == 1 ? 3 : tensor == 2 ? 7 : 13; }
+template <int kDegree>
+__device__ inline float small_gradient(const WarpGradients<kDegree>& warp, int tensor, int value) {
+  const int columns = small_columns(tensor);
+  return warp.raw.values[value / columns * warp.raw.kStride + small_offset(tensor) + value % columns];
+}
+
+// `count` Gaussians from `first` on, whose gradients are all usable.
+template <int kDegree>
+__device__ inline void update_all(const FrameAdam& adam, WarpGradients<kDegree>& warp, int64_t first, int count,
+                                  const AdamFactors& factors, int lane) {
+  AdamQuad small[kSmall];
+#pragma unroll
+  for (int t = 0; t < kSmall; ++t)
+    if (lane < count * small_columns(t) / 4) small[t] = load_quad(adam, t, first / 4 * small_columns(t) + lane);
+#pragma unroll
+  for (int t = 0; t < kSmall; ++t) {
+    const int values = count * small_columns(t), quads = values / 4;
+    const auto gradient = [&](int i) { return small_gradient(warp, t, i); };
+    if (lane < quads) {
+      const float4 g = make_float4(gradient(4 * lane), gradient(4 * lane + 1), gradient(4 * lane + 2), gradient(4 * lane + 3));
+      update(small[t], g, factors.rates[t], factors);
+      store_quad(adam, t, first / 4 * small_columns(t) + lane, small[t]);
+    }
+    const int left = 4 * quads + lane;
+    if (left < values) update_value(adam, t, first * small_columns(t) + left, gradient(left), factors);
   }
-  for (int i = lane; i < rows * kColumns; i += 32) single(i);
-  if (lane == 0) atomicAdd(adam.skipped + tensor, (unsigned long long)(__popc(poisoned)));
+  constexpr int kBatch = 4;
+  const int values = count * warp.kHarmonics, quads = values / 4;
+  const int64_t at = first / 4 * warp.kHarmonics;
+  for (int base = lane; base < quads; base += 32 * kBatch) {
+    AdamQuad batch[kBatch];
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k)
+      if (base + 32 * k < quads) batch[k] = load_quad(adam, kSmall, at + base + 32 * k);
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k) {
+      if (base + 32 * k >= quads) continue;
+      update(batch[k], warp.sh.quad(base + 32 * k), factors.rates[kSmall], factors);
+      store_quad(adam, kSmall, at + base + 32 * k, batch[k]);
+    }
+  }
+  const int left = 4 * quads + lane;
+  if (left < values) update_value(adam, kSmall, first * warp.kHarmonics + left, warp.sh.values[warp.sh.place(left)], factors);
+}
+
+// Value by value, where a gradient is not usable: rows with a bit in `poisoned` stay as they are, and are counted.
+template <class Gradient>
+__device__ inline void update_some(const FrameAdam& adam, int tensor, int columns, int64_t first, int count, unsigned poisoned,
+                                   const AdamFactors& factors, int lane, const Gradient& gradient) {
+  for (int i = lane; i < count * columns; i += 32)
+    if ((poisoned >> (i / columns) & 1) == 0) update_value(adam, tensor, first * columns + i, gradient(i), factors);
+  if (lane == 0 && poisoned != 0) atomicAdd(adam.skipped + tensor, (unsigned long long)(__popc(poisoned)));
 }
 
 // Whether Adam can use these gradients: their squares too are finite.
@@ -93,11 +149,6 @@ __global__ void __launch_bounds__(kSplatThreads<kDegree>, kDegree < 4 ? 5 : 1)
   if (first >= scene.count) return;
   const int count = int(scene.count - first < 32 ? scene.count - first : 32);
   WarpGradients<kDegree>& warp = warps[threadIdx.x / 32];
-  constexpr int columns[] = {3, 4, 3, 1, warp.kHarmonics};
-  for (int i = 0; i < kRateCount; ++i) {
-    prefetch(adam.first[i] + first * columns[i], count * columns[i], lane);
-    prefetch(adam.second[i] + first * columns[i], count * columns[i], lane);
-  }
   warp.compute(scene, camera, lists, from, first, count, lane);
 
   float raw[kRawColumns], sh[warp.kHarmonics];
@@ -112,15 +163,16 @@ __global__ void __launch_bounds__(kSplatThreads<kDegree>, kDegree < 4 ? 5 : 1)
   __syncwarp();
   if (lists.status[kStatusCut] == 0) {
     const AdamFactors factors = factors_of(adam, lane);
-    const auto column = [&](int columns, int offset) {
-      return [&warp, columns, offset](int i) { return warp.raw.values[i / columns * warp.raw.kStride + offset + i % columns]; };
-    };
-    update_rows<3>(adam, 0, first, count, poisoned[0], factors, lane, column(3, 0));
-    update_rows<4>(adam, 1, first, count, poisoned[1], factors, lane, column(4, 3));
-    update_rows<3>(adam, 2, first, count, poisoned[2], factors, lane, column(3, 7));
-    update_rows<1>(adam, 3, first, count, poisoned[3], factors, lane, column(1, 13));
-    update_rows<warp.kHarmonics>(adam, 4, first, count, poisoned[4], factors, lane,
-                                 [&](int i) { return warp.sh.values[warp.sh.place(i)]; });
+    if ((poisoned[0] | poisoned[1] | poisoned[2] | poisoned[3] | poisoned[4]) == 0) {
+      update_all(adam, warp, first, count, factors, lane);
+    } else {
+#pragma unroll
+      for (int t = 0; t < kSmall; ++t)
+        update_some(adam, t, small_columns(t), first, count, poisoned[t], factors, lane,
+                    [&](int i) { return small_gradient(warp, t, i); });
+      update_some(adam, kSmall, warp.kHarmonics, first, count, poisoned[kSmall], factors, lane,
+                  [&](int i) { return warp.sh.values[warp.sh.place(i)]; });
+    }
   }
   // A field learns nothing from a Gaussian whose gradient is not usable.
   __syncwarp();

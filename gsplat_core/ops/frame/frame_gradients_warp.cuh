@@ -149,11 +149,6 @@ __device__ inline SplatRow sum_rows(const float4* rows, int start, int count, in
   return sum;
 }
 
-// Brings memory that the warp will read later nearer.
-__device__ inline void prefetch(const float* from, int64_t count, int lane) {
-  for (int64_t i = 32 * lane; i < count; i += 32 * 32) asm volatile("prefetch.global.L2 [%0];" ::"l"(from + i));
-}
-
 // What a warp computes: the raw gradients of its Gaussians, and those of their coefficients in the place of these.
 template <int kDegree>
 struct WarpGradients {

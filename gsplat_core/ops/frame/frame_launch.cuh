@@ -4,6 +4,8 @@
 
 #include <cuda_runtime.h>
 
+#include <type_traits>
+
 namespace {
 
 // What the kernels in front wrote can be read behind this. Every thread of a kernel that is launched behind another calls it.
@@ -21,7 +23,8 @@ __device__ inline void let_kernel_behind_come() {
 }
 
 template <class... Parameters>
-void launch_behind(void (*kernel)(Parameters...), unsigned blocks, int threads, cudaStream_t stream, Parameters... parameters) {
+void launch_behind(void (*kernel)(Parameters...), unsigned blocks, int threads, cudaStream_t stream, size_t shared_bytes,
+                   std::type_identity_t<Parameters>... parameters) {
   cudaFuncAttributes code = {};
   cudaFuncGetAttributes(&code, kernel);
   cudaLaunchAttribute attribute = {};
@@ -30,6 +33,7 @@ void launch_behind(void (*kernel)(Parameters...), unsigned blocks, int threads, 
   cudaLaunchConfig_t config = {};
   config.gridDim = dim3(blocks);
   config.blockDim = dim3(unsigned(threads));
+  config.dynamicSmemBytes = shared_bytes;
   config.stream = stream;
   config.attrs = &attribute;
   config.numAttrs = code.ptxVersion >= 90 ? 1 : 0;     // code for earlier ones does not wait by itself

@@ -1,7 +1,8 @@
 #include "../spherical_harmonics/spherical_harmonics_bases.h"
-#include "frame_footprint.cuh"
+#include "frame_emit.cuh"
 #include "frame_gaussian.cuh"
 #include "frame_launch.cuh"
+#include "frame_sums.cuh"
 
 using namespace GSPLAT_ISA;
 
@@ -132,25 +133,18 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
   }
   if (n < in.count) scratch.footprints[n] = make_uint2(footprint.x, footprint.y);
 
-  for_small_tiles(footprint, in.tile_width, [&](int tile, int) { atomicAdd(scratch.counts + tile, 1); });
-  int tiles = footprint.small_count();
+  const auto count = [&](int tile, int) { atomicAdd(scratch.slots + tile * scratch.slot_stride, 1u); };
+  for_small_tiles(footprint, in.tile_width, count);
+  uint32_t tiles = uint32_t(footprint.small_count());
   __syncwarp();  // the records of large footprints are written
-  for (unsigned large = __ballot_sync(kAll, footprint.large()); large != 0; large &= large - 1) {
-    const int owner = __ffs(int(large)) - 1;
-    const int count =
-        for_large_tiles(footprint, records, n, owner, in.tile_width, [&](int tile, int) { atomicAdd(scratch.counts + tile, 1); });
-    if (lane == owner) tiles = count;
-  }
+  for_large_owners(footprint, [&](int owner) {
+    const int of_large = for_large_tiles(footprint, records, n, owner, in.tile_width, count);
+    if (lane == owner) tiles = uint32_t(of_large);
+  });
   if (scratch.sums == nullptr) return;
-  __shared__ int of_warps[kFrameThreads / 32];
-  const int of_warp = __reduce_add_sync(kAll, tiles);
-  if (lane == 0) of_warps[warp] = of_warp;
-  __syncthreads();
-  if (threadIdx.x == 0) {
-    int sum = 0;
-    for (int w = 0; w < kFrameThreads / 32; ++w) sum += of_warps[w];
-    scratch.sums[blockIdx.x] = sum;
-  }
+  __shared__ uint32_t of_warps[32];
+  const uint32_t sum = sum_over_block(tiles, of_warps).all;
+  if (threadIdx.x == 0) scratch.sums[blockIdx.x] = sum;
 }
 
 }  // namespace

@@ -146,15 +146,29 @@ def test_any_number_of_gaussians(count: int) -> None:
     check(scene(count, deltas=count % 2 == 0, seed=2))
 
 
-def test_the_picture_is_that_of_rasterization() -> None:
-    s = scene(3000, 320, 240, degree=3, deltas=False, seed=3)
-    frame = s.render()
-    means, quats, log_scales, logits, sh, _, viewmat, K, background = s.tensors("cuda", torch.float32)
+def plain(s: Scene) -> tuple[Tensor, Tensor]:
+    """What `rasterization` makes of the scene on the same device, on the CPU."""
+    means, quats, log_scales, logits, sh, d, viewmat, K, background = s.tensors("cuda", torch.float32)
+    if d is not None:
+        means, quats, log_scales, logits = (
+            means + d[:, :3],
+            quats + d[:, 3:7],
+            log_scales + d[:, 7:10],
+            logits + d[:, 13],
+        )
+        sh = torch.cat([sh[:, :1] + d[:, None, 10:13], sh[:, 1:]], 1)
     image, alphas, _ = rasterization(
-        means, quats, log_scales.exp(), torch.sigmoid(logits), sh, viewmat[None], K[None], 320, 240, sh_degree=3,
-        backgrounds=background[None], render_mode="RGB+ED", packed=False,
+        means, quats, log_scales.exp(), torch.sigmoid(logits), sh, viewmat[None], K[None], s.width, s.height,
+        sh_degree=math.isqrt(sh.shape[1]) - 1, backgrounds=None if background is None else background[None],
+        render_mode="RGB+ED", packed=False, camera_model=s.camera_model,
     )  # fmt: skip
-    assert_near(frame, (image[0].double().cpu(), alphas[0, ..., 0].double().cpu()))
+    return image[0].double().cpu(), alphas[0, ..., 0].double().cpu()
+
+
+@pytest.mark.parametrize("deltas", [False, True])
+def test_the_picture_is_that_of_rasterization(deltas: bool) -> None:
+    s = scene(3000, 320, 240, degree=3, deltas=deltas, seed=3)
+    assert_near(s.render(), plain(s))
 
 
 def test_deltas_are_added_to_the_raw_parameters() -> None:
@@ -204,6 +218,28 @@ def test_very_many_splats_in_one_tile(count: int) -> None:
     s.logit_opacities[:] = -5.4
     frame = check(s, capacity=4 * count)
     assert frame.status[STATUS_MOST] == count
+
+
+def test_a_large_scene() -> None:
+    s = scene(70_000, 150, 110, degree=0, seed=14, size=0.01)
+    s.log_scales[::5000] = 0.5
+    s.log_scales[1::2000] = -1.5
+    s.means[2::100] = math.nan
+    assert_near(s.render(1 << 19), plain(s))
+    frame = s.render(1 << 19, training=True)
+    check_lists(frame)
+    assert frame.splat_starts.diff().max() == 10 * 7
+    again = s.render(1 << 19, training=True)
+    for name in ("image", "last", "tile_offsets", "splat_starts"):
+        assert torch.equal(getattr(frame, name), getattr(again, name)), name
+    needed = int(frame.status[STATUS_NEEDED])
+    assert s.render(needed - 1, training=True).status[STATUS_CUT]
+    assert torch.equal(s.render(needed, training=True).image, frame.image)
+
+
+def test_a_large_scene_on_more_tiles_than_fit_into_shared_memory() -> None:
+    s = scene(66_000, 4096, 4100, degree=0, seed=15, size=0.002)
+    assert_near(s.render(1 << 20), plain(s))
 
 
 def test_values_that_are_not_finite_leave_their_gaussian_out() -> None:

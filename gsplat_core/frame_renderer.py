@@ -1,0 +1,174 @@
+"""Whole frames on an NVIDIA GPU without a wait of the host: deform, project, sort and blend as one CUDA graph."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_shape
+from gsplat_core.cameras import Camera
+from gsplat_core.captured import CapturedSequence, GraphMemory
+from gsplat_core.deformation import DeformationField
+from gsplat_core.errors import InvalidInput
+from gsplat_core.gaussians import Gaussians
+from gsplat_core.ops.frame.frame import STATUS_CUT, STATUS_NEEDED, Frame, render_frame
+from gsplat_core.ops.scalars.scalars import store_scalars_
+from gsplat_core.rendering import RenderOutput
+
+CAPACITY_STEP = 1 << 16
+"""Lists grow by multiples of this many instances (a splat in a tile)."""
+HEADROOM = 1.5
+"""Room kept beyond what a frame needed, so that a scene that moves seldom outgrows its lists."""
+
+
+def capacity_for(needed: int) -> int:
+    """How many instances to make room for where `needed` were seen."""
+    return max(1, math.ceil(needed * HEADROOM / CAPACITY_STEP)) * CAPACITY_STEP
+
+
+class FrameControls:
+    """What changes from frame to frame, in one piece of device memory: pose, intrinsics and the field's time."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._values = torch.zeros(26, device=device)
+        self.viewmat = self._values[:16].view(4, 4)
+        self.intrinsics = self._values[16:25].view(3, 3)
+        self.time = self._values[25:26]
+
+    def set(self, camera: Camera, time: float) -> None:
+        """One launch, with the values in its arguments: nothing is copied from memory that could change meanwhile."""
+        values = [*camera.world_to_camera.ravel().tolist(), *camera.K.ravel().tolist(), time]
+        store_scalars_(self._values, values)
+
+
+class FrameStatus:
+    """How much room the last frame needed, copied to the host behind its launches and read when it has arrived."""
+
+    def __init__(self) -> None:
+        self._values = torch.zeros(4, dtype=torch.int32, pin_memory=True)
+        self._arrived = torch.cuda.Event()
+
+    def fetch(self, status: Tensor) -> None:
+        """Queue the copy of `status` behind what was launched."""
+        self._values.copy_(status, non_blocking=True)
+        self._arrived.record()
+
+    def wait(self) -> tuple[int, int]:
+        """Instances needed, and how many frames had to leave some out for want of room; waits for them."""
+        self._arrived.synchronize()
+        return int(self._values[STATUS_NEEDED]), int(self._values[STATUS_CUT])
+
+
+@dataclass(frozen=True)
+class PendingFrame:
+    """A frame that was launched. `result` gives its picture, rendered again with more room if the lists were too short."""
+
+    _renderer: FrameRenderer
+    _number: int
+
+    def result(self) -> RenderOutput:
+        """Waits for the frame. The tensors are the renderer's own and hold until its next `render`.
+
+        Raises InvalidInput when another frame was rendered since.
+        """
+        return self._renderer._finish(self._number)
+
+
+class FrameRenderer:
+    """Renders one set of Gaussians again and again: new camera, new time, changed parameters, same number.
+
+    `render` queues a frame and returns at once; nothing in it waits for the device. The lists of splats per tile have a fixed size; a
+    frame that does not fit is noticed on the device and rendered again with more room by `PendingFrame.result`, so no splat is ever left
+    out of a finished picture.
+
+    The Gaussians' tensors and the field's parameters are used where they are: changed in place, they change the next frame.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        field: DeformationField | None = None,
+        *,
+        background: Tensor | None = None,
+    ) -> None:
+        """`camera` gives size and camera model of every frame, and the pose of those rendered without one.
+
+        Raises InvalidInput when the Gaussians are not float32 on a CUDA device.
+        """
+        if gaussians.device.type != "cuda" or gaussians.dtype != torch.float32:
+            raise InvalidInput(
+                f"FrameRenderer needs float32 Gaussians on a CUDA device, got {gaussians.dtype} on {gaussians.device};"
+                " gsplat_core.render takes those of the CPU"
+            )
+        if background is not None:
+            require_shape("background", background, (3,), "[3]")
+        self.gaussians = gaussians.detach()
+        self.field = field
+        self._camera = camera
+        self._background = background
+        self._deltas: Callable[[Tensor], Tensor] | None = None if field is None else field.frame_deltas(self.gaussians)
+        self._controls = FrameControls(gaussians.device)
+        self._status = FrameStatus()
+        self._memory = GraphMemory(gaussians.device)
+        self._number = 0
+        self._asked: tuple[Camera, float] | None = None
+        self._capacity = capacity_for(4 * gaussians.count)
+        self._captured: CapturedSequence[Frame] | None = None
+
+    @property
+    def capacity(self) -> int:
+        """Instances (a splat in a tile) that there is room for now."""
+        return self._capacity
+
+    def render(self, camera: Camera | None = None, time_s: float = 0.0) -> PendingFrame:
+        """Queue the picture of `camera` at `time_s` on the current stream."""
+        camera = camera or self._camera
+        wanted = (self._camera.width_px, self._camera.height_px, self._camera.model)
+        if (camera.width_px, camera.height_px, camera.model) != wanted:
+            raise InvalidInput(
+                f"this renderer makes {wanted[0]}x{wanted[1]} {wanted[2]} pictures, the camera is"
+                f" {camera.width_px}x{camera.height_px} {camera.model}; make another FrameRenderer for it"
+            )
+        self._number += 1
+        self._asked = camera, 0.0 if self.field is None else self.field.frame_time(time_s)
+        self._launch()
+        return PendingFrame(self, self._number)
+
+    def _launch(self) -> None:
+        assert self._asked is not None
+        self._controls.set(*self._asked)
+        if self._captured is None:
+            self._captured = CapturedSequence(self._sequence, self.gaussians.device, self._memory, warm_up=True)
+        self._status.fetch(self._captured.replay().status)
+
+    def _sequence(self) -> Frame:
+        deltas = None if self._deltas is None else self._deltas(self._controls.time)
+        return render_frame(
+            *self.gaussians.tensors().values(),
+            deltas,
+            self._controls.viewmat,
+            self._controls.intrinsics,
+            self._background,
+            self._camera.width_px,
+            self._camera.height_px,
+            self._capacity,
+            camera_model=self._camera.model,
+        )
+
+    def _finish(self, number: int) -> RenderOutput:
+        if number != self._number:
+            raise InvalidInput("this frame's memory was used for a later one; take result() before the next render()")
+        needed, cut = self._status.wait()
+        while cut:
+            self._capacity = capacity_for(needed)
+            self._captured = None
+            self._launch()
+            needed, cut = self._status.wait()
+        assert self._captured is not None
+        frame = self._captured.results
+        return RenderOutput(frame.image[..., :3], frame.alphas, frame.image[..., 3])

@@ -1,0 +1,95 @@
+// Sums over the 64 pixels of a warp's quadrant for eight splats at a time, as small matrix products on the tensor cores.
+//
+// A pixel's part in a splat's gradient is s = alpha dL/dalpha for the shape and w for the colours. The moments are S Phi with
+// Phi = (1, x, y, x^2, xy, y^2) of every pixel, exact in tf32; the colours' gradients are W V with V = dL/dcolour. What is not
+// exact is split into two tf32 numbers, so that the products are as good as float32's.
+#pragma once
+
+#include "blend_window.cuh"
+
+namespace {
+
+constexpr int kSlots = 8;        // splats that are summed at once
+constexpr int kShareLanes = 36;  // the lanes' shares of one splat, and what keeps eight lanes' reads in different banks
+constexpr int kSteps = 4;        // a product runs over 8 of the 32 lanes at a time
+
+// A lane's share of a splat: s and w of its two pixels.
+using SplatShares = float4[kSlots][kShareLanes];
+
+__device__ inline float upper_bits(float x) { return __uint_as_float(__float_as_uint(x) & 0xffffe000u); }  // tf32, truncated
+
+// sums += a b, where a is 16x8 and b is 8x8; lane 4 r + c holds a[r][c], a[r + 8][c], a[r][c + 4], a[r + 8][c + 4], b[c][r],
+// b[c + 4][r] and the sums of [r][2 c], [r][2 c + 1], [r + 8][2 c], [r + 8][2 c + 1].
+__device__ inline void multiply_add(float (&sums)[4], float a0, float a1, float a2, float a3, const float (&b)[2]) {
+  asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
+      : "+f"(sums[0]), "+f"(sums[1]), "+f"(sums[2]), "+f"(sums[3])
+      : "r"(__float_as_uint(a0)), "r"(__float_as_uint(a1)), "r"(__float_as_uint(a2)), "r"(__float_as_uint(a3)),
+        "r"(__float_as_uint(b[0])), "r"(__float_as_uint(b[1])));
+}
+
+// The right-hand matrices of a warp: what its pixels contribute per unit of s and of w.
+template <int D>
+struct PixelFactors {
+  static constexpr int kColorTiles = (2 * D + 7) / 8;  // columns: the upper and the lower part of every channel
+  float moments[kSteps][2];                            // of the lanes' first pixels, about their rows' middle
+  float colors[kColorTiles][kSteps][kPixelsEach][2];
+
+  // The whole warp takes part, with the dL/dcolour of each lane's pixels.
+  __device__ explicit PixelFactors(const float (&v_color)[kPixelsEach][D]) {
+    const int row = (threadIdx.x & 31) / 4, column = threadIdx.x % 4;
+#pragma unroll
+    for (int step = 0; step < kSteps; ++step) {
+      const float y = float(row_of_lane(8 * step, 0)) - 2.5f;
+#pragma unroll
+      for (int half = 0; half < 2; ++half) {
+        const float x = float(column + 4 * half) - 3.5f;
+        const float powers[6] = {1, x, y, x * x, x * y, y * y};
+        float value = 0;
+#pragma unroll
+        for (int i = 0; i < 6; ++i) value = row == i ? powers[i] : value;
+        moments[step][half] = value;
+#pragma unroll
+        for (int p = 0; p < kPixelsEach; ++p) {
+#pragma unroll
+          for (int d = 0; d < 4 * kColorTiles; ++d) {
+            const float v = __shfl_sync(kAll, d < D ? v_color[p][d < D ? d : 0] : 0, 8 * step + 4 * half + column);
+            if (row / 2 == d % 4) colors[d / 4][step][p][half] = row % 2 == 0 ? upper_bits(v) : v - upper_bits(v);
+          }
+        }
+      }
+    }
+  }
+};
+
+// Sums the shares of eight splats. Lane 4 r + c gets of splat r: in `moments` two of the sums of s (1, x | y, x^2 | xy, y^2 for
+// c = 0, 1, 2; nothing for c = 3) about the quadrant's middle, in `colors` the sums of w dL/dcolour of channel c, then c + 4.
+template <int D>
+__device__ inline void sum_shares(const SplatShares& shares, const PixelFactors<D>& factors, float (&moments)[2],
+                                  float (&colors)[PixelFactors<D>::kColorTiles]) {
+  constexpr int kTiles = PixelFactors<D>::kColorTiles;
+  const int row = (threadIdx.x & 31) / 4, column = threadIdx.x % 4;
+  float shape[4] = {}, color[kTiles][4] = {};  // shape: of the first pixels, then of the second
+#pragma unroll
+  for (int step = 0; step < kSteps; ++step) {
+    const float4 a = shares[row][8 * step + column], b = shares[row][8 * step + 4 + column];
+    const float4 upper_a = make_float4(upper_bits(a.x), upper_bits(a.y), upper_bits(a.z), upper_bits(a.w));
+    const float4 upper_b = make_float4(upper_bits(b.x), upper_bits(b.y), upper_bits(b.z), upper_bits(b.w));
+    multiply_add(shape, upper_a.x, upper_a.y, upper_b.x, upper_b.y, factors.moments[step]);
+    multiply_add(shape, a.x - upper_a.x, a.y - upper_a.y, b.x - upper_b.x, b.y - upper_b.y, factors.moments[step]);
+#pragma unroll
+    for (int tile = 0; tile < kTiles; ++tile) {
+      multiply_add(color[tile], upper_a.z, a.z - upper_a.z, upper_b.z, b.z - upper_b.z, factors.colors[tile][step][0]);
+      multiply_add(color[tile], upper_a.w, a.w - upper_a.w, upper_b.w, b.w - upper_b.w, factors.colors[tile][step][1]);
+    }
+  }
+  // The middles of the first and of the second pixels' rows lie one pixel above and below the quadrant's: y = y' -+ 1.
+  const float more = shape[2] - shape[0], more_x = shape[3] - shape[1], all = shape[0] + shape[2];
+  const float more_of_s = __shfl_sync(kAll, more, 4 * row), more_of_x = __shfl_sync(kAll, more_x, 4 * row);
+  const float more_of_y = __shfl_sync(kAll, more, 4 * row + 1), all_of_s = __shfl_sync(kAll, all, 4 * row);
+  moments[0] = all + (column == 1 ? more_of_s : column == 2 ? more_of_x : 0);
+  moments[1] = shape[1] + shape[3] + (column == 2 ? fmaf(2, more_of_y, all_of_s) : 0);
+#pragma unroll
+  for (int tile = 0; tile < kTiles; ++tile) colors[tile] = (color[tile][0] + color[tile][2]) + (color[tile][1] + color[tile][3]);
+}
+
+}  // namespace

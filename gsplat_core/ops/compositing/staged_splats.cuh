@@ -1,0 +1,118 @@
+// Splats of a window in shared memory: each thread of a block prepares one, for all pixels of the window at once.
+#pragma once
+
+#include "blend_window.cuh"
+
+namespace {
+
+// log2(alpha / 0.99) before the cut-offs, as a polynomial in the offset (x, y) from the window's centre to the pixel:
+// one + y (by_y + y by_yy) where one = k + x (by_x + x by_xx) and by_y = ky + x by_xy are the same for a whole column.
+// Beyond `cap` a splat is skipped.
+template <int D>
+struct alignas(16) StagedSplat {
+  float k, by_x, by_xx, by_y, by_xy, by_yy;
+  float colors[D];
+  float cap;
+};
+static_assert(sizeof(StagedSplat<1>) == 32 && sizeof(StagedSplat<4>) == 48 && sizeof(StagedSplat<5>) == 48);
+
+// Reads a splat at an address in shared memory. Spelt out, for the compiler would read the colours again for every pixel, where
+// they are needed.
+template <int D, bool kCapped>
+__device__ inline StagedSplat<D> staged_at(uint32_t address) {
+  constexpr int kFloats = 6 + D + (kCapped ? 1 : 0);
+  union {
+    float floats[12];
+    StagedSplat<D> splat;
+  } read;
+  const auto quad = [&](int at) {
+    asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
+                 : "=f"(read.floats[at]), "=f"(read.floats[at + 1]), "=f"(read.floats[at + 2]), "=f"(read.floats[at + 3])
+                 : "r"(address + 4 * at)
+                 : "memory");
+  };
+  quad(0);
+  quad(4);
+  if constexpr (kFloats > 10) {
+    quad(8);
+  } else if constexpr (kFloats > 8) {
+    asm volatile("ld.shared.v2.f32 {%0, %1}, [%2];" : "=f"(read.floats[8]), "=f"(read.floats[9]) : "r"(address + 32) : "memory");
+  }
+  return read.splat;
+}
+__device__ inline uint32_t shared_address(const void* at) { return uint32_t(__cvta_generic_to_shared(at)); }
+
+constexpr float kFaintestStaged = kFaintest - kOpaque;  // the cut-off of 1/255, as the polynomial counts
+
+// (x, y) is the window's centre. The order of operations is spelt out, so that both passes get the same bits.
+template <int D>
+__device__ inline StagedSplat<D> staged(const Record<D>& r, float x, float y) {
+  const float a = r.xyab.z, b = r.xyab.w, c = r.c, dx = x - r.xyab.x, dy = y - r.xyab.y;
+  StagedSplat<D> s;
+  s.by_x = fmaf(2 * a, dx, __fmul_rn(b, dy));
+  s.by_y = fmaf(2 * c, dy, __fmul_rn(b, dx));
+  s.k = fmaf(fmaf(b, dy, __fmul_rn(a, dx)), dx, fmaf(__fmul_rn(c, dy), dy, r.l - kOpaque));
+  s.by_xx = a;
+  s.by_xy = b;
+  s.by_yy = c;
+  s.cap = r.cap - kOpaque;
+  for (int d = 0; d < D; ++d) s.colors[d] = r.colors[d];
+  return s;
+}
+
+__device__ inline float sqrt_fast(float x) {
+  float y;
+  asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+
+// In which parts of the window the contour alpha = 1/255 may reach a pixel centre; the parts are 8 pixels wide and `kRows` high,
+// numbered from left to right and downwards. (x, y) is the first pixel centre of the window. The ellipse's part in a part's rows
+// reaches in x from the left to the right solution of a dx^2 + 2 b dx dy + c dy^2 = k at the dy of those rows that is nearest to
+// the outermost point; never less than that, for a splat left out would be missing in the image.
+template <int kRows, int D>
+__device__ inline unsigned parts_reached(const Record<D>& r, float x, float y) {
+  constexpr int kBands = 2 * kQuadrant / kRows;
+  constexpr float kBeside = 2e-3f;            // pixels, against rounding
+  const float k = r.l + (2e-3f - kFaintest);  // a little outside of the contour, likewise
+  if (!(k >= 0)) return 0;
+  const float a = -r.xyab.z, b = -0.5f * r.xyab.w, c = -r.c, ux = r.xyab.x - x, uy = r.xyab.y - y;
+  const float ac = a * c, det = fmaf(-b, b, ac) - ac * 5e-7f;
+  const float top = -b * sqrt_fast(k * reciprocal(c * det));
+  if (!(a > 0 && c > 0 && det > ac * 1e-6f && fabsf(top) <= 1e30f)) return (1u << 2 * kBands) - 1;  // no proper ellipse
+  const float inverse = reciprocal(a), slope = -b * inverse, offset = k * inverse, curve = det * inverse * inverse;
+  unsigned reached = 0;
+#pragma unroll
+  for (int band = 0; band < kBands; ++band) {
+    const float low = float(band * kRows) - uy, high = low + float(kRows - 1);
+    const float at_right = fminf(fmaxf(top, low), high), at_left = fminf(fmaxf(-top, low), high);
+    const float right_square = fmaf(-curve * at_right, at_right, offset), left_square = fmaf(-curve * at_left, at_left, offset);
+    const bool rows = fminf(right_square, left_square) >= 0;
+    const float right = fmaf(slope, at_right, ux) + sqrt_fast(right_square) + kBeside;
+    const float left = fmaf(slope, at_left, ux) - sqrt_fast(left_square) - kBeside;
+    if (rows && right >= 0 && left <= float(kQuadrant - 1)) reached |= 1u << (2 * band);
+    if (rows && right >= float(kQuadrant) && left <= float(2 * kQuadrant - 1)) reached |= 2u << (2 * band);
+  }
+  return reached;
+}
+
+// Prepares this thread's splat of a batch and notes, by part of the window, which of the batch's splats reach it. `any`: one of
+// the warp's threads has a splat.
+template <int kRows, int D>
+__device__ inline void put_staged(bool any, const Record<D>& r, const Window& w, StagedSplat<D>* splats, uint4* reached_by_part) {
+  constexpr int kParts = 4 * kQuadrant / kRows;
+  const int lane = threadIdx.x & 31;
+  unsigned mine = 0;
+  if (any) {
+    splats[threadIdx.x] = staged(r, float(w.left + kQuadrant), float(w.top + kQuadrant));
+    const unsigned reached = parts_reached<kRows>(r, float(w.left) + 0.5f, float(w.top) + 0.5f);
+#pragma unroll
+    for (int part = 0; part < kParts; ++part) {
+      const unsigned bits = __ballot_sync(kAll, reached >> part & 1);
+      mine = lane == part ? bits : mine;
+    }
+  }
+  if (lane < kParts) reinterpret_cast<unsigned*>(&reached_by_part[lane])[threadIdx.x / 32] = mine;
+}
+
+}  // namespace

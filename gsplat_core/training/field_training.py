@@ -1,0 +1,60 @@
+"""How a deformation field takes part in a fused training step: its deltas before the frame, its update after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from torch import Tensor
+
+from gsplat_core.deformation import BasisField, DeformationField
+from gsplat_core.errors import InvalidInput
+from gsplat_core.gaussians import Gaussians
+
+
+class FieldTraining(Protocol):
+    """A field as the step sees it; nothing of it waits for the device."""
+
+    rates: int
+    """How many learning rates it takes."""
+    reads_positions: bool
+    """Whether what it adds depends on the canonical positions, which then get a gradient through it too."""
+
+    def tensors(self) -> Sequence[Tensor]:
+        """Everything on the device that a step changes."""
+
+    def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor | None:
+        """What the field adds at the time that the device scalar holds: [N, 16], the frame path's layout; None: nothing."""
+
+    def update(self, gradient: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor) -> None:
+        """One optimiser step for dL/d(deltas) `gradient` [N, 16]; none where the frame's `status` says that splats were left out.
+
+        A field that reads positions adds what goes back to them to the first three columns of `gradient`.
+        """
+
+
+class BasisTraining:
+    """Lazy Adam over the bumps that are active at a step's time."""
+
+    rates = 6
+    reads_positions = False
+
+    def __init__(self, field: BasisField) -> None:
+        self._field = field
+
+    def tensors(self) -> Sequence[Tensor]:
+        return self._field.training_tensors()
+
+    def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor:
+        return self._field.frame_deltas(gaussians)(time)
+
+    def update(self, gradient: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor) -> None:
+        # A frame that was cut has a gradient of zero, and bumps of Gaussians without gradient are left alone.
+        self._field.adam_step_at(time, gradient, rates)
+
+
+def training_of(field: DeformationField) -> FieldTraining:
+    """What trains this field."""
+    if isinstance(field, BasisField):
+        return BasisTraining(field)
+    raise InvalidInput(f"no fused training for a {field.kind or type(field).__name__} field")

@@ -1,0 +1,127 @@
+"""The captured training step on its own: what it learns, what a frame without room leaves alone, new tensors."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsplat_core import Camera, Gaussians, render
+from gsplat_core.training.fused_step import FusedStep
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.optimiser import FusedAdam
+from gsplat_core.training.photometric import LossWeights
+
+pytestmark = pytest.mark.cuda
+
+RATES = {"means": 1e-2, "quats": 2e-3, "log_scales": 5e-3, "logit_opacities": 2e-2, "sh": 1e-2}
+
+
+class NoField:
+    """Adds nothing and learns nothing."""
+
+    rates = 0
+    reads_positions = False
+
+    def deltas(self, gaussians, time):
+        return None
+
+    def tensors(self):
+        return ()
+
+    def update(self, gradient, time, rates, step, status):
+        self.gradient = gradient
+
+
+@pytest.fixture
+def camera() -> Camera:
+    return Camera.from_focal(90.0, 130, 90)
+
+
+@pytest.fixture
+def observation(make_gaussians, camera) -> Observation:
+    """A picture of other Gaussians, with a tool in one corner and depth."""
+    with torch.no_grad():
+        seen = render(make_gaussians(600, seed=4), camera)
+    mask = torch.ones(camera.height_px, camera.width_px, dtype=torch.uint8)
+    mask[:20, :30] = 0
+    image = (seen.image.clamp(0, 1) * 255).round().to(torch.uint8)
+    return Observation(seq=0, time_s=0.0, camera=camera, image=image, mask=mask, depth=seen.depth)
+
+
+def train(gaussians: Gaussians, observation: Observation, weights: LossWeights, steps: int) -> tuple[list[float], FusedAdam]:
+    adam = FusedAdam(gaussians.tensors())
+    step = FusedStep(gaussians, NoField(), adam, weights, observation.camera)
+    losses = [float(step(gaussians, observation, 0.0, RATES, [])) for _ in range(steps)]
+    assert step.settle() == 0
+    assert adam.steps == steps
+    return losses, adam
+
+
+@pytest.mark.parametrize("weights", [LossWeights(), LossWeights(ssim=0.2, depth=0.5)])
+def test_it_learns_as_the_cpu_does(make_gaussians, observation, weights):
+    from gsplat_core.training.photometric import loss_and_gradients
+
+    start = make_gaussians(800, sh_degree=1)
+    gaussians = start.clone().to("cuda")
+    losses, _ = train(gaussians, observation, weights, 12)
+
+    on_cpu, adam, expected = start.clone(), FusedAdam(start.tensors(), RATES), []
+    for _ in range(12):
+        loss, gradients = loss_and_gradients(on_cpu, observation, weights)
+        expected.append(float(loss))
+        adam.step(on_cpu.tensors(), gradients)
+    assert losses == pytest.approx(expected, rel=2e-3)
+    assert losses[-1] < 0.95 * losses[0]
+    for name, tensor in gaussians.tensors().items():
+        moved = (on_cpu.tensors()[name] - start.tensors()[name]).norm()
+        assert (tensor.cpu() - on_cpu.tensors()[name]).norm() < 0.02 * moved, name
+
+
+def test_the_same_bits_twice(make_gaussians, observation):
+    results = []
+    for _ in range(2):
+        gaussians = make_gaussians(3000, sh_degree=2).to("cuda")
+        losses, _ = train(gaussians, observation, LossWeights(0.2, 0.1), 8)
+        results.append((losses, gaussians))
+    assert results[0][0] == results[1][0]
+    for name, tensor in results[0][1].tensors().items():
+        assert torch.equal(tensor, results[1][1].tensors()[name])
+
+
+def test_a_frame_without_room_changes_nothing_and_the_next_ones_have_room(make_gaussians, observation, camera):
+    # Each of these covers most of the picture: more instances than the lists have room for at first.
+    scene = make_gaussians(4000)
+    gaussians = dataclasses.replace(scene, log_scales=torch.full_like(scene.log_scales, 2.3)).to("cuda")
+    before = gaussians.clone()
+    adam = FusedAdam(gaussians.tensors())
+    step = FusedStep(gaussians, NoField(), adam, LossWeights(), camera)
+    for _ in range(3):
+        step(gaussians, observation, 0.0, RATES, [])
+    assert step.settle() == 3
+    assert adam.steps == 0
+    for name, tensor in gaussians.tensors().items():
+        assert torch.equal(tensor, before.tensors()[name])
+        assert not adam.first_moments[name].any()
+    losses = [float(step(gaussians, observation, 0.0, RATES, [])) for _ in range(5)]
+    assert step.settle() == 0
+    assert adam.steps == 5
+    assert losses[-1] < losses[0]
+
+
+def test_other_tensors_are_recorded_anew(make_gaussians, observation, camera):
+    gaussians = make_gaussians(500).to("cuda")
+    adam = FusedAdam(gaussians.tensors())
+    step = FusedStep(gaussians, NoField(), adam, LossWeights(), camera)
+    for _ in range(3):
+        step(gaussians, observation, 0.0, RATES, [])
+    more = gaussians.append(make_gaussians(300, seed=9).to("cuda"))
+    adam.append(300)
+    old = gaussians.clone()
+    for _ in range(3):
+        step(more, observation, 0.0, RATES, [])
+    assert step.settle() == 0
+    for name, tensor in old.tensors().items():
+        assert torch.equal(tensor, gaussians.tensors()[name])
+    assert not torch.equal(more.means[500:], make_gaussians(300, seed=9).means.cuda())
