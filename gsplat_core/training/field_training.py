@@ -7,9 +7,10 @@ from typing import Protocol
 
 from torch import Tensor
 
-from gsplat_core.deformation import BasisField, DeformationField
+from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
 from gsplat_core.errors import InvalidInput
 from gsplat_core.gaussians import Gaussians
+from gsplat_core.training.hexplane_training import HexPlaneTraining
 
 
 class FieldTraining(Protocol):
@@ -57,4 +58,6 @@ def training_of(field: DeformationField) -> FieldTraining:
     """What trains this field."""
     if isinstance(field, BasisField):
         return BasisTraining(field)
+    if isinstance(field, HexPlaneField):
+        return HexPlaneTraining(field)
     raise InvalidInput(f"no fused training for a {field.kind or type(field).__name__} field")
