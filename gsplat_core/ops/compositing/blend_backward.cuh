@@ -80,8 +80,8 @@ __device__ inline Share share_of(const StagedSplat<D>& r, float power, bool draw
 }
 
 // The sums over the window of one of the batch's splats whose mean is (x, y), from those of the quadrants, into its row.
-template <int D, bool kAbs>
-__device__ inline void write_row(const BackwardStage<D, kAbs>& stage, const Window& w, int i, float x, float y, float4* row) {
+template <int D, bool kAbs, class Row>
+__device__ inline void write_row(const BackwardStage<D, kAbs>& stage, const Window& w, int i, float x, float y, const Row& row) {
   constexpr int kShape = shape_size(D, kAbs), kQuads = BackwardStage<D, kAbs>::kQuads;
   float v[4 * kQuads] = {};
 #pragma unroll
@@ -204,7 +204,7 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
     }
     __syncthreads();
     if (threadIdx.x < kBatch && first + int(threadIdx.x) < end)
-      write_row<D, kAbs>(stage, w, int(threadIdx.x), mean_x, mean_y, row(first + int(threadIdx.x)));
+      write_row(stage, w, int(threadIdx.x), mean_x, mean_y, row(first + int(threadIdx.x)));
   }
 }
 

@@ -45,7 +45,7 @@ struct SharedRow {
 };
 
 template <bool kByArrival>
-__global__ void __launch_bounds__(kBlockThreads, 8) gradients_of_tiles(FrameScene scene, FrameLists lists, FrameGradients from) {
+__global__ void __launch_bounds__(kBlockThreads, 5) gradients_of_tiles(FrameScene scene, FrameLists lists, FrameGradients from) {
   __shared__ BackwardStage<kChannels, false> stage;
   if (lists.status[kStatusCut] != 0) return;
   const int tile = blockIdx.x, left = tile % scene.tile_width * kFrameTile, top = tile / scene.tile_width * kFrameTile;
