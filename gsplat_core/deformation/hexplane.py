@@ -205,7 +205,8 @@ class HexPlaneField(DeformationField):
         times = torch.linspace(start, end, rows, dtype=torch.float64)
         at = ((times - old_start) / ((old_end - old_start) or 1.0)).clamp(0, 1) * (rows - 1)
         row = at.long().clamp(max=rows - 2)
-        share = (at - row).to(torch.float32)[:, None, None]
+        share = (at - row).to(torch.float32)[:, None, None].to(self.box.device)
+        row = row.to(self.box.device)
         for plane in self._named(TIME_PLANES):
             plane.data.copy_(torch.lerp(plane.data[row], plane.data[row + 1], share))
         self._time_window_s = (start, end)
