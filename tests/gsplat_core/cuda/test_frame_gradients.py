@@ -148,7 +148,7 @@ def test_one_over_the_whole_screen_among_thin_and_tiny_ones() -> None:
     scene = frame_scene(300, 200, 150, degree=1, median_px=2.0)
     scene.log_scales[7] = 4.0
     scene.logit_opacities[7] = -1.0
-    scene.log_scales[1::5] = torch.tensor([0.0, -3.0, -3.0])
+    scene.log_scales[1::5] = torch.tensor([0.5, -4.0, -4.0])
     scene.log_scales[2::5] = -8.0
     check(scene)
 
