@@ -11,7 +11,7 @@ using Splat = Record<4>;
 union BlendRoom {
   uint64_t keys[kSortKeys];
   struct {
-    uint32_t numbers[kSortKeys];
+    uint32_t numbers[kBlockThreads * kMostInThread];
     ForwardStage<4> stage;
   };
 };
@@ -46,8 +46,8 @@ __device__ inline SortedNumbers sort_tile(uint64_t* keys, int length, BlendRoom&
     sort_short<2>(keys, length, room);
   } else if (length <= 4 * kBlockThreads) {
     sort_short<4>(keys, length, room);
-  } else if (length <= 8 * kBlockThreads) {
-    sort_short<8>(keys, length, room);
+  } else if (length <= kMostInThread * kBlockThreads) {
+    sort_short<kMostInThread>(keys, length, room);
   } else {
     sort_long(keys, length, room.keys);
     sorted = {reinterpret_cast<const uint32_t*>(keys), 2};  // little-endian
@@ -72,7 +72,7 @@ struct TileSplats {
 };
 
 template <bool training>
-__global__ void __launch_bounds__(kBlockThreads) blend(FrameScene in, FrameLists lists, FramePixels out) {
+__global__ void __launch_bounds__(kBlockThreads, 8) blend(FrameScene in, FrameLists lists, FramePixels out) {
   wait_for_kernel_in_front();
   __shared__ BlendRoom room;
   const int begin = int(min(int64_t(lists.tile_offsets[blockIdx.x]), lists.capacity));
@@ -83,7 +83,8 @@ __global__ void __launch_bounds__(kBlockThreads) blend(FrameScene in, FrameLists
 
   const int left = int(blockIdx.x) % in.tile_width * kFrameTile, top = int(blockIdx.x) / in.tile_width * kFrameTile;
   const Window w(begin, end, left, top, min(left + kFrameTile, in.width), min(top + kFrameTile, in.height));
-  BlendedPixels<4> pixels = blend_forward<4, false>(w, TileSplats<training>{lists, sorted, in.count, begin}, room.stage);
+  BlendedPixels<4> pixels =
+      blend_forward<4, false, training>(w, TileSplats<training>{lists, sorted, in.count, begin}, room.stage);
   for (int p = 0; p < kPixelsEach; ++p) {
     if (!w.inside[p]) continue;
     const int64_t pixel = int64_t(w.y[p]) * in.width + w.x;

@@ -49,20 +49,20 @@ struct FrameLists {
   int64_t capacity;
 };
 
-// On the way from one kernel to the next. The Gaussians are in chunks, each a block's when the lists are filled. In a small scene
-// preprocess counts the tiles' instances in `counts` and the fill reserves places at `cursors`; in a large one (chunk_counts is
-// not null) preprocess does not count.
+// On the way from one kernel to the next. Preprocess counts a tile's instances in the tile's slot; the scan puts there where they
+// start, and the fill counts on from there. Slots lie apart, because atomics on words of the same 32 or 128 bytes wait for each
+// other.
 struct FrameScratch {
-  uint2* footprints;       // [N], see frame_footprint.cuh
-  uint32_t* depths;        // [N], z of visible Gaussians as bits
-  int32_t* counts;         // [tiles]; small scene: zero before
-  uint32_t* cursors;       // [tiles], small scene
-  uint32_t* chunk_counts;  // [chunks, tiles], large scene: instances, and then those of the chunks in front
-  int32_t* sums;           // [chunks], training: instances of each chunk
-  uint32_t* starts;        // [chunks], training: where they start
-  int64_t chunk;           // Gaussians
-  int32_t chunks;
+  uint2* footprints;  // [N], see frame_footprint.cuh
+  uint32_t* depths;   // [N], z of visible Gaussians as bits
+  uint32_t* slots;    // [tiles, slot_stride], zero before
+  uint64_t* states;   // [scan_states], zero before
+  uint32_t* sums;     // [blocks of Gaussians], training: instances of each block
+  uint32_t* starts;   // [blocks of Gaussians], training: where they start
+  int32_t slot_stride;
 };
+constexpr int kScanThreads = 1024;
+constexpr int64_t scan_states(int64_t tiles, int64_t blocks) { return tiles / kScanThreads + blocks / kScanThreads + 2; }
 
 struct FramePixels {
   float* image;   // [H, W, 4]: colours, and the sum of z (training) or its mean over the splats, weighted by their contribution
@@ -71,8 +71,6 @@ struct FramePixels {
 };
 
 void preprocess_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
-void count_frame_in_chunks(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
 void scan_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
 void fill_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
-void fill_frame_in_chunks(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
 void blend_frame(const FrameScene& in, const FrameLists& lists, const FramePixels& out, cudaStream_t stream);

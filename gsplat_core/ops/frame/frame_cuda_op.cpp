@@ -5,7 +5,7 @@
 namespace {
 
 constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
-constexpr int64_t kLargeScene = 1 << 16;  // Gaussians
+constexpr int64_t kFewTiles = 4096;  // for so many a slot may have 128 bytes
 
 using Frame = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
@@ -33,34 +33,22 @@ Frame render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_o
                             training ? instance_splats.mutable_data_ptr<int32_t>() : nullptr,
                             status.mutable_data_ptr<int32_t>(),
                             capacity};
-  // In a large scene the tiles are counted chunk by chunk, if the counts of all tiles fit into shared memory.
-  int processors = 0, shared_bytes = 0;
-  cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, means.get_device_index());
-  cudaDeviceGetAttribute(&shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, means.get_device_index());
-  const bool large = in.count >= kLargeScene && tiles * int64_t(sizeof(int32_t)) <= shared_bytes - 1024;
-  const int64_t chunk = large ? (in.count + processors * 32 - 1) / (processors * 32) * 32 : kFrameThreads;
-  const int64_t chunks = (in.count + chunk - 1) / chunk;
+  const int64_t blocks = blocks_for(in.count, kFrameThreads), states = scan_states(tiles, blocks);
+  const int32_t stride = tiles <= kFewTiles ? 32 : 8;
+  uint64_t* const zeros = call.array<uint64_t>(states + tiles * stride / 2);
   const FrameScratch scratch = {call.array<uint2>(in.count),
                                 call.array<uint32_t>(in.count),
-                                call.array<int32_t>(tiles),
-                                large ? nullptr : call.array<uint32_t>(tiles),
-                                large ? call.array<uint32_t>(chunks * tiles) : nullptr,
-                                training ? call.array<int32_t>(chunks) : nullptr,
-                                training ? call.array<uint32_t>(chunks) : nullptr,
-                                chunk,
-                                int32_t(chunks)};
+                                reinterpret_cast<uint32_t*>(zeros + states),
+                                zeros,
+                                training ? call.array<uint32_t>(blocks) : nullptr,
+                                training ? call.array<uint32_t>(blocks) : nullptr,
+                                stride};
   const FramePixels out = {mutable_data(image), mutable_data(alphas), training ? last.mutable_data_ptr<int32_t>() : nullptr};
-  if (large) {
-    preprocess_frame(in, lists, scratch, call.stream);
-    count_frame_in_chunks(in, lists, scratch, call.stream);
-    scan_frame(in, lists, scratch, call.stream);
-    fill_frame_in_chunks(in, lists, scratch, call.stream);
-  } else {
-    check_cuda(cudaMemsetAsync(scratch.counts, 0, size_t(tiles) * sizeof(int32_t), call.stream), "clearing the tiles' counts");
-    preprocess_frame(in, lists, scratch, call.stream);
-    scan_frame(in, lists, scratch, call.stream);
-    fill_frame(in, lists, scratch, call.stream);
-  }
+  check_cuda(cudaMemsetAsync(zeros, 0, size_t(states + tiles * stride / 2) * sizeof(uint64_t), call.stream),
+             "clearing the counts");
+  preprocess_frame(in, lists, scratch, call.stream);
+  scan_frame(in, lists, scratch, call.stream);
+  fill_frame(in, lists, scratch, call.stream);
   blend_frame(in, lists, out, call.stream);
   check_cuda(cudaGetLastError(), "render_frame");
   return {image, alphas, last, records, tile_offsets, sorted, splat_starts, instance_splats, status};

@@ -4,84 +4,75 @@
 
 namespace {
 
-constexpr int kScanThreads = 1024;
-constexpr int kScanEach = 8;
-// write(i, the sum of the counts in front of i) for i from 0 to count - 1, by one block; returns the sum of all. `counts` begin
-// at a multiple of 16 bytes and can be read to a multiple of 4 of them.
-template <class Write>
-__device__ inline uint32_t scan_counts(const int32_t* counts, int64_t count, uint32_t& most, const Write& write) {
-  __shared__ uint32_t of_warps[2][32];
-  uint32_t values[kScanEach];
-  const auto load = [&](int64_t at) {
-    for (int k = 0; k < kScanEach; k += 4) {
-      if (at + k + 3 < count) {
-        const int4 four = *reinterpret_cast<const int4*>(counts + at + k);
-        values[k] = uint32_t(four.x), values[k + 1] = uint32_t(four.y);
-        values[k + 2] = uint32_t(four.z), values[k + 3] = uint32_t(four.w);
-      } else {
-        for (int j = k; j < k + 4; ++j) values[j] = at + j < count ? uint32_t(counts[at + j]) : 0;
+// Counts to sum up: each block has kScanThreads of them and adds what the blocks in front of it have published.
+struct Counts {
+  uint32_t* counts;  // [count, stride]
+  uint32_t* starts;  // [count]: the sum of the counts in front
+  uint64_t* states;  // [blocks], zero before: a block's 1 << 63 | greatest count << 32 | sum
+  int64_t count;
+  int32_t stride;
+  bool in_place;  // also write the starts over the counts
+
+  __host__ __device__ int64_t blocks() const { return (count + kScanThreads - 1) / kScanThreads; }
+};
+
+struct Total {
+  uint32_t sum, most;
+};
+
+__device__ inline Total unpack(uint64_t state) { return {uint32_t(state) & kMost, uint32_t(state >> 32) & kMost}; }
+
+// Returns, to the first thread of the last block, the total of all counts.
+__device__ inline Total scan_part(const Counts& in, int64_t block) {
+  __shared__ uint32_t of_warps[32], most_of_warps[32];
+  __shared__ Total in_front;
+  const int64_t i = block * kScanThreads + threadIdx.x;
+  const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
+  const uint32_t value = i < in.count ? in.counts[i * in.stride] : 0, most = __reduce_max_sync(kAll, value);
+  if (lane == 0) most_of_warps[warp] = most;
+  const BlockSum sum = sum_over_block(value, of_warps);
+  Total all = {};
+  if (warp == 0) {
+    const uint32_t most_here = __reduce_max_sync(kAll, most_of_warps[lane]);
+    volatile uint64_t* const states = in.states;
+    if (lane == 0) states[block] = uint64_t(1) << 63 | uint64_t(most_here) << 32 | sum.all;
+    Total before = {};
+    for (int64_t other = lane; other < block; other += 32) {
+      uint64_t state = 0;
+      while ((state = states[other]) >> 63 == 0) {
       }
+      const Total its = unpack(state);
+      before = {add(before.sum, its.sum), max(before.most, its.most)};
     }
-  };
-  uint32_t in_front = 0;
-  int64_t at = int64_t(threadIdx.x) * kScanEach;
-  load(at);
-  for (int64_t first = 0; first < count; first += kScanThreads * kScanEach, at += kScanThreads * kScanEach) {
-    uint32_t starts[kScanEach], mine = 0;
-    for (int k = 0; k < kScanEach; ++k) {
-      starts[k] = mine;
-      mine = add(mine, values[k]);
-      most = max(most, values[k]);
-    }
-    load(at + kScanThreads * kScanEach);  // on its way meanwhile
-    const BlockSum sum = sum_over_block(mine, of_warps[first / (kScanThreads * kScanEach) & 1]);
-    const uint32_t before = add(in_front, sum.before);
-    for (int k = 0; k < kScanEach; k += 4) {
-      const uint4 four =
-          make_uint4(add(before, starts[k]), add(before, starts[k + 1]), add(before, starts[k + 2]), add(before, starts[k + 3]));
-      if (at + k < count) write(at + k, four);
-    }
-    in_front = add(in_front, sum.all);
+    before.sum = __shfl_sync(kAll, sum_up_to_lane(before.sum), 31);
+    before.most = __reduce_max_sync(kAll, before.most);
+    if (lane == 0) in_front = before;
+    all = {add(before.sum, sum.all), max(before.most, most_here)};
   }
-  return in_front;
+  __syncthreads();
+  if (i < in.count) {
+    const uint32_t start = add(in_front.sum, sum.before);
+    in.starts[i] = start;
+    if (in.in_place) in.counts[i * in.stride] = start;
+  }
+  return all;
 }
 
-// Those of the four that are in front of `count`.
-__device__ inline void store_four(uint32_t* to, int64_t at, int64_t count, uint4 four) {
-  if (at + 3 < count) {
-    *reinterpret_cast<uint4*>(to + at) = four;
-  } else {
-    to[at] = four.x;
-    if (at + 1 < count) to[at + 1] = four.y;
-    if (at + 2 < count) to[at + 2] = four.z;
-  }
-}
-
-// The first block has the tiles, the second one, when training, the chunks.
-__global__ void __launch_bounds__(kScanThreads) scan(FrameScene in, FrameLists lists, FrameScratch scratch) {
+// The first blocks have the tiles, the others, when training, the blocks of Gaussians.
+__global__ void __launch_bounds__(kScanThreads) scan(FrameLists lists, Counts tiles, Counts splats) {
   let_kernel_behind_come();
   wait_for_kernel_in_front();
-  __shared__ uint32_t most_of_warps[32];
-  uint32_t most = 0;
-  if (blockIdx.x == 1) {
-    scan_counts(scratch.sums, scratch.chunks, most,
-                [&](int64_t i, uint4 starts) { store_four(scratch.starts, i, scratch.chunks, starts); });
+  const int64_t block = blockIdx.x, of_tiles = tiles.blocks();
+  if (block >= of_tiles) {
+    scan_part(splats, block - of_tiles);
     return;
   }
-  const uint32_t all = scan_counts(scratch.counts, in.tiles(), most, [&](int64_t i, uint4 starts) {
-    store_four(reinterpret_cast<uint32_t*>(lists.tile_offsets), i, in.tiles(), starts);
-    if (scratch.cursors != nullptr) store_four(scratch.cursors, i, in.tiles(), starts);
-  });
-  most = __reduce_max_sync(kAll, most);
-  if (threadIdx.x % 32 == 0) most_of_warps[threadIdx.x / 32] = most;
-  __syncthreads();
-  if (threadIdx.x >= 32) return;
-  most = __reduce_max_sync(kAll, most_of_warps[threadIdx.x]);
-  if (threadIdx.x > 0) return;
-  lists.tile_offsets[in.tiles()] = int32_t(all);
-  lists.status[kStatusNeeded] = int32_t(all);
-  lists.status[kStatusMost] = int32_t(most);
-  lists.status[kStatusCut] = all > lists.capacity;
+  const Total all = scan_part(tiles, block);
+  if (block + 1 < of_tiles || threadIdx.x > 0) return;
+  lists.tile_offsets[tiles.count] = int32_t(all.sum);
+  lists.status[kStatusNeeded] = int32_t(all.sum);
+  lists.status[kStatusMost] = int32_t(all.most);
+  lists.status[kStatusCut] = all.sum > lists.capacity;
   lists.status[kStatusCut + 1] = 0;
 }
 
@@ -105,7 +96,7 @@ __global__ void __launch_bounds__(kFrameThreads) fill(FrameScene in, FrameLists 
     start = add(scratch.starts[blockIdx.x], sum_over_block(tiles, of_warps).before);
     store_start(in, lists, n, start, add(start, tiles));
   }
-  const auto reserve = [&](int tile) { return atomicAdd(scratch.cursors + tile, 1u); };
+  const auto reserve = [&](int tile) { return atomicAdd(scratch.slots + tile * scratch.slot_stride, 1u); };
 
   // A splat has one tile or thirty: the warp's are written down first and then dealt out evenly.
   const int through = int(sum_up_to_lane(uint32_t(small))), first = through - small, all = __shfl_sync(kAll, through, 31);
@@ -139,8 +130,11 @@ __global__ void no_splats(int32_t* splat_starts) { splat_starts[0] = 0; }
 }  // namespace
 
 void scan_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream) {
-  const unsigned parts = scratch.sums != nullptr && scratch.chunks > 0 ? 2 : 1;
-  launch_behind(scan, parts, kScanThreads, stream, 0, in, lists, scratch);
+  const int64_t blocks = scratch.sums != nullptr ? blocks_for(in.count, kFrameThreads) : 0;
+  uint32_t* const offsets = reinterpret_cast<uint32_t*>(lists.tile_offsets);
+  const Counts tiles = {scratch.slots, offsets, scratch.states, in.tiles(), scratch.slot_stride, true};
+  const Counts splats = {scratch.sums, scratch.starts, scratch.states + tiles.blocks(), blocks, 1, false};
+  launch_behind(scan, unsigned(tiles.blocks() + splats.blocks()), kScanThreads, stream, 0, lists, tiles, splats);
 }
 
 void fill_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream) {

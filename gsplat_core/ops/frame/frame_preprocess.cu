@@ -133,9 +133,7 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
   }
   if (n < in.count) scratch.footprints[n] = make_uint2(footprint.x, footprint.y);
 
-  if (scratch.chunk_counts != nullptr) return;
-
-  const auto count = [&](int tile, int) { atomicAdd(scratch.counts + tile, 1); };
+  const auto count = [&](int tile, int) { atomicAdd(scratch.slots + tile * scratch.slot_stride, 1u); };
   for_small_tiles(footprint, in.tile_width, count);
   uint32_t tiles = uint32_t(footprint.small_count());
   __syncwarp();  // the records of large footprints are written
@@ -146,7 +144,7 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
   if (scratch.sums == nullptr) return;
   __shared__ uint32_t of_warps[32];
   const uint32_t sum = sum_over_block(tiles, of_warps).all;
-  if (threadIdx.x == 0) scratch.sums[blockIdx.x] = int32_t(sum);
+  if (threadIdx.x == 0) scratch.sums[blockIdx.x] = sum;
 }
 
 }  // namespace
