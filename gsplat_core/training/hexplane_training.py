@@ -95,13 +95,15 @@ class HexPlaneTraining:
         """
         gradient = self.gradient(v_raw)
         assert self._state is not None
-        options = {"status": status, "betas": self._betas, "epsilon": self._epsilon}
-        planes = self._field.plane_tensors()
+        betas, epsilon = self._betas, self._epsilon
         hexplane_planes_adam_(
-            planes, self._first, self._second, self._state, time, gradient, rates[:1], step, penalties=self._penalties, **options
+            self._field.plane_tensors(), self._first, self._second, self._state, time, gradient, rates[:1], step,
+            status=status, penalties=self._penalties, betas=betas, epsilon=epsilon,
         )  # fmt: skip
-        moments = (self._network_first, self._network_second)
-        network_adam_(self._network(), gradient.network, *moments, rates[1:], step, **options)
+        network_adam_(
+            self._network(), gradient.network, self._network_first, self._network_second, rates[1:], step,
+            status=status, betas=betas, epsilon=epsilon,
+        )  # fmt: skip
         self._state = self._means = None
 
     def _layers(self) -> tuple[list[Tensor], list[Tensor]]:
