@@ -1,4 +1,4 @@
-// Writing the tiles' lists: what both ways of filling them share.
+// Counting the tiles that a warp's splats touch, and writing the keys of their instances.
 #pragma once
 
 #include "frame_footprint.cuh"

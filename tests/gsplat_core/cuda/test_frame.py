@@ -221,7 +221,7 @@ def test_very_many_splats_in_one_tile(count: int) -> None:
 
 
 def test_a_large_scene() -> None:
-    s = scene(70_000, 150, 110, degree=0, seed=14, size=0.01)
+    s = scene(140_000, 150, 110, degree=0, seed=14, size=0.006)
     s.log_scales[::5000] = 0.5
     s.log_scales[1::2000] = -1.5
     s.means[2::100] = math.nan
@@ -237,7 +237,7 @@ def test_a_large_scene() -> None:
     assert torch.equal(s.render(needed, training=True).image, frame.image)
 
 
-def test_a_large_scene_on_more_tiles_than_fit_into_shared_memory() -> None:
+def test_a_large_scene_on_very_many_tiles() -> None:
     s = scene(66_000, 4096, 4100, degree=0, seed=15, size=0.002)
     assert_near(s.render(1 << 20), plain(s))
 

@@ -265,7 +265,7 @@ def test_ops_pass_opcheck(gpu):
     torch.library.opcheck(ops.hexplane_train.default, (case.means, case.box, case.time, *network))
     kept = (state.lines, state.features, state.hidden)
     torch.library.opcheck(ops.hexplane_train_backward.default, (case.v_raw, case.means, case.box, *kept, *network))
-    factored = (gradient.rows, gradient.items, gradient.starts, gradient.v_lines)
+    factored = (gradient.rows, gradient.segments, gradient.items, gradient.starts, gradient.v_lines)
     torch.library.opcheck(ops.hexplane_planes_gradient.default, (state.coordinates, case.time, *factored, case.planes))
     first, second = ([torch.zeros_like(p) for p in case.planes] for _ in range(2))
     rate, step = torch.tensor([0.01], device=gpu), torch.ones(1, dtype=torch.int64, device=gpu)
