@@ -81,7 +81,7 @@ __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& f
   Record<D> next = fetch_ahead(w.end - w.begin);
   int now = 0;
   for (int left = w.end - w.begin; left > 0; left -= kBatch, now ^= 1) {
-    put_staged<kQuadrant / 2>(32 * warp < left, next, w, stage.splats[now], stage.reached[now]);
+    put_staged<kQuadrant / 2>(int(threadIdx.x), 32 * warp < left, next, w, stage.splats[now], stage.reached[now]);
     bool warp_open = __any_sync(kAll, front[0] > kStop || front[1] > kStop);
     if (!__syncthreads_or(warp_open)) break;
     next = fetch_ahead(left - kBatch);  // on its way meanwhile
