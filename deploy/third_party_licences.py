@@ -24,8 +24,8 @@ HEADER = """# Third-party licences
 The packages that `requirements.lock` installs on Linux with Python {python}, and the licence that each states. Written by
 `deploy/third_party_licences.py`. None of them is part of this repository.
 
-OpenCV's wheel carries FFmpeg's libraries, which are under the LGPL 2.1. NVIDIA's packages come with torch; IntraSplat does not
-call them.
+OpenCV's wheel carries FFmpeg's libraries, which are under the LGPL 2.1. NVIDIA's packages come with torch. `make cuda` also installs
+NVIDIA's compiler (`requirements-cuda.lock`), under NVIDIA's own licence; the kernels that it builds contain CUDA's static runtime.
 
 | package | version | licence |
 |---|---|---|
