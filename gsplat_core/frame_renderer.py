@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -23,6 +24,8 @@ CAPACITY_STEP = 1 << 16
 """Lists grow by multiples of this many instances (a splat in a tile)."""
 HEADROOM = 1.5
 """Room kept beyond what a frame needed, so that a scene that moves seldom outgrows its lists."""
+
+Precision = Literal["fp32", "fp16"]
 
 
 def capacity_for(needed: int) -> int:
@@ -85,7 +88,8 @@ class FrameRenderer:
     frame that does not fit is noticed on the device and rendered again with more room by `PendingFrame.result`, so no splat is ever left
     out of a finished picture.
 
-    The Gaussians' tensors and the field's parameters are used where they are: changed in place, they change the next frame.
+    The Gaussians' tensors and the field's parameters are used where they are: changed in place, they change the next frame. Not so in half
+    precision, which keeps what it rounds: the harmonics and what a field computes ahead.
     """
 
     def __init__(
@@ -95,11 +99,17 @@ class FrameRenderer:
         field: DeformationField | None = None,
         *,
         background: Tensor | None = None,
+        precision: Precision = "fp32",
     ) -> None:
         """`camera` gives size and camera model of every frame, and the pose of those rendered without one.
 
-        Raises InvalidInput when the Gaussians are not float32 on a CUDA device.
+        With `precision` "fp16" the harmonics are kept, the field deforms and splats are blended in half precision: a near-exact picture
+        (`benchmarks/RESULTS.md` has its PSNR to the exact one) in less time.
+
+        Raises InvalidInput when the Gaussians are not float32 on a CUDA device, or the precision is another one.
         """
+        if precision not in get_args(Precision):
+            raise InvalidInput(f"unknown precision {precision!r}; choose {' or '.join(get_args(Precision))}")
         if gaussians.device.type != "cuda" or gaussians.dtype != torch.float32:
             raise InvalidInput(
                 f"FrameRenderer needs float32 Gaussians on a CUDA device, got {gaussians.dtype} on {gaussians.device};"
@@ -111,7 +121,11 @@ class FrameRenderer:
         self.field = field
         self._camera = camera
         self._background = background
-        self._deltas: Callable[[Tensor], Tensor] | None = None if field is None else field.frame_deltas(self.gaussians)
+        kept = torch.float32 if precision == "fp32" else torch.float16
+        self._sh = self.gaussians.sh.to(kept)
+        self._deltas: Callable[[Tensor], Tensor] | None = (
+            None if field is None else field.frame_deltas(self.gaussians, kept)
+        )
         self._controls = FrameControls(gaussians.device)
         self._status = FrameStatus()
         self._memory = GraphMemory(gaussians.device)
@@ -154,7 +168,7 @@ class FrameRenderer:
             scene.quats,
             scene.log_scales,
             scene.logit_opacities,
-            scene.sh,
+            self._sh,
             deltas,
             self._controls.viewmat,
             self._controls.intrinsics,

@@ -182,10 +182,11 @@ class BasisField(DeformationField):
         """What `frame_deltas` takes for a time: its `tau`."""
         return self.tau(time_s)
 
-    def frame_deltas(self, gaussians: Gaussians) -> Callable[[Tensor], Tensor]:
+    def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:
         """From the float32 tau [1] on the field's device to what the field adds then, in the frame path's layout [N, 16].
 
-        No autograd graph. The function reads the field's parameters of the moment; they do not depend on `gaussians`.
+        No autograd graph. The function reads the field's parameters of the moment; they do not depend on `gaussians`, nor is anything
+        computed in another `dtype`.
         """
         if gaussians.count != self.count:
             raise InvalidInput(f"the field holds bumps for {self.count} Gaussians, got {gaussians.count}")

@@ -55,9 +55,10 @@ class DeformationField(torch.nn.Module):
         """`time_s` as `frame_deltas` counts it."""
         raise NotImplementedError(f"a {self.kind} field has no fused frame path")
 
-    def frame_deltas(self, gaussians: Gaussians) -> Callable[[Tensor], Tensor]:
+    def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:
         """From a time ([1] on the field's device, see `frame_time`) to what the field adds then: [N, 16], the columns of
-        `gsplat_core.ops.frame`. No autograd graph and no wait, so a CUDA graph can hold it."""
+        `gsplat_core.ops.frame`. No autograd graph and no wait, so a CUDA graph can hold it. With `dtype` torch.float16 a field may
+        compute in half precision where that is faster; the result is float32."""
         raise NotImplementedError(f"a {self.kind} field has no fused frame path")
 
     def config(self) -> dict[str, Any]:

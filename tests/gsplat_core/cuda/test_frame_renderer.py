@@ -106,3 +106,15 @@ def test_what_it_cannot_render_is_refused(scene, camera):
         FrameRenderer(scene.to(dtype=torch.float64), camera)
     with pytest.raises(InvalidInput, match="64x64"):
         FrameRenderer(scene, camera).render(Camera.from_focal(50.0, 64, 64))
+
+
+def test_half_precision_is_near_exact(scene, camera):
+    field = BasisField(scene.count, (0.0, 1.0), bumps=6).to("cuda")
+    torch.nn.init.normal_(field.weights, std=0.1)
+    exact = FrameRenderer(scene, camera, field).render(time_s=0.4).result()
+    near = FrameRenderer(scene, camera, field, precision="fp16").render(time_s=0.4).result()
+    error = (near.image - exact.image).square().mean()
+    assert 0 < error < 10 ** -(50 / 10)
+    assert (near.alpha - exact.alpha).abs().max() < 0.02
+    with pytest.raises(InvalidInput, match="fp8"):
+        FrameRenderer(scene, camera, precision="fp8")
