@@ -13,7 +13,7 @@ from gsplat_core.frame_renderer import FrameControls, FrameStatus, capacity_for
 from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.adam.adam import adam_step_at_
 from gsplat_core.ops.frame.frame import STATUS_CUT, render_frame
-from gsplat_core.ops.frame.frame_gradients import DC, render_frame_backward, render_frame_backward_adam_
+from gsplat_core.ops.frame.frame_gradients import render_frame_backward_adam_
 from gsplat_core.ops.image_loss.frame_loss import frame_loss
 from gsplat_core.ops.scalars.scalars import store_scalars_
 from gsplat_core.training.field_training import FieldTraining
@@ -49,7 +49,8 @@ class FusedStep:
         self._mask = torch.ones(shape, dtype=torch.uint8, device=device)
         self._depth = torch.zeros(shape, device=device) if weights.depth > 0 else None
         self._controls = FrameControls(device)
-        self._rates = torch.zeros(len(GAUSSIAN_TENSORS) + field.rates, device=device)
+        self._rates = torch.zeros(len(GAUSSIAN_TENSORS) + 1 + field.rates, device=device)
+        """Of the Gaussians in the frame's pass, of the positions behind it, of the field."""
         self._step = torch.full((1,), adam.steps, dtype=torch.int64, device=device)
         self._skipped = torch.zeros(len(GAUSSIAN_TENSORS), dtype=torch.int64, device=device)
         self._most = torch.zeros(4, dtype=torch.int32, device=device)
@@ -86,7 +87,8 @@ class FusedStep:
                 self._depth.copy_(observation.depth, non_blocking=True)
         self._controls.set(observation.camera, time)
         rates = [gaussian_rates[name] for name in GAUSSIAN_TENSORS]
-        store_scalars_(self._rates, [*rates, *field_rates])
+        in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
+        store_scalars_(self._rates, [*in_frame, rates[0], *field_rates])
         self._gaussians = gaussians
         self._adam.steps += 1
         if not self._warm:  # kernels are loaded by their first launch, which a recording does not allow
@@ -119,57 +121,49 @@ class FusedStep:
         return tuple(number for tensor in tensors for number in (tensor.data_ptr(), tensor.numel()))
 
     def _sequence(self) -> Tensor:
-        gaussian_rates, field_rates = self._rates[: len(GAUSSIAN_TENSORS)], self._rates[len(GAUSSIAN_TENSORS) :]
+        in_frame, of_means, of_field = self._rates.split([len(GAUSSIAN_TENSORS), 1, self._field.rates])
         scene, controls = self._gaussians, self._controls
         gaussians = tuple(scene.tensors().values())
         deltas = self._field.deltas(scene, controls.time)
-        view = (deltas, controls.viewmat, controls.intrinsics, None)
+        viewmat, intrinsics = controls.viewmat, controls.intrinsics
         size, model = (self._camera.width_px, self._camera.height_px), self._camera.model
         frame = render_frame(
-            scene.means, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh, *view, *size, self._capacity,
-            camera_model=model, training=True,
+            scene.means, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh, deltas, viewmat,
+            intrinsics, None, *size, self._capacity, camera_model=model, training=True,
         )  # fmt: skip
         loss = frame_loss(
             frame.image, frame.alphas, self._image, self._mask, self._depth, self._weights.ssim, self._weights.depth
         )
         fits = 1 - frame.status[STATUS_CUT : STATUS_CUT + 1]
         self._step.add_(fits)
-        pictures = (frame, loss.grad_image, loss.grad_alphas)
-        first = tuple(self._adam.first_moments[name] for name in GAUSSIAN_TENSORS)
-        second = tuple(self._adam.second_moments[name] for name in GAUSSIAN_TENSORS)
+        gradient = render_frame_backward_adam_(
+            gaussians, *self._moments(), in_frame, self._step, self._skipped, deltas, viewmat, intrinsics, None, frame,
+            loss.grad_image, loss.grad_alphas, camera_model=model, betas=self._adam.betas, epsilon=self._adam.epsilon,
+        )  # fmt: skip
+        assert gradient is not None
+        self._field.update(gradient, controls.time, of_field, self._step, frame.status)
         if self._field.reads_positions:
-            raw, sh = render_frame_backward(gaussians, *view, *pictures, camera_model=model)
-            self._field.update(raw, controls.time, field_rates, self._step, frame.status)
-            raw.div_(fits)  # not a number where the frame was cut: Adam leaves such rows alone, moments and all
-            v_sh = raw[:, None, DC] if sh.numel() == 0 else sh.div_(fits)
-            self._update_gaussians(gaussians, first, second, (*_columns(raw), v_sh), gaussian_rates)
-        else:
-            gradient = render_frame_backward_adam_(
-                gaussians, first, second, gaussian_rates, self._step, self._skipped, *view, *pictures, camera_model=model,
-                betas=self._adam.betas, epsilon=self._adam.epsilon,
-            )  # fmt: skip
-            assert gradient is not None
-            self._field.update(gradient, controls.time, field_rates, self._step, frame.status)
+            self._move(scene.means, gradient, of_means, fits)
         cut_so_far = self._most[STATUS_CUT] + frame.status[STATUS_CUT]
         torch.maximum(self._most, frame.status, out=self._most)
         self._most[STATUS_CUT] = cut_so_far
         return loss.loss
 
-    def _update_gaussians(
-        self,
-        gaussians: Sequence[Tensor],
-        first: Sequence[Tensor],
-        second: Sequence[Tensor],
-        gradients: Sequence[Tensor],
-        rates: Tensor,
-    ) -> None:
-        for i, (parameter, gradient) in enumerate(zip(gaussians, gradients, strict=True)):
-            adam_step_at_(
-                parameter, gradient.reshape(parameter.shape).contiguous(), first[i], second[i], rates[i : i + 1], self._step,
-                self._skipped[i : i + 1], *self._adam.betas, self._adam.epsilon, row_size=parameter[:1].numel() or 1,
-            )  # fmt: skip
+    def _moments(self) -> tuple[list[Tensor], list[Tensor]]:
+        """Adam's moments of the Gaussians in the frame's pass. Where the field has a part in the positions' gradient, they do not move
+        there: their rate is 0, and the moments are not theirs."""
+        first = [self._adam.first_moments[name] for name in GAUSSIAN_TENSORS]
+        second = [self._adam.second_moments[name] for name in GAUSSIAN_TENSORS]
+        if self._field.reads_positions:
+            first[0], second[0] = torch.zeros_like(first[0]), torch.zeros_like(second[0])
+        return first, second
 
-
-def _columns(raw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The gradients of means, quats, log-scales and logit opacities out of the frame path's rows."""
-    return raw[:, :3], raw[:, 3:7], raw[:, 7:10], raw[:, 13]
+    def _move(self, means: Tensor, gradient: Tensor, rate: Tensor, fits: Tensor) -> None:
+        """Adam over the positions, whose gradient the field has completed."""
+        # Not a number where the frame was cut: Adam leaves such rows alone, moments and all.
+        complete = gradient[:, :3] / fits
+        first, second = self._adam.first_moments["means"], self._adam.second_moments["means"]
+        adam_step_at_(
+            means, complete, first, second, rate, self._step, self._skipped[:1], *self._adam.betas,
+            self._adam.epsilon, row_size=3,
+        )  # fmt: skip
