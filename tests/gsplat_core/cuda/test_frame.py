@@ -220,6 +220,22 @@ def test_very_many_splats_in_one_tile(count: int) -> None:
     assert frame.status[STATUS_MOST] == count
 
 
+@pytest.mark.parametrize("count", [100, 128, 200, 256, 500, 512, 900, 1024, 1025])
+@pytest.mark.parametrize("far", [False, True])
+def test_depths_that_are_equal_or_next_to_each_other(count: int, far: bool) -> None:
+    s = scene(count, 16, 16, seed=16, deltas=False)
+    g = torch.Generator().manual_seed(2)
+    s.viewmat[:] = torch.eye(4)
+    s.means[:, :2] = 0.1 * torch.randn(count, 2, generator=g)
+    s.means[:, 2] = 2 + torch.randint(0, 40, (count,), generator=g) * 2.0**-22
+    s.log_scales[:] = 3.0  # over the whole tile, so that no pixel is near the cut-off of 1/255
+    if far:  # told apart from this one, the others are not told apart at once
+        s.means[-1] = torch.tensor([0.0, 0.0, 1e8])
+        s.log_scales[-1] = math.log(1e9)
+    s.logit_opacities[:] = -4.6
+    assert check(s).status[STATUS_MOST] == count
+
+
 def test_a_large_scene() -> None:
     s = scene(140_000, 150, 110, degree=0, seed=14, size=0.006)
     s.log_scales[::5000] = 0.5
