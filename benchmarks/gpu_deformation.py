@@ -1,7 +1,7 @@
 """How fast one NVIDIA GPU deforms Gaussians at a new time, alone and with the picture, beside plain PyTorch and gsplat.
 
     python benchmarks/gpu_deformation.py
-    python benchmarks/gpu_deformation.py --repetitions 100
+    python benchmarks/gpu_deformation.py --fields 85M --repetitions 100
 
 HexPlane with a network in G-SHARP's size (85 million parameters) and a small one, and the basis field; every call is at another
 time. Times are explained in gpu_timing.py. Prints one JSON object per line.
@@ -138,14 +138,17 @@ def basis(count: int, repetitions: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--fields", nargs="*", default=[*HEXPLANES, "basis"], choices=[*HEXPLANES, "basis"])
     parser.add_argument("--repetitions", type=int, default=50)
     options = parser.parse_args()
     torch.manual_seed(0)
     report_machine()
-    for count in (50_000, 200_000):
-        hexplane("85M", count, options.repetitions)
-    hexplane("small", 50_000, options.repetitions)
-    basis(40_000, options.repetitions)
+    for kind in options.fields:
+        if kind == "basis":
+            basis(40_000, options.repetitions)
+        else:
+            for count in (50_000, 200_000):
+                hexplane(kind, count, options.repetitions)
 
 
 if __name__ == "__main__":

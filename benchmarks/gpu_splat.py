@@ -79,14 +79,18 @@ class FramePath:
 
 
 def l1_gradients(image: Tensor, alphas: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of the mean absolute difference of RGB and expected depth, which is the last channel divided by alpha."""
+    """Gradients of the mean absolute difference of RGB and expected depth, which is the last channel divided by alpha.
+
+    `image` is overwritten.
+    """
     weight = alphas.clamp_min(1e-10)
-    image[..., 3] /= weight
-    difference = image - target
-    difference.abs().mean()  # the loss itself, which the peer takes too
+    depth = image[..., 3] / weight
+    image[..., 3] = depth
+    difference = image.sub_(target)
+    torch.linalg.vector_norm(difference, 1)  # the loss itself but for a factor, which the peer takes too
     v_image = difference.sign_().mul_(1 / difference.numel())
     v_image[..., 3] /= weight
-    return v_image, -(v_image[..., 3] * image[..., 3])
+    return v_image, -(v_image[..., 3] * depth)
 
 
 def called(rasterization: Callable[..., Any], scene: Scene, target: Tensor) -> tuple[Callable[[], Tensor], Work]:

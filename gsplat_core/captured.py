@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 
@@ -19,7 +19,7 @@ class GraphMemory:
         _record(self._anchor, lambda: torch.zeros(1, device=device), device, None)
 
     @property
-    def pool(self) -> tuple[int, int]:
+    def pool(self) -> Any:
         """What torch knows the memory by."""
         return self._anchor.pool()
 
@@ -51,7 +51,7 @@ def _record(
     graph: torch.cuda.CUDAGraph,
     sequence: Callable[[], Result],
     device: torch.device,
-    pool: tuple[int, int] | None,
+    pool: Any,
 ) -> Result:
     # Not `torch.cuda.graph`, which collects garbage first: that takes longer than many frames.
     current, side = torch.cuda.current_stream(device), torch.cuda.Stream(device)

@@ -148,8 +148,13 @@ class FrameRenderer:
 
     def _sequence(self) -> Frame:
         deltas = None if self._deltas is None else self._deltas(self._controls.time)
+        scene = self.gaussians
         return render_frame(
-            *self.gaussians.tensors().values(),
+            scene.means,
+            scene.quats,
+            scene.log_scales,
+            scene.logit_opacities,
+            scene.sh,
             deltas,
             self._controls.viewmat,
             self._controls.intrinsics,

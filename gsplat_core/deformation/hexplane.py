@@ -20,8 +20,10 @@ from gsplat_core.deformation.field import DeformationField, checked_window
 from gsplat_core.errors import InvalidInput
 from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.hexplane import hexplane as compiled
+from gsplat_core.ops.hexplane.deltas import hexplane_deltas, takes_layers
+from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.reference import deformation as reference
-from gsplat_core.reference.deformation import PLANE_AXES
+from gsplat_core.reference.deformation import HEAD_COLUMNS, PLANE_AXES
 
 HEAD_CHANNELS = (3, 3, 4, 1)
 """Outputs of the head: position, log-scale, rotation (wxyz), opacity logit."""
@@ -34,7 +36,7 @@ BOX_MARGIN = 0.05
 
 def box_around(means: Tensor) -> Tensor:
     """[2, 3]: corners of the finite positions with a margin; the unit box around the origin when there are none."""
-    box = torch.tensor([[-1.0] * 3, [1.0] * 3])
+    box = torch.tensor([[-1.0] * 3, [1.0] * 3], device="cpu" if means.is_meta else means.device)
     if means.is_meta:  # only the shape is wanted
         return box
     finite = means.detach().to(torch.float32)
@@ -44,6 +46,16 @@ def box_around(means: Tensor) -> Tensor:
     low, high = finite.amin(dim=0), finite.amax(dim=0)
     margin = max(float((high - low).max()) * BOX_MARGIN, 1e-3)
     return torch.stack([low - margin, high + margin])
+
+
+def _along_a_curve(coordinates: Tensor) -> Tensor:
+    """int32 [N]: the points in the order of a Morton curve, so that those side by side read the same memory."""
+    code = torch.zeros(coordinates.shape[0], dtype=torch.int64, device=coordinates.device)
+    cells = ((coordinates[:, :3].nan_to_num() + 1) * 511.5).clamp(0, 1023).long()
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return code.argsort(stable=True).int()
 
 
 class HexPlaneField(DeformationField):
@@ -85,14 +97,18 @@ class HexPlaneField(DeformationField):
         self.head = torch.nn.Linear(width, sum(HEAD_CHANNELS))
         torch.nn.init.zeros_(self.head.weight)
         torch.nn.init.zeros_(self.head.bias)
+        self.to(self.box.device)
 
     def coordinates(self, means: Tensor, time_s: float) -> Tensor:
         """[N, 4] in [-1, 1]: the one place where space and time are normalised. Outside the box or window: clamped."""
-        start, end = self.time_window_s
-        t = 2 * (self.clamp_time(time_s) - start) / (end - start) - 1 if end > start else 0.0
         low, high = self.box.to(means.dtype)
         space = (2 * (means - low) / (high - low) - 1).clamp(-1, 1)
-        return torch.cat([space, torch.full_like(space[:, :1], t)], dim=1)
+        return torch.cat([space, torch.full_like(space[:, :1], self.frame_time(time_s))], dim=1)
+
+    def frame_time(self, time_s: float) -> float:
+        """What `frame_deltas` takes for a time: it, clamped to the window, in [-1, 1]."""
+        start, end = self.time_window_s
+        return 2 * (self.clamp_time(time_s) - start) / (end - start) - 1 if end > start else 0.0
 
     def features(self, means: Tensor, time_s: float) -> Tensor:
         """[N, levels * channels]: product over the planes, levels side by side."""
@@ -111,6 +127,14 @@ class HexPlaneField(DeformationField):
         """Factorised inference: the product of the space planes is kept per Gaussian, and at a new time the time planes
         are interpolated into lines once, then sampled and multiplied. Exact up to rounding."""
         gaussians = gaussians.detach()
+        if self.box.device.type == "cuda" and self._ops is compiled:
+            deltas = self.frame_deltas(gaussians)
+
+            def displaced_at(time_s: float) -> Gaussians:
+                time = torch.full((1,), self.frame_time(time_s), device=self.box.device)
+                return self._displaced(gaussians, deltas(time)[:, list(HEAD_COLUMNS)])
+
+            return displaced_at
         with torch.no_grad():
             coordinates = self.coordinates(gaussians.means, self.time_window_s[0])
             spaces = [self._ops.hexplane_space(coordinates, *level) for level in self._levels(SPACE_PLANES)]
@@ -120,6 +144,40 @@ class HexPlaneField(DeformationField):
                 lines = [line for level in self._levels(TIME_PLANES) for line in self._lines(level, time_s)]
                 deltas = self._ops.hexplane_decode(spaces, coordinates, lines, *self._network())
                 return self._displaced(gaussians, deltas)
+
+        return at
+
+    def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:
+        """From a float32 [1] on the field's device, a time of `frame_time`, to what the field adds then: [N, 16], the frame path's layout.
+
+        No autograd graph. What does not depend on time is computed now, for the planes as they are; the function follows later changes of
+        time planes and network only. On CUDA nothing waits for the host, so that a CUDA graph can hold the call.
+
+        Args:
+            dtype: torch.float16 keeps the space features in half the memory and runs the network in half precision, which on CUDA is
+                twice as fast and adds an error of about 1e-3 of the deltas. Elsewhere, and for sizes that the kernels do not take, float32.
+        """
+        is_cuda = self.box.device.type == "cuda" and self._ops is compiled
+        with torch.no_grad():
+            coordinates = self.coordinates(gaussians.means.detach(), self.time_window_s[0])
+            order = _along_a_curve(coordinates) if is_cuda else None
+            if order is not None:
+                coordinates = coordinates[order.long()].contiguous()
+            spaces = [self._ops.hexplane_space(coordinates, *level) for level in self._levels(SPACE_PLANES)]
+        sizes = (self.channels, len(self.levels), self.width, self.depth)
+        if is_cuda and dtype == torch.float16 and takes_layers(*sizes, item=2):
+            spaces = [space.half() for space in spaces]
+        fits = is_cuda and takes_layers(*sizes, item=spaces[0].element_size())
+
+        def at(time: Tensor) -> Tensor:
+            with torch.no_grad():
+                planes = [plane.data for plane in self._named(TIME_PLANES)]
+                weights, biases = self.network_tensors()
+                if fits:
+                    return hexplane_deltas(spaces, coordinates, time, planes, weights, biases, order)
+                return reference.hexplane_deltas(
+                    spaces, coordinates, time, planes, weights, biases, order, self._ops.hexplane_decode
+                )
 
         return at
 
@@ -147,10 +205,20 @@ class HexPlaneField(DeformationField):
         times = torch.linspace(start, end, rows, dtype=torch.float64)
         at = ((times - old_start) / ((old_end - old_start) or 1.0)).clamp(0, 1) * (rows - 1)
         row = at.long().clamp(max=rows - 2)
-        share = (at - row).to(torch.float32)[:, None, None]
+        share = (at - row).to(torch.float32)[:, None, None].to(self.box.device)
+        row = row.to(self.box.device)
         for plane in self._named(TIME_PLANES):
             plane.data.copy_(torch.lerp(plane.data[row], plane.data[row + 1], share))
         self._time_window_s = (start, end)
+
+    def plane_tensors(self) -> list[Tensor]:
+        """The planes' memory, outside of autograd: xy, xz, yz, xt, yt, zt of every level."""
+        return [plane.data for plane in self._named(PLANE_NAMES)]
+
+    def network_tensors(self) -> tuple[list[Tensor], list[Tensor]]:
+        """Weights and biases of the trunk and the head, layer by layer, outside of autograd."""
+        weights, biases = self._network()
+        return [weight.data for weight in weights], [bias.data for bias in biases]
 
     def select(self, index: Tensor) -> None:
         """The field holds no state per Gaussian; nothing to do."""
@@ -195,8 +263,9 @@ class HexPlaneField(DeformationField):
     @property
     def _ops(self) -> ModuleType:
         """The compiled ops where they exist, plain torch for other dtypes and devices."""
-        is_native = self.box.dtype == torch.float32 and self.box.device.type == "cpu"
-        return compiled if is_native else reference
+        device = self.box.device.type
+        has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
+        return compiled if has_kernels and self.box.dtype == torch.float32 else reference
 
     def _named(self, names: Sequence[str]) -> list[Tensor]:
         return [plane for level in self._levels(names) for plane in level]
@@ -208,7 +277,9 @@ class HexPlaneField(DeformationField):
     def _lines(self, planes: Sequence[Tensor], time_s: float) -> list[Tensor]:
         """The time planes of one level interpolated at `time_s`: three lines [U, C]."""
         rows = self.resolution[3]
-        t = self.coordinates(self.box[:1], time_s)[0, 3]
+        t = torch.tensor(
+            self.frame_time(time_s), dtype=self.box.dtype
+        )  # on the CPU: reading it back from a GPU would wait
         at = float((t + 1) / 2 * (rows - 1))
         row = min(int(at), rows - 2)
         return [torch.lerp(plane[row], plane[row + 1], at - row) for plane in planes]

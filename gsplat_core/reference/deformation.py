@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -174,18 +174,19 @@ def hexplane_deltas(
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
     order: Tensor | None = None,
+    decode: Callable[..., Tensor] | None = None,
 ) -> Tensor:
     """What the field adds to the raw parameters at `time` (a number in [-1, 1]) in the frame path's columns: [N, 16].
 
-    The time planes [V, U, C], three per level, are interpolated into lines, then `hexplane_decode`. With `order`, row i of the inputs is
-    Gaussian order[i].
+    The time planes [V, U, C], three per level, are interpolated into lines, then `hexplane_decode` (or another `decode`). With `order`,
+    row i of the inputs is Gaussian order[i].
     """
     lines = []
     for plane in time_planes:
         at = ((time.reshape(()) + 1) / 2 * (plane.shape[0] - 1)).clamp(0, plane.shape[0] - 1)
         row = at.detach().nan_to_num().long().clamp(max=max(plane.shape[0] - 2, 0))
         lines.append(torch.lerp(plane[row], plane[(row + 1).clamp(max=plane.shape[0] - 1)], at - row))
-    outputs = hexplane_decode(spaces, coordinates, lines, weights, biases)
+    outputs = (decode or hexplane_decode)(spaces, coordinates, lines, weights, biases)
     deltas = outputs.new_zeros(outputs.shape[0], DELTA_COLUMNS)
     rows = torch.arange(outputs.shape[0], device=outputs.device) if order is None else order.long()
     return deltas.index_put((rows[:, None], torch.tensor(HEAD_COLUMNS, device=outputs.device)), outputs)

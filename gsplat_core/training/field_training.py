@@ -7,9 +7,10 @@ from typing import Protocol
 
 from torch import Tensor
 
-from gsplat_core.deformation import BasisField, DeformationField
-from gsplat_core.errors import InvalidInput
+from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
 from gsplat_core.gaussians import Gaussians
+from gsplat_core.ops.hexplane.deltas import takes_layers
+from gsplat_core.training.hexplane_training import HexPlaneTraining
 
 
 class FieldTraining(Protocol):
@@ -53,8 +54,10 @@ class BasisTraining:
         self._field.adam_step_at(time, gradient, rates)
 
 
-def training_of(field: DeformationField) -> FieldTraining:
-    """What trains this field."""
+def training_of(field: DeformationField) -> FieldTraining | None:
+    """What trains this field on a GPU without autograd; None where nothing does."""
     if isinstance(field, BasisField):
         return BasisTraining(field)
-    raise InvalidInput(f"no fused training for a {field.kind or type(field).__name__} field")
+    if isinstance(field, HexPlaneField) and takes_layers(field.channels, len(field.levels), field.width, field.depth):
+        return HexPlaneTraining(field)
+    return None

@@ -120,12 +120,14 @@ class FusedStep:
 
     def _sequence(self) -> Tensor:
         gaussian_rates, field_rates = self._rates[: len(GAUSSIAN_TENSORS)], self._rates[len(GAUSSIAN_TENSORS) :]
-        gaussians, controls = tuple(self._gaussians.tensors().values()), self._controls
-        deltas = self._field.deltas(self._gaussians, controls.time)
+        scene, controls = self._gaussians, self._controls
+        gaussians = tuple(scene.tensors().values())
+        deltas = self._field.deltas(scene, controls.time)
         view = (deltas, controls.viewmat, controls.intrinsics, None)
-        model = self._camera.model
+        size, model = (self._camera.width_px, self._camera.height_px), self._camera.model
         frame = render_frame(
-            *gaussians, *view, self._camera.width_px, self._camera.height_px, self._capacity, camera_model=model, training=True
+            scene.means, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh, *view, *size, self._capacity,
+            camera_model=model, training=True,
         )  # fmt: skip
         loss = frame_loss(
             frame.image, frame.alphas, self._image, self._mask, self._depth, self._weights.ssim, self._weights.depth

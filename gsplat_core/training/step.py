@@ -44,8 +44,9 @@ class TrainingStep:
         self._adam = FusedAdam(gaussians.tensors())
         self._fused: FusedStep | None = None
         self._queued = 0
-        if gaussians.device.type == "cuda":
-            self._fused = FusedStep(gaussians, training_of(field), self._adam, self._weights, camera)
+        field_training = training_of(field) if gaussians.device.type == "cuda" else None
+        if field_training is not None:
+            self._fused = FusedStep(gaussians, field_training, self._adam, self._weights, camera)
         network = {} if isinstance(field, BasisField) else dict(field.named_parameters())
         self._network_adam = FusedAdam(network, rows=False)
 

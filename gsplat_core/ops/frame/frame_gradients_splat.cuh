@@ -20,26 +20,51 @@ struct RawGradient {
   float mean[3], quat[4], log_scales[3], color[3], logit;
 };
 
+// a b - c d without the loss of digits where they are nearly the same (Kahan; Jeannerod et al. 2013).
+__device__ inline float difference_of_products(float a, float b, float c, float d) {
+  const float cd = __fmul_rn(c, d);
+  return fmaf(a, b, -cd) + fmaf(-c, d, cd);
+}
+
+// Gradients of the mean and of the blurred covariance S, as a symmetric matrix: S^-1 m and 1/2 S^-1 M S^-1, with m and M the
+// moments of first and second order. Taken along the axes u and w of the ellipse: in x and y a thin splat's share along its
+// length, smaller by the square of the ratio of its axes, would be lost in rounding.
+struct EllipseGradient {
+  float mean[2], covariance[3];
+};
+__device__ inline EllipseGradient ellipse_gradient(float a, float b, float c, const float* m) {
+  const float half = 0.5f * (a - c), radius = sqrtf(half * half + b * b);
+  const float longer = 0.5f * (a + c) + radius, shorter = difference_of_products(a, c, b, b) / longer;
+  float x = half < 0 ? b : half + radius, y = half < 0 ? radius - half : b;  // u; w is (-y, x)
+  const float norm = sqrtf(x * x + y * y);
+  x = norm > 0 ? x / norm : 1;
+  y = norm > 0 ? y / norm : 0;
+  const float m_u = (x * m[1] + y * m[2]) / longer, m_w = difference_of_products(x, m[2], y, m[1]) / shorter;
+  const float wx = difference_of_products(x, m[4], y, m[3]), wy = difference_of_products(x, m[5], y, m[4]);  // M w
+  const float uu = (x * (x * m[3] + y * m[4]) + y * (x * m[4] + y * m[5])) / (longer * longer);
+  const float uw = (x * wx + y * wy) / (longer * shorter), ww = difference_of_products(x, wy, y, wx) / (shorter * shorter);
+  return {{x * m_u - y * m_w, y * m_u + x * m_w},
+          {0.5f * (x * x * uu - 2 * x * y * uw + y * y * ww), 0.5f * (x * y * (uu - ww) + (x * x - y * y) * uw),
+           0.5f * (y * y * uu + 2 * x * y * uw + x * x * ww)}};
+}
+
 template <CameraModel model>
 __device__ inline RawGradient projection_gradient(const FrameScene& scene, const FrameCamera& camera, const RawGaussian& gaussian,
                                                   const SplatRow& sum) {
   const ProjectionInput in = projection_input(scene, camera);
   const View<model> view(in);
   const Geometry geometry = geometry_of(gaussian);
-  const Ellipse e = ellipse_of(view, Projector<model>::forward(view.k, view.to_camera(gaussian.mean)), geometry.sigma);
-  const float a = e.a0 + scene.eps2d, c = e.c0 + scene.eps2d, inverse = 1.0f / (a * c - e.b * e.b);
-  const float conic[3] = {c * inverse, -e.b * inverse, a * inverse};
-  const float* const m = sum.moments;
-  const ProjectedGradient v = {{conic[0] * m[1] + conic[1] * m[2], conic[1] * m[1] + conic[2] * m[2]},
-                               sum.colors[3],
-                               {-0.5f * m[3], -m[4], -0.5f * m[5]},
-                               0};
-  const BackProjected back = project_backward(in, view, gaussian.mean, geometry, v, false, false);
+  const Point3 p = view.to_camera(gaussian.mean);
+  const ImagePoint image = Projector<model>::forward(view.k, p);
+  const Ellipse e = ellipse_of(view, image, geometry.sigma);
+  const EllipseGradient v = ellipse_gradient(e.a0 + scene.eps2d, e.b, e.c0 + scene.eps2d, sum.moments);
+  const BackProjected back =
+      project_backward(in, view, gaussian.mean, geometry, p, image, e, v.covariance, v.mean, sum.colors[3], false);
   RawGradient to = {};
   for (int k = 0; k < 3; ++k) to.mean[k] = back.mean[k];
   for (int k = 0; k < 4; ++k) to.quat[k] = back.quat[k];
   for (int k = 0; k < 3; ++k) to.log_scales[k] = back.scales[k] * geometry.scales[k];
-  to.logit = m[0] * (1 - opacity_of(gaussian));  // dL/dlogit = o (1 - o) dL/do, and the first moment is o dL/do
+  to.logit = sum.moments[0] * (1 - opacity_of(gaussian));  // dL/dlogit = o (1 - o) dL/do, and the first moment is o dL/do
   return to;
 }
 

@@ -50,7 +50,7 @@ void place_gaussians(const FieldPlanes& planes, const float* means, const float*
                      cudaStream_t stream) {
   if (cells.count > 0)
     coordinates_of<<<blocks_for(cells.count), kThreads, 0, stream>>>(means, box, cells.coordinates, cells.count);
-  if (cells.items == nullptr) return;
+  if (cells.starts == nullptr) return;
   const int64_t slots = 3 * planes.levels, count = slots * cells.count;
   cudaMemsetAsync(cells.starts, 0, size_t(cells.cells + 1) * sizeof(int32_t), stream);
   if (count == 0) return;

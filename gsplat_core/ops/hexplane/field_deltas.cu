@@ -110,13 +110,6 @@ __device__ __forceinline__ void start_with_bias(float (&sums)[kBlocks][4], const
   }
 }
 
-__device__ __forceinline__ void copy_to_shared(void* to, const void* from, int pieces) {
-  const uint32_t base = uint32_t(__cvta_generic_to_shared(to));
-  for (int i = int(threadIdx.x); i < pieces; i += 32 * kWarps)
-    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(base + 16 * i), "l"(static_cast<const char*>(from) + 16 * i));
-  asm volatile("cp.async.commit_group;");
-}
-
 // Where a lane's two rows fall on the three lines of a level. Each of the four lanes of a row works out one axis and tells the
 // others.
 struct LinePlaces {
@@ -160,7 +153,8 @@ __global__ void __launch_bounds__(32 * kWarps, blocks_of(int(sizeof(T)), kWidth)
   extern __shared__ uint4 shared[];
   constexpr int kItem = int(sizeof(T)), kPiece = 16 / kItem, kQuad = 4 * kPiece, kBlocks = kWidth / 8;
   constexpr int kParts = kChannels * kItem % 128 == 0 && kChannels > 0 ? 2 : 1;  // of 64 bytes that are loaded together
-  copy_to_shared(shared, packed, int(net.packed_bytes(kItem) / 16));
+  for (int i = int(threadIdx.x); i < int(net.packed_bytes(kItem) / 16); i += 32 * kWarps)
+    copy_16(shared + i, static_cast<const uint4*>(packed) + i);
   const T* weights = reinterpret_cast<const T*>(shared);
   const float* biases = reinterpret_cast<const float*>(weights + net.weight_items(kItem));
   const WarpPlace place;
@@ -172,7 +166,7 @@ __global__ void __launch_bounds__(32 * kWarps, blocks_of(int(sizeof(T)), kWidth)
     rows[r] = first + place.group + 8 * r;
     if (kLines && rows[r] < count) x[r] = in.coordinates[int64_t(4) * rows[r] + min(place.quad, 2)];
   }
-  asm volatile("cp.async.wait_all;");
+  wait_for_copies();
   __syncthreads();
   if (first >= count) return;
 
@@ -200,6 +194,8 @@ __global__ void __launch_bounds__(32 * kWarps, blocks_of(int(sizeof(T)), kWidth)
       }
     }
     const int other = kQuad - 2 * odd * kQuad;  // from the half that a lane starts with to the other one
+    constexpr int kAhead = kLines ? 1 : 4;      // without lines a turn is two loads, and several turns' are made together
+#pragma unroll kAhead
     for (int c = 0; c < channels; c += kParts * kQuad, w += kParts * kQuad) {
       Piece<T> value[kParts][2];
 #pragma unroll

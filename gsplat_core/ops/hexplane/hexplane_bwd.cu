@@ -109,6 +109,7 @@ void plane_gradients(const HexPlanes& level, const float* gradient, float* v_coo
                                      sorted,
                                      level.coordinates,
                                      rows + p * count * channels,
+                                     nullptr,
                                      p * count,
                                      v_axis(p),
                                      u_axis(p),

@@ -1,89 +1,153 @@
-// The gradient of the lines: the Gaussians of a line's cell lie together in the order of the plane that has the axis as its
-// major.
-#include "plane_samples.cuh"
+// Sums of rows that many Gaussians share. The gradient of the lines: the Gaussians of a line's cell lie together in the order of
+// the plane that has the axis as its major. And the sums of the crowded cells of the space planes.
+#include "plane_update.cuh"
 #include "team_launch.h"
-#include "training_cuda.h"
 
 using namespace hexplane;
 
 namespace {
 
+constexpr int kRun = 32;  // sorted Gaussians that a team goes through
+
 constexpr int plane_of_major(int axis) { return axis == 0 ? 1 : axis == 1 ? 0 : 2; }  // x: xz, y: xy, z: yz
 
-// Sums of one part of a cell's Gaussians: for its left node at parts[part][0], for its right one at parts[part][1].
+// One line's Gaussians, and where their sums go: those of run r that are in cell c at place r + c, which no other run and cell
+// have, because from one item to the next either may only grow.
+struct LineRuns {
+  int32_t begin, end, minor_size, width;
+  float* sums;  // [runs + cells, 2, C]: for the left node, for the right one
+
+  __device__ LineRuns(const FieldPlanes& planes, const FieldCells& cells, int slot, int runs, float* all) {
+    const int level = slot / 3, axis = slot % 3, plane = plane_of_major(axis);
+    width = planes.sizes[level][axis], minor_size = planes.sizes[level][minor_axis(plane)];
+    const int32_t* starts = cells.starts + cells.first[level][plane];
+    begin = starts[0], end = starts[int64_t(width) * minor_size];
+    int64_t before = int64_t(slot) * runs;
+    for (int s = 0; s < slot; ++s) before += planes.sizes[s / 3][s % 3];
+    sums = all + before * 2 * planes.channels;
+  }
+};
+
 template <int kLane, int kTeam>
-__global__ void __launch_bounds__(kThreads) sum_parts(FieldPlanes planes, FieldLines lines, FieldCells cells,
-                                                      const float* __restrict__ rows, float* parts, int64_t size) {
+__global__ void __launch_bounds__(kThreads) sum_runs(FieldPlanes planes, FieldCells cells, FieldRows rows, int runs, float* all) {
+  const int slot = int(blockIdx.y), run = int(blockIdx.x) * (kThreads / kTeam) + int(threadIdx.x) / kTeam,
+            channels = planes.channels;
+  const LineRuns line(planes, cells, slot, runs, all);
+  const int32_t begin = line.begin + run * kRun, end = min(begin + kRun, line.end);
+  if (begin >= end) return;
+  const int level = slot / 3, axis = slot % 3, plane = 3 * level + plane_of_major(axis);
+  SortedCells sorted = sorted_cells(planes, cells, rows, plane);
+  sorted.rows = rows.lines + slot * cells.count * channels;
+  for (int c = int(threadIdx.x) % kTeam * kLane; c < channels; c += kTeam * kLane) {
+    Channels<kLane> left = Channels<kLane>::all(0.0f), right = left;
+    int cell = -1;
+    const auto flush = [&] {
+      float* to = line.sums + (int64_t(run) + cell) * 2 * channels + c;
+      left.store(to);
+      right.store(to + channels);
+      left = right = Channels<kLane>::all(0.0f);
+    };
+    for_rows<kLane>(sorted, begin, end, c, channels, [&](int32_t, float x, float, const Channels<kLane>& row) {
+      const LinePosition at = position_on(x, line.width);
+      if (int(at.cell) != cell && cell >= 0) flush();
+      cell = int(at.cell);
+      left = plus(left, 1.0f - at.fraction, row);
+      right = plus(right, at.fraction, row);
+    });
+    flush();
+  }
+}
+
+// A block adds up one node's runs: those of its cell for its left node, and those of the cell before for its right one.
+template <int kLane, int kTeam>
+__global__ void __launch_bounds__(kThreads)
+    add_runs(FieldPlanes planes, FieldLines lines, FieldCells cells, int runs, float* all, float* gradient) {
   constexpr int kTeams = kThreads / kTeam;
-  __shared__ float shared[2][kTeams][kTeam * kLane];
-  const int slot = int(blockIdx.y), level = slot / 3, axis = slot % 3, plane = plane_of_major(axis), part = int(blockIdx.z);
-  const int width = lines.widths[level][axis], cell = int(blockIdx.x);
-  if (cell >= width) return;
-  const int64_t minor = planes.sizes[level][minor_axis(plane)], key = cells.first[level][plane] + cell * minor;
-  const int64_t from = cells.starts[key], count = cells.starts[key + minor] - from;
-  const int64_t begin = from + count * part / kLineParts, end = from + count * (part + 1) / kLineParts;
-  const int lane = int(threadIdx.x) % kTeam, team = int(threadIdx.x) / kTeam, channels = planes.channels;
-  const int64_t first_item = (3 * level + plane) * cells.count;
+  __shared__ float shared[kTeams][kTeam * kLane];
+  const int slot = int(blockIdx.y), level = slot / 3, axis = slot % 3, node = int(blockIdx.x), channels = planes.channels;
+  const LineRuns line(planes, cells, slot, runs, all);
+  if (node >= line.width) return;
+  const int32_t* starts = cells.starts + cells.first[level][plane_of_major(axis)];
+  const int lane = int(threadIdx.x) % kTeam, team = int(threadIdx.x) / kTeam;
   for (int c0 = 0; c0 < channels; c0 += kTeam * kLane) {
     const int c = c0 + lane * kLane;
-    Channels<kLane> left = Channels<kLane>::all(0.0f), right = left;
-    if (c < channels) {
+    Channels<kLane> sum = Channels<kLane>::all(0.0f);
+    for (int side = 0; side < 2 && c < channels; ++side) {
+      const int cell = node - side;
+      if (cell < 0) continue;
+      const int32_t from = starts[int64_t(cell) * line.minor_size] - line.begin,
+                    to = starts[int64_t(cell + 1) * line.minor_size] - line.begin;
+      if (from == to) continue;
 #pragma unroll 4
-      for (int64_t i = begin + team; i < end; i += kTeams) {
-        const int64_t n = cells.items[i] - first_item;
-        const float share = position_on(cells.coordinates[4 * n + axis], width).fraction;
-        const auto g = Channels<kLane>::load(rows + (slot * cells.count + n) * channels + c);
-        left = plus(left, 1.0f - share, g);
-        right = plus(right, share, g);
-      }
+      for (int run = from / kRun + team; run <= (to - 1) / kRun; run += kTeams)
+        sum = plus(sum, 1.0f, Channels<kLane>::load(line.sums + ((int64_t(run) + cell) * 2 + side) * channels + c));
     }
     __syncthreads();
-    for (int i = 0; i < kLane; ++i) {
-      shared[0][team][lane * kLane + i] = left.v[i];
-      shared[1][team][lane * kLane + i] = right.v[i];
-    }
+    for (int i = 0; i < kLane; ++i) shared[team][lane * kLane + i] = sum.v[i];
     __syncthreads();
-    for (int i = int(threadIdx.x); i < 2 * kTeam * kLane; i += kThreads) {
-      const int side = i / (kTeam * kLane), at = i % (kTeam * kLane);
-      if (c0 + at >= channels) continue;
-      float sum = 0.0f;
-      for (int t = 0; t < kTeams; ++t) sum += shared[side][t][at];
-      parts[(2 * part + side) * size + lines.starts[level][axis] + cell * channels + c0 + at] = sum;
+    for (int i = int(threadIdx.x); i < kTeam * kLane && c0 + i < channels; i += kThreads) {
+      float total = 0.0f;
+      for (int t = 0; t < kTeams; ++t) total += shared[t][i];
+      gradient[lines.starts[level][axis] + int64_t(node) * channels + c0 + i] = total;
     }
   }
 }
 
-__global__ void __launch_bounds__(kThreads)
-    add_parts(FieldLines lines, int channels, const float* __restrict__ parts, int64_t size, float* gradient) {
-  const int level = int(blockIdx.y) / 3, axis = int(blockIdx.y) % 3;
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x, start = lines.starts[level][axis];
-  if (i >= int64_t(lines.widths[level][axis]) * channels) return;
-  float sum = 0.0f;
-  for (int part = 0; part < kLineParts; ++part) {
-    sum += parts[2 * part * size + start + i];
-    if (i >= channels) sum += parts[(2 * part + 1) * size + start + i - channels];
+template <int kLane, int kTeam>
+__global__ void __launch_bounds__(kThreads) segments_kernel(FieldPlanes planes, FieldCells cells, FieldRows rows, int segments) {
+  const int segment = (int(blockIdx.x) * kThreads + int(threadIdx.x)) / kTeam, channels = planes.channels;
+  const int32_t begin = segment * kSegment, end = begin + kSegment;
+  if (segment >= segments || end > cells.starts[cells.cells]) return;  // behind the last cell are those that take no part
+  const int slot = int(cells.items[begin] / cells.count);
+  if (cells.items[end - 1] / cells.count != slot) return;
+  const SortedCells sorted = sorted_cells(planes, cells, rows, slot);
+  const auto cell = [&](int32_t i, int axis, int32_t size) {
+    return position_on(cells.coordinates[4 * (cells.items[i] - sorted.first_item) + axis], size).cell;
+  };
+  if (cell(begin, sorted.major, sorted.major_size) != cell(end - 1, sorted.major, sorted.major_size) ||
+      cell(begin, sorted.minor, sorted.minor_size) != cell(end - 1, sorted.minor, sorted.minor_size))
+    return;
+  for (int c = int(threadIdx.x) % kTeam * kLane; c < channels; c += kTeam * kLane) {
+    Channels<kLane> sums[4] = {Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f),
+                               Channels<kLane>::all(0.0f)};
+    for_rows<kLane>(sorted, begin, end, c, channels, [&](int32_t, float x, float y, const Channels<kLane>& row) {
+      const float along = position_on(x, sorted.major_size).fraction, across = position_on(y, sorted.minor_size).fraction;
+#pragma unroll
+      for (int corner = 0; corner < 4; ++corner)
+        sums[corner] = plus(sums[corner], (corner / 2 ? along : 1.0f - along) * (corner % 2 ? across : 1.0f - across), row);
+    });
+#pragma unroll
+    for (int corner = 0; corner < 4; ++corner) sums[corner].store(rows.segments + (int64_t(segment) * 4 + corner) * channels + c);
   }
-  gradient[start + i] = sum;
 }
 
 }  // namespace
 
+void sum_segments(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows, cudaStream_t stream) {
+  const int segments = int(3 * planes.levels * cells.count / kSegment);
+  if (segments == 0) return;
+  with_team(planes.channels % 4 == 0, planes.channels, [&](auto lane, auto team) {
+    segments_kernel<lane(), team()>
+        <<<blocks_for(int64_t(segments) * team()), kThreads, 0, stream>>>(planes, cells, rows, segments);
+  });
+}
+
 void line_gradient(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, const FieldRows& rows,
                    float* gradient, CudaScratch& scratch, cudaStream_t stream) {
-  int64_t size = 0;
+  const int runs = int((cells.count + kRun - 1) / kRun), slots = 3 * planes.levels;
+  int64_t places = int64_t(slots) * runs;
   int32_t widest = 0;
-  for (int l = 0; l < planes.levels; ++l)
-    for (const int32_t width : lines.widths[l]) {
-      size += int64_t(width) * planes.channels;
-      widest = width > widest ? width : widest;
-    }
-  float* parts = scratch.array<float>(2 * kLineParts * size);
-  const unsigned slots = unsigned(3 * planes.levels);
-  const bool wide = planes.channels % 4 == 0 && uintptr_t(rows.lines) % 16 == 0;
-  with_team(wide, planes.channels, [&](auto lane, auto team) {
-    sum_parts<lane(), team()>
-        <<<dim3(unsigned(widest), slots, kLineParts), kThreads, 0, stream>>>(planes, lines, cells, rows.lines, parts, size);
+  for (int slot = 0; slot < slots; ++slot) {
+    const int32_t width = planes.sizes[slot / 3][slot % 3];
+    places += width;
+    widest = width > widest ? width : widest;
+  }
+  float* sums = scratch.array<float>(places * 2 * planes.channels);
+  with_team(planes.channels % 4 == 0, planes.channels, [&](auto lane, auto team) {
+    if (runs > 0)
+      sum_runs<lane(), team()>
+          <<<dim3(blocks_for(runs, kThreads / team()), unsigned(slots)), kThreads, 0, stream>>>(planes, cells, rows, runs, sums);
+    add_runs<lane(), team()>
+        <<<dim3(unsigned(widest), unsigned(slots)), kThreads, 0, stream>>>(planes, lines, cells, runs, sums, gradient);
   });
-  add_parts<<<dim3(blocks_for(int64_t(widest) * planes.channels), slots), kThreads, 0, stream>>>(lines, planes.channels, parts,
-                                                                                                 size, gradient);
 }

@@ -61,3 +61,10 @@ __device__ __forceinline__ uint32_t pack_halves(float x, float y) {
 
 // Not `x > 0`, so that NaN stays and shows.
 __device__ __forceinline__ float rectified(float x) { return x < 0.0f ? 0.0f : x; }
+
+// 16 bytes from device to shared memory while the thread goes on.
+__device__ __forceinline__ void copy_16(void* shared, const void* from) {
+  asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(uint32_t(__cvta_generic_to_shared(shared))), "l"(from));
+}
+
+__device__ __forceinline__ void wait_for_copies() { asm volatile("cp.async.wait_all;" ::: "memory"); }

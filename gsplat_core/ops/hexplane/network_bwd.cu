@@ -21,16 +21,16 @@ struct BackwardLayout {
   __device__ __host__ int floats(int layers) const { return start(layers - 1) + 16 * hidden_stride(); }
 };
 
-__device__ void load_weights(const FieldNetwork& net, const BackwardLayout& layout, float* shared) {
-  for (int layer = 0; layer < net.layers; ++layer) {
-    const bool head = layer == net.layers - 1;
-    const int columns = layer == 0 ? layout.features : layout.width, inputs = layer == 0 ? net.features : net.width;
-    const int stride = columns + 4, rows = head ? 16 : layout.width;
-    for (int i = int(threadIdx.x); i < rows * columns; i += kThreads) {
-      const int row = i / columns, column = i % columns, output = head ? head_output(row) : row;
-      const bool inside = output >= 0 && (head || output < net.width) && column < inputs;
-      shared[layout.start(layer) + row * stride + column] = inside ? net.weights[layer][output * inputs + column] : 0.0f;
-    }
+__global__ void __launch_bounds__(kThreads) pack_weights(FieldNetwork net, float* packed) {
+  const BackwardLayout layout(net);
+  const int layer = int(blockIdx.y);
+  const bool head = layer == net.layers - 1;
+  const int columns = layer == 0 ? layout.features : layout.width, inputs = layer == 0 ? net.features : net.width;
+  const int stride = columns + 4, rows = head ? 16 : layout.width;
+  for (int i = int(blockIdx.x) * kThreads + int(threadIdx.x); i < rows * stride; i += int(gridDim.x) * kThreads) {
+    const int row = i / stride, column = i % stride, output = head ? head_output(row) : row;
+    const bool inside = output >= 0 && (head || output < net.width) && column < inputs;
+    packed[layout.start(layer) + i] = inside ? net.weights[layer][output * inputs + column] : 0.0f;
   }
 }
 
@@ -49,12 +49,15 @@ __device__ __forceinline__ void previous_layer(const float (&in)[kIn][4], float 
 
 template <int kWidth>
 __global__ void __launch_bounds__(kThreads)
-    backward_kernel(FieldNetwork net, const float* __restrict__ v_raw, const float* __restrict__ hidden,
-                    float* __restrict__ v_features, float* __restrict__ v_hidden, float* __restrict__ v_head, int64_t count) {
-  extern __shared__ float weights[];
+    backward_kernel(FieldNetwork net, const uint4* __restrict__ packed, const float* __restrict__ v_raw,
+                    const float* __restrict__ hidden, float* __restrict__ v_features, float* __restrict__ v_hidden,
+                    float* __restrict__ v_head, int64_t count) {
+  extern __shared__ uint4 shared[];
+  const float* weights = reinterpret_cast<const float*>(shared);
   constexpr int kBlocks = kWidth / 8, kColumnBlocks = 4;
   const BackwardLayout layout(net);
-  load_weights(net, layout, weights);
+  for (int i = int(threadIdx.x); i < layout.floats(net.layers) / 4; i += kThreads) copy_16(shared + i, packed + i);
+  wait_for_copies();
   __syncthreads();
   const WarpPlace place;
   const int64_t first = int64_t(blockIdx.x) * kRowsPerBlock + threadIdx.x / 32 * kRowsPerWarp;
@@ -117,21 +120,23 @@ __global__ void __launch_bounds__(kThreads)
 
 template <int kWidth>
 void launch(const FieldNetwork& net, const float* v_raw, const float* hidden, float* v_features, float* v_hidden, float* v_head,
-            int64_t count, cudaStream_t stream) {
+            int64_t count, CudaScratch& scratch, cudaStream_t stream) {
   const int bytes = BackwardLayout(net).floats(net.layers) * int(sizeof(float));
   cudaFuncSetAttribute(backward_kernel<kWidth>, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
-  backward_kernel<kWidth>
-      <<<blocks_for(count, kRowsPerBlock), kThreads, bytes, stream>>>(net, v_raw, hidden, v_features, v_hidden, v_head, count);
+  float* packed = scratch.array<float>(BackwardLayout(net).floats(net.layers));
+  pack_weights<<<dim3(16, unsigned(net.layers)), kThreads, 0, stream>>>(net, packed);
+  backward_kernel<kWidth><<<blocks_for(count, kRowsPerBlock), kThreads, bytes, stream>>>(
+      net, reinterpret_cast<const uint4*>(packed), v_raw, hidden, v_features, v_hidden, v_head, count);
 }
 
 }  // namespace
 
 void network_backward(const FieldNetwork& net, const float* v_raw, const float* hidden, float* v_features, float* v_hidden,
-                      float* v_head, int64_t count, cudaStream_t stream) {
+                      float* v_head, int64_t count, CudaScratch& scratch, cudaStream_t stream) {
   if (count == 0) return;
   switch (net.padded_width()) {
-    case 32: return launch<32>(net, v_raw, hidden, v_features, v_hidden, v_head, count, stream);
-    case 64: return launch<64>(net, v_raw, hidden, v_features, v_hidden, v_head, count, stream);
-    default: return launch<128>(net, v_raw, hidden, v_features, v_hidden, v_head, count, stream);
+    case 32: return launch<32>(net, v_raw, hidden, v_features, v_hidden, v_head, count, scratch, stream);
+    case 64: return launch<64>(net, v_raw, hidden, v_features, v_hidden, v_head, count, scratch, stream);
+    default: return launch<128>(net, v_raw, hidden, v_features, v_hidden, v_head, count, scratch, stream);
   }
 }

@@ -5,7 +5,7 @@
 
 namespace {
 
-constexpr int kShares = 128;
+constexpr int kShares = 256;
 constexpr int kOutputs = 32, kInputs = 64, kDeep = 16, kTileThreads = 128;
 
 struct LayerTiles {
@@ -16,8 +16,8 @@ struct LayerTiles {
   int32_t layers;
 };
 
-__global__ void __launch_bounds__(kTileThreads) sum_shares(LayerTiles tiles, float* __restrict__ shares, int64_t count) {
-  __shared__ float v[kDeep][kOutputs], x[kDeep][kInputs];
+__global__ void __launch_bounds__(kTileThreads, 8) sum_shares(LayerTiles tiles, float* __restrict__ shares, int64_t count) {
+  __shared__ __align__(16) float v[kDeep][kOutputs], x[kDeep][kInputs];
   int layer = 0;
   while (int(blockIdx.x) >= tiles.first_tile[layer + 1]) ++layer;
   const int inputs = tiles.input_count[layer], outputs = tiles.output_count[layer], across = (inputs + kInputs - 1) / kInputs;
@@ -25,21 +25,32 @@ __global__ void __launch_bounds__(kTileThreads) sum_shares(LayerTiles tiles, flo
             first_input = tile % across * kInputs;
   const int64_t begin = count * blockIdx.y / kShares, end = count * (blockIdx.y + 1) / kShares;
   const int o = int(threadIdx.x) / 16 * 4, i = int(threadIdx.x) % 16 * 4;
-  float sums[4][4] = {}, bias = 0.0f;
+  constexpr int kV = kDeep * kOutputs / kTileThreads, kX = kDeep * kInputs / kTileThreads;
+  float sums[4][4] = {}, bias = 0.0f, next_v[kV], next_x[kX];
+  // The next rows are on their way while these are multiplied.
+  const auto fetch = [&](int64_t row) {
+#pragma unroll
+    for (int k = 0; k < kV; ++k) {
+      const int at = k * kTileThreads + int(threadIdx.x), output = first_output + at % kOutputs;
+      const int64_t n = row + at / kOutputs;
+      next_v[k] = n < end && output < outputs ? tiles.v_outputs[layer][n * outputs + output] : 0.0f;
+    }
+#pragma unroll
+    for (int k = 0; k < kX; ++k) {
+      const int at = k * kTileThreads + int(threadIdx.x), input = first_input + at % kInputs;
+      const int64_t n = row + at / kInputs;
+      next_x[k] = n < end && input < inputs ? tiles.inputs[layer][n * inputs + input] : 0.0f;
+    }
+  };
+  fetch(begin);
   for (int64_t row = begin; row < end; row += kDeep) {
-#pragma unroll
-    for (int k = int(threadIdx.x); k < kDeep * kOutputs; k += kTileThreads) {
-      const int64_t n = row + k / kOutputs;
-      const int output = first_output + k % kOutputs;
-      v[k / kOutputs][k % kOutputs] = n < end && output < outputs ? tiles.v_outputs[layer][n * outputs + output] : 0.0f;
-    }
-#pragma unroll
-    for (int k = int(threadIdx.x); k < kDeep * kInputs; k += kTileThreads) {
-      const int64_t n = row + k / kInputs;
-      const int input = first_input + k % kInputs;
-      x[k / kInputs][k % kInputs] = n < end && input < inputs ? tiles.inputs[layer][n * inputs + input] : 0.0f;
-    }
     __syncthreads();
+#pragma unroll
+    for (int k = 0; k < kV; ++k) (&v[0][0])[k * kTileThreads + threadIdx.x] = next_v[k];
+#pragma unroll
+    for (int k = 0; k < kX; ++k) (&x[0][0])[k * kTileThreads + threadIdx.x] = next_x[k];
+    __syncthreads();
+    if (row + kDeep < end) fetch(row + kDeep);
 #pragma unroll
     for (int k = 0; k < kDeep; ++k) {
       const float4 a = *reinterpret_cast<const float4*>(&v[k][o]), b = *reinterpret_cast<const float4*>(&x[k][i]);
@@ -50,7 +61,6 @@ __global__ void __launch_bounds__(kTileThreads) sum_shares(LayerTiles tiles, flo
         for (int q = 0; q < 4; ++q) sums[p][q] += left[p] * right[q];
       if (threadIdx.x < kOutputs) bias += v[k][threadIdx.x];
     }
-    __syncthreads();
   }
   float* to = shares + int64_t(blockIdx.y) * tiles.first_value[tiles.layers] + tiles.first_value[layer];
   for (int p = 0; p < 4; ++p)

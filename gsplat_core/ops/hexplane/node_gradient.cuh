@@ -5,12 +5,16 @@
 
 namespace hexplane {
 
+constexpr int kSegment = 32;  // sorted Gaussians whose sums are kept when they are all in one cell
+constexpr int kBatch = 4;     // rows that are on their way at once
+
 // One plane's Gaussians, sorted by cell = along the major axis * minor size + along the minor axis.
 struct SortedCells {
   const int32_t* starts;     // of the plane's first cell
   const int32_t* items;      // of all planes; item - first_item is a Gaussian
   const float* coordinates;  // [N, 4]
   const float* rows;         // [N, C]: gradient of the plane's sample
+  const float* segments;     // [all items / kSegment, 4, C]: sums of full segments for the corners of their cell; null: none
   int64_t first_item;
   int32_t major, minor;  // axes of the coordinates
   int32_t major_size, minor_size;
@@ -21,18 +25,56 @@ __device__ __forceinline__ float share_of(const LinePosition& at, int node) {
   return int(at.cell) == node ? 1.0f - at.fraction : int(at.cell) == node - 1 ? at.fraction : 0.0f;
 }
 
+// Calls use(k, coordinate along major, along minor, row) for the sorted items [begin, end) in order; their rows are loaded kBatch
+// at a time.
+template <int kLane, class Use>
+__device__ __forceinline__ void for_rows(const SortedCells& cells, int32_t begin, int32_t end, int channel, int channels,
+                                         const Use& use) {
+  for (int32_t i = begin; i < end; i += kBatch) {
+    int64_t n[kBatch];
+    Channels<kLane> row[kBatch];
+    float major[kBatch], minor[kBatch];
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k) n[k] = cells.items[min(i + k, end - 1)] - cells.first_item;
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k) {
+      row[k] = Channels<kLane>::load(cells.rows + n[k] * channels + channel);
+      major[k] = cells.coordinates[4 * n[k] + cells.major];
+      minor[k] = cells.coordinates[4 * n[k] + cells.minor];
+    }
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k)
+      if (i + k < end) use(i + k, major[k], minor[k], row[k]);
+  }
+}
+
 template <int kLane>
 __device__ Channels<kLane> node_gradient(const SortedCells& cells, int major, int minor, int channel, int channels) {
   Channels<kLane> sum = Channels<kLane>::all(0.0f);
-  for (int cell = major > 0 ? major - 1 : 0; cell <= major; ++cell) {
-    const int32_t* starts = cells.starts + int64_t(cell) * cells.minor_size;
-    const int32_t end = starts[minor + 1];
+  for (int left = 0; left < 2; ++left) {  // the cell that the node is the left corner of along the major axis comes last
+    const int cell_major = major - 1 + left;
+    if (cell_major < 0) continue;
+    const int32_t* starts = cells.starts + int64_t(cell_major) * cells.minor_size;
+    const int32_t bounds[3] = {starts[minor > 0 ? minor - 1 : 0], starts[minor], starts[minor + 1]};
+    if (bounds[0] == bounds[2]) continue;
+    for (int low = 0; low < 2; ++low) {
+      const int32_t begin = bounds[low], end = bounds[low + 1];
+      const auto add = [&](int32_t from, int32_t to) {
+        for_rows<kLane>(cells, from, to, channel, channels, [&](int32_t, float x, float y, const Channels<kLane>& row) {
+          const float along = position_on(x, cells.major_size).fraction, across = position_on(y, cells.minor_size).fraction;
+          sum = plus(sum, (left ? 1.0f - along : along) * (low ? 1.0f - across : across), row);
+        });
+      };
+      const int32_t first = (begin + kSegment - 1) / kSegment, last = end / kSegment;
+      if (cells.segments == nullptr || first >= last) {
+        add(begin, end);
+        continue;
+      }
+      add(begin, first * kSegment);
+      const float* corner = cells.segments + (2 * (1 - left) + (1 - low)) * channels + channel;
 #pragma unroll 4
-    for (int32_t i = starts[minor > 0 ? minor - 1 : 0]; i < end; ++i) {
-      const int64_t n = cells.items[i] - cells.first_item;
-      const float share = share_of(position_on(cells.coordinates[4 * n + cells.major], cells.major_size), major) *
-                          share_of(position_on(cells.coordinates[4 * n + cells.minor], cells.minor_size), minor);
-      sum = plus(sum, share, Channels<kLane>::load(cells.rows + n * channels + channel));
+      for (int64_t s = first; s < last; ++s) sum = plus(sum, 1.0f, Channels<kLane>::load(corner + s * 4 * channels));
+      add(last * kSegment, end);
     }
   }
   return sum;

@@ -6,10 +6,12 @@
 
 namespace hexplane {
 
-template <int kLane>
+// `gradient` is called after the moments' loads are on their way.
+template <int kLane, class Gradient>
 __device__ __forceinline__ void update(const PlaneMoments& plane, int64_t at, const Channels<kLane>& value,
-                                       const Channels<kLane>& gradient, const AdamStep& step) {
+                                       const Gradient& gradient_of, const AdamStep& step) {
   Channels<kLane> p = value, m = Channels<kLane>::load(plane.first + at), v = Channels<kLane>::load(plane.second + at);
+  const Channels<kLane> gradient = gradient_of();
 #pragma unroll
   for (int i = 0; i < kLane; ++i) {
     const float g = gradient.v[i];
@@ -35,22 +37,28 @@ __device__ __forceinline__ int slot_of_block(const Slots& slots) {
   return slot;
 }
 
-// The gradient of node (major, minor) of a slot's space plane, for the channels from `channel` on.
-template <int kLane>
-__device__ Channels<kLane> space_gradient(const FieldPlanes& planes, const FieldCells& cells, const float* rows, int slot, int u,
-                                          int v, int channel) {
+// The Gaussians of a slot's space plane.
+__device__ __forceinline__ SortedCells sorted_cells(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows,
+                                                    int slot) {
   const int level = slot / 3, p = slot % 3, major = major_axis(p), minor = minor_axis(p);
-  const bool v_major = v_axis(p) == major;
-  const SortedCells sorted = {cells.starts + cells.first[level][p],
-                              cells.items,
-                              cells.coordinates,
-                              rows + slot * cells.count * planes.channels,
-                              slot * cells.count,
-                              major,
-                              minor,
-                              planes.sizes[level][major],
-                              planes.sizes[level][minor]};
-  return node_gradient<kLane>(sorted, v_major ? v : u, v_major ? u : v, channel, planes.channels);
+  return {cells.starts + cells.first[level][p],
+          cells.items,
+          cells.coordinates,
+          rows.space + slot * cells.count * planes.channels,
+          rows.segments,
+          slot * cells.count,
+          major,
+          minor,
+          planes.sizes[level][major],
+          planes.sizes[level][minor]};
+}
+
+template <int kLane>
+__device__ Channels<kLane> space_gradient(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows, int slot,
+                                          int u, int v, int channel) {
+  const bool v_major = v_axis(slot % 3) == major_axis(slot % 3);
+  return node_gradient<kLane>(sorted_cells(planes, cells, rows, slot), v_major ? v : u, v_major ? u : v, channel,
+                              planes.channels);
 }
 
 }  // namespace hexplane

@@ -4,21 +4,33 @@ using namespace hexplane;
 
 namespace {
 
-__global__ void prepare_scalars(PlanesAdam options, AdamScalars* scalars) {
+__device__ AdamScalars scalars_of(const PlanesAdam& options) {
   const double t = double(*options.step), bias1 = 1 - pow(options.beta1, t), bias2 = 1 - pow(options.beta2, t);
-  scalars->step = {float(double(*options.rate) / bias1),
-                   float(1 / sqrt(bias2)),
-                   float(1 - options.beta1),
-                   float(1 - options.beta2),
-                   float(options.epsilon),
-                   1};
-  scalars->leave = options.status != nullptr && options.status[2] != 0;
+  return {{float(double(*options.rate) / bias1), float(1 / sqrt(bias2)), float(1 - options.beta1), float(1 - options.beta2),
+           float(options.epsilon), 1},
+          options.status != nullptr && options.status[2] != 0};
+}
+
+__global__ void prepare_scalars(PlanesAdam options, AdamScalars* scalars) { *scalars = scalars_of(options); }
+
+__global__ void __launch_bounds__(kThreads) update_network(NetworkParameters parameters, const float* __restrict__ gradient,
+                                                           float* first, float* second, PlanesAdam options) {
+  __shared__ AdamScalars scalars;
+  if (threadIdx.x == 0) scalars = scalars_of(options);
+  __syncthreads();
+  const int i = int(blockIdx.x) * kThreads + int(threadIdx.x);
+  if (scalars.leave || i >= parameters.starts[parameters.count]) return;
+  int tensor = 0;
+  while (i >= parameters.starts[tensor + 1]) ++tensor;
+  const int start = parameters.starts[tensor];
+  const PlaneMoments shifted = {parameters.values[tensor] - start, first, second};  // the moments of all tensors are one
+  update<1>(shifted, i, Channels<1>::load(shifted.values + i), [&] { return Channels<1>::load(gradient + i); }, scalars.step);
 }
 
 // A thread has the neighbouring channels of one node.
 template <int kLane, class Sink>
 __global__ void __launch_bounds__(kThreads)
-    space_nodes(FieldPlanes planes, FieldCells cells, const float* __restrict__ rows, Slots slots, Sink sink) {
+    space_nodes(FieldPlanes planes, FieldCells cells, FieldRows rows, Slots slots, Sink sink) {
   const int slot = slot_of_block(slots), level = slot / 3, p = slot % 3, channels = planes.channels;
   const int width = planes.sizes[level][u_axis(p)], height = planes.sizes[level][v_axis(p)];
   const int64_t at = (int64_t(int(blockIdx.x) - slots.first_block[slot]) * kThreads + threadIdx.x) * kLane;
@@ -53,8 +65,7 @@ struct UpdateSink {
   __device__ void take(int level, int p, bool time, int64_t at, const Gradient& gradient) const {
     if (scalars->leave) return;
     const PlaneMoments& plane = time ? state.time[level][p] : state.space[level][p];
-    const auto value = Channels<kLane>::load(plane.values + at);
-    update<kLane>(plane, at, value, gradient(), scalars->step);
+    update<kLane>(plane, at, Channels<kLane>::load(plane.values + at), gradient, scalars->step);
   }
 };
 
@@ -85,14 +96,14 @@ void visit_nodes(const FieldPlanes& planes, const FieldLines& lines, const Field
   }
   const unsigned space_blocks = unsigned(slots.first_block[slots.count]),
                  time_blocks = unsigned(time_slots.first_block[slots.count]);
-  if (space) space_nodes<kLane><<<space_blocks, kThreads, 0, stream>>>(planes, cells, rows.space, slots, sink);
+  if (space) space_nodes<kLane><<<space_blocks, kThreads, 0, stream>>>(planes, cells, rows, slots, sink);
   if (times)
     time_nodes<kLane><<<time_blocks, kThreads, 0, stream>>>(lines, line_gradient, time, planes.channels, time_slots, sink);
 }
 
 // Whether all planes and rows can be read 16 bytes at a time.
 uintptr_t alignment(const FieldPlanes& planes, const FieldRows& rows, const float* line_gradient) {
-  return uintptr_t(planes.channels) * 4 | uintptr_t(rows.space) | uintptr_t(line_gradient);
+  return uintptr_t(planes.channels) * 4 | uintptr_t(rows.space) | uintptr_t(rows.segments) | uintptr_t(line_gradient);
 }
 
 }  // namespace
@@ -113,7 +124,7 @@ void planes_adam(const FieldPlanes& planes, const FieldLines& lines, const Field
              smooth_time = penalties.time_smoothness != 0.0f || penalties.sparsity != 0.0f;
   visit(planes, lines, cells, rows, line_gradient, time, state.time_rows, sink, !smooth_space, !smooth_time, stream);
   if (smooth_space)
-    smooth_space_planes(bits % 16 == 0, planes, cells, rows.space, state, penalties.smoothness, sink.scalars, scratch, stream);
+    smooth_space_planes(bits % 16 == 0, planes, cells, rows, state, penalties.smoothness, sink.scalars, scratch, stream);
   if (smooth_time) smooth_time_planes(planes, lines, line_gradient, time, state, penalties, sink.scalars, stream);
 }
 
@@ -124,4 +135,10 @@ void planes_gradient(const FieldPlanes& planes, const FieldLines& lines, const F
     for (int p = 0; p < 3; ++p) bits |= uintptr_t(gradients.space[l][p]) | uintptr_t(gradients.time[l][p]);
   const auto visit = bits % 16 == 0 ? visit_nodes<4, StoreSink> : visit_nodes<1, StoreSink>;
   visit(planes, lines, cells, rows, line_gradient, time, gradients.time_rows, StoreSink{gradients}, true, true, stream);
+}
+
+void network_adam(const NetworkParameters& parameters, const float* gradient, float* first, float* second,
+                  const PlanesAdam& options, cudaStream_t stream) {
+  update_network<<<blocks_for(parameters.starts[parameters.count]), kThreads, 0, stream>>>(parameters, gradient, first, second,
+                                                                                           options);
 }

@@ -41,7 +41,7 @@ void planes_adam(const FieldPlanes& planes, const FieldLines& lines, const Field
 
 // The pass with penalties (planes_penalties.cu): over the space planes, and over the time planes. `wide`: all rows start at 16
 // bytes.
-void smooth_space_planes(bool wide, const FieldPlanes& planes, const FieldCells& cells, const float* rows,
+void smooth_space_planes(bool wide, const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows,
                          const PlanesState& state, float smoothness, const AdamScalars* scalars, CudaScratch& scratch,
                          cudaStream_t stream);
 void smooth_time_planes(const FieldPlanes& planes, const FieldLines& lines, const float* line_gradient, const float* time,
@@ -56,3 +56,13 @@ struct PlaneGradients {
 
 void planes_gradient(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, const FieldRows& rows,
                      const float* line_gradient, const float* time, const PlaneGradients& gradients, cudaStream_t stream);
+
+// The network's weights and biases, whose gradient and moments lie one after the other in their order.
+struct NetworkParameters {
+  float* values[2 * kFieldLayers];
+  int32_t starts[2 * kFieldLayers + 1];
+  int32_t count;
+};
+
+void network_adam(const NetworkParameters& parameters, const float* gradient, float* first, float* second,
+                  const PlanesAdam& options, cudaStream_t stream);

@@ -69,8 +69,8 @@ __global__ void __launch_bounds__(kTileThreads) copy_borders(FieldPlanes planes,
 
 template <int kLane>
 __global__ void __launch_bounds__(kTileThreads)
-    space_tiles(FieldPlanes planes, FieldCells cells, const float* __restrict__ rows, PlanesState state, Tiles tiles,
-                float smoothness, const AdamScalars* scalars) {
+    space_tiles(FieldPlanes planes, FieldCells cells, FieldRows rows, PlanesState state, Tiles tiles, float smoothness,
+                const AdamScalars* scalars) {
   __shared__ float shown[2][kTileThreads * kLane];
   if (scalars->leave) return;
   const Tile tile(planes, tiles, kLane);
@@ -110,7 +110,7 @@ __global__ void __launch_bounds__(kTileThreads)
     Channels<kLane> gradient = space_gradient<kLane>(planes, cells, rows, tile.slot, tile.u, v, tile.channel);
     gradient = plus(gradient, along_u, (current - left) - (right - current));
     gradient = plus(gradient, along_v, (current - above) - (below - current));
-    update<kLane>(plane, place(v), current, gradient, step);
+    update<kLane>(plane, place(v), current, [&] { return gradient; }, step);
     above = current;
     current = below;
   }
@@ -146,7 +146,7 @@ __global__ void __launch_bounds__(kThreads)
       const float apart = window[0].v[i] - 1.0f;
       gradient.v[i] += apart > 0.0f ? away : apart < 0.0f ? -away : 0.0f;
     }
-    update<kLane>(plane, v * size + column, window[0], gradient, step);
+    update<kLane>(plane, v * size + column, window[0], [&] { return gradient; }, step);
     bends[0] = bends[1], bends[1] = bends[2];
     window[0] = window[1], window[1] = window[2], window[2] = next;
   }
@@ -173,7 +173,7 @@ Tiles make_tiles(const FieldPlanes& planes, CudaScratch& scratch) {
 }
 
 template <int kLane>
-void smooth_space(const FieldPlanes& planes, const FieldCells& cells, const float* rows, const PlanesState& state,
+void smooth_space(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows, const PlanesState& state,
                   float smoothness, const AdamScalars* scalars, CudaScratch& scratch, cudaStream_t stream) {
   const Tiles tiles = make_tiles<kLane>(planes, scratch);
   const unsigned blocks = unsigned(tiles.blocks.first_block[tiles.blocks.count]);
@@ -198,7 +198,7 @@ void smooth_time(const FieldPlanes& planes, const FieldLines& lines, const float
 
 }  // namespace
 
-void smooth_space_planes(bool wide, const FieldPlanes& planes, const FieldCells& cells, const float* rows,
+void smooth_space_planes(bool wide, const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows,
                          const PlanesState& state, float smoothness, const AdamScalars* scalars, CudaScratch& scratch,
                          cudaStream_t stream) {
   (wide ? smooth_space<4> : smooth_space<1>)(planes, cells, rows, state, smoothness, scalars, scratch, stream);

@@ -44,6 +44,8 @@ class FieldGradient(NamedTuple):
     """Weight and bias of every layer, one after the other."""
     rows: Tensor
     """[2, 3 * levels, N, C]: gradients of the samples of the space planes (xy, xz, yz) and of the lines (x, y, z)."""
+    segments: Tensor
+    """[3 * levels * N / 32, 4, C]: sums of 32 sorted rows each, where these are all in one cell."""
     items: Tensor
     """int32 [3 * levels * N]: slot * N + Gaussian, sorted by the cell of that slot's space plane."""
     starts: Tensor
@@ -110,7 +112,14 @@ def hexplane_planes_gradient(
 ) -> list[Tensor]:
     """The gradient of every plane as a tensor of its size."""
     return torch.ops.gsplat_core.hexplane_planes_gradient(
-        state.coordinates, time, gradient.rows, gradient.items, gradient.starts, gradient.v_lines, list(planes)
+        state.coordinates,
+        time,
+        gradient.rows,
+        gradient.segments,
+        gradient.items,
+        gradient.starts,
+        gradient.v_lines,
+        list(planes),
     )
 
 
@@ -140,9 +149,30 @@ def hexplane_planes_adam_(
     """
     _check(*planes, *first, *second, rate)
     torch.ops.gsplat_core.hexplane_planes_adam_(
-        list(planes), list(first), list(second), state.coordinates, time, gradient.rows, gradient.items, gradient.starts,
+        list(planes), list(first), list(second), state.coordinates, time, gradient.rows, gradient.segments, gradient.items, gradient.starts,
         gradient.v_lines, rate, step, status, *betas, epsilon, *penalties,
     )  # fmt: skip
+
+
+def network_adam_(
+    parameters: Sequence[Tensor],
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
+    rate: Tensor,
+    step: Tensor,
+    *,
+    status: Tensor | None = None,
+    betas: tuple[float, float] = (0.9, 0.999),
+    epsilon: float = 1e-8,
+) -> None:
+    """One step of Adam over a network's small tensors in one launch, in place; as `hexplane_planes_adam_` otherwise.
+
+    Args:
+        parameters: weight and bias of every layer; `gradient`, `first` and `second` have their values one after the other.
+    """
+    _check(*parameters, gradient, first, second, rate)
+    torch.ops.gsplat_core.network_adam_(list(parameters), gradient, first, second, rate, step, status, *betas, epsilon)
 
 
 def _check(*tensors: Tensor) -> None:
@@ -183,12 +213,13 @@ def _(
     planes: list[Tensor],
     weights: list[Tensor],
     biases: list[Tensor],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     n, slots = means.shape[0], len(planes) // 2
     cells = sum(int(plane.shape[0] * plane.shape[1]) for index, plane in enumerate(planes) if index % 6 < 3)
     return (
         means.new_empty(sum(t.numel() for t in (*weights, *biases))),
         means.new_empty(2, slots, n, planes[0].shape[2]),
+        means.new_empty(slots * n // 32, 4, planes[0].shape[2]),
         means.new_empty(slots * n, dtype=torch.int32),
         means.new_empty(cells + 1, dtype=torch.int32),
         means.new_empty(_lines_size(planes)),
@@ -200,6 +231,7 @@ def _(
     coordinates: Tensor,
     time: Tensor,
     rows: Tensor,
+    segments: Tensor,
     items: Tensor,
     starts: Tensor,
     v_lines: Tensor,
@@ -216,6 +248,7 @@ def _(
     coordinates: Tensor,
     time: Tensor,
     rows: Tensor,
+    segments: Tensor,
     items: Tensor,
     starts: Tensor,
     v_lines: Tensor,
@@ -228,5 +261,21 @@ def _(
     smoothness: float,
     time_smoothness: float,
     sparsity: float,
+) -> None:
+    return None
+
+
+@torch.library.register_fake("gsplat_core::network_adam_")
+def _(
+    parameters: list[Tensor],
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
+    rate: Tensor,
+    step: Tensor,
+    status: Tensor | None,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
 ) -> None:
     return None

@@ -10,8 +10,6 @@
 #include "hexplane.h"
 #include "network_cuda.h"
 
-constexpr int kLineParts = 8;  // in which the Gaussians of a line's cell are summed
-
 // Space plane p of a level has cells in the order of its major axis, so that those around a node of the major axis lie together.
 constexpr int major_axis(int p) { return p == 0 ? 1 : p == 1 ? 0 : 2; }  // xy: y, xz: x, yz: z
 constexpr int minor_axis(int p) { return p == 0 ? 0 : p == 1 ? 2 : 1; }
@@ -38,9 +36,12 @@ struct FieldCells {
 struct FieldRows {
   float* space;  // [slots, N, C]: gradient of the plane's sample
   float* lines;  // [slots, N, C]: of the line's, slot = 3 * level + axis
+  // [slots * N / 32, 4, C]: of 32 items that are all in one cell, the sums of their rows for its four corners, the second along
+  // the minor axis first; what belongs to other items is not written
+  float* segments;
 };
 
-// Coordinates of `means` [N, 3] in `box` [2, 3], and with `cells.items` the sorted cells.
+// Coordinates of `means` [N, 3] in `box` [2, 3], and with `cells.starts` the sorted cells.
 void place_gaussians(const FieldPlanes& planes, const float* means, const float* box, FieldCells& cells, CudaScratch& scratch,
                      cudaStream_t stream);
 
@@ -51,7 +52,7 @@ void field_features(const FieldPlanes& planes, const FieldLines& lines, const Fi
 // From v_raw [N, 16] to the gradient of the features [N, levels * C] and, layer by layer, of the layers' sums: v_hidden
 // [layers - 1, N, width] and v_head [N, 16]. A row of v_raw that is not finite counts as zero.
 void network_backward(const FieldNetwork& net, const float* v_raw, const float* hidden, float* v_features, float* v_hidden,
-                      float* v_head, int64_t count, cudaStream_t stream);
+                      float* v_head, int64_t count, CudaScratch& scratch, cudaStream_t stream);
 
 // The gradient of weights and biases, layer by layer: weight [outputs, inputs], then bias.
 void network_weight_gradient(const FieldNetwork& net, const float* features, const float* hidden, const float* v_hidden,
@@ -60,6 +61,9 @@ void network_weight_gradient(const FieldNetwork& net, const float* features, con
 // Rows for all planes and lines, and the gradient of the positions, which is added to the first three columns of v_raw.
 void field_rows(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, const float* box,
                 const float* v_features, const FieldRows& rows, float* v_raw, cudaStream_t stream);
+
+// Fills rows.segments, so that a cell with many Gaussians does not hold up the nodes around it.
+void sum_segments(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows, cudaStream_t stream);
 
 // The gradient of the lines, laid out as they are.
 void line_gradient(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, const FieldRows& rows,

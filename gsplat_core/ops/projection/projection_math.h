@@ -168,17 +168,12 @@ struct BackProjected {
   Symmetric3 sigma;
 };
 
+// From the gradient g of the blurred 2D covariance (xx, xy, yy; as a symmetric matrix), of the image point and of the depth.
 template <CameraModel model>
 GSPLAT_INLINE BackProjected project_backward(const ProjectionInput& in, const View<model>& view, const vfloat mean[3],
-                                             const Geometry& geometry, const ProjectedGradient& v, bool compensate,
-                                             bool needs_viewmat) {
+                                             const Geometry& geometry, const Point3& p, const ImagePoint& image, const Ellipse& e,
+                                             const vfloat g[3], const vfloat v_means2d[2], vfloat v_depth, bool needs_viewmat) {
   BackProjected to = {};
-  const Point3 p = view.to_camera(mean);
-  const ImagePoint image = Projector<model>::forward(view.k, p);
-  const Ellipse e = ellipse_of(view, image, geometry.sigma);
-  vfloat g[3];
-  covariance2d_gradient(e, in.eps2d, v.conic, compensate, v.compensation, g);
-
   // Sigma' = A Sigma A^T: v_Sigma = A^T G A, v_A = 2 G A Sigma
   const vfloat G[2][2] = {{g[0], g[1]}, {g[1], g[2]}};
   vfloat ga[2][3], v_affine[2][3];
@@ -195,8 +190,8 @@ GSPLAT_INLINE BackProjected project_backward(const ProjectionInput& in, const Vi
   for (int r = 0; r < 2; ++r)
     for (int c = 0; c < 3; ++c)
       v_j[r][c] = v_affine[r][0] * view.w.m[c][0] + v_affine[r][1] * view.w.m[c][1] + v_affine[r][2] * view.w.m[c][2];
-  const Point3 v_point = Projector<model>::backward(view.k, p, v.means2d[0], v.means2d[1], v_j);
-  const vfloat v_p[3] = {v_point.x, v_point.y, v_point.z + v.depth};
+  const Point3 v_point = Projector<model>::backward(view.k, p, v_means2d[0], v_means2d[1], v_j);
+  const vfloat v_p[3] = {v_point.x, v_point.y, v_point.z + v_depth};
   for (int i = 0; i < 3; ++i) to.mean[i] = view.w.m[0][i] * v_p[0] + view.w.m[1][i] * v_p[1] + view.w.m[2][i] * v_p[2];
   if (needs_viewmat)
     for (int i = 0; i < 3; ++i) {
@@ -214,6 +209,18 @@ GSPLAT_INLINE BackProjected project_backward(const ProjectionInput& in, const Vi
     rotation_backward(geometry.quat, v_rotation, to.quat);
   }
   return to;
+}
+
+template <CameraModel model>
+GSPLAT_INLINE BackProjected project_backward(const ProjectionInput& in, const View<model>& view, const vfloat mean[3],
+                                             const Geometry& geometry, const ProjectedGradient& v, bool compensate,
+                                             bool needs_viewmat) {
+  const Point3 p = view.to_camera(mean);
+  const ImagePoint image = Projector<model>::forward(view.k, p);
+  const Ellipse e = ellipse_of(view, image, geometry.sigma);
+  vfloat g[3];
+  covariance2d_gradient(e, in.eps2d, v.conic, compensate, v.compensation, g);
+  return project_backward(in, view, mean, geometry, p, image, e, g, v.means2d, v.depth, needs_viewmat);
 }
 
 }  // namespace GSPLAT_ISA

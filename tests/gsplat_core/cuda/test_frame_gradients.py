@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.frame.frame import render_frame
 from gsplat_core.ops.frame.frame_gradients import DC, RawGradients, render_frame_backward
 from tests.gsplat_core.cuda.frame_scenes import (
     NAMES,
@@ -60,30 +59,6 @@ def check(scene: FrameScene, with_alphas: bool = True) -> RawGradients:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_every_degree_of_spherical_harmonics(degree: int, deltas: bool) -> None:
     check(frame_scene(300, degree=degree, deltas=deltas))
-
-
-@pytest.mark.parametrize("degree", [0, 2])
-def test_autograd_takes_the_same_way(degree: int) -> None:
-    scene = on_gpu(frame_scene(300, degree=degree, deltas=True))
-    wanted = by_name(backward(scene), scene.sh.shape[1])
-    leaves = {name: getattr(scene, name).clone().requires_grad_() for name in (*NAMES, "deltas")}
-    frame = rendered(replace(scene, **leaves))
-    v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
-    ((frame.image * v_image).sum() + (frame.alphas * v_alphas).sum()).backward()
-    for name in NAMES:
-        assert torch.equal(leaves[name].grad.cpu().double(), wanted[name].reshape(leaves[name].shape))
-    assert torch.equal(leaves["deltas"].grad, backward(scene).raw)
-
-
-def test_autograd_refuses_what_has_no_gradient() -> None:
-    scene = on_gpu(frame_scene(30, 20, 18))
-    means = scene.means.clone().requires_grad_()
-    inputs = (means, *scene.gaussians[1:], None, scene.viewmat, scene.K, None, 20, 18, 1000)
-    with pytest.raises(InvalidInput, match="training=True"):
-        render_frame(*inputs).image.sum().backward()
-    camera = scene.viewmat.clone().requires_grad_()
-    with pytest.raises(InvalidInput, match="no gradient for the camera"):
-        render_frame(*inputs[:6], camera, *inputs[7:], training=True).image.sum().backward()
 
 
 @pytest.mark.parametrize("camera_model", MODELS)
@@ -140,7 +115,7 @@ def test_one_over_the_whole_screen_among_thin_and_tiny_ones() -> None:
     scene = frame_scene(300, 200, 150, degree=1, median_px=2.0)
     scene.log_scales[7] = 4.0
     scene.logit_opacities[7] = -1.0
-    scene.log_scales[1::5] = torch.tensor([0.0, -3.0, -3.0])
+    scene.log_scales[1::5] = torch.tensor([0.5, -4.0, -4.0])
     scene.log_scales[2::5] = -8.0
     check(scene)
 

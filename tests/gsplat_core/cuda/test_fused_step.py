@@ -50,7 +50,9 @@ def observation(make_gaussians, camera) -> Observation:
     return Observation(seq=0, time_s=0.0, camera=camera, image=image, mask=mask, depth=seen.depth)
 
 
-def train(gaussians: Gaussians, observation: Observation, weights: LossWeights, steps: int) -> tuple[list[float], FusedAdam]:
+def train(
+    gaussians: Gaussians, observation: Observation, weights: LossWeights, steps: int
+) -> tuple[list[float], FusedAdam]:
     adam = FusedAdam(gaussians.tensors())
     step = FusedStep(gaussians, NoField(), adam, weights, observation.camera)
     losses = [float(step(gaussians, observation, 0.0, RATES, [])) for _ in range(steps)]

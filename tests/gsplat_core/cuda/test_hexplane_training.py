@@ -115,7 +115,7 @@ def test_deltas_and_gradients_equal_the_reference(gpu, case):
     assert torch.equal(v_raw[:, 3:], ours.v_raw[:, 3:])
     assert relative(gradient.network, network) < 1e-4
     added = v_raw[:, :3].cpu().double() - case.v_raw[:, :3].double()
-    assert float((added - v_means).norm()) < 1e-4 * float(v_means.norm()) + 1e-6 * float(case.v_raw.norm())
+    assert float((added - v_means).norm()) <= 1e-4 * float(v_means.norm()) + 1e-6 * float(case.v_raw.norm())
     for seen, wanted in zip(hexplane_planes_gradient(state, ours.time, gradient, ours.planes), v_planes, strict=True):
         assert relative(seen, wanted) < 1e-4
 
@@ -126,7 +126,13 @@ def test_the_same_bits_every_time(gpu):
     for _ in range(2):
         state, v_raw = case.forward(), case.v_raw.clone()
         gradient = case.backward(state, v_raw)
-        results.append([*state, v_raw, *gradient, *hexplane_planes_gradient(state, case.time, gradient, case.planes)])
+        left = (
+            gradient.network,
+            gradient.rows,
+            gradient.starts,
+            gradient.v_lines,
+        )  # segments has places that nobody writes
+        results.append([*state, v_raw, *left, *hexplane_planes_gradient(state, case.time, gradient, case.planes)])
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
@@ -265,7 +271,7 @@ def test_ops_pass_opcheck(gpu):
     torch.library.opcheck(ops.hexplane_train.default, (case.means, case.box, case.time, *network))
     kept = (state.lines, state.features, state.hidden)
     torch.library.opcheck(ops.hexplane_train_backward.default, (case.v_raw, case.means, case.box, *kept, *network))
-    factored = (gradient.rows, gradient.items, gradient.starts, gradient.v_lines)
+    factored = (gradient.rows, gradient.segments, gradient.items, gradient.starts, gradient.v_lines)
     torch.library.opcheck(ops.hexplane_planes_gradient.default, (state.coordinates, case.time, *factored, case.planes))
     first, second = ([torch.zeros_like(p) for p in case.planes] for _ in range(2))
     rate, step = torch.tensor([0.01], device=gpu), torch.ones(1, dtype=torch.int64, device=gpu)

@@ -146,7 +146,7 @@ def test_opcheck():
 
 
 def test_what_it_cannot_take_is_refused():
-    image, alphas, target, mask, target_depth = frame((4, 5))
+    image, alphas, target, mask, _ = frame((4, 5))
     with pytest.raises(InvalidInput, match="CUDA"):
         frame_loss(image.cpu(), alphas, target)
     with pytest.raises(InvalidInput, match="float64"):

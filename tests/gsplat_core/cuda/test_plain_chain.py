@@ -9,9 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsplat_core import InvalidInput, fully_fused_projection, rasterization, rasterize_to_pixels, spherical_harmonics
+from gsplat_core import (
+    InvalidInput,
+    fully_fused_projection,
+    quat_scale_to_covar_preci,
+    rasterization,
+    rasterize_to_pixels,
+    spherical_harmonics,
+)
 from gsplat_core.ops.tiles.tiles import bin_splats
-from gsplat_core.pipeline import camera_centers
+from gsplat_core.view_colors import camera_centers
 
 pytestmark = pytest.mark.cuda
 
@@ -74,6 +81,34 @@ def test_a_frame_and_its_gradient_are_captured_and_replayed_with_another_camera(
         assert_same_bits(replayed, frame(None)[0])
         pictures.append(replayed[0].clone())
     assert not torch.equal(pictures[0], pictures[2])
+
+
+@pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype")
+@pytest.mark.parametrize("render_mode", ["RGB", "RGB+ED", "D"])
+@pytest.mark.parametrize("geometry", ["quats", "covars"])
+def test_nothing_but_the_lists_length_makes_the_host_wait(make_scene, render_mode, geometry):
+    scene = place(make_scene(300, cameras=2))
+    leaves = scene.leaves()
+    means, quats, scales, opacities, sh, viewmats = leaves
+    options = dict(render_mode=render_mode, rasterize_mode="antialiased", packed=False, sh_degree=3)
+    options["backgrounds"] = torch.rand(2, 1 if render_mode == "D" else 3, device="cuda")
+    if geometry == "covars":
+        quats = quat_scale_to_covar_preci(quats, scales, compute_preci=False)[0].detach().requires_grad_()
+        options["covars"] = quats
+
+    def step() -> None:
+        given = (None, None) if geometry == "covars" else (quats, scales)
+        image, alpha, _ = rasterization(
+            means, *given, opacities, sh, viewmats, scene.Ks, scene.width, scene.height, **options
+        )
+        torch.autograd.grad(image.sum() + alpha.sum(), (means, quats, opacities, viewmats))
+
+    step()
+    torch.cuda.set_sync_debug_mode("error")  # knows of torch's own waits; that for the length is ours
+    try:
+        step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
 
 
 def test_on_a_side_stream_while_another_one_is_busy(make_scene):

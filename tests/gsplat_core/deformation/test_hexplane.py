@@ -134,3 +134,28 @@ def test_nan_positions_do_not_make_the_box(make_gaussians):
 def test_impossible_architectures_are_refused(wrong, make_gaussians):
     with pytest.raises(InvalidInput):
         HexPlaneField(make_gaussians(2), WINDOW, **(SMALL | wrong))
+
+
+@pytest.mark.parametrize("count", [0, 1, 30])
+def test_frame_deltas_are_what_forward_adds(make_gaussians, count):
+    gaussians = make_gaussians(count)
+    field = small_field(gaussians)
+    with torch.no_grad():
+        field.head.weight.normal_(std=0.3)
+        field.planes[0]["xt"].add_(0.3 * torch.rand_like(field.planes[0]["xt"]))
+        moved = field(gaussians, 3.1)
+    deltas = field.frame_deltas(gaussians)(torch.full((1,), field.frame_time(3.1)))
+    assert deltas.shape == (count, 16) and not deltas[:, [10, 11, 12, 14, 15]].any()
+    columns = {
+        "means": deltas[:, :3],
+        "quats": deltas[:, 3:7],
+        "log_scales": deltas[:, 7:10],
+        "logit_opacities": deltas[:, 13],
+    }
+    for name, added in columns.items():
+        torch.testing.assert_close(gaussians.tensors()[name] + added, moved.tensors()[name], rtol=1e-5, atol=1e-5)
+
+
+def test_frame_time_is_clamped_to_the_window(make_gaussians):
+    field = small_field(make_gaussians(3))
+    assert [field.frame_time(t) for t in (1.0, 2.0, 3.0, 4.0, 9.0)] == [-1.0, -1.0, 0.0, 1.0, 1.0]

@@ -1,0 +1,137 @@
+#include <optional>
+
+#include "planes_adam_cuda.h"
+#include "training_arguments.h"
+
+namespace {
+
+// What hexplane_train_backward left, as the pass over the planes takes it.
+struct Backward {
+  Tensor coordinates, time, rows, segments, items, starts, v_lines;
+  FieldRows raw = {};
+
+  Backward(const CudaCall& call, Field& field, const Tensor& coordinates_, const Tensor& time_, const Tensor& rows_,
+           const Tensor& segments_, const Tensor& items_, const Tensor& starts_, const Tensor& v_lines_)
+      : coordinates(call.floats(coordinates_, "coordinates")),
+        time(call.floats(time_, "time")),
+        rows(call.floats(rows_, "rows")),
+        segments(call.floats(segments_, "segments")),
+        items(call.ints(items_, "items")),
+        starts(call.ints(starts_, "starts")),
+        v_lines(call.floats(v_lines_, "line gradient")) {
+    const int64_t values = 3 * field.planes.levels * field.cells.count;
+    STD_TORCH_CHECK(items.numel() == values && rows.numel() == 2 * values * field.planes.channels &&
+                        segments.numel() == values / 32 * 4 * field.planes.channels && starts.numel() == field.cells.cells + 1 &&
+                        v_lines.numel() == field.line_size && time.numel() == 1,
+                    "rows, items, starts and line gradient must be those that hexplane_train_backward gave");
+    field.cells.coordinates = const_cast<float*>(data(coordinates));
+    field.cells.items = const_cast<int32_t*>(items.const_data_ptr<int32_t>());
+    field.cells.starts = const_cast<int32_t*>(starts.const_data_ptr<int32_t>());
+    raw.space = const_cast<float*>(data(rows));
+    raw.segments = const_cast<float*>(data(segments));
+    raw.lines = raw.space + values * field.planes.channels;
+  }
+};
+
+// Rate, step and status of an update, from their tensors, which must outlive the result.
+struct UpdateOptions {
+  Tensor rate, step;
+  std::optional<Tensor> status;
+  PlanesAdam raw = {};
+
+  UpdateOptions(const CudaCall& call, const Tensor& rate_, const Tensor& step_, const std::optional<Tensor>& status_,
+                double beta1, double beta2, double epsilon)
+      : rate(call.floats(rate_, "rate")), step(call.take(step_, ScalarType::Long, "step")) {
+    if (status_.has_value()) status = call.ints(*status_, "status");
+    STD_TORCH_CHECK(rate.numel() == 1 && step.numel() == 1 && (!status.has_value() || status->numel() >= 3),
+                    "rate and step must be one number each, and status four");
+    raw = {data(rate),
+           step.const_data_ptr<int64_t>(),
+           status.has_value() ? status->const_data_ptr<int32_t>() : nullptr,
+           beta1,
+           beta2,
+           epsilon,
+           {}};
+  }
+};
+
+Tensors hexplane_planes_gradient(Tensor coordinates, Tensor time, Tensor rows, Tensor segments, Tensor items, Tensor starts,
+                                 Tensor v_lines, Tensors planes) {
+  CudaCall call(coordinates);
+  Field field(call, planes, coordinates.size(0));
+  const Backward backward(call, field, coordinates, time, rows, segments, items, starts, v_lines);
+  PlaneGradients gradients = {};
+  Tensors out;
+  for (size_t i = 0; i < planes.size(); ++i) {
+    out.push_back(call.empty({planes[i].size(0), planes[i].size(1), planes[i].size(2)}));
+    const size_t level = i / 6, p = i % 6;
+    (p < 3 ? gradients.space[level][p] : gradients.time[level][p - 3]) = mutable_data(out.back());
+    if (p >= 3) gradients.time_rows[level][p - 3] = int32_t(planes[i].size(0));
+  }
+  planes_gradient(field.planes, field.lines, field.cells, backward.raw, data(backward.v_lines), data(backward.time), gradients,
+                  call.stream);
+  check_cuda(cudaGetLastError(), "hexplane_planes_gradient");
+  return out;
+}
+
+void hexplane_planes_adam_(Tensors planes, Tensors first, Tensors second, Tensor coordinates, Tensor time, Tensor rows,
+                           Tensor segments, Tensor items, Tensor starts, Tensor v_lines, Tensor rate, Tensor step,
+                           std::optional<Tensor> status, double beta1, double beta2, double epsilon, double smoothness,
+                           double time_smoothness, double sparsity) {
+  CudaCall call(coordinates);
+  Field field(call, planes, coordinates.size(0));
+  const Backward backward(call, field, coordinates, time, rows, segments, items, starts, v_lines);
+  STD_TORCH_CHECK(first.size() == planes.size() && second.size() == planes.size(), "every plane needs its two moments");
+  PlanesState state = {};
+  for (size_t i = 0; i < planes.size(); ++i) {
+    for (const Tensor* moment : {&first[i], &second[i]}) {
+      call.floats(*moment, "a moment");
+      STD_TORCH_CHECK(moment->is_contiguous() && moment->numel() == planes[i].numel(),
+                      "moments must be contiguous and of their plane's size");
+    }
+    const size_t level = i / 6, p = i % 6;
+    (p < 3 ? state.space[level][p] : state.time[level][p - 3]) = {mutable_data(planes[i]), mutable_data(first[i]),
+                                                                  mutable_data(second[i])};
+    if (p >= 3) state.time_rows[level][p - 3] = int32_t(planes[i].size(0));
+  }
+  STD_TORCH_CHECK(smoothness == 0 || field.planes.channels <= 512, "the penalty on space planes takes up to 512 channels, got ",
+                  field.planes.channels);
+  UpdateOptions options(call, rate, step, status, beta1, beta2, epsilon);
+  options.raw.penalties = {float(smoothness), float(time_smoothness), float(sparsity)};
+  planes_adam(field.planes, field.lines, field.cells, backward.raw, data(backward.v_lines), data(backward.time), state,
+              options.raw, call, call.stream);
+  check_cuda(cudaGetLastError(), "hexplane_planes_adam_");
+}
+
+void network_adam_(Tensors parameters, Tensor gradient, Tensor first, Tensor second, Tensor rate, Tensor step,
+                   std::optional<Tensor> status, double beta1, double beta2, double epsilon) {
+  CudaCall call(gradient);
+  const Tensor g = call.floats(gradient, "gradient");
+  STD_TORCH_CHECK(!parameters.empty() && parameters.size() <= size_t(2 * kFieldLayers), "network_adam_ takes 1 to ",
+                  2 * kFieldLayers, " tensors, got ", parameters.size());
+  NetworkParameters list = {};
+  for (const Tensor& t : parameters) {
+    call.floats(t, "a parameter");
+    STD_TORCH_CHECK(t.is_contiguous(), "network_adam_ updates contiguous tensors in place");
+    list.values[list.count] = mutable_data(t);
+    list.starts[list.count + 1] = list.starts[list.count] + int32_t(t.numel());
+    ++list.count;
+  }
+  for (const Tensor* t : {&g, static_cast<const Tensor*>(&first), static_cast<const Tensor*>(&second)}) {
+    call.floats(*t, "gradient and moments");
+    STD_TORCH_CHECK(t->is_contiguous() && t->numel() == list.starts[list.count],
+                    "gradient and moments must be contiguous, with the parameters one after the other: ", list.starts[list.count],
+                    " values");
+  }
+  const UpdateOptions options(call, rate, step, status, beta1, beta2, epsilon);
+  network_adam(list, data(g), mutable_data(first), mutable_data(second), options.raw, call.stream);
+  check_cuda(cudaGetLastError(), "network_adam_");
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
+  m.impl("hexplane_planes_gradient", TORCH_BOX(&hexplane_planes_gradient));
+  m.impl("hexplane_planes_adam_", TORCH_BOX(&hexplane_planes_adam_));
+  m.impl("network_adam_", TORCH_BOX(&network_adam_));
+}

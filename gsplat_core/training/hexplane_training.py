@@ -1,0 +1,114 @@
+"""The HexPlane field's part in a training step that runs on the GPU alone, without autograd and without a wait of the host."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gsplat_core.deformation import HexPlaneField
+from gsplat_core.errors import InvalidInput
+from gsplat_core.gaussians import Gaussians
+from gsplat_core.ops.hexplane.deltas import takes_layers
+from gsplat_core.ops.hexplane.training import (
+    FieldGradient,
+    Penalties,
+    TrainingState,
+    hexplane_planes_adam_,
+    hexplane_train,
+    hexplane_train_backward,
+    network_adam_,
+)
+
+
+class HexPlaneTraining:
+    """Deltas, gradients and Adam of one field: `deltas`, then `update` with their gradient, and again.
+
+    Both only queue work on the current stream and read time, rates and step from device memory, so a CUDA graph can hold a step and be
+    replayed with others. Parameters and moments change in place. The same inputs give the same bits.
+
+    Args:
+        field: float32 on a CUDA device.
+        penalties: weights in the loss of the penalties of `gsplat_core.deformation.regularisers`.
+
+    Raises:
+        InvalidInput: the field is elsewhere, or its sizes are not those that the kernels take; train it with autograd then.
+    """
+
+    rates = 2
+    """Learning rates that `update` takes: of the planes, of the network."""
+    reads_positions = True
+    """The deltas depend on the Gaussians' positions, whose gradient `update` completes."""
+
+    def __init__(
+        self,
+        field: HexPlaneField,
+        penalties: Penalties = Penalties(),
+        betas: tuple[float, float] = (0.9, 0.999),
+        epsilon: float = 1e-8,
+    ) -> None:
+        sizes = (field.channels, len(field.levels), field.width, field.depth)
+        if field.box.device.type != "cuda" or field.box.dtype != torch.float32 or not takes_layers(*sizes):
+            raise InvalidInput(
+                f"training without autograd takes a float32 field on CUDA with a multiple of 16 channels and layers up to 128 wide, got"
+                f" {field.box.dtype} on {field.box.device}, {field.channels} channels, {field.depth} layers of {field.width}"
+            )
+        self._field = field
+        self._penalties = penalties
+        self._betas = betas
+        self._epsilon = epsilon
+        self._first, self._second = ([torch.zeros_like(p) for p in field.plane_tensors()] for _ in range(2))
+        size = sum(t.numel() for t in self._network())
+        self._network_first, self._network_second = (torch.zeros(size, device=field.box.device) for _ in range(2))
+        self._means: Tensor | None = None
+        self._state: TrainingState | None = None
+
+    def tensors(self) -> Sequence[Tensor]:
+        """Everything on the device that a step reads or changes."""
+        moments = (*self._first, *self._second, self._network_first, self._network_second)
+        return (*self._field.plane_tensors(), *self._network(), *moments, self._field.box)
+
+    def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor:
+        """What the field adds to the Gaussians at `time` [1], one of `HexPlaneField.frame_time`: [N, 16], the frame path's layout."""
+        weights, biases = self._layers()
+        self._means = gaussians.means.detach()
+        self._state = hexplane_train(self._means, self._field.box, time, self._field.plane_tensors(), weights, biases)
+        return self._state.deltas
+
+    def gradient(self, v_raw: Tensor) -> FieldGradient:
+        """The field's gradient for dL/d(deltas) `v_raw` [N, 16] of the last `deltas`; adds the part of the positions to it in place."""
+        if self._state is None or self._means is None:
+            raise InvalidInput("there are no deltas to go back from; call deltas first")
+        weights, biases = self._layers()
+        planes = self._field.plane_tensors()
+        return hexplane_train_backward(v_raw, self._means, self._field.box, self._state, planes, weights, biases)
+
+    def update(self, v_raw: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor | None = None) -> None:
+        """One step of Adam for dL/d(deltas) `v_raw` [N, 16] of the last `deltas`; adds the positions' part to its first 3 columns.
+
+        Args:
+            time: as for `deltas`.
+            rates: float32 [2], of the planes and of the network.
+            step: int64 [1], counts from 1.
+            status: int32 [4] of the frame; where status[2] is not 0 its lists were cut, and nothing but `v_raw` is changed.
+        """
+        gradient = self.gradient(v_raw)
+        assert self._state is not None
+        betas, epsilon = self._betas, self._epsilon
+        hexplane_planes_adam_(
+            self._field.plane_tensors(), self._first, self._second, self._state, time, gradient, rates[:1], step,
+            status=status, penalties=self._penalties, betas=betas, epsilon=epsilon,
+        )  # fmt: skip
+        network_adam_(
+            self._network(), gradient.network, self._network_first, self._network_second, rates[1:], step,
+            status=status, betas=betas, epsilon=epsilon,
+        )  # fmt: skip
+        self._state = self._means = None
+
+    def _layers(self) -> tuple[list[Tensor], list[Tensor]]:
+        weights, biases = self._field.network_tensors()
+        return weights, biases
+
+    def _network(self) -> list[Tensor]:
+        return [t for pair in zip(*self._layers(), strict=True) for t in pair]

@@ -1,0 +1,46 @@
+"""Autograd through render_frame on CUDA."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gsplat_core import InvalidInput
+from gsplat_core.ops.frame.frame import render_frame
+from tests.gsplat_core.cuda.frame_scenes import NAMES, backward, by_name, frame_scene, on_gpu, rendered
+
+pytestmark = pytest.mark.cuda
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_autograd_takes_the_same_way(degree: int) -> None:
+    scene = on_gpu(frame_scene(300, degree=degree, deltas=True))
+    wanted = by_name(backward(scene), scene.sh.shape[1])
+    leaves = {name: getattr(scene, name).clone().requires_grad_() for name in (*NAMES, "deltas")}
+    frame = rendered(replace(scene, **leaves))
+    v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
+    ((frame.image * v_image).sum() + (frame.alphas * v_alphas).sum()).backward()
+    for name in NAMES:
+        assert torch.equal(leaves[name].grad.cpu().double(), wanted[name].reshape(leaves[name].shape))
+    assert torch.equal(leaves["deltas"].grad, backward(scene).raw)
+
+
+def test_autograd_is_registered_as_it_should_be() -> None:
+    scene = on_gpu(frame_scene(30, 20, 18, deltas=True))
+    leaves = [t.clone().requires_grad_() for t in (*scene.gaussians, scene.deltas)]
+    arguments = (*leaves, scene.viewmat, scene.K, scene.background, 20, 18, 0.3, 0.01, 1e10, 0, 1000, True)
+    checks = ("test_schema", "test_autograd_registration", "test_faketensor")
+    torch.library.opcheck(torch.ops.gsplat_core.render_frame.default, arguments, test_utils=checks)
+
+
+def test_autograd_refuses_what_has_no_gradient() -> None:
+    scene = on_gpu(frame_scene(30, 20, 18))
+    means = scene.means.clone().requires_grad_()
+    inputs = (means, *scene.gaussians[1:], None, scene.viewmat, scene.K, None, 20, 18, 1000)
+    with pytest.raises(InvalidInput, match="training=True"):
+        render_frame(*inputs).image.sum().backward()
+    camera = scene.viewmat.clone().requires_grad_()
+    with pytest.raises(InvalidInput, match="no gradient for the camera"):
+        render_frame(*inputs[:6], camera, *inputs[7:], training=True).image.sum().backward()

@@ -1,0 +1,59 @@
+"""What doctor says about the GPU and the kernels for it, in each state that a machine can be in."""
+
+from __future__ import annotations
+
+import pytest
+
+from gsplat_core.ops import native
+from services.cli import doctor, graphics
+
+GPU = graphics.Graphics(True, "NVIDIA H200 (compute capability 9.0)")
+NONE = graphics.Graphics(False, "none: this machine has no NVIDIA driver", "not needed")
+
+
+@pytest.fixture
+def said(monkeypatch):
+    """Doctor's lines by name for a machine, what is missing of the kernels, and what the GPU says of them."""
+
+    def look(machine: graphics.Graphics, missing: str | None, refusal: str | None = None) -> dict[str, doctor.Check]:
+        monkeypatch.setattr(graphics, "look", lambda: machine)
+        monkeypatch.setattr(native, "CUDA_MISSING", missing)
+        monkeypatch.setattr(native, "cuda_build", lambda: "nvcc 13.0 for 8.0, 9.0")
+        monkeypatch.setattr(native, "cuda_refusal", lambda: refusal)
+        checks = {check.name: check for check in doctor._cuda(["adam_", "composite"])}
+        assert not any(check.needed for check in checks.values())
+        return checks
+
+    return look
+
+
+def test_kernels_that_run(said):
+    checks = said(GPU, None)
+    assert all(check.ok for check in checks.values())
+    assert checks["CUDA kernels"].value == "built by nvcc 13.0 for compute capability 8.0, 9.0"
+    assert checks["ops on the GPU"].value == "2: adam_, composite"
+
+
+def test_a_gpu_without_kernels_is_told_how_to_build_them(said):
+    checks = said(GPU, "not built")
+    assert checks["GPU"].ok and not checks["CUDA kernels"].ok
+    assert "make cuda" in checks["CUDA kernels"].advice
+
+
+def test_kernels_for_another_gpu_are_told_from_kernels_that_run(said):
+    checks = said(GPU, None, "no kernel image is available for execution on the device")
+    assert not checks["CUDA kernels"].ok and "no kernel image" in checks["CUDA kernels"].value
+    assert "--device cpu" in checks["CUDA kernels"].advice
+
+
+def test_kernels_without_a_gpu_are_not_tried(said):
+    checks = said(NONE, None, "must not be asked")
+    assert not checks["GPU"].ok and checks["CUDA kernels"].ok and "must not" not in checks["CUDA kernels"].value
+
+
+def test_neither_is_nothing_to_do(said):
+    checks = said(NONE, "not built")
+    assert (
+        "everything runs on the CPU" in checks["CUDA kernels"].advice
+        and "make cuda" not in checks["CUDA kernels"].advice
+    )
