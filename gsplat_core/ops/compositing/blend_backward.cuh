@@ -123,23 +123,26 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
 
   const float middle_x = float(w.left + kQuadrant), middle_y = float(w.top + kQuadrant), x = float(w.x) + 0.5f - middle_x;
   const uint32_t first_address = shared_address(stage.splats);
-  const PixelFactors<D> factors(v_color);
+  const PixelFactors<D> factors(v_color, stage.shares[warp]);
   float y[kPixelsEach];
   PixelState states[kPixelsEach];
   for (int p = 0; p < kPixelsEach; ++p) {
     y[p] = float(w.y[p]) + 0.5f - middle_y;
     states[p] = {pixels[p].through, pixels[p].behind / pixels[p].through};
   }
+  // The splat of the batch that this thread prepares and whose row it writes. The batch has fewer splats than the block threads:
+  // other blocks use other warps for it, for every warp of a block has its scheduler.
+  const int mine = int(threadIdx.x) ^ (__popc(blockIdx.x) % 2 * kBatch);
   const auto fetch_ahead = [&](int first) {
-    const int position = first + int(threadIdx.x);
-    return threadIdx.x < kBatch && position >= w.begin && position < end ? fetch(position) : faint_record<D>();
+    const int position = first + mine;
+    return mine < kBatch && position >= w.begin && position < end ? fetch(position) : faint_record<D>();
   };
   if (threadIdx.x == kBlockThreads - 1) stage.splats[kBatch] = staged(faint_record<D>(), middle_x, middle_y);
   int first = w.begin + (end - 1 - w.begin) / kBatch * kBatch;
   Record<D> next = fetch_ahead(first);
   for (; first >= w.begin; first -= kBatch) {
     const float mean_x = next.xyab.x, mean_y = next.xyab.y;
-    if (threadIdx.x < kBatch) put_staged<kQuadrant>(first + 32 * warp < end, next, w, stage.splats, stage.reached);
+    if (mine < kBatch) put_staged<kQuadrant>(mine, first + mine / 32 * 32 < end, next, w, stage.splats, stage.reached);
     __syncthreads();
     next = fetch_ahead(first - kBatch);  // on its way meanwhile
     unsigned groups[kBatch / 32];
@@ -203,8 +206,7 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
       __syncwarp();
     }
     __syncthreads();
-    if (threadIdx.x < kBatch && first + int(threadIdx.x) < end)
-      write_row(stage, w, int(threadIdx.x), mean_x, mean_y, row(first + int(threadIdx.x)));
+    if (mine < kBatch && first + mine < end) write_row(stage, w, mine, mean_x, mean_y, row(first + mine));
   }
 }
 

@@ -1,7 +1,9 @@
 // Front-to-back blending of one window by one block of kBlockThreads threads.
 #pragma once
 
-#include "staged_splats.cuh"
+#include <type_traits>
+
+#include "blended_pixels.cuh"
 
 namespace {
 
@@ -14,14 +16,6 @@ struct ForwardStage {
   StagedSplat<D> splats[2][kForwardBatch + 1];  // the last one reaches no pixel
   uint4 reached[2][2 * kWarps];                 // by half of a quadrant: bits of the batch's splats
   uint4 hits[2 * kWarps][kForwardBatch / 4];    // where the splats lie that reach the half: addresses in shared memory
-};
-
-// A thread's pixels: what shines through behind the last splat, the sums of the channels, and the position of the last splat
-// that was blended, -1 where there is none.
-template <int D>
-struct BlendedPixels {
-  float through[kPixelsEach], sum[kPixelsEach][D];
-  int last[kPixelsEach];
 };
 
 // Lists, for both halves of this warp's quadrant, the splats that reach it. Returns how many of the longer list, to which the
@@ -53,27 +47,31 @@ __device__ inline int list_hits(const uint4* reached, const StagedSplat<D>* spla
   return most;
 }
 
-// `fetch(position)` gives the splat at a position in [w.begin, w.end), which are in the order of depth. kCapped:
-// there may be splats with a finite `cap` (an indefinite conic). kLast: `last` is wanted. All threads of the block take part.
-template <int D, bool kCapped, bool kLast = true, class Fetch>
+// `fetch(position)` gives the splat at a position in [w.begin, w.end), which are in the order of depth. kCapped: there may be
+// splats with a finite `cap` (an indefinite conic). kLast: `last` is wanted. kHalf: blend in half precision, without either; the
+// last channel must be the depth, or at least not larger than that of the window's last splat. All threads of the block take
+// part.
+template <int D, bool kCapped, bool kLast = true, bool kHalf = false, class Fetch>
 __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& fetch, ForwardStage<D>& stage) {
+  static_assert(!kHalf || (!kCapped && !kLast));
   constexpr int kBatch = kForwardBatch;
   constexpr uint32_t kNone = ~0u;
   const int lane = threadIdx.x & 31, warp = threadIdx.x / 32, first_part = warp / 2 * 4 + warp % 2;
   const uint4* const hits = stage.hits[2 * warp + lane / 16];
-  const float middle_x = float(w.left + kQuadrant), middle_y = float(w.top + kQuadrant);
-  const float x = float(w.x) + 0.5f - middle_x;
+  const float middle_x = float(w.left + kQuadrant), middle_y = float(w.top + kQuadrant), x = float(w.x) + 0.5f - middle_x;
+  std::conditional_t<kHalf, HalfPixels<D>, FloatPixels<D, kCapped, kLast>> pixels(w);
   BlendedPixels<D> out;
   float y[kPixelsEach];
-  float front[kPixelsEach];  // transmittance behind all splats so far, the one included that closed the pixel: then <= kStop
   for (int p = 0; p < kPixelsEach; ++p) {
     y[p] = float(w.y[p]) + 0.5f - middle_y;
-    front[p] = w.inside[p] ? 1 : 0;
-    out.through[p] = 1;
     out.last[p] = -1;
-    for (int d = 0; d < D; ++d) out.sum[p][d] = 0;
   }
 
+  float unit = 1;  // of the last channel: half precision ends at 65,504
+  if constexpr (kHalf) {
+    const float deepest = w.end > w.begin ? fetch(w.end - 1).colors[D - 1] : 0;
+    unit = deepest > 0 ? deepest : 1;
+  }
   const auto fetch_ahead = [&](int left) {  // this thread's splat in the batch that has `left` more and what follows it
     return int(threadIdx.x) < left ? fetch(w.end - left + int(threadIdx.x)) : faint_record<D>();
   };
@@ -81,40 +79,34 @@ __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& f
   Record<D> next = fetch_ahead(w.end - w.begin);
   int now = 0;
   for (int left = w.end - w.begin; left > 0; left -= kBatch, now ^= 1) {
-    put_staged<kQuadrant / 2>(32 * warp < left, next, w, stage.splats[now], stage.reached[now]);
-    bool warp_open = __any_sync(kAll, front[0] > kStop || front[1] > kStop);
+    if constexpr (kHalf)
+      for (int d = 0; d < D; ++d) next.colors[d] = pixels.both(d + 1 < D ? next.colors[d] : next.colors[d] / unit);
+    put_staged<kQuadrant / 2>(int(threadIdx.x), 32 * warp < left, next, w, stage.splats[now], stage.reached[now]);
+    bool warp_open = __any_sync(kAll, pixels.open());
     if (!__syncthreads_or(warp_open)) break;
     next = fetch_ahead(left - kBatch);  // on its way meanwhile
     const int count = warp_open ? list_hits<D>(&stage.reached[now][first_part], stage.splats[now], stage.hits[2 * warp]) : 0;
-    uint32_t last[kPixelsEach] = {kNone, kNone};
+    for (uint32_t& last : pixels.last) last = kNone;
     for (int j = 0; j < count && warp_open; j += kAhead) {
       const uint4 four = hits[j / 4];
       const uint32_t addresses[kAhead] = {four.x, four.y, four.z, four.w};
 #pragma unroll
-      for (int n = 0; n < kAhead; ++n) {
-        const StagedSplat<D> r = staged_at<D, kCapped>(addresses[n]);
+      for (const uint32_t address : addresses) {
+        const StagedSplat<D> r = staged_at<D, kCapped>(address);
         const float constant = fmaf(fmaf(r.by_xx, x, r.by_x), x, r.k), by_y = fmaf(r.by_xy, x, r.by_y);
-#pragma unroll
-        for (int p = 0; p < kPixelsEach; ++p) {
-          const float power = fmaf(fmaf(r.by_yy, y[p], by_y), y[p], constant);
-          const bool drawn = power >= kFaintestStaged && (!kCapped || power <= r.cap);
-          const float weight = drawn ? __saturatef(exp2_fast(power)) * front[p] : 0;  // of 1 / 0.99
-          front[p] = fmaf(weight, -0.99f, front[p]);
-          if (front[p] > kStop) {
-            out.through[p] = front[p];
-            for (int d = 0; d < D; ++d) out.sum[p][d] = fmaf(weight, r.colors[d], out.sum[p][d]);
-            if (kLast && drawn) last[p] = addresses[n];
-          }
-        }
+        float power[kPixelsEach];
+        for (int p = 0; p < kPixelsEach; ++p) power[p] = fmaf(fmaf(r.by_yy, y[p], by_y), y[p], constant);
+        pixels.blend(r, power, address);
       }
-      warp_open = __any_sync(kAll, front[0] > kStop || front[1] > kStop);
+      warp_open = __any_sync(kAll, pixels.open());
     }
     for (int p = 0; p < kPixelsEach; ++p)
-      if (last[p] != kNone)
-        out.last[p] = w.end - left + int((last[p] - shared_address(stage.splats[now])) / sizeof(StagedSplat<D>));
+      if (kLast && pixels.last[p] != kNone)
+        out.last[p] = w.end - left + int((pixels.last[p] - shared_address(stage.splats[now])) / sizeof(StagedSplat<D>));
   }
-  for (int p = 0; p < kPixelsEach; ++p)
-    for (int d = 0; d < D; ++d) out.sum[p][d] *= 0.99f;
+  pixels.finish(out);
+  if constexpr (kHalf)
+    for (int p = 0; p < kPixelsEach; ++p) out.sum[p][D - 1] *= unit;
   return out;
 }
 

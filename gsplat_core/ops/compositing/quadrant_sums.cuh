@@ -34,9 +34,15 @@ struct PixelFactors {
   float moments[kSteps][2];                            // of the lanes' first pixels, about their rows' middle
   float colors[kColorTiles][kSteps][kPixelsEach][2];
 
-  // The whole warp takes part, with the dL/dcolour of each lane's pixels.
-  __device__ explicit PixelFactors(const float (&v_color)[kPixelsEach][D]) {
-    const int row = (threadIdx.x & 31) / 4, column = threadIdx.x % 4;
+  // The whole warp takes part, with the dL/dcolour of each lane's pixels, and writes over the shares.
+  __device__ PixelFactors(const float (&v_color)[kPixelsEach][D], SplatShares& shares) {
+    static_assert(sizeof(float[kPixelsEach][32][D]) <= sizeof(SplatShares));
+    auto& colors_of_lanes = reinterpret_cast<float (&)[kPixelsEach][32][D]>(shares);
+    const int lane = threadIdx.x & 31, row = lane / 4, column = lane % 4;
+#pragma unroll
+    for (int p = 0; p < kPixelsEach; ++p)
+      for (int d = 0; d < D; ++d) colors_of_lanes[p][lane][d] = v_color[p][d];
+    __syncwarp();
 #pragma unroll
     for (int step = 0; step < kSteps; ++step) {
       const float y = float(row_of_lane(8 * step, 0)) - 2.5f;
@@ -49,15 +55,17 @@ struct PixelFactors {
         for (int i = 0; i < 6; ++i) value = row == i ? powers[i] : value;
         moments[step][half] = value;
 #pragma unroll
-        for (int p = 0; p < kPixelsEach; ++p) {
+        for (int tile = 0; tile < kColorTiles; ++tile) {
+          const int d = 4 * tile + row / 2;
 #pragma unroll
-          for (int d = 0; d < 4 * kColorTiles; ++d) {
-            const float v = __shfl_sync(kAll, d < D ? v_color[p][d < D ? d : 0] : 0, 8 * step + 4 * half + column);
-            if (row / 2 == d % 4) colors[d / 4][step][p][half] = row % 2 == 0 ? upper_bits(v) : v - upper_bits(v);
+          for (int p = 0; p < kPixelsEach; ++p) {
+            const float v = d < D ? colors_of_lanes[p][8 * step + 4 * half + column][d] : 0;
+            colors[tile][step][p][half] = row % 2 == 0 ? upper_bits(v) : v - upper_bits(v);
           }
         }
       }
     }
+    __syncwarp();
   }
 };
 

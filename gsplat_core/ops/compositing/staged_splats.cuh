@@ -96,15 +96,16 @@ __device__ inline unsigned parts_reached(const Record<D>& r, float x, float y) {
   return reached;
 }
 
-// Prepares this thread's splat of a batch and notes, by part of the window, which of the batch's splats reach it. `any`: one of
-// the warp's threads has a splat.
+// Prepares splat i of a batch, i being the thread's lane in a group of 32, and notes, by part of the window, which of the batch's
+// splats reach it. `any`: one of the warp's threads has a splat.
 template <int kRows, int D>
-__device__ inline void put_staged(bool any, const Record<D>& r, const Window& w, StagedSplat<D>* splats, uint4* reached_by_part) {
+__device__ inline void put_staged(int i, bool any, const Record<D>& r, const Window& w, StagedSplat<D>* splats,
+                                  uint4* reached_by_part) {
   constexpr int kParts = 4 * kQuadrant / kRows;
   const int lane = threadIdx.x & 31;
   unsigned mine = 0;
   if (any) {
-    splats[threadIdx.x] = staged(r, float(w.left + kQuadrant), float(w.top + kQuadrant));
+    splats[i] = staged(r, float(w.left + kQuadrant), float(w.top + kQuadrant));
     const unsigned reached = parts_reached<kRows>(r, float(w.left) + 0.5f, float(w.top) + 0.5f);
 #pragma unroll
     for (int part = 0; part < kParts; ++part) {
@@ -112,7 +113,7 @@ __device__ inline void put_staged(bool any, const Record<D>& r, const Window& w,
       mine = lane == part ? bits : mine;
     }
   }
-  if (lane < kParts) reinterpret_cast<unsigned*>(&reached_by_part[lane])[threadIdx.x / 32] = mine;
+  if (lane < kParts) reinterpret_cast<unsigned*>(&reached_by_part[lane])[i / 32] = mine;
 }
 
 }  // namespace

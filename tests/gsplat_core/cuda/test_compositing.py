@@ -160,6 +160,21 @@ def test_thin_huge_and_tiny_splats() -> None:
     check(s, absgrad=True)
 
 
+def test_gradients_of_single_tiny_splats_keep_single_precision() -> None:
+    """Moments are summed about the middle of 8x8 pixels: what is left after moving them to a tiny splat's mean must be good."""
+    s, random = scene(400, 160, 160, channels=4), torch.Generator().manual_seed(5)
+    s.means2d[0] = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)) * 8 + 8 * torch.rand(
+        400, 2, generator=random
+    )
+    s.conics[:] = torch.tensor([3.3, 0.4, 2.8])
+    s.opacities.clamp_(0.02, 0.95)
+    seen, wanted = s.run(), s.run("cpu", reference.rasterize_to_pixels, torch.float64)
+    for name in ("v_means2d", "v_conics", "v_colors", "v_opacities"):
+        error = (seen[name].double() - wanted[name]).reshape(400, -1).norm(dim=-1)
+        # One splat in a hundred may have a pixel within rounding of the cut-off of 1/255.
+        assert (error > 2e-4 * wanted[name].reshape(400, -1).norm(dim=-1)).sum() <= 4, name
+
+
 @pytest.mark.parametrize("channels", [3, 6])
 def test_values_that_are_not_finite_are_skipped_and_get_no_gradient(channels: int) -> None:
     s = scene(200, channels=channels)
