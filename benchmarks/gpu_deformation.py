@@ -41,7 +41,8 @@ def times_s() -> Iterator[float]:
 def moving(field: HexPlaneField) -> HexPlaneField:
     """A field that was not trained adds nothing; this one moves things a little."""
     with torch.no_grad():
-        field.head.weight.normal_(std=1e-3, generator=torch.Generator().manual_seed(3))
+        weights = torch.randn(field.head.weight.shape, generator=torch.Generator().manual_seed(3))
+        field.head.weight.copy_(1e-3 * weights)
     return field.cuda()
 
 
