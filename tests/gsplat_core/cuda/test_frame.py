@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsplat_core import rasterization, reference
+from gsplat_core import InvalidInput, rasterization, reference
 from gsplat_core.ops.frame.frame import STATUS_CUT, STATUS_MOST, STATUS_NEEDED, Frame, render_frame
 
 pytestmark = pytest.mark.cuda
@@ -349,11 +349,38 @@ def test_strided_and_misaligned_inputs_and_a_side_stream() -> None:
         assert torch.equal(frame.last, wanted.last)
 
 
-@pytest.mark.parametrize("training", [False, True])
+@pytest.mark.parametrize("size", [0.03, 0.2])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_half_precision_shows_nearly_the_same_picture(degree: int, size: float) -> None:
+    s = scene(3000, 320, 240, degree=degree, seed=17, size=size)
+    tensors = s.tensors("cuda", torch.float32)
+    full = s.render(1 << 20)
+    tensors[4] = tensors[4].half()
+    shifted = torch.cat([tensors[4].new_zeros(1), tensors[4].flatten()])[1:].view(tensors[4].shape)
+    half, again = (render_frame(*tensors[:4], sh, *tensors[5:], 320, 240, 1 << 20) for sh in (tensors[4], shifted))
+    assert torch.equal(half.image, again.image)
+    assert torch.equal(full.status, half.status)
+    for seen, wanted in ((half.image[..., :3], full.image[..., :3]), (half.alphas, full.alphas)):
+        assert (seen - wanted).square().mean() <= 1e-5  # 50 dB
+    dense = full.alphas > 0.5
+    assert ((half.image - full.image)[..., 3][dense] / full.image[..., 3][dense]).abs().mean() <= 0.01
+
+
+def test_coefficients_in_half_precision_are_refused_for_training() -> None:
+    s = scene(10)
+    tensors = s.tensors("cuda", torch.float32)
+    with pytest.raises(InvalidInput, match="sh must be float32"):
+        render_frame(*tensors[:4], tensors[4].half(), *tensors[5:], s.width, s.height, 100, training=True)
+
+
+@pytest.mark.parametrize(("training", "half"), [(False, False), (True, False), (False, True)])
 @pytest.mark.parametrize("optional", [False, True])
-def test_op_passes_opcheck(training: bool, optional: bool) -> None:
+def test_op_passes_opcheck(training: bool, half: bool, optional: bool) -> None:
     s = scene(30, 20, 18, deltas=optional, background=optional)
-    arguments = (*s.tensors("cuda", torch.float32), 20, 18, 0.3, 0.01, 1e10, 0, 1000, training)
+    tensors = s.tensors("cuda", torch.float32)
+    if half:
+        tensors[4] = tensors[4].half()
+    arguments = (*tensors, 20, 18, 0.3, 0.01, 1e10, 0, 1000, training)
     # What is not written (rows of culled Gaussians, the room behind the lists) differs from call to call.
     torch.library.opcheck(
         torch.ops.gsplat_core.render_frame.default, arguments, test_utils=["test_schema", "test_faketensor"]
