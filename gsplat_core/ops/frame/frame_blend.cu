@@ -71,7 +71,7 @@ struct TileSplats {
   }
 };
 
-template <bool training>
+template <bool training, bool half>
 __global__ void __launch_bounds__(kBlockThreads, 8) blend(FrameScene in, FrameLists lists, FramePixels out) {
   wait_for_kernel_in_front();
   __shared__ BlendRoom room;
@@ -84,7 +84,7 @@ __global__ void __launch_bounds__(kBlockThreads, 8) blend(FrameScene in, FrameLi
   const int left = int(blockIdx.x) % in.tile_width * kFrameTile, top = int(blockIdx.x) / in.tile_width * kFrameTile;
   const Window w(begin, end, left, top, min(left + kFrameTile, in.width), min(top + kFrameTile, in.height));
   BlendedPixels<4> pixels =
-      blend_forward<4, false, training>(w, TileSplats<training>{lists, sorted, in.count, begin}, room.stage);
+      blend_forward<4, false, training, half>(w, TileSplats<training>{lists, sorted, in.count, begin}, room.stage);
   for (int p = 0; p < kPixelsEach; ++p) {
     if (!w.inside[p]) continue;
     const int64_t pixel = int64_t(w.y[p]) * in.width + w.x;
@@ -106,6 +106,6 @@ __global__ void __launch_bounds__(kBlockThreads, 8) blend(FrameScene in, FrameLi
 
 void blend_frame(const FrameScene& in, const FrameLists& lists, const FramePixels& out, cudaStream_t stream) {
   if (in.tiles() == 0) return;
-  const auto kernel = lists.splat_starts != nullptr ? blend<true> : blend<false>;
+  const auto kernel = lists.splat_starts != nullptr ? blend<true, false> : in.half_sh ? blend<false, true> : blend<false, false>;
   launch_behind(kernel, unsigned(in.tiles()), kBlockThreads, stream, 0, in, lists, out);
 }

@@ -22,7 +22,7 @@ constexpr int kMostTilesAcross = 1 << 13;
 // One camera's view of N Gaussians.
 struct FrameScene {
   const float *means, *quats, *log_scales, *logit_opacities;  // [N, 3], [N, 4], [N, 3], [N]
-  const float* sh;                                            // [N, bases, 3]
+  const float* sh;                                            // [N, bases, 3]; half precision where half_sh
   const float* deltas;                                        // [N, kRawColumns], or null
   const float *viewmat, *intrinsics;                          // [4, 4], [3, 3]
   const float* background;                                    // [3], or null: black
@@ -32,6 +32,7 @@ struct FrameScene {
   float eps2d, near_plane, far_plane;
   int32_t camera_model;
   bool aligned;  // quats, sh and deltas begin at a multiple of 16 bytes
+  bool half_sh;  // then the picture is blended in half precision, too; not for training
 
   constexpr int64_t tiles() const { return int64_t(tile_width) * tile_height; }
 };

@@ -13,7 +13,7 @@ Frame render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_o
                    Tensor viewmat, Tensor intrinsics, std::optional<Tensor> background, int64_t width, int64_t height,
                    double eps2d, double near_plane, double far_plane, int64_t camera_model, int64_t capacity, bool training) {
   FrameInputs inputs(means, quats, log_scales, logit_opacities, sh, deltas, viewmat, intrinsics, background, width, height, eps2d,
-                     near_plane, far_plane, camera_model);
+                     near_plane, far_plane, camera_model, !training);
   STD_TORCH_CHECK(capacity > 0 && capacity <= kMostInts, "render_frame: capacity must be 1 to 2^31 - 1 instances, got ",
                   capacity);
   CudaCall& call = inputs.call;

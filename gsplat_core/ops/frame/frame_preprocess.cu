@@ -1,3 +1,5 @@
+#include <cuda_fp16.h>
+
 #include "../spherical_harmonics/spherical_harmonics_bases.h"
 #include "frame_emit.cuh"
 #include "frame_gaussian.cuh"
@@ -9,7 +11,7 @@ using namespace GSPLAT_ISA;
 namespace {
 
 template <int bytes>
-__device__ inline void copy_async(float* to, const float* from) {
+__device__ inline void copy_async(void* to, const void* from) {
   const unsigned at = unsigned(__cvta_generic_to_shared(to));
   if constexpr (bytes == 16) {
     asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(at), "l"(from));
@@ -18,29 +20,37 @@ __device__ inline void copy_async(float* to, const float* from) {
   }
 }
 
-// Coefficients of 32 Gaussians in shared memory. A Gaussian's row is an odd number of float4s apart from the next, so that eight
+__device__ inline float to_float(float x) { return x; }
+__device__ inline float to_float(__half x) { return __half2float(x); }
+
+// Coefficients of 32 Gaussians in shared memory. A Gaussian's row is an odd number of 16 bytes apart from the next, so that eight
 // lanes reading theirs meet in no bank.
-template <int degree>
+template <int degree, class Coefficient>
 struct StagedHarmonics {
-  static constexpr int kBases = (degree + 1) * (degree + 1), kRow = 3 * kBases, kQuads = (kRow + 3) / 4;
-  static constexpr int kStride = 4 * (kQuads | 1);
-  float4 rows[32 * kStride / 4];
+  static constexpr int kBases = (degree + 1) * (degree + 1), kRow = 3 * kBases, kInQuad = 16 / sizeof(Coefficient);
+  static constexpr int kQuads = (kRow + kInQuad - 1) / kInQuad, kStride = kInQuad * (kQuads | 1);
+  uint4 rows[32 * kStride / kInQuad];
 
   // By a warp, those of the Gaussians in `shown` alone: what is culled is not read. They are there after `wait`.
-  __device__ void load(const float* from, unsigned shown, bool aligned) {
+  __device__ void load(const Coefficient* from, unsigned shown, bool aligned) {
     const int lane = threadIdx.x & 31;
-    float* const to = reinterpret_cast<float*>(rows);
-    if (kRow % 4 == 0 && aligned) {
+    Coefficient* const to = reinterpret_cast<Coefficient*>(rows);
+    if (kRow % kInQuad == 0 && aligned) {
 #pragma unroll 4
       for (int i = lane; i < 32 * kQuads; i += 32) {
         const int row = i / kQuads;
-        if (shown >> row & 1) copy_async<16>(to + row * kStride + 4 * (i % kQuads), from + 4 * i);
+        if (shown >> row & 1) copy_async<16>(to + row * kStride + kInQuad * (i % kQuads), from + kInQuad * i);
       }
     } else {
 #pragma unroll 4
       for (int i = lane; i < 32 * kRow; i += 32) {
         const int row = i / kRow;
-        if (shown >> row & 1) copy_async<4>(to + row * kStride + i % kRow, from + i);
+        if (!(shown >> row & 1)) continue;
+        if constexpr (sizeof(Coefficient) == 4) {
+          copy_async<4>(to + row * kStride + i % kRow, from + i);
+        } else {
+          to[row * kStride + i % kRow] = from[i];
+        }
       }
     }
   }
@@ -51,13 +61,16 @@ struct StagedHarmonics {
   }
 
   __device__ void color_at(const float direction[3], float color[3]) const {
-    float bases[kBases], values[4 * kQuads];
+    float bases[kBases], values[kInQuad * kQuads];
     bases_at<degree>(direction[0], direction[1], direction[2], bases);
-    const float4* const row = rows + (threadIdx.x & 31) * kStride / 4;
+    const uint4* const row = rows + (threadIdx.x & 31) * (kStride / kInQuad);
 #pragma unroll
     for (int i = 0; i < kQuads; ++i) {
-      const float4 quad = row[i];
-      values[4 * i] = quad.x, values[4 * i + 1] = quad.y, values[4 * i + 2] = quad.z, values[4 * i + 3] = quad.w;
+      const uint4 quad = row[i];
+      Coefficient of_quad[kInQuad];
+      memcpy(of_quad, &quad, sizeof(quad));
+#pragma unroll
+      for (int j = 0; j < kInQuad; ++j) values[kInQuad * i + j] = to_float(of_quad[j]);
     }
 #pragma unroll
     for (int k = 0; k < kBases; ++k)
@@ -76,15 +89,16 @@ __device__ inline Projected project_with(const FrameScene& in, const ProjectionI
 
 constexpr float kConstantBase = 0.28209479177387814f;
 
-template <int degree>
+template <int degree, class Coefficient>
 __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
     preprocess(FrameScene in, FrameLists lists, FrameScratch scratch) {
   let_kernel_behind_come();
   __shared__ FrameCamera camera;
-  __shared__ StagedHarmonics<degree> harmonics[kFrameThreads / 32];
+  __shared__ StagedHarmonics<degree, Coefficient> harmonics[kFrameThreads / 32];
   const int64_t n = int64_t(blockIdx.x) * kFrameThreads + threadIdx.x;
   const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
   Record<4>* const records = static_cast<Record<4>*>(lists.records);
+  const Coefficient* const sh = reinterpret_cast<const Coefficient*>(in.sh);
 
   RawGaussian g;
   g.usable = false;
@@ -99,7 +113,8 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
   }
   const unsigned shown = __ballot_sync(kAll, p.valid);
   if constexpr (degree > 0)
-    harmonics[warp].load(in.sh + (n - lane) * StagedHarmonics<degree>::kRow, shown, in.aligned);  // on their way meanwhile
+    harmonics[warp].load(sh + (n - lane) * StagedHarmonics<degree, Coefficient>::kRow, shown,
+                         in.aligned);  // on their way meanwhile
 
   Record<4> r = {};
   Footprint footprint = {0, 0};
@@ -112,7 +127,7 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
     box.ellipse = ellipse_of_record(r.xyab, r.c, r.l);
     footprint = footprint_of(box);
   }
-  if constexpr (degree > 0) StagedHarmonics<degree>::wait();
+  if constexpr (degree > 0) StagedHarmonics<degree, Coefficient>::wait();
   if (footprint.y != 0) {
     float color[3], direction[3];
     for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, g.color[j], 0.5f);
@@ -120,7 +135,7 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
       unit_direction(camera, g.mean, direction);
       harmonics[warp].color_at(direction, color);
     } else {
-      for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, in.sh[3 * n + j], color[j]);
+      for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, to_float(sh[3 * n + j]), color[j]);
     }
     if (0 * color[0] + 0 * color[1] + 0 * color[2] == 0) {
       for (int j = 0; j < 3; ++j) r.colors[j] = fmaxf(color[j], 0.0f);
@@ -147,10 +162,18 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
   if (threadIdx.x == 0) scratch.sums[blockIdx.x] = sum;
 }
 
+template <class Coefficient>
+void preprocess_by_degree(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream) {
+  constexpr decltype(&preprocess<0, Coefficient>) by_degree[] = {preprocess<0, Coefficient>, preprocess<1, Coefficient>,
+                                                                 preprocess<2, Coefficient>, preprocess<3, Coefficient>,
+                                                                 preprocess<4, Coefficient>};
+  by_degree[in.sh_degree]<<<blocks_for(in.count, kFrameThreads), kFrameThreads, 0, stream>>>(in, lists, scratch);
+}
+
 }  // namespace
 
 void preprocess_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream) {
   if (in.count == 0) return;
-  constexpr decltype(&preprocess<0>) by_degree[] = {preprocess<0>, preprocess<1>, preprocess<2>, preprocess<3>, preprocess<4>};
-  by_degree[in.sh_degree]<<<blocks_for(in.count, kFrameThreads), kFrameThreads, 0, stream>>>(in, lists, scratch);
+  const auto run = in.half_sh ? preprocess_by_degree<__half> : preprocess_by_degree<float>;
+  run(in, lists, scratch, stream);
 }

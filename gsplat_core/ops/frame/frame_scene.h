@@ -16,13 +16,14 @@ struct FrameInputs {
   FrameInputs(const Tensor& means_in, const Tensor& quats_in, const Tensor& log_scales_in, const Tensor& logit_opacities_in,
               const Tensor& sh_in, const std::optional<Tensor>& deltas_in, const Tensor& viewmat_in, const Tensor& intrinsics_in,
               const std::optional<Tensor>& background_in, int64_t width, int64_t height, double eps2d, double near_plane,
-              double far_plane, int64_t camera_model)
+              double far_plane, int64_t camera_model, bool takes_half_sh = false)
       : call(means_in),
         means(call.floats(means_in, "means")),
         quats(call.floats(quats_in, "quats")),
         log_scales(call.floats(log_scales_in, "log_scales")),
         logit_opacities(call.floats(logit_opacities_in, "logit_opacities")),
-        sh(call.floats(sh_in, "sh")),
+        sh(takes_half_sh && sh_in.scalar_type() == ScalarType::Half ? call.take(sh_in, ScalarType::Half, "sh")
+                                                                    : call.floats(sh_in, "sh")),
         viewmat(call.floats(viewmat_in, "viewmat")),
         intrinsics(call.floats(intrinsics_in, "K")) {
     constexpr int64_t kMostPixels = int64_t(kMostTilesAcross) * kFrameTile, kMostGaussians = (int64_t(1) << 31) - 2;
@@ -46,7 +47,7 @@ struct FrameInputs {
              data(quats),
              data(log_scales),
              data(logit_opacities),
-             data(sh),
+             static_cast<const float*>(sh.data_ptr()),
              deltas ? data(*deltas) : nullptr,
              data(viewmat),
              data(intrinsics),
@@ -62,6 +63,7 @@ struct FrameInputs {
              float(near_plane),
              float(far_plane),
              int32_t(camera_model),
-             aligned(quats) && aligned(sh) && (!deltas || aligned(*deltas))};
+             aligned(quats) && aligned(sh) && (!deltas || aligned(*deltas)),
+             sh.scalar_type() == ScalarType::Half};
   }
 };

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsplat_core import rasterization, reference
+from gsplat_core import InvalidInput, rasterization, reference
 from gsplat_core.ops.frame.frame import STATUS_CUT, STATUS_MOST, STATUS_NEEDED, Frame, render_frame
 
 pytestmark = pytest.mark.cuda
@@ -220,6 +220,22 @@ def test_very_many_splats_in_one_tile(count: int) -> None:
     assert frame.status[STATUS_MOST] == count
 
 
+@pytest.mark.parametrize("count", [100, 128, 200, 256, 500, 512, 900, 1024, 1025])
+@pytest.mark.parametrize("far", [False, True])
+def test_depths_that_are_equal_or_next_to_each_other(count: int, far: bool) -> None:
+    s = scene(count, 16, 16, seed=16, deltas=False)
+    g = torch.Generator().manual_seed(2)
+    s.viewmat[:] = torch.eye(4)
+    s.means[:, :2] = 0.1 * torch.randn(count, 2, generator=g)
+    s.means[:, 2] = 2 + torch.randint(0, 40, (count,), generator=g) * 2.0**-22
+    s.log_scales[:] = 3.0  # over the whole tile, so that no pixel is near the cut-off of 1/255
+    if far:  # told apart from this one, the others are not told apart at once
+        s.means[-1] = torch.tensor([0.0, 0.0, 1e8])
+        s.log_scales[-1] = math.log(1e9)
+    s.logit_opacities[:] = -4.6
+    assert check(s).status[STATUS_MOST] == count
+
+
 def test_a_large_scene() -> None:
     s = scene(140_000, 150, 110, degree=0, seed=14, size=0.006)
     s.log_scales[::5000] = 0.5
@@ -333,11 +349,38 @@ def test_strided_and_misaligned_inputs_and_a_side_stream() -> None:
         assert torch.equal(frame.last, wanted.last)
 
 
-@pytest.mark.parametrize("training", [False, True])
+@pytest.mark.parametrize("size", [0.03, 0.2])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_half_precision_shows_nearly_the_same_picture(degree: int, size: float) -> None:
+    s = scene(3000, 320, 240, degree=degree, seed=17, size=size)
+    tensors = s.tensors("cuda", torch.float32)
+    full = s.render(1 << 20)
+    tensors[4] = tensors[4].half()
+    shifted = torch.cat([tensors[4].new_zeros(1), tensors[4].flatten()])[1:].view(tensors[4].shape)
+    half, again = (render_frame(*tensors[:4], sh, *tensors[5:], 320, 240, 1 << 20) for sh in (tensors[4], shifted))
+    assert torch.equal(half.image, again.image)
+    assert torch.equal(full.status, half.status)
+    for seen, wanted in ((half.image[..., :3], full.image[..., :3]), (half.alphas, full.alphas)):
+        assert (seen - wanted).square().mean() <= 1e-5  # 50 dB
+    dense = full.alphas > 0.5
+    assert ((half.image - full.image)[..., 3][dense] / full.image[..., 3][dense]).abs().mean() <= 0.01
+
+
+def test_coefficients_in_half_precision_are_refused_for_training() -> None:
+    s = scene(10)
+    tensors = s.tensors("cuda", torch.float32)
+    with pytest.raises(InvalidInput, match="sh must be float32"):
+        render_frame(*tensors[:4], tensors[4].half(), *tensors[5:], s.width, s.height, 100, training=True)
+
+
+@pytest.mark.parametrize(("training", "half"), [(False, False), (True, False), (False, True)])
 @pytest.mark.parametrize("optional", [False, True])
-def test_op_passes_opcheck(training: bool, optional: bool) -> None:
+def test_op_passes_opcheck(training: bool, half: bool, optional: bool) -> None:
     s = scene(30, 20, 18, deltas=optional, background=optional)
-    arguments = (*s.tensors("cuda", torch.float32), 20, 18, 0.3, 0.01, 1e10, 0, 1000, training)
+    tensors = s.tensors("cuda", torch.float32)
+    if half:
+        tensors[4] = tensors[4].half()
+    arguments = (*tensors, 20, 18, 0.3, 0.01, 1e10, 0, 1000, training)
     # What is not written (rows of culled Gaussians, the room behind the lists) differs from call to call.
     torch.library.opcheck(
         torch.ops.gsplat_core.render_frame.default, arguments, test_utils=["test_schema", "test_faketensor"]
