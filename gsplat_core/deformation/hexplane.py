@@ -97,7 +97,8 @@ class HexPlaneField(DeformationField):
         self.head = torch.nn.Linear(width, sum(HEAD_CHANNELS))
         torch.nn.init.zeros_(self.head.weight)
         torch.nn.init.zeros_(self.head.bias)
-        self.to(self.box.device)
+        if not gaussians.means.is_meta:
+            self.to(self.box.device)
 
     def coordinates(self, means: Tensor, time_s: float) -> Tensor:
         """[N, 4] in [-1, 1]: the one place where space and time are normalised. Outside the box or window: clamped."""
