@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gsplat_core import Camera, Gaussians, render
 from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
-from gsplat_core.frame_renderer import FrameRenderer
+from gsplat_core.frame_renderer import FrameRenderer, Precision
 
 WINDOW_S = (0.0, 6.0)
 HEXPLANES = {
@@ -30,6 +30,7 @@ HEXPLANES = {
     "small": ({"channels": 32, "resolution": (64, 64, 64, 25), "levels": (1, 2), "width": 64, "depth": 3}, small),
 }
 """Our field and the peer's, of one size. Where G-SHARP has a hidden layer per head, ours has one in common."""
+KEPT: dict[Precision, torch.dtype] = {"fp32": torch.float32, "fp16": torch.float16}
 ASKED_MS = {("85M", 50_000): 0.10}
 
 
@@ -51,19 +52,19 @@ def camera_of(scene: Scene) -> Camera:
     return Camera(intrinsics, *scene.size_px, pose)
 
 
-def deltas_alone(field: DeformationField, gaussians: Gaussians, repetitions: int) -> Times:
+def deltas_alone(field: DeformationField, gaussians: Gaussians, repetitions: int, dtype: torch.dtype) -> Times:
     """What the field adds, at a time that changes in device memory between replays."""
     time = torch.zeros(1, device="cuda")
-    deltas = field.frame_deltas(gaussians)
+    deltas = field.frame_deltas(gaussians, dtype)
     with torch.no_grad():
         return measure(captured(lambda: deltas(time)), repetitions)
 
 
 def with_picture(
-    field: DeformationField, gaussians: Gaussians, camera: Camera, repetitions: int
+    field: DeformationField, gaussians: Gaussians, camera: Camera, repetitions: int, precision: Precision = "fp32"
 ) -> tuple[Times, float]:
     """`FrameRenderer` with a new time for every frame; and how near its picture is to that of float32 ops, in dB."""
-    renderer = FrameRenderer(gaussians, camera, field)
+    renderer = FrameRenderer(gaussians, camera, field, precision=precision)
     at = times_s()
     picture = renderer.render(time_s=2.5).result().image
     with torch.no_grad():
@@ -102,16 +103,17 @@ def hexplane(size: str, count: int, repetitions: int) -> None:
     field = moving(HexPlaneField(gaussians, WINDOW_S, **settings))
     module = gsplat()
     plain, plain_picture = peer_times(scene, new_peer(), None if module is None else module.rasterization, repetitions)
-    ours = deltas_alone(field, gaussians, repetitions)
-    compare(f"deform, hexplane {size}, {count} Gaussians", ours, {"plain": plain})
-    picture, psnr_db = with_picture(field, gaussians, camera_of(scene), repetitions)
-    compare(
-        f"deform and render, hexplane {size}, {count} Gaussians, 640x512",
-        picture,
-        {} if plain_picture is None else {"plain_on_gsplat": plain_picture},
-        ASKED_MS.get((size, count)),
-        psnr_to_float32_db=psnr_db,
-    )
+    for precision, dtype in KEPT.items():
+        ours = deltas_alone(field, gaussians, repetitions, dtype)
+        compare(f"deform, hexplane {size}, {precision}, {count} Gaussians", ours, {"plain": plain})
+        picture, psnr_db = with_picture(field, gaussians, camera_of(scene), repetitions, precision)
+        compare(
+            f"deform and render, hexplane {size}, {precision}, {count} Gaussians, 640x512",
+            picture,
+            {} if plain_picture is None else {"plain_on_gsplat": plain_picture},
+            ASKED_MS.get((size, count)),
+            psnr_to_float32_db=psnr_db,
+        )
 
 
 def basis(count: int, repetitions: int) -> None:
@@ -130,7 +132,7 @@ def basis(count: int, repetitions: int) -> None:
 
     compare(
         f"deform, basis field, {count} Gaussians",
-        deltas_alone(field, gaussians, repetitions),
+        deltas_alone(field, gaussians, repetitions, torch.float32),
         {"plain": measure(plain, repetitions)},
     )
     picture, psnr_db = with_picture(field, gaussians, camera_of(scene), repetitions)

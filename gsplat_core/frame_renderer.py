@@ -22,7 +22,7 @@ from gsplat_core.rendering import RenderOutput
 
 CAPACITY_STEP = 1 << 16
 """Lists grow by multiples of this many instances (a splat in a tile)."""
-HEADROOM = 1.5
+HEADROOM = 1.25
 """Room kept beyond what a frame needed, so that a scene that moves seldom outgrows its lists."""
 
 Precision = Literal["fp32", "fp16"]
