@@ -145,13 +145,13 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "hexplane_train_backward(Tensor(a!) v_raw, Tensor means, Tensor box, Tensor lines, Tensor features, Tensor hidden, "
       "Tensor[] planes, Tensor[] weights, Tensor[] biases) -> "
-      "(Tensor network, Tensor rows, Tensor segments, Tensor items, Tensor starts, Tensor v_lines)");
+      "(Tensor network, Tensor rows, Tensor shares, Tensor segments, Tensor starts, Tensor v_lines)");
   m.def(
-      "hexplane_planes_gradient(Tensor coordinates, Tensor time, Tensor rows, Tensor segments, Tensor items, Tensor starts, "
+      "hexplane_planes_gradient(Tensor time, Tensor rows, Tensor shares, Tensor segments, Tensor starts, "
       "Tensor v_lines, Tensor[] planes) -> Tensor[]");
   m.def(
-      "hexplane_planes_adam_(Tensor(a!)[] planes, Tensor(b!)[] first, Tensor(c!)[] second, Tensor coordinates, Tensor time, "
-      "Tensor rows, Tensor segments, Tensor items, Tensor starts, Tensor v_lines, Tensor rate, Tensor step, Tensor? status, "
+      "hexplane_planes_adam_(Tensor(a!)[] planes, Tensor(b!)[] first, Tensor(c!)[] second, Tensor time, Tensor rows, Tensor "
+      "shares, Tensor segments, Tensor starts, Tensor v_lines, Tensor rate, Tensor step, Tensor? status, "
       "float beta1, float beta2, float epsilon, float smoothness, float time_smoothness, float sparsity) -> ()");
   m.def(
       "network_adam_(Tensor(a!)[] parameters, Tensor gradient, Tensor(b!) first, Tensor(c!) second, Tensor rate, Tensor step, "

@@ -94,10 +94,9 @@ class HexPlaneTraining:
             status: int32 [4] of the frame; where status[2] is not 0 its lists were cut, and nothing but `v_raw` is changed.
         """
         gradient = self.gradient(v_raw)
-        assert self._state is not None
         betas, epsilon = self._betas, self._epsilon
         hexplane_planes_adam_(
-            self._field.plane_tensors(), self._first, self._second, self._state, time, gradient, rates[:1], step,
+            self._field.plane_tensors(), self._first, self._second, time, gradient, rates[:1], step,
             status=status, penalties=self._penalties, betas=betas, epsilon=epsilon,
         )  # fmt: skip
         network_adam_(

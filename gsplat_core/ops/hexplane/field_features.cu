@@ -52,8 +52,17 @@ __global__ void __launch_bounds__(kThreads)
   const float* values = static_cast<const float*>(lines.values);
   float v_x[3] = {};
   for (int level = 0; level < planes.levels && active; ++level) {
+    int64_t ranks[3];
+#pragma unroll
+    for (int p = 0; p < 3; ++p) {
+      ranks[p] = cells.ranks[(3 * level + p) * cells.count + n];
+      if (lane != p) continue;
+      const int major = major_axis(p), minor = minor_axis(p);
+      const float along = position_on(x[major], planes.sizes[level][major]).fraction;
+      const float across = position_on(x[minor], planes.sizes[level][minor]).fraction;
+      *reinterpret_cast<float2*>(rows.shares + 2 * ranks[p]) = make_float2(along, across);
+    }
     for (int c = lane * kLane; c < channels; c += kTeam * kLane) {
-      const int64_t row = n * channels + c, slot_size = cells.count * channels;
       const auto v = Channels<kLane>::load(v_features + (n * planes.levels + level) * channels + c);
       Channels<kLane> value[6], along_u[6], along_v[3];
 #pragma unroll
@@ -82,8 +91,7 @@ __global__ void __launch_bounds__(kThreads)
       for (int p = 5; p >= 0; --p) {
         const Channels<kLane> g = before[p] * after;
         after = after * value[p];
-        const int slot = 3 * level + p % 3;
-        g.store((p < 3 ? rows.space : rows.lines) + slot * slot_size + row);
+        g.store((p < 3 ? rows.space : rows.lines) + ranks[p < 3 ? p : plane_of_major(p - 3)] * channels + c);
         if (p < 3) {
           v_x[u_axis(p)] += (g * along_u[p]).sum();
           v_x[v_axis(p)] += (g * along_v[p]).sum();

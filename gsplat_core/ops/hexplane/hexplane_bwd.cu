@@ -13,7 +13,8 @@ namespace {
 
 template <int kLane, int kTeam>
 __global__ void __launch_bounds__(kThreads)
-    sample_gradients(HexPlanes level, const float* __restrict__ gradient, float* rows, float* v_coordinates, int64_t count) {
+    sample_gradients(HexPlanes level, const float* __restrict__ gradient, const int32_t* __restrict__ ranks, float* rows,
+                     float* shares, float* v_coordinates, int64_t count) {
   const int64_t index = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / kTeam;
   const int64_t n = index < count ? index : count - 1;  // the last team's lanes take part in the sums
   const int lane = int(threadIdx.x) % kTeam, channels = int(level.channels);
@@ -32,12 +33,18 @@ __global__ void __launch_bounds__(kThreads)
     for (int p = kPlanes - 1; p >= 0; --p) {
       const Channels<kLane> g = before[p] * after;
       after = after * value[p];
-      if (index < count) g.store(rows + (p * count + n) * channels + c);
+      if (index < count) g.store(rows + int64_t(ranks[p * count + n]) * channels + c);
       const Corners at(level.planes[p], x[u_axis(p)], x[v_axis(p)], channels);
       const Sample<kLane> sample(level.planes[p].values, at, c);
       v_x[u_axis(p)] += (g * sample.along_u(at)).sum() * at.u.slope;
       v_x[v_axis(p)] += (g * sample.along_v(at)).sum() * at.v.slope;
     }
+  }
+#pragma unroll
+  for (int p = 0; p < kPlanes; ++p) {
+    if (lane != p || index >= count) continue;
+    const Corners at(level.planes[p], x[u_axis(p)], x[v_axis(p)], channels);
+    *reinterpret_cast<float2*>(shares + 2 * int64_t(ranks[p * count + n])) = make_float2(at.v.fraction, at.u.fraction);
   }
 #pragma unroll
   for (int axis = 0; axis < 4; ++axis) {
@@ -64,10 +71,15 @@ __global__ void __launch_bounds__(kThreads)
   items[p * count + n] = int32_t(p * count + n);
 }
 
+__global__ void __launch_bounds__(kThreads) rank_items(const int32_t* __restrict__ items, int32_t* ranks, int64_t count) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < count) ranks[items[i]] = int32_t(i);
+}
+
 template <int kLane>
-__global__ void __launch_bounds__(kThreads) add_rows(SortedCells cells, float* gradient, int channels) {
+__global__ void __launch_bounds__(kThreads) add_rows(SortedCells cells, float* gradient, int major_size, int channels) {
   const int64_t i = (int64_t(blockIdx.x) * kThreads + threadIdx.x) * kLane, node = i / channels;
-  if (node >= int64_t(cells.major_size) * cells.minor_size) return;
+  if (node >= int64_t(major_size) * cells.minor_size) return;
   node_gradient<kLane>(cells, int(node / cells.minor_size), int(node % cells.minor_size), int(i % channels), channels)
       .store(gradient + i);
 }
@@ -85,41 +97,34 @@ void plane_gradients(const HexPlanes& level, const float* gradient, float* v_coo
     bits |= uintptr_t(plane.values) | uintptr_t(v_planes[p]);
   }
   const int64_t all = cells.first[kPlanes];
-  float* rows = scratch.array<float>(items * channels);
+  float *rows = scratch.array<float>(items * channels), *shares = scratch.array<float>(2 * items);
   uint32_t *keys = scratch.array<uint32_t>(items), *sorted_keys = scratch.array<uint32_t>(items);
   int32_t *unsorted = scratch.array<int32_t>(items), *sorted = scratch.array<int32_t>(items);
   int32_t *counts = scratch.array<int32_t>(all + 1), *starts = scratch.array<int32_t>(all + 1);
   cudaMemsetAsync(counts, 0, size_t(all + 1) * sizeof(int32_t), stream);
-  if (count > 0) {
-    with_team(bits % 16 == 0, channels, [&](auto lane, auto team) {
-      sample_gradients<lane(), team()>
-          <<<blocks_for(count * team()), kThreads, 0, stream>>>(level, gradient, rows, v_coordinates, count);
-    });
-    cells_of<<<dim3(blocks_for(count), kPlanes), kThreads, 0, stream>>>(level, cells, keys, unsorted, counts, count);
-  }
+  if (count > 0) cells_of<<<dim3(blocks_for(count), kPlanes), kThreads, 0, stream>>>(level, cells, keys, unsorted, counts, count);
   size_t size = 0;
   cub::DeviceScan::ExclusiveSum(nullptr, size, counts, starts, all + 1, stream);
   cub::DeviceScan::ExclusiveSum(scratch.bytes(size), size, counts, starts, all + 1, stream);
   cub::DeviceRadixSort::SortPairs(nullptr, size, keys, sorted_keys, unsorted, sorted, items, 0, bits_below(all), stream);
   cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, keys, sorted_keys, unsorted, sorted, items, 0, bits_below(all),
                                   stream);
+  if (count > 0) {
+    int32_t* ranks = scratch.array<int32_t>(items);
+    rank_items<<<blocks_for(items), kThreads, 0, stream>>>(sorted, ranks, items);
+    with_team(bits % 16 == 0, channels, [&](auto lane, auto team) {
+      sample_gradients<lane(), team()>
+          <<<blocks_for(count * team()), kThreads, 0, stream>>>(level, gradient, ranks, rows, shares, v_coordinates, count);
+    });
+  }
   for (int p = 0; p < kPlanes; ++p) {
     const FeaturePlane& plane = level.planes[p];
-    const SortedCells plane_cells = {starts + cells.first[p],
-                                     sorted,
-                                     level.coordinates,
-                                     rows + p * count * channels,
-                                     nullptr,
-                                     p * count,
-                                     v_axis(p),
-                                     u_axis(p),
-                                     plane.height,
-                                     plane.width};
+    const SortedCells plane_cells = {starts + cells.first[p], rows, shares, nullptr, plane.width};
     const int64_t values = int64_t(plane.width) * plane.height * channels;
     if (bits % 16 == 0) {
-      add_rows<4><<<blocks_for(values / 4), kThreads, 0, stream>>>(plane_cells, v_planes[p], int(channels));
+      add_rows<4><<<blocks_for(values / 4), kThreads, 0, stream>>>(plane_cells, v_planes[p], plane.height, int(channels));
     } else {
-      add_rows<1><<<blocks_for(values), kThreads, 0, stream>>>(plane_cells, v_planes[p], int(channels));
+      add_rows<1><<<blocks_for(values), kThreads, 0, stream>>>(plane_cells, v_planes[p], plane.height, int(channels));
     }
   }
 }

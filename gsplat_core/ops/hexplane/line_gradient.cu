@@ -7,9 +7,8 @@ using namespace hexplane;
 
 namespace {
 
-constexpr int kRun = 32;  // sorted Gaussians that a team goes through
-
-constexpr int plane_of_major(int axis) { return axis == 0 ? 1 : axis == 1 ? 0 : 2; }  // x: xz, y: xy, z: yz
+constexpr int kRun = 32;      // sorted Gaussians that a team goes through
+constexpr int kRunBatch = 8;  // of them on their way at once
 
 // One line's Gaussians, and where their sums go: those of run r that are in cell c at place r + c, which no other run and cell
 // have, because from one item to the next either may only grow.
@@ -35,9 +34,10 @@ __global__ void __launch_bounds__(kThreads) sum_runs(FieldPlanes planes, FieldCe
   const LineRuns line(planes, cells, slot, runs, all);
   const int32_t begin = line.begin + run * kRun, end = min(begin + kRun, line.end);
   if (begin >= end) return;
-  const int level = slot / 3, axis = slot % 3, plane = 3 * level + plane_of_major(axis);
-  SortedCells sorted = sorted_cells(planes, cells, rows, plane);
-  sorted.rows = rows.lines + slot * cells.count * channels;
+  const int level = slot / 3, axis = slot % 3;
+  SortedCells sorted = {nullptr, rows.space, rows.shares, nullptr, 0};
+  sorted.rows = rows.lines;
+  const int64_t first_cell = cells.first[level][plane_of_major(axis)];
   for (int c = int(threadIdx.x) % kTeam * kLane; c < channels; c += kTeam * kLane) {
     Channels<kLane> left = Channels<kLane>::all(0.0f), right = left;
     int cell = -1;
@@ -47,12 +47,12 @@ __global__ void __launch_bounds__(kThreads) sum_runs(FieldPlanes planes, FieldCe
       right.store(to + channels);
       left = right = Channels<kLane>::all(0.0f);
     };
-    for_rows<kLane>(sorted, begin, end, c, channels, [&](int32_t, float x, float, const Channels<kLane>& row) {
-      const LinePosition at = position_on(x, line.width);
-      if (int(at.cell) != cell && cell >= 0) flush();
-      cell = int(at.cell);
-      left = plus(left, 1.0f - at.fraction, row);
-      right = plus(right, at.fraction, row);
+    for_rows<kLane, kRunBatch>(sorted, begin, end, c, channels, [&](int32_t i, float along, float, const Channels<kLane>& row) {
+      const int now = int((cells.keys[i] - first_cell) / line.minor_size);
+      if (now != cell && cell >= 0) flush();
+      cell = now;
+      left = plus(left, 1.0f - along, row);
+      right = plus(right, along, row);
     });
     flush();
   }
@@ -94,28 +94,21 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 template <int kLane, int kTeam>
-__global__ void __launch_bounds__(kThreads) segments_kernel(FieldPlanes planes, FieldCells cells, FieldRows rows, int segments) {
-  const int segment = (int(blockIdx.x) * kThreads + int(threadIdx.x)) / kTeam, channels = planes.channels;
+__global__ void __launch_bounds__(kThreads) segments_kernel(FieldCells cells, FieldRows rows, int channels, int segments) {
+  const int segment = (int(blockIdx.x) * kThreads + int(threadIdx.x)) / kTeam;
   const int32_t begin = segment * kSegment, end = begin + kSegment;
   if (segment >= segments || end > cells.starts[cells.cells]) return;  // behind the last cell are those that take no part
-  const int slot = int(cells.items[begin] / cells.count);
-  if (cells.items[end - 1] / cells.count != slot) return;
-  const SortedCells sorted = sorted_cells(planes, cells, rows, slot);
-  const auto cell = [&](int32_t i, int axis, int32_t size) {
-    return position_on(cells.coordinates[4 * (cells.items[i] - sorted.first_item) + axis], size).cell;
-  };
-  if (cell(begin, sorted.major, sorted.major_size) != cell(end - 1, sorted.major, sorted.major_size) ||
-      cell(begin, sorted.minor, sorted.minor_size) != cell(end - 1, sorted.minor, sorted.minor_size))
-    return;
+  if (cells.keys[begin] != cells.keys[end - 1]) return;
+  const SortedCells sorted = {nullptr, rows.space, rows.shares, nullptr, 0};
   for (int c = int(threadIdx.x) % kTeam * kLane; c < channels; c += kTeam * kLane) {
     Channels<kLane> sums[4] = {Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f),
                                Channels<kLane>::all(0.0f)};
-    for_rows<kLane>(sorted, begin, end, c, channels, [&](int32_t, float x, float y, const Channels<kLane>& row) {
-      const float along = position_on(x, sorted.major_size).fraction, across = position_on(y, sorted.minor_size).fraction;
+    for_rows<kLane, kRunBatch>(
+        sorted, begin, end, c, channels, [&](int32_t, float along, float across, const Channels<kLane>& row) {
 #pragma unroll
-      for (int corner = 0; corner < 4; ++corner)
-        sums[corner] = plus(sums[corner], (corner / 2 ? along : 1.0f - along) * (corner % 2 ? across : 1.0f - across), row);
-    });
+          for (int corner = 0; corner < 4; ++corner)
+            sums[corner] = plus(sums[corner], (corner / 2 ? along : 1.0f - along) * (corner % 2 ? across : 1.0f - across), row);
+        });
 #pragma unroll
     for (int corner = 0; corner < 4; ++corner) sums[corner].store(rows.segments + (int64_t(segment) * 4 + corner) * channels + c);
   }
@@ -128,7 +121,7 @@ void sum_segments(const FieldPlanes& planes, const FieldCells& cells, const Fiel
   if (segments == 0) return;
   with_team(planes.channels % 4 == 0, planes.channels, [&](auto lane, auto team) {
     segments_kernel<lane(), team()>
-        <<<blocks_for(int64_t(segments) * team()), kThreads, 0, stream>>>(planes, cells, rows, segments);
+        <<<blocks_for(int64_t(segments) * team()), kThreads, 0, stream>>>(cells, rows, planes.channels, segments);
   });
 }
 

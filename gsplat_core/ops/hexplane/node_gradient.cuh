@@ -5,19 +5,16 @@
 
 namespace hexplane {
 
-constexpr int kSegment = 32;  // sorted Gaussians whose sums are kept when they are all in one cell
-constexpr int kBatch = 4;     // rows that are on their way at once
+constexpr int kSegment = 32;   // sorted Gaussians whose sums are kept when they are all in one cell
+constexpr int kNodeBatch = 2;  // rows of a node that are on their way at once: few, so that many nodes are
 
 // One plane's Gaussians, sorted by cell = along the major axis * minor size + along the minor axis.
 struct SortedCells {
-  const int32_t* starts;     // of the plane's first cell
-  const int32_t* items;      // of all planes; item - first_item is a Gaussian
-  const float* coordinates;  // [N, 4]
-  const float* rows;         // [N, C]: gradient of the plane's sample
-  const float* segments;     // [all items / kSegment, 4, C]: sums of full segments for the corners of their cell; null: none
-  int64_t first_item;
-  int32_t major, minor;  // axes of the coordinates
-  int32_t major_size, minor_size;
+  const int32_t* starts;  // of the plane's first cell
+  const float* rows;      // [all planes' items, C], sorted: gradient of the plane's sample
+  const float* shares;    // [items, 2]: of the way to the right node along the major and the minor axis
+  const float* segments;  // [items / kSegment, 4, C]: sums of full segments for the corners of their cell; null: none
+  int32_t minor_size;
 };
 
 // How much of a sample comes from node `node`, when the point lies at `at`.
@@ -25,26 +22,23 @@ __device__ __forceinline__ float share_of(const LinePosition& at, int node) {
   return int(at.cell) == node ? 1.0f - at.fraction : int(at.cell) == node - 1 ? at.fraction : 0.0f;
 }
 
-// Calls use(k, coordinate along major, along minor, row) for the sorted items [begin, end) in order; their rows are loaded kBatch
-// at a time.
-template <int kLane, class Use>
+// Calls use(i, share along major, along minor, row) for the sorted items [begin, end) in order; kBatch of them are loaded at a
+// time.
+template <int kLane, int kBatch, class Use>
 __device__ __forceinline__ void for_rows(const SortedCells& cells, int32_t begin, int32_t end, int channel, int channels,
                                          const Use& use) {
   for (int32_t i = begin; i < end; i += kBatch) {
-    int64_t n[kBatch];
     Channels<kLane> row[kBatch];
-    float major[kBatch], minor[kBatch];
-#pragma unroll
-    for (int k = 0; k < kBatch; ++k) n[k] = cells.items[min(i + k, end - 1)] - cells.first_item;
+    float2 share[kBatch];
 #pragma unroll
     for (int k = 0; k < kBatch; ++k) {
-      row[k] = Channels<kLane>::load(cells.rows + n[k] * channels + channel);
-      major[k] = cells.coordinates[4 * n[k] + cells.major];
-      minor[k] = cells.coordinates[4 * n[k] + cells.minor];
+      const int64_t at = min(i + k, end - 1);
+      row[k] = Channels<kLane>::load(cells.rows + at * channels + channel);
+      share[k] = *reinterpret_cast<const float2*>(cells.shares + 2 * at);
     }
 #pragma unroll
     for (int k = 0; k < kBatch; ++k)
-      if (i + k < end) use(i + k, major[k], minor[k], row[k]);
+      if (i + k < end) use(i + k, share[k].x, share[k].y, row[k]);
   }
 }
 
@@ -60,10 +54,10 @@ __device__ Channels<kLane> node_gradient(const SortedCells& cells, int major, in
     for (int low = 0; low < 2; ++low) {
       const int32_t begin = bounds[low], end = bounds[low + 1];
       const auto add = [&](int32_t from, int32_t to) {
-        for_rows<kLane>(cells, from, to, channel, channels, [&](int32_t, float x, float y, const Channels<kLane>& row) {
-          const float along = position_on(x, cells.major_size).fraction, across = position_on(y, cells.minor_size).fraction;
-          sum = plus(sum, (left ? 1.0f - along : along) * (low ? 1.0f - across : across), row);
-        });
+        for_rows<kLane, kNodeBatch>(cells, from, to, channel, channels,
+                                    [&](int32_t, float along, float across, const Channels<kLane>& row) {
+                                      sum = plus(sum, (left ? 1.0f - along : along) * (low ? 1.0f - across : across), row);
+                                    });
       };
       const int32_t first = (begin + kSegment - 1) / kSegment, last = end / kSegment;
       if (cells.segments == nullptr || first >= last) {

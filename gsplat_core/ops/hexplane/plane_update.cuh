@@ -40,17 +40,8 @@ __device__ __forceinline__ int slot_of_block(const Slots& slots) {
 // The Gaussians of a slot's space plane.
 __device__ __forceinline__ SortedCells sorted_cells(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows,
                                                     int slot) {
-  const int level = slot / 3, p = slot % 3, major = major_axis(p), minor = minor_axis(p);
-  return {cells.starts + cells.first[level][p],
-          cells.items,
-          cells.coordinates,
-          rows.space + slot * cells.count * planes.channels,
-          rows.segments,
-          slot * cells.count,
-          major,
-          minor,
-          planes.sizes[level][major],
-          planes.sizes[level][minor]};
+  const int level = slot / 3, p = slot % 3;
+  return {cells.starts + cells.first[level][p], rows.space, rows.shares, rows.segments, planes.sizes[level][minor_axis(p)]};
 }
 
 template <int kLane>

@@ -2,7 +2,7 @@
 
     state = hexplane_train(means, box, time, planes, weights, biases)           # state.deltas into the frame
     gradient = hexplane_train_backward(v_raw, means, box, state, planes, weights, biases)
-    hexplane_planes_adam_(planes, first, second, state, time, gradient, rate, step, ...)
+    hexplane_planes_adam_(planes, first, second, time, gradient, rate, step, ...)
 
 Nothing waits for the host and every call can be captured in a CUDA graph; time, rate and step are read from device memory. The same
 inputs give the same bits: no sum is made by atomic additions. The gradient of the planes stays factored, one row per Gaussian, level
@@ -43,13 +43,14 @@ class FieldGradient(NamedTuple):
     network: Tensor
     """Weight and bias of every layer, one after the other."""
     rows: Tensor
-    """[2, 3 * levels, N, C]: gradients of the samples of the space planes (xy, xz, yz) and of the lines (x, y, z)."""
+    """[2, 3 * levels * N, C]: gradients of the samples of the space planes (xy, xz, yz of every level) and of the lines of their major
+    axes (y, x, z), sorted by the cell of the plane."""
+    shares: Tensor
+    """[3 * levels * N, 2]: fractions of the way to the next node along the major and the minor axis, in the same order."""
     segments: Tensor
     """[3 * levels * N / 32, 4, C]: sums of 32 sorted rows each, where these are all in one cell."""
-    items: Tensor
-    """int32 [3 * levels * N]: slot * N + Gaussian, sorted by the cell of that slot's space plane."""
     starts: Tensor
-    """int32 [cells + 1]: where each cell's items start."""
+    """int32 [cells + 1]: where each cell's rows start."""
     v_lines: Tensor
     """The gradient of the lines."""
 
@@ -107,16 +108,13 @@ def hexplane_train_backward(
     return FieldGradient(*gradient)
 
 
-def hexplane_planes_gradient(
-    state: TrainingState, time: Tensor, gradient: FieldGradient, planes: Sequence[Tensor]
-) -> list[Tensor]:
+def hexplane_planes_gradient(time: Tensor, gradient: FieldGradient, planes: Sequence[Tensor]) -> list[Tensor]:
     """The gradient of every plane as a tensor of its size."""
     return torch.ops.gsplat_core.hexplane_planes_gradient(
-        state.coordinates,
         time,
         gradient.rows,
+        gradient.shares,
         gradient.segments,
-        gradient.items,
         gradient.starts,
         gradient.v_lines,
         list(planes),
@@ -127,7 +125,6 @@ def hexplane_planes_adam_(
     planes: Sequence[Tensor],
     first: Sequence[Tensor],
     second: Sequence[Tensor],
-    state: TrainingState,
     time: Tensor,
     gradient: FieldGradient,
     rate: Tensor,
@@ -149,7 +146,7 @@ def hexplane_planes_adam_(
     """
     _check(*planes, *first, *second, rate)
     torch.ops.gsplat_core.hexplane_planes_adam_(
-        list(planes), list(first), list(second), state.coordinates, time, gradient.rows, gradient.segments, gradient.items, gradient.starts,
+        list(planes), list(first), list(second), time, gradient.rows, gradient.shares, gradient.segments, gradient.starts,
         gradient.v_lines, rate, step, status, *betas, epsilon, *penalties,
     )  # fmt: skip
 
@@ -218,9 +215,9 @@ def _(
     cells = sum(int(plane.shape[0] * plane.shape[1]) for index, plane in enumerate(planes) if index % 6 < 3)
     return (
         means.new_empty(sum(t.numel() for t in (*weights, *biases))),
-        means.new_empty(2, slots, n, planes[0].shape[2]),
+        means.new_empty(2, slots * n, planes[0].shape[2]),
+        means.new_empty(slots * n, 2),
         means.new_empty(slots * n // 32, 4, planes[0].shape[2]),
-        means.new_empty(slots * n, dtype=torch.int32),
         means.new_empty(cells + 1, dtype=torch.int32),
         means.new_empty(_lines_size(planes)),
     )
@@ -228,11 +225,10 @@ def _(
 
 @torch.library.register_fake("gsplat_core::hexplane_planes_gradient")
 def _(
-    coordinates: Tensor,
     time: Tensor,
     rows: Tensor,
+    shares: Tensor,
     segments: Tensor,
-    items: Tensor,
     starts: Tensor,
     v_lines: Tensor,
     planes: list[Tensor],
@@ -245,11 +241,10 @@ def _(
     planes: list[Tensor],
     first: list[Tensor],
     second: list[Tensor],
-    coordinates: Tensor,
     time: Tensor,
     rows: Tensor,
+    shares: Tensor,
     segments: Tensor,
-    items: Tensor,
     starts: Tensor,
     v_lines: Tensor,
     rate: Tensor,

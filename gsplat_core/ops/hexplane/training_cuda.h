@@ -24,18 +24,23 @@ struct FieldPlanes {
   }
 };
 
-// Where the Gaussians are: slot = 3 * level + plane, item = slot * N + Gaussian.
+// Where the Gaussians are: slot = 3 * level + plane, item = slot * N + Gaussian, sorted by the cell of its slot's plane and,
+// within one, by Gaussian; those that take no part come last.
 struct FieldCells {
   float* coordinates;  // [N, 4] in [-1, 1]; the fourth is 0 for a Gaussian that takes no part because its position is not finite
-  int32_t* items;      // [slots * N] by cell, Gaussians in order within one
   int32_t* starts;     // [cells + 1] of the cell's items
+  int32_t* ranks;      // [slots * N]: place of an item among the sorted ones
+  uint32_t* keys;      // [slots * N] cells of the sorted items
   int64_t first[kFieldLevels][3];  // a slot's first cell
   int64_t cells, count;
 };
 
+constexpr int plane_of_major(int axis) { return axis == 0 ? 1 : axis == 1 ? 0 : 2; }  // x: xz, y: xy, z: yz
+
 struct FieldRows {
-  float* space;  // [slots, N, C]: gradient of the plane's sample
-  float* lines;  // [slots, N, C]: of the line's, slot = 3 * level + axis
+  float* space;   // [slots * N, C], sorted: gradient of the plane's sample
+  float* lines;   // the same for the line of the plane's major axis
+  float* shares;  // [slots * N, 2], sorted: fractions of the way to the next node along the major and the minor axis
   // [slots * N / 32, 4, C]: of 32 items that are all in one cell, the sums of their rows for its four corners, the second along
   // the minor axis first; what belongs to other items is not written
   float* segments;

@@ -40,7 +40,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train(Tensor means, 
   return {deltas, coordinates, lines, features, hidden};
 }
 
-// (network gradient, rows [2, slots, N, C], segments, items, starts, line gradient); adds the positions' gradient to v_raw.
+// (network gradient, rows [2, slots * N, C], shares, segments, starts, line gradient); adds the positions' gradient to v_raw.
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tensor v_raw, Tensor means, Tensor box,
                                                                                    Tensor lines, Tensor features, Tensor hidden,
                                                                                    Tensors planes, Tensors weights,
@@ -60,13 +60,15 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backwa
   const int64_t slots = 3 * field.planes.levels;
   int64_t parameters = 0;
   for (size_t i = 0; i < weights.size(); ++i) parameters += weights[i].numel() + biases[i].numel();
-  Tensor network_gradient = call.empty({parameters}), rows = call.empty({2, slots, n, field.planes.channels});
-  Tensor items = call.empty({slots * n}, ScalarType::Int), starts = call.empty({field.cells.cells + 1}, ScalarType::Int);
+  Tensor network_gradient = call.empty({parameters}), rows = call.empty({2, slots * n, field.planes.channels});
+  Tensor shares = call.empty({slots * n, 2}), starts = call.empty({field.cells.cells + 1}, ScalarType::Int);
   Tensor v_lines = call.empty({field.line_size}), segments = call.empty({slots * n / 32, 4, field.planes.channels});
   field.lines.values = const_cast<float*>(data(l));
   field.cells.coordinates = call.array<float>(4 * n);
-  field.cells.items = items.mutable_data_ptr<int32_t>(), field.cells.starts = starts.mutable_data_ptr<int32_t>();
-  const FieldRows r = {mutable_data(rows), mutable_data(rows) + slots * n * field.planes.channels, mutable_data(segments)};
+  field.cells.ranks = call.array<int32_t>(slots * n), field.cells.keys = call.array<uint32_t>(slots * n);
+  field.cells.starts = starts.mutable_data_ptr<int32_t>();
+  const FieldRows r = {mutable_data(rows), mutable_data(rows) + slots * n * field.planes.channels, mutable_data(shares),
+                       mutable_data(segments)};
   float *v_features = call.array<float>(n * field.features), *v_hidden = call.array<float>((net.layers - 1) * n * net.width);
   float* v_head = call.array<float>(n * kDeltaColumns);
   place_gaussians(field.planes, data(m), data(b), field.cells, call, call.stream);
@@ -76,7 +78,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backwa
   sum_segments(field.planes, field.cells, r, call.stream);
   line_gradient(field.planes, field.lines, field.cells, r, mutable_data(v_lines), call, call.stream);
   check_cuda(cudaGetLastError(), "hexplane_train_backward");
-  return {network_gradient, rows, segments, items, starts, v_lines};
+  return {network_gradient, rows, shares, segments, starts, v_lines};
 }
 
 }  // namespace

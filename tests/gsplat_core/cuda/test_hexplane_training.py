@@ -116,7 +116,7 @@ def test_deltas_and_gradients_equal_the_reference(gpu, case):
     assert relative(gradient.network, network) < 1e-4
     added = v_raw[:, :3].cpu().double() - case.v_raw[:, :3].double()
     assert float((added - v_means).norm()) <= 1e-4 * float(v_means.norm()) + 1e-6 * float(case.v_raw.norm())
-    for seen, wanted in zip(hexplane_planes_gradient(state, ours.time, gradient, ours.planes), v_planes, strict=True):
+    for seen, wanted in zip(hexplane_planes_gradient(ours.time, gradient, ours.planes), v_planes, strict=True):
         assert relative(seen, wanted) < 1e-4
 
 
@@ -132,7 +132,7 @@ def test_the_same_bits_every_time(gpu):
             gradient.starts,
             gradient.v_lines,
         )  # segments has places that nobody writes
-        results.append([*state, v_raw, *left, *hexplane_planes_gradient(state, case.time, gradient, case.planes)])
+        results.append([*state, v_raw, *left, *hexplane_planes_gradient(case.time, gradient, case.planes)])
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
@@ -150,7 +150,7 @@ def test_what_is_not_finite_takes_no_part(gpu):
     case.v_raw[7] = 0
     _, _, v_planes, network = case.exact()
     assert relative(gradient.network, network) < 1e-4
-    for seen, wanted in zip(hexplane_planes_gradient(state, ours.time, gradient, ours.planes), v_planes, strict=True):
+    for seen, wanted in zip(hexplane_planes_gradient(ours.time, gradient, ours.planes), v_planes, strict=True):
         assert relative(seen, wanted) < 1e-4
     assert (v_raw[[3, 4], :3] == 0).all()
 
@@ -195,7 +195,7 @@ def test_adam_over_the_planes_equals_the_reference(gpu, shape, penalties):
         elif penalties.plane_smoothness:
             pytest.skip("a plane one cell wide has no total variation")
         extra = torch.autograd.grad(loss, leaves, allow_unused=True)
-        hexplane_planes_adam_(ours.planes, first, second, state, ours.time, gradient, rate, step, penalties=penalties)
+        hexplane_planes_adam_(ours.planes, first, second, ours.time, gradient, rate, step, penalties=penalties)
         for p, m, v, g, e in zip(*wanted, gradients, extra, strict=True):
             adam_step(p, g if e is None else g + e, m, v, count, 0.01)
         for actual, expected in zip((ours.planes, first, second), wanted, strict=True):
@@ -214,7 +214,7 @@ def test_a_cut_frame_changes_nothing(gpu):
     rate, step = torch.tensor([0.01], device=gpu), torch.ones(1, dtype=torch.int64, device=gpu)
     for penalties in (Penalties(), Penalties(1.0, 1.0, 1.0)):
         status = torch.tensor([9, 9, 1, 0], dtype=torch.int32, device=gpu)
-        args = (case.planes, first, second, state, case.time, gradient, rate, step)
+        args = (case.planes, first, second, case.time, gradient, rate, step)
         hexplane_planes_adam_(*args, status=status, penalties=penalties)
         assert all(torch.equal(a, b) for a, b in zip(before, (*case.planes, *first, *second), strict=True))
     status[2] = 0
@@ -232,7 +232,7 @@ def test_a_step_in_a_graph_follows_time_and_rate(gpu):
     def train():
         state, v_raw = case.forward(), case.v_raw.clone()
         gradient = case.backward(state, v_raw)
-        hexplane_planes_adam_(case.planes, first, second, state, case.time, gradient, rate, step)
+        hexplane_planes_adam_(case.planes, first, second, case.time, gradient, rate, step)
         step.add_(1)
 
     def run(step_of):
@@ -271,12 +271,12 @@ def test_ops_pass_opcheck(gpu):
     torch.library.opcheck(ops.hexplane_train.default, (case.means, case.box, case.time, *network))
     kept = (state.lines, state.features, state.hidden)
     torch.library.opcheck(ops.hexplane_train_backward.default, (case.v_raw, case.means, case.box, *kept, *network))
-    factored = (gradient.rows, gradient.segments, gradient.items, gradient.starts, gradient.v_lines)
-    torch.library.opcheck(ops.hexplane_planes_gradient.default, (state.coordinates, case.time, *factored, case.planes))
+    factored = (gradient.rows, gradient.shares, gradient.segments, gradient.starts, gradient.v_lines)
+    torch.library.opcheck(ops.hexplane_planes_gradient.default, (case.time, *factored, case.planes))
     first, second = ([torch.zeros_like(p) for p in case.planes] for _ in range(2))
     rate, step = torch.tensor([0.01], device=gpu), torch.ones(1, dtype=torch.int64, device=gpu)
     options = (rate, step, None, 0.9, 0.999, 1e-8, 0.0, 0.0, 0.0)
     torch.library.opcheck(
         ops.hexplane_planes_adam_.default,
-        (case.planes, first, second, state.coordinates, case.time, *factored, *options),
+        (case.planes, first, second, case.time, *factored, *options),
     )
