@@ -8,7 +8,7 @@ namespace {
 
 // A team has one Gaussian at one level.
 template <int kLane, int kTeam>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, 3)
     features_kernel(FieldPlanes planes, FieldLines lines, FieldCells cells, float* __restrict__ features) {
   const int64_t n = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / kTeam;
   if (n >= cells.count) return;
@@ -39,7 +39,7 @@ __global__ void __launch_bounds__(kThreads)
 
 // A team has one Gaussian at all levels, so that the gradient of its position has one sum.
 template <int kLane, int kTeam>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, 2)
     rows_kernel(FieldPlanes planes, FieldLines lines, FieldCells cells, const float* __restrict__ box,
                 const float* __restrict__ v_features, FieldRows rows, float* v_raw) {
   const int64_t index = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / kTeam;
@@ -52,16 +52,9 @@ __global__ void __launch_bounds__(kThreads)
   const float* values = static_cast<const float*>(lines.values);
   float v_x[3] = {};
   for (int level = 0; level < planes.levels && active; ++level) {
-    int64_t ranks[3];
+    int32_t ranks[3];
 #pragma unroll
-    for (int p = 0; p < 3; ++p) {
-      ranks[p] = cells.ranks[(3 * level + p) * cells.count + n];
-      if (lane != p) continue;
-      const int major = major_axis(p), minor = minor_axis(p);
-      const float along = position_on(x[major], planes.sizes[level][major]).fraction;
-      const float across = position_on(x[minor], planes.sizes[level][minor]).fraction;
-      *reinterpret_cast<float2*>(rows.shares + 2 * ranks[p]) = make_float2(along, across);
-    }
+    for (int p = 0; p < 3; ++p) ranks[p] = cells.ranks[(3 * level + p) * cells.count + n];
     for (int c = lane * kLane; c < channels; c += kTeam * kLane) {
       const auto v = Channels<kLane>::load(v_features + (n * planes.levels + level) * channels + c);
       Channels<kLane> value[6], along_u[6], along_v[3];
@@ -91,7 +84,7 @@ __global__ void __launch_bounds__(kThreads)
       for (int p = 5; p >= 0; --p) {
         const Channels<kLane> g = before[p] * after;
         after = after * value[p];
-        g.store((p < 3 ? rows.space : rows.lines) + ranks[p < 3 ? p : plane_of_major(p - 3)] * channels + c);
+        g.store((p < 3 ? rows.space : rows.lines) + int64_t(ranks[p < 3 ? p : plane_of_major(p - 3)]) * channels + c);
         if (p < 3) {
           v_x[u_axis(p)] += (g * along_u[p]).sum();
           v_x[v_axis(p)] += (g * along_v[p]).sum();
@@ -99,6 +92,15 @@ __global__ void __launch_bounds__(kThreads)
           v_x[p - 3] += (g * along_u[p]).sum();
         }
       }
+    }
+    // After the loads of the level, none of which may pass a store.
+#pragma unroll
+    for (int p = 0; p < 3; ++p) {
+      if (lane != p) continue;
+      const int major = major_axis(p), minor = minor_axis(p);
+      const float along = position_on(x[major], planes.sizes[level][major]).fraction;
+      const float across = position_on(x[minor], planes.sizes[level][minor]).fraction;
+      *reinterpret_cast<float2*>(rows.shares + 2 * int64_t(ranks[p])) = make_float2(along, across);
     }
   }
 #pragma unroll

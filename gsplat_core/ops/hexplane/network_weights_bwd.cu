@@ -27,20 +27,25 @@ __global__ void __launch_bounds__(kTileThreads, 8) sum_shares(LayerTiles tiles, 
   const int o = int(threadIdx.x) / 16 * 4, i = int(threadIdx.x) % 16 * 4;
   constexpr int kV = kDeep * kOutputs / kTileThreads, kX = kDeep * kInputs / kTileThreads;
   float sums[4][4] = {}, bias = 0.0f, next_v[kV], next_x[kX];
-  // The next rows are on their way while these are multiplied.
+  // A thread has one column of each operand. The next rows are on their way while these are multiplied.
+  const int v_row = int(threadIdx.x) / kOutputs, v_output = first_output + int(threadIdx.x) % kOutputs;
+  const int x_row = int(threadIdx.x) / kInputs, x_input = first_input + int(threadIdx.x) % kInputs;
+  const float* v_from = tiles.v_outputs[layer] + (begin + v_row) * outputs + v_output;
+  const float* x_from = tiles.inputs[layer] + (begin + x_row) * inputs + x_input;
   const auto fetch = [&](int64_t row) {
+    const int left = int(end - row);
 #pragma unroll
     for (int k = 0; k < kV; ++k) {
-      const int at = k * kTileThreads + int(threadIdx.x), output = first_output + at % kOutputs;
-      const int64_t n = row + at / kOutputs;
-      next_v[k] = n < end && output < outputs ? tiles.v_outputs[layer][n * outputs + output] : 0.0f;
+      const int down = k * (kTileThreads / kOutputs);
+      next_v[k] = v_row + down < left && v_output < outputs ? v_from[down * outputs] : 0.0f;
     }
 #pragma unroll
     for (int k = 0; k < kX; ++k) {
-      const int at = k * kTileThreads + int(threadIdx.x), input = first_input + at % kInputs;
-      const int64_t n = row + at / kInputs;
-      next_x[k] = n < end && input < inputs ? tiles.inputs[layer][n * inputs + input] : 0.0f;
+      const int down = k * (kTileThreads / kInputs);
+      next_x[k] = x_row + down < left && x_input < inputs ? x_from[down * inputs] : 0.0f;
     }
+    v_from += kDeep * outputs;
+    x_from += kDeep * inputs;
   };
   fetch(begin);
   for (int64_t row = begin; row < end; row += kDeep) {

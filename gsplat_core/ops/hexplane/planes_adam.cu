@@ -29,7 +29,7 @@ __global__ void __launch_bounds__(kThreads) update_network(NetworkParameters par
 
 // A thread has the neighbouring channels of one node.
 template <int kLane, class Sink>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, 5)
     space_nodes(FieldPlanes planes, FieldCells cells, FieldRows rows, Slots slots, Sink sink) {
   const int slot = slot_of_block(slots), level = slot / 3, p = slot % 3, channels = planes.channels;
   const int width = planes.sizes[level][u_axis(p)], height = planes.sizes[level][v_axis(p)];
