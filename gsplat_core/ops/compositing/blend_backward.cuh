@@ -141,6 +141,7 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
   int first = w.begin + (end - 1 - w.begin) / kBatch * kBatch;
   Record<D> next = fetch_ahead(first);
   for (; first >= w.begin; first -= kBatch) {
+    __syncwarp();  // the warp's lanes have read of the batch behind what they now write over
     const float mean_x = next.xyab.x, mean_y = next.xyab.y;
     if (mine < kBatch) put_staged<kQuadrant>(mine, first + mine / 32 * 32 < end, next, w, stage.splats, stage.reached);
     __syncthreads();
