@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from gsplat_core.cameras import Camera
     from gsplat_core.deformation import DeformationField
     from gsplat_core.errors import CoreError, InvalidInput
+    from gsplat_core.frame_renderer import FrameRenderer
     from gsplat_core.frames import Frame, FrameStatus
     from gsplat_core.gaussians import Gaussians
     from gsplat_core.io.bundle import load_bundle, save_bundle
@@ -33,6 +34,7 @@ __all__ = [
     "CoreError",
     "DeformationField",
     "Frame",
+    "FrameRenderer",
     "FrameStatus",
     "Gaussians",
     "InvalidInput",
@@ -60,6 +62,7 @@ _HOME = {
     "CoreError": "errors",
     "DeformationField": "deformation",
     "Frame": "frames",
+    "FrameRenderer": "frame_renderer",
     "FrameStatus": "frames",
     "Gaussians": "gaussians",
     "InvalidInput": "errors",
