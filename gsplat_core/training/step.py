@@ -101,8 +101,6 @@ class TrainingStep:
         deltas = torch.cat(
             [gradients["means"], gradients["quats"], gradients["log_scales"], gradients["sh"][:, 0]], dim=1
         )
-        if not torch.isfinite(deltas.sum()):  # such a Gaussian is left alone, as `FusedAdam` does
-            deltas[~deltas.isfinite().all(1)] = 0
         field.adam_step(observation.time_s, deltas, self._basis_rates(rate_scale))
         self._update_gaussians(gradients, rate_scale)
         return loss

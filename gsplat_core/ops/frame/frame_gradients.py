@@ -7,7 +7,7 @@ both can be captured in a CUDA graph.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,31 +19,13 @@ from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.reference.frame import RAW_COLUMNS
 from gsplat_core.render_settings import EPS2D
 
+if TYPE_CHECKING:
+    from gsplat_core.ops.frame.frame import Frame
+
 RATES = 5
 """Learning rates of the fused Adam: means, quats, log-scales, logit opacities, spherical harmonics."""
 DC = slice(10, 13)
 """Where the first coefficient of the colour is in a row of raw gradients (see `reference.frame.RAW_COLUMNS`)."""
-
-
-class FramePass(Protocol):
-    """What `render_frame(..., training=True)` leaves for its gradient."""
-
-    @property
-    def alphas(self) -> Tensor: ...
-    @property
-    def last(self) -> Tensor: ...
-    @property
-    def records(self) -> Tensor: ...
-    @property
-    def tile_offsets(self) -> Tensor: ...
-    @property
-    def sorted(self) -> Tensor: ...
-    @property
-    def splat_starts(self) -> Tensor: ...
-    @property
-    def instance_splats(self) -> Tensor: ...
-    @property
-    def status(self) -> Tensor: ...
 
 
 class RawGradients(NamedTuple):
@@ -61,7 +43,7 @@ def render_frame_backward(
     viewmat: Tensor,
     K: Tensor,
     background: Tensor | None,
-    forward: FramePass,
+    forward: Frame,
     v_image: Tensor,
     v_alphas: Tensor | None = None,
     *,
@@ -101,7 +83,7 @@ def render_frame_backward_adam_(
     viewmat: Tensor,
     K: Tensor,
     background: Tensor | None,
-    forward: FramePass,
+    forward: Frame,
     v_image: Tensor,
     v_alphas: Tensor | None = None,
     *,
@@ -146,7 +128,7 @@ def render_frame_backward_adam_(
     return raw if needs_raw else None
 
 
-def _lists(forward: FramePass) -> tuple[Tensor, ...]:
+def _lists(forward: Frame) -> tuple[Tensor, ...]:
     return (
         forward.records, forward.tile_offsets, forward.sorted, forward.splat_starts, forward.instance_splats,
         forward.status, forward.alphas, forward.last,
@@ -159,7 +141,7 @@ def _check(
     viewmat: Tensor,
     K: Tensor,
     background: Tensor | None,
-    forward: FramePass,
+    forward: Frame,
     v_image: Tensor,
     v_alphas: Tensor | None,
     camera_model: str,
