@@ -141,17 +141,17 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // Training of the whole field without autograd, CUDA only: gsplat_core/ops/hexplane/training.py says what passes between them.
   m.def(
       "hexplane_train(Tensor means, Tensor box, Tensor time, Tensor[] planes, Tensor[] weights, Tensor[] biases) -> "
-      "(Tensor deltas, Tensor coordinates, Tensor lines, Tensor features, Tensor hidden)");
+      "(Tensor deltas, Tensor coordinates, Tensor lines, Tensor features, Tensor hidden, Tensor order, Tensor starts)");
   m.def(
-      "hexplane_train_backward(Tensor(a!) v_raw, Tensor means, Tensor box, Tensor lines, Tensor features, Tensor hidden, "
-      "Tensor[] planes, Tensor[] weights, Tensor[] biases) -> "
-      "(Tensor network, Tensor rows, Tensor shares, Tensor segments, Tensor starts, Tensor v_lines)");
+      "hexplane_train_backward(Tensor(a!) v_raw, Tensor box, Tensor coordinates, Tensor lines, Tensor features, Tensor hidden, "
+      "Tensor order, Tensor starts, Tensor[] planes, Tensor[] weights, Tensor[] biases) -> "
+      "(Tensor network, Tensor rows, Tensor shares, Tensor crowds, Tensor v_lines)");
   m.def(
-      "hexplane_planes_gradient(Tensor time, Tensor rows, Tensor shares, Tensor segments, Tensor starts, "
+      "hexplane_planes_gradient(Tensor time, Tensor rows, Tensor shares, Tensor crowds, Tensor starts, "
       "Tensor v_lines, Tensor[] planes) -> Tensor[]");
   m.def(
       "hexplane_planes_adam_(Tensor(a!)[] planes, Tensor(b!)[] first, Tensor(c!)[] second, Tensor time, Tensor rows, Tensor "
-      "shares, Tensor segments, Tensor starts, Tensor v_lines, Tensor rate, Tensor step, Tensor? status, "
+      "shares, Tensor crowds, Tensor starts, Tensor v_lines, Tensor rate, Tensor step, Tensor? status, "
       "float beta1, float beta2, float epsilon, float smoothness, float time_smoothness, float sparsity) -> ()");
   m.def(
       "network_adam_(Tensor(a!)[] parameters, Tensor gradient, Tensor(b!) first, Tensor(c!) second, Tensor rate, Tensor step, "

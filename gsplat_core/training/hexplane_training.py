@@ -29,7 +29,7 @@ class HexPlaneTraining:
     replayed with others. Parameters and moments change in place. The same inputs give the same bits.
 
     Args:
-        field: float32 on a CUDA device.
+        field: float32 on a CUDA device. Its tensors are taken now: where they are replaced by others, another `HexPlaneTraining` is due.
         penalties: weights in the loss of the penalties of `gsplat_core.deformation.regularisers`.
 
     Raises:
@@ -54,35 +54,36 @@ class HexPlaneTraining:
                 f"training without autograd takes a float32 field on CUDA with a multiple of 16 channels and layers up to 128 wide, got"
                 f" {field.box.dtype} on {field.box.device}, {field.channels} channels, {field.depth} layers of {field.width}"
             )
-        self._field = field
+        self._box = field.box
+        self._planes = field.plane_tensors()
+        self._weights, self._biases = field.network_tensors()
+        self._network = [t for pair in zip(self._weights, self._biases, strict=True) for t in pair]
         self._penalties = penalties
         self._betas = betas
         self._epsilon = epsilon
-        self._first, self._second = ([torch.zeros_like(p) for p in field.plane_tensors()] for _ in range(2))
-        size = sum(t.numel() for t in self._network())
-        self._network_first, self._network_second = (torch.zeros(size, device=field.box.device) for _ in range(2))
-        self._means: Tensor | None = None
+        self._first, self._second = ([torch.zeros_like(p) for p in self._planes] for _ in range(2))
+        size = sum(t.numel() for t in self._network)
+        self._network_first, self._network_second = (torch.zeros(size, device=self._box.device) for _ in range(2))
+        moments = (*self._first, *self._second, self._network_first, self._network_second)
+        self._tensors = (*self._planes, *self._network, *moments, self._box)
         self._state: TrainingState | None = None
 
     def tensors(self) -> Sequence[Tensor]:
         """Everything on the device that a step reads or changes."""
-        moments = (*self._first, *self._second, self._network_first, self._network_second)
-        return (*self._field.plane_tensors(), *self._network(), *moments, self._field.box)
+        return self._tensors
 
     def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor:
         """What the field adds to the Gaussians at `time` [1], one of `HexPlaneField.frame_time`: [N, 16], the frame path's layout."""
-        weights, biases = self._layers()
-        self._means = gaussians.means.detach()
-        self._state = hexplane_train(self._means, self._field.box, time, self._field.plane_tensors(), weights, biases)
+        means = gaussians.means.detach()
+        self._state = hexplane_train(means, self._box, time, self._planes, self._weights, self._biases)
         return self._state.deltas
 
     def gradient(self, v_raw: Tensor) -> FieldGradient:
         """The field's gradient for dL/d(deltas) `v_raw` [N, 16] of the last `deltas`; adds the part of the positions to it in place."""
-        if self._state is None or self._means is None:
+        if self._state is None:
             raise InvalidInput("there are no deltas to go back from; call deltas first")
-        weights, biases = self._layers()
-        planes = self._field.plane_tensors()
-        return hexplane_train_backward(v_raw, self._means, self._field.box, self._state, planes, weights, biases)
+        layers = self._weights, self._biases
+        return hexplane_train_backward(v_raw, self._box, self._state, self._planes, *layers)
 
     def update(self, v_raw: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor | None = None) -> None:
         """One step of Adam for dL/d(deltas) `v_raw` [N, 16] of the last `deltas`; adds the positions' part to its first 3 columns.
@@ -96,18 +97,11 @@ class HexPlaneTraining:
         gradient = self.gradient(v_raw)
         betas, epsilon = self._betas, self._epsilon
         hexplane_planes_adam_(
-            self._field.plane_tensors(), self._first, self._second, time, gradient, rates[:1], step,
+            self._planes, self._first, self._second, time, gradient, rates[:1], step,
             status=status, penalties=self._penalties, betas=betas, epsilon=epsilon,
         )  # fmt: skip
         network_adam_(
-            self._network(), gradient.network, self._network_first, self._network_second, rates[1:], step,
+            self._network, gradient.network, self._network_first, self._network_second, rates[1:], step,
             status=status, betas=betas, epsilon=epsilon,
         )  # fmt: skip
-        self._state = self._means = None
-
-    def _layers(self) -> tuple[list[Tensor], list[Tensor]]:
-        weights, biases = self._field.network_tensors()
-        return weights, biases
-
-    def _network(self) -> list[Tensor]:
-        return [t for pair in zip(*self._layers(), strict=True) for t in pair]
+        self._state = None

@@ -57,9 +57,14 @@ def hexplane_deltas(
     )
 
 
+def padded_width(width: int) -> int:
+    """The width that the kernels give a layer of `width`; 0: it is wider than they take."""
+    return next((size for size in (32, 64, 128) if width <= size), 0)
+
+
 def takes_layers(channels: int, levels: int, width: int, depth: int, item: int = 4) -> bool:
     """Whether the kernels take a field of these sizes; `item` is 4 for float32 and 2 for float16 features."""
-    padded = next((size for size in (32, 64, 128) if width <= size), 0)
+    padded = padded_width(width)
     features = channels * levels
     stride = features if features * item % 128 == 64 else features + 64 // item
     weights = padded * stride + (padded * (depth - 1) + DELTA_COLUMNS) * (padded + 32 // item)

@@ -2,6 +2,7 @@
 #include <cub/device/device_scan.cuh>
 
 #include "line_position.h"
+#include "node_gradient.cuh"
 #include "training_cuda.h"
 
 using namespace GSPLAT_ISA;
@@ -44,23 +45,28 @@ __global__ void __launch_bounds__(kThreads)
   items[item] = int32_t(item);
 }
 
-__global__ void __launch_bounds__(kThreads) rank_items(const int32_t* __restrict__ items, int32_t* ranks, int64_t count) {
+__global__ void __launch_bounds__(kThreads) rank_items(FieldCells cells, int64_t count) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < count) ranks[items[i]] = int32_t(i);
+  if (i >= count) return;
+  cells.ranks[cells.items[i]] = int32_t(i);
+  const uint32_t cell = cells.keys[i];
+  if (cell < cells.cells && cells.starts[cell + 1] - cells.starts[cell] >= hexplane::kCrowded) cells.keys[i] = cell | kCrowdedBit;
 }
 
 }  // namespace
 
-void place_gaussians(const FieldPlanes& planes, const float* means, const float* box, FieldCells& cells, CudaScratch& scratch,
-                     cudaStream_t stream) {
+void place_gaussians(const float* means, const float* box, const FieldCells& cells, cudaStream_t stream) {
   if (cells.count > 0)
     coordinates_of<<<blocks_for(cells.count), kThreads, 0, stream>>>(means, box, cells.coordinates, cells.count);
-  if (cells.starts == nullptr) return;
+}
+
+void sort_gaussians(const FieldPlanes& planes, const FieldCells& cells, CudaScratch& scratch, cudaStream_t stream) {
   const int64_t slots = 3 * planes.levels, count = slots * cells.count;
-  cudaMemsetAsync(cells.starts, 0, size_t(cells.cells + 1) * sizeof(int32_t), stream);
-  if (count == 0) return;
+  if (count == 0) {
+    cudaMemsetAsync(cells.starts, 0, size_t(cells.cells + 1) * sizeof(int32_t), stream);
+    return;
+  }
   uint32_t* keys = scratch.array<uint32_t>(count);
-  int32_t* sorted_items = scratch.array<int32_t>(count);
   int32_t *items = scratch.array<int32_t>(count), *counts = scratch.array<int32_t>(cells.cells + 1);
   cudaMemsetAsync(counts, 0, size_t(cells.cells + 1) * sizeof(int32_t), stream);
   cells_of<<<dim3(blocks_for(cells.count), unsigned(slots)), kThreads, 0, stream>>>(planes, cells, keys, items, counts);
@@ -68,7 +74,7 @@ void place_gaussians(const FieldPlanes& planes, const float* means, const float*
   cub::DeviceScan::ExclusiveSum(nullptr, size, counts, cells.starts, cells.cells + 1, stream);
   cub::DeviceScan::ExclusiveSum(scratch.bytes(size), size, counts, cells.starts, cells.cells + 1, stream);
   const int bits = bits_below(cells.cells + 1);
-  cub::DeviceRadixSort::SortPairs(nullptr, size, keys, cells.keys, items, sorted_items, count, 0, bits, stream);
-  cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, keys, cells.keys, items, sorted_items, count, 0, bits, stream);
-  rank_items<<<blocks_for(count), kThreads, 0, stream>>>(sorted_items, cells.ranks, count);
+  cub::DeviceRadixSort::SortPairs(nullptr, size, keys, cells.keys, items, cells.items, count, 0, bits, stream);
+  cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, keys, cells.keys, items, cells.items, count, 0, bits, stream);
+  rank_items<<<blocks_for(count), kThreads, 0, stream>>>(cells, count);
 }

@@ -1,5 +1,7 @@
 // Features in the order in which the matrix units want them: four lanes share a Gaussian and take 16 bytes each of 64 bytes of
 // its features, so that loads are wide and nothing is exchanged between lanes. A warp has 16 Gaussians.
+#include <type_traits>
+
 #include "field_layers.cuh"
 #include "line_position.h"
 #include "network_cuda.h"
@@ -10,8 +12,6 @@ using namespace hexplane;
 namespace {
 
 constexpr int kRowsPerWarp = 16;
-constexpr int kWarps = 4;  // of a block
-constexpr int kRowsPerBlock = kRowsPerWarp * kWarps;
 
 // Where a row falls on the three lines of a level. Each of the four lanes of a row works out one axis and tells the others.
 struct LinePlaces {
@@ -28,15 +28,20 @@ struct LinePlaces {
   }
 };
 
-// Blocks that a multiprocessor should hold at once, by the registers that the layers need.
-constexpr int blocks_of(int item, int width) { return width == 32 ? (item == 2 ? 6 : 4) : width == 64 ? 4 : 2; }
+// Warps of a block, which share the weights, and blocks that a multiprocessor should hold at once, by the registers that the
+// layers need.
+constexpr int warps_of(int item, int width) { return item == 2 ? 4 : width == 32 ? 12 : 8; }
+constexpr int blocks_of(int item, int width) {
+  return item == 2 ? (width == 32 ? 6 : width == 64 ? 4 : 2) : width == 128 ? 1 : 2;
+}
 
 // kChannels: channels where they are known and every line has two nodes or more; 0: read from the input.
 template <class T, int kWidth, bool kLines, int kChannels>
-__global__ void __launch_bounds__(32 * kWarps, blocks_of(int(sizeof(T)), kWidth))
+__global__ void __launch_bounds__(32 * warps_of(int(sizeof(T)), kWidth), blocks_of(int(sizeof(T)), kWidth))
     deltas_kernel(FieldInput in, FieldNetwork net, const void* packed, float* deltas, float* hidden) {
   extern __shared__ uint4 shared[];
   constexpr int kItem = int(sizeof(T)), kPiece = 16 / kItem, kQuad = 4 * kPiece, kBlocks = kWidth / 8;
+  constexpr int kWarps = warps_of(kItem, kWidth);
   constexpr int kParts = kChannels * kItem % 128 == 0 && kChannels > 0 ? 2 : 1;  // of 64 bytes that are loaded together
   for (int i = int(threadIdx.x); i < int(net.packed_bytes(kItem) / 16); i += 32 * kWarps)
     copy_16(shared + i, static_cast<const uint4*>(packed) + i);
@@ -44,7 +49,7 @@ __global__ void __launch_bounds__(32 * kWarps, blocks_of(int(sizeof(T)), kWidth)
   const float* biases = reinterpret_cast<const float*>(weights + net.weight_items(kItem));
   const WarpPlace place;
   const int channels = kChannels > 0 ? kChannels : in.channels;
-  const int count = int(in.count), first = int(blockIdx.x) * kRowsPerBlock + int(threadIdx.x) / 32 * kRowsPerWarp;
+  const int count = int(in.count), first = (int(blockIdx.x) * kWarps + int(threadIdx.x) / 32) * kRowsPerWarp;
   int rows[2];
   float x[2] = {};
   for (int r = 0; r < 2; ++r) {
@@ -65,7 +70,8 @@ __global__ void __launch_bounds__(32 * kWarps, blocks_of(int(sizeof(T)), kWidth)
   const int odd = kParts == 2 ? place.group % 2 : 0;
   const int lane_at = place.quad * kPiece + odd * kQuad;
   for (int level = 0; level < in.levels; ++level) {
-    const T *left[2][kParts][3] = {}, *space[2][kParts];
+    const T* space[2][kParts];
+    int left[2][kParts][3] = {};
     float fraction[2][kParts][3] = {};
     int right[3] = {kChannels, kChannels, kChannels};
     const int32_t* widths = in.lines.widths[level];
@@ -82,9 +88,8 @@ __global__ void __launch_bounds__(32 * kWarps, blocks_of(int(sizeof(T)), kWidth)
           const LinePlaces places(own, group, channels);
 #pragma unroll
           for (int axis = 0; axis < 3; ++axis) {
-            const T* line = static_cast<const T*>(in.lines.values) + in.lines.starts[level][axis] + lane_at;
             if (kChannels == 0) right[axis] = widths[axis] > 1 ? channels : 0;
-            left[r][row][axis] = line + places.offset[axis], fraction[r][row][axis] = places.fraction[axis];
+            left[r][row][axis] = places.offset[axis] + lane_at, fraction[r][row][axis] = places.fraction[axis];
           }
         }
       }
@@ -102,7 +107,7 @@ __global__ void __launch_bounds__(32 * kWarps, blocks_of(int(sizeof(T)), kWidth)
           if constexpr (kLines) {
 #pragma unroll
             for (int axis = 0; axis < 3; ++axis) {
-              const T* node = left[r][row][axis] + c;
+              const T* node = static_cast<const T*>(in.lines.values) + in.lines.starts[level][axis] + (left[r][row][axis] + c);
               pieces[row].modulate(Piece<T>::load(node), Piece<T>::load(node + right[axis]), fraction[r][row][axis]);
             }
           }
@@ -122,12 +127,11 @@ __global__ void __launch_bounds__(32 * kWarps, blocks_of(int(sizeof(T)), kWidth)
   for (int layer = 1; layer < net.layers; ++layer) {
 #pragma unroll
     for (int t = 0; t < kBlocks; ++t)
-#pragma unroll
-      for (int i = 0; i < 4; ++i) {
-        sums[t][i] = rectified(sums[t][i]);
-        const int column = 8 * t + 2 * place.quad + i % 2;
-        if (hidden != nullptr && rows[i / 2] < count && column < net.width)
-          hidden[((layer - 1) * in.count + rows[i / 2]) * net.width + column] = sums[t][i];
+      for (int r = 0; r < 2; ++r) {
+        const float2 pair = make_float2(rectified(sums[t][2 * r]), rectified(sums[t][2 * r + 1]));
+        sums[t][2 * r] = pair.x, sums[t][2 * r + 1] = pair.y;
+        if (hidden != nullptr && rows[r] < count)
+          *reinterpret_cast<float2*>(hidden + ((layer - 1) * in.count + rows[r]) * kWidth + 8 * t + 2 * place.quad) = pair;
       }
     const T* next = weights + net.hidden_start(layer, kItem) + place.group * hidden_stride + place.quad * (8 / kItem);
     const float* bias = biases + layer * kWidth;
@@ -156,18 +160,19 @@ __global__ void __launch_bounds__(32 * kWarps, blocks_of(int(sizeof(T)), kWidth)
 template <class T, int kWidth>
 void launch(const FieldInput& in, const FieldNetwork& net, const void* packed, float* deltas, float* hidden,
             cudaStream_t stream) {
-  auto kernel = deltas_kernel<T, kWidth, false, 0>;
-  if (in.lines.values != nullptr) {
-    bool wide = true;
-    for (int level = 0; level < in.levels; ++level)
-      for (const int32_t width : in.lines.widths[level]) wide = wide && width > 1;
-    kernel = wide && in.channels == 64   ? deltas_kernel<T, kWidth, true, 64>
-             : wide && in.channels == 32 ? deltas_kernel<T, kWidth, true, 32>
-                                         : deltas_kernel<T, kWidth, true, 0>;
+  bool wide = true;
+  for (int level = 0; level < in.levels; ++level)
+    for (const int32_t width : in.lines.widths[level]) wide = wide && width > 1;
+  auto kernel = wide && in.channels == 64   ? deltas_kernel<T, kWidth, true, 64>
+                : wide && in.channels == 32 ? deltas_kernel<T, kWidth, true, 32>
+                                            : deltas_kernel<T, kWidth, true, 0>;
+  if constexpr (std::is_same_v<T, float>) {  // training is in float32
+    if (in.lines.values == nullptr) kernel = deltas_kernel<T, kWidth, false, 0>;
   }
+  constexpr int kWarps = warps_of(int(sizeof(T)), kWidth);
   const int bytes = int(net.packed_bytes(int(sizeof(T))));
   cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
-  kernel<<<blocks_for(in.count, kRowsPerBlock), 32 * kWarps, bytes, stream>>>(in, net, packed, deltas, hidden);
+  kernel<<<blocks_for(in.count, kRowsPerWarp * kWarps), 32 * kWarps, bytes, stream>>>(in, net, packed, deltas, hidden);
 }
 
 template <class T>

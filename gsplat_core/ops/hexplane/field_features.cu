@@ -14,7 +14,8 @@ __global__ void __launch_bounds__(kThreads, 3)
   if (n >= cells.count) return;
   const int level = int(blockIdx.y), channels = planes.channels;
   const float4 at4 = *reinterpret_cast<const float4*>(cells.coordinates + 4 * n);
-  const float x[3] = {at4.x, at4.y, at4.z};
+  const int32_t* sizes = planes.sizes[level];
+  const LinePosition places[3] = {position_on(at4.x, sizes[0]), position_on(at4.y, sizes[1]), position_on(at4.z, sizes[2])};
   float* out = features + (n * planes.levels + level) * channels;
   const float* values = static_cast<const float*>(lines.values);
   for (int c = int(threadIdx.x) % kTeam * kLane; c < channels; c += kTeam * kLane) {
@@ -22,32 +23,31 @@ __global__ void __launch_bounds__(kThreads, 3)
 #pragma unroll
     for (int p = 0; p < 3; ++p) {
       const FeaturePlane plane = planes.plane(level, p);
-      const Corners at(plane, x[u_axis(p)], x[v_axis(p)], channels);
+      const Corners at(plane, places[u_axis(p)], places[v_axis(p)], channels);
       value = value * Sample<kLane>(plane.values, at, c).value(at);
     }
 #pragma unroll
     for (int axis = 0; axis < 3; ++axis) {
-      const int32_t width = lines.widths[level][axis];
-      const LinePosition at = position_on(x[axis], width);
-      const float* left = values + lines.starts[level][axis] + at.cell * channels + c;
-      const float* right = left + (width > 1 ? channels : 0);
-      value = value * between(Channels<kLane>::load(left), Channels<kLane>::load(right), at.fraction);
+      const float* left = values + lines.starts[level][axis] + int32_t(places[axis].cell) * channels + c;
+      const float* right = left + (planes.sizes[level][axis] > 1 ? channels : 0);
+      value = value * between(Channels<kLane>::load(left), Channels<kLane>::load(right), places[axis].fraction);
     }
     value.store(out + c);
   }
 }
 
-// A team has one Gaussian at all levels, so that the gradient of its position has one sum.
+// A team has one Gaussian at all levels, so that the gradient of its position has one sum. Teams take Gaussians in the order of
+// the first plane's cells, where neighbours read the same nodes.
 template <int kLane, int kTeam>
 __global__ void __launch_bounds__(kThreads, 2)
     rows_kernel(FieldPlanes planes, FieldLines lines, FieldCells cells, const float* __restrict__ box,
                 const float* __restrict__ v_features, FieldRows rows, float* v_raw) {
   const int64_t index = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / kTeam;
-  const bool inside = index < cells.count;
-  const int64_t n = inside ? index : cells.count - 1;  // the last team's lanes take part in the sums
+  const int64_t item = index < cells.count ? cells.items[index] : cells.count;  // behind the first plane's items come others
+  const bool inside = item < cells.count;
+  const int64_t n = inside ? item : 0;  // lanes without a Gaussian take part in the sums
   const int lane = int(threadIdx.x) % kTeam, channels = planes.channels;
   const float4 at4 = *reinterpret_cast<const float4*>(cells.coordinates + 4 * n);
-  const float x[3] = {at4.x, at4.y, at4.z};
   const bool active = inside && at4.w != 0.0f;
   const float* values = static_cast<const float*>(lines.values);
   float v_x[3] = {};
@@ -55,26 +55,24 @@ __global__ void __launch_bounds__(kThreads, 2)
     int32_t ranks[3];
 #pragma unroll
     for (int p = 0; p < 3; ++p) ranks[p] = cells.ranks[(3 * level + p) * cells.count + n];
+    const int32_t* sizes = planes.sizes[level];
+    const LinePosition places[3] = {position_on(at4.x, sizes[0]), position_on(at4.y, sizes[1]), position_on(at4.z, sizes[2])};
+    float v_place[3] = {};  // the gradient of the place in cells
     for (int c = lane * kLane; c < channels; c += kTeam * kLane) {
       const auto v = Channels<kLane>::load(v_features + (n * planes.levels + level) * channels + c);
       Channels<kLane> value[6], along_u[6], along_v[3];
 #pragma unroll
       for (int p = 0; p < 3; ++p) {
         const FeaturePlane plane = planes.plane(level, p);
-        const Corners at(plane, x[u_axis(p)], x[v_axis(p)], channels);
-        const Sample<kLane> sample(plane.values, at, c);
-        value[p] = sample.value(at);
-        along_u[p] = Channels<kLane>::all(at.u.slope) * sample.along_u(at);
-        along_v[p] = Channels<kLane>::all(at.v.slope) * sample.along_v(at);
+        const Corners at(plane, places[u_axis(p)], places[v_axis(p)], channels);
+        Sample<kLane>(plane.values, at, c).value_and_slopes(at, value[p], along_u[p], along_v[p]);
       }
 #pragma unroll
       for (int axis = 0; axis < 3; ++axis) {
-        const int32_t width = lines.widths[level][axis];
-        const LinePosition at = position_on(x[axis], width);
-        const float* left = values + lines.starts[level][axis] + at.cell * channels + c;
-        const auto a = Channels<kLane>::load(left), b = Channels<kLane>::load(left + (width > 1 ? channels : 0));
-        value[3 + axis] = between(a, b, at.fraction);
-        along_u[3 + axis] = Channels<kLane>::all(at.slope) * (b - a);
+        const float* left = values + lines.starts[level][axis] + int32_t(places[axis].cell) * channels + c;
+        const auto a = Channels<kLane>::load(left), b = Channels<kLane>::load(left + (sizes[axis] > 1 ? channels : 0));
+        along_u[3 + axis] = b - a;
+        value[3 + axis] = plus(a, places[axis].fraction, along_u[3 + axis]);
       }
       Channels<kLane> before[6], after = Channels<kLane>::all(1.0f);
       before[0] = v;
@@ -86,21 +84,21 @@ __global__ void __launch_bounds__(kThreads, 2)
         after = after * value[p];
         g.store((p < 3 ? rows.space : rows.lines) + int64_t(ranks[p < 3 ? p : plane_of_major(p - 3)]) * channels + c);
         if (p < 3) {
-          v_x[u_axis(p)] += (g * along_u[p]).sum();
-          v_x[v_axis(p)] += (g * along_v[p]).sum();
+          v_place[u_axis(p)] += (g * along_u[p]).sum();
+          v_place[v_axis(p)] += (g * along_v[p]).sum();
         } else {
-          v_x[p - 3] += (g * along_u[p]).sum();
+          v_place[p - 3] += (g * along_u[p]).sum();
         }
       }
     }
+#pragma unroll
+    for (int axis = 0; axis < 3; ++axis) v_x[axis] += v_place[axis] * places[axis].slope;
     // After the loads of the level, none of which may pass a store.
 #pragma unroll
     for (int p = 0; p < 3; ++p) {
       if (lane != p) continue;
-      const int major = major_axis(p), minor = minor_axis(p);
-      const float along = position_on(x[major], planes.sizes[level][major]).fraction;
-      const float across = position_on(x[minor], planes.sizes[level][minor]).fraction;
-      *reinterpret_cast<float2*>(rows.shares + 2 * int64_t(ranks[p])) = make_float2(along, across);
+      *reinterpret_cast<float2*>(rows.shares + 2 * int64_t(ranks[p])) =
+          make_float2(places[major_axis(p)].fraction, places[minor_axis(p)].fraction);
     }
   }
 #pragma unroll

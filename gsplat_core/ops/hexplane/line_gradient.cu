@@ -7,8 +7,9 @@ using namespace hexplane;
 
 namespace {
 
-constexpr int kRun = 32;      // sorted Gaussians that a team goes through
-constexpr int kRunBatch = 8;  // of them on their way at once
+constexpr int kRun = 32;        // sorted Gaussians that a team goes through
+constexpr int kRunBatch = 8;    // of them on their way at once
+constexpr int kCrowdBatch = 4;  // the same of the planes, which have four sums
 
 // One line's Gaussians, and where their sums go: those of run r that are in cell c at place r + c, which no other run and cell
 // have, because from one item to the next either may only grow.
@@ -48,7 +49,7 @@ __global__ void __launch_bounds__(kThreads) sum_runs(FieldPlanes planes, FieldCe
       left = right = Channels<kLane>::all(0.0f);
     };
     for_rows<kLane, kRunBatch>(sorted, begin, end, c, channels, [&](int32_t i, float along, float, const Channels<kLane>& row) {
-      const int now = int((cells.keys[i] - first_cell) / line.minor_size);
+      const int now = int((cell_of(cells.keys[i]) - first_cell) / line.minor_size);
       if (now != cell && cell >= 0) flush();
       cell = now;
       left = plus(left, 1.0f - along, row);
@@ -93,35 +94,61 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
+// A team goes through one run and adds up the rows that are in crowded cells, cell by cell, for the cells' four corners.
 template <int kLane, int kTeam>
-__global__ void __launch_bounds__(kThreads) segments_kernel(FieldCells cells, FieldRows rows, int channels, int segments) {
-  const int segment = (int(blockIdx.x) * kThreads + int(threadIdx.x)) / kTeam;
-  const int32_t begin = segment * kSegment, end = begin + kSegment;
-  if (segment >= segments || end > cells.starts[cells.cells]) return;  // behind the last cell are those that take no part
-  if (cells.keys[begin] != cells.keys[end - 1]) return;
-  const SortedCells sorted = {nullptr, rows.space, rows.shares, nullptr, 0};
+__global__ void __launch_bounds__(kThreads) sum_crowds_kernel(FieldCells cells, FieldRows rows, int channels, int runs) {
+  const int run = (int(blockIdx.x) * kThreads + int(threadIdx.x)) / kTeam;
+  if (run >= runs) return;
+  const int32_t begin = run * kCrowdRun, end = min(begin + kCrowdRun, cells.starts[cells.cells]);  // behind: those without part
   for (int c = int(threadIdx.x) % kTeam * kLane; c < channels; c += kTeam * kLane) {
-    Channels<kLane> sums[4] = {Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f),
-                               Channels<kLane>::all(0.0f)};
-    for_rows<kLane, kRunBatch>(
-        sorted, begin, end, c, channels, [&](int32_t, float along, float across, const Channels<kLane>& row) {
+    Channels<kLane> sums[4];
+    uint32_t now = 0;
+    int64_t place = 0;
+    const auto flush = [&] {
 #pragma unroll
-          for (int corner = 0; corner < 4; ++corner)
-            sums[corner] = plus(sums[corner], (corner / 2 ? along : 1.0f - along) * (corner % 2 ? across : 1.0f - across), row);
-        });
+      for (int corner = 0; corner < 4; ++corner) sums[corner].store(rows.crowds + (place + corner) * channels + c);
+    };
+    for (int32_t i = begin; i < end; i += kCrowdBatch) {
+      uint32_t key[kCrowdBatch];
+      Channels<kLane> row[kCrowdBatch];
+      float2 share[kCrowdBatch];
 #pragma unroll
-    for (int corner = 0; corner < 4; ++corner) sums[corner].store(rows.segments + (int64_t(segment) * 4 + corner) * channels + c);
+      for (int k = 0; k < kCrowdBatch; ++k) key[k] = i + k < end ? cells.keys[i + k] : 0;
+#pragma unroll
+      for (int k = 0; k < kCrowdBatch; ++k) {
+        if (!is_crowded(key[k])) continue;
+        row[k] = Channels<kLane>::load(rows.space + int64_t(i + k) * channels + c);
+        share[k] = *reinterpret_cast<const float2*>(rows.shares + 2 * int64_t(i + k));
+      }
+#pragma unroll
+      for (int k = 0; k < kCrowdBatch; ++k) {
+        if (!is_crowded(key[k])) continue;
+        if (key[k] != now) {
+          if (now != 0) flush();
+          now = key[k];
+          const bool begins = i + k > begin || begin == 0 || cells.keys[begin - 1] != now;
+          place = crowd_place(run, begins, i + k, 0);
+#pragma unroll
+          for (int corner = 0; corner < 4; ++corner) sums[corner] = Channels<kLane>::all(0.0f);
+        }
+        const float along[2] = {1.0f - share[k].x, share[k].x}, across[2] = {1.0f - share[k].y, share[k].y};
+#pragma unroll
+        for (int corner = 0; corner < 4; ++corner)
+          sums[corner] = plus(sums[corner], along[corner / 2] * across[corner % 2], row[k]);
+      }
+    }
+    if (now != 0) flush();
   }
 }
 
 }  // namespace
 
-void sum_segments(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows, cudaStream_t stream) {
-  const int segments = int(3 * planes.levels * cells.count / kSegment);
-  if (segments == 0) return;
-  with_team(planes.channels % 4 == 0, planes.channels, [&](auto lane, auto team) {
-    segments_kernel<lane(), team()>
-        <<<blocks_for(int64_t(segments) * team()), kThreads, 0, stream>>>(cells, rows, planes.channels, segments);
+void sum_crowds(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows, cudaStream_t stream) {
+  const int runs = int(blocks_for(3 * planes.levels * cells.count, kCrowdRun));
+  if (runs == 0) return;
+  with_wide_team(planes.channels, [&](auto lane, auto team) {
+    sum_crowds_kernel<lane(), team()>
+        <<<blocks_for(int64_t(runs) * team()), kThreads, 0, stream>>>(cells, rows, planes.channels, runs);
   });
 }
 
@@ -136,7 +163,7 @@ void line_gradient(const FieldPlanes& planes, const FieldLines& lines, const Fie
     widest = width > widest ? width : widest;
   }
   float* sums = scratch.array<float>(places * 2 * planes.channels);
-  with_team(planes.channels % 4 == 0, planes.channels, [&](auto lane, auto team) {
+  with_wide_team(planes.channels, [&](auto lane, auto team) {
     if (runs > 0)
       sum_runs<lane(), team()>
           <<<dim3(blocks_for(runs, kThreads / team()), unsigned(slots)), kThreads, 0, stream>>>(planes, cells, rows, runs, sums);

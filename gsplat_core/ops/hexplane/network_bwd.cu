@@ -1,4 +1,7 @@
 // The way back through the network: gradients of the layers' sums and of the features, on the matrix units as the way forward.
+//
+// Which column of a layer a column of the product stands for is free. Here it is so that a lane has four neighbours of each row,
+// at 16 half + 4 quad of 32 columns, and reads and writes 16 bytes everywhere.
 #include "matrix_units.cuh"
 #include "network_cuda.h"
 #include "training_cuda.h"
@@ -7,12 +10,14 @@ namespace {
 
 constexpr int kRowsPerWarp = 16;
 constexpr int kRowsPerBlock = kRowsPerWarp * kThreads / 32;
+constexpr int kFeatureColumns = 64;  // that a warp works out at once
 
-// Weights as [outputs, inputs] with 4 floats between rows: the lanes of a warp, 4 rows and 8 columns, meet in no bank.
+// Weights as [outputs, inputs] with 4 floats between rows, and in every 16 rows row 4 a + b at place 4 b + a: the lanes of a
+// warp, whose quads are 4 rows apart, meet in no bank.
 struct BackwardLayout {
   int width, features;  // padded
   __device__ __host__ explicit BackwardLayout(const FieldNetwork& net)
-      : width(net.padded_width()), features((net.features + 31) / 32 * 32) {}
+      : width(net.padded_width()), features((net.features + kFeatureColumns - 1) / kFeatureColumns * kFeatureColumns) {}
   __device__ __host__ int first_stride() const { return features + 4; }
   __device__ __host__ int hidden_stride() const { return width + 4; }
   __device__ __host__ int start(int layer) const {
@@ -24,37 +29,72 @@ struct BackwardLayout {
 __global__ void __launch_bounds__(kThreads) pack_weights(FieldNetwork net, float* packed) {
   const BackwardLayout layout(net);
   const int layer = int(blockIdx.y);
-  const bool head = layer == net.layers - 1;
+  const bool is_head = layer == net.layers - 1;
   const int columns = layer == 0 ? layout.features : layout.width, inputs = layer == 0 ? net.features : net.width;
-  const int stride = columns + 4, rows = head ? 16 : layout.width;
-  for (int i = int(blockIdx.x) * kThreads + int(threadIdx.x); i < rows * stride; i += int(gridDim.x) * kThreads) {
-    const int row = i / stride, column = i % stride, output = head ? head_output(row) : row;
-    const bool inside = output >= 0 && (head || output < net.width) && column < inputs;
+  const int stride = columns + 4, places = is_head ? 16 : layout.width;
+  for (int i = int(blockIdx.x) * kThreads + int(threadIdx.x); i < places * stride; i += int(gridDim.x) * kThreads) {
+    const int place = i / stride, column = i % stride, row = place / 16 * 16 + place % 4 * 4 + place % 16 / 4;
+    const int output = is_head ? head_output(row) : row;
+    const bool inside = output >= 0 && (is_head || output < net.width) && column < inputs;
     packed[layout.start(layer) + i] = inside ? net.weights[layer][output * inputs + column] : 0.0f;
   }
 }
 
-// sums[j] = in W for column block first + j of W's inputs; `in` as the sums of a product lie in the registers.
-template <int kIn, int kOut>
-__device__ __forceinline__ void previous_layer(const float (&in)[kIn][4], float (&sums)[kOut][4], const float* w, int stride,
-                                               const WarpPlace& place) {
+// 16 rows and 32 columns of a product.
+struct Columns {
+  float sums[4][4];  // [t][2 r + half]: of row group + 8 r and column 16 half + 4 quad + t
+
+  __device__ float4 at(int r, int half) const {
+    return make_float4(sums[0][2 * r + half], sums[1][2 * r + half], sums[2][2 * r + half], sums[3][2 * r + half]);
+  }
+  // Keeps what `outputs`, the layer's own at the same place, let through.
+  __device__ void rectify(int r, int half, const float4& outputs) {
+    const float out[4] = {outputs.x, outputs.y, outputs.z, outputs.w};
 #pragma unroll
-  for (int k = 0; k < kIn; ++k) {
-    const SplitLeft a(in[k][0], in[k][2], in[k][1], in[k][3]);
-    const float* row = w + (8 * k + 2 * place.quad) * stride + place.group;
+    for (int t = 0; t < 4; ++t) sums[t][2 * r + half] = out[t] > 0.0f ? sums[t][2 * r + half] : 0.0f;
+  }
+};
+
+// out += the product of `a` and the weights' rows at `first` and `second`.
+template <int kOut>
+__device__ __forceinline__ void multiply_rows(Columns (&out)[kOut], const SplitLeft& a, const float* first, const float* second) {
 #pragma unroll
-    for (int t = 0; t < kOut; ++t) multiply_split(sums[t], a, row[8 * t], row[stride + 8 * t]);
+  for (int b = 0; b < kOut; ++b) {
+    const float4 w0 = *reinterpret_cast<const float4*>(first + 32 * b), w1 = *reinterpret_cast<const float4*>(second + 32 * b);
+    multiply_split(out[b].sums[0], a, w0.x, w1.x);
+    multiply_split(out[b].sums[1], a, w0.y, w1.y);
+    multiply_split(out[b].sums[2], a, w0.z, w1.z);
+    multiply_split(out[b].sums[3], a, w0.w, w1.w);
   }
 }
 
+// out += in W for 32 of the weights' rows; `w` points to the lane's columns of the quad's first one.
+template <int kOut>
+__device__ __forceinline__ void multiply_columns(Columns (&out)[kOut], const Columns& in, const float* w, int stride) {
+#pragma unroll
+  for (int t = 0; t < 4; ++t) {
+    const auto& x = in.sums[t];
+    multiply_rows(out, SplitLeft(x[0], x[2], x[1], x[3]), w + 4 * t * stride, w + (4 * t + 16) * stride);
+  }
+}
+
+// Four columns of a row of v_raw; zeros where the row is not finite, and in columns that are not the field's.
+__device__ __forceinline__ float4 head_gradient(const float* v_raw, int64_t row, bool inside, const WarpPlace& place) {
+  const int column = 4 * place.quad;
+  const float4 v = inside ? *reinterpret_cast<const float4*>(v_raw + row * kDeltaColumns + column) : float4{};
+  const unsigned team = 0xfu << (place.group * 4);  // the four lanes of the row
+  const bool finite = __all_sync(team, isfinite(v.x) && isfinite(v.y) && isfinite(v.z) && isfinite(v.w));
+  const auto own = [&](int i, float x) { return finite && head_output(column + i) >= 0 ? x : 0.0f; };
+  return make_float4(own(0, v.x), own(1, v.y), own(2, v.z), own(3, v.w));
+}
+
 template <int kWidth>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kWidth == 128 ? 1 : 2)
     backward_kernel(FieldNetwork net, const uint4* __restrict__ packed, const float* __restrict__ v_raw,
                     const float* __restrict__ hidden, float* __restrict__ v_features, float* __restrict__ v_hidden,
                     float* __restrict__ v_head, int64_t count) {
   extern __shared__ uint4 shared[];
-  const float* weights = reinterpret_cast<const float*>(shared);
-  constexpr int kBlocks = kWidth / 8, kColumnBlocks = 4;
+  constexpr int kBlocks = kWidth / 32;
   const BackwardLayout layout(net);
   for (int i = int(threadIdx.x); i < layout.floats(net.layers) / 4; i += kThreads) copy_16(shared + i, packed + i);
   wait_for_copies();
@@ -63,57 +103,60 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t first = int64_t(blockIdx.x) * kRowsPerBlock + threadIdx.x / 32 * kRowsPerWarp;
   if (first >= count) return;
   const int64_t rows[2] = {first + place.group, first + place.group + 8};
+  const float* weights = reinterpret_cast<const float*>(shared) + 4 * (place.group / 2) + 16 * (place.group % 2);
 
-  float head[2][4];
+  float4 head[2];
 #pragma unroll
   for (int r = 0; r < 2; ++r) {
-    const bool inside = rows[r] < count;
-    float2 v[2] = {};
-    bool finite = true;
-    for (int t = 0; t < 2 && inside; ++t) {
-      v[t] = *reinterpret_cast<const float2*>(v_raw + rows[r] * kDeltaColumns + 8 * t + 2 * place.quad);
-      finite = finite && isfinite(v[t].x) && isfinite(v[t].y);
-    }
-    const unsigned team = 0xfu << (place.group * 4);  // the four lanes of the row
-    finite = __all_sync(team, finite);
-    for (int t = 0; t < 2; ++t) {
-      const int column = 8 * t + 2 * place.quad;
-      head[t][2 * r] = finite && head_output(column) >= 0 ? v[t].x : 0.0f;
-      head[t][2 * r + 1] = finite && head_output(column + 1) >= 0 ? v[t].y : 0.0f;
-      if (inside)
-        *reinterpret_cast<float2*>(v_head + rows[r] * kDeltaColumns + column) = make_float2(head[t][2 * r], head[t][2 * r + 1]);
-    }
+    head[r] = head_gradient(v_raw, rows[r], rows[r] < count, place);
+    if (rows[r] < count) *reinterpret_cast<float4*>(v_head + rows[r] * kDeltaColumns + 4 * place.quad) = head[r];
   }
-
-  float now[kBlocks][4];
+  Columns now[kBlocks];
   for (int layer = net.layers - 1; layer >= 1; --layer) {
-    float sums[kBlocks][4] = {};
-    const float* w = weights + layout.start(layer);
+    const int64_t start = (layer - 1) * count;  // of the layer before
+    const int stride = layout.hidden_stride();
+    const float* w = weights + layout.start(layer) + place.quad * stride;
+    Columns before[kBlocks] = {};
     if (layer == net.layers - 1) {
-      previous_layer(head, sums, w, layout.hidden_stride(), place);
+      multiply_rows(before, SplitLeft(head[0].x, head[1].x, head[0].y, head[1].y), w, w + 4 * stride);
+      multiply_rows(before, SplitLeft(head[0].z, head[1].z, head[0].w, head[1].w), w + 8 * stride, w + 12 * stride);
     } else {
-      previous_layer(now, sums, w, layout.hidden_stride(), place);
+#pragma unroll
+      for (int b = 0; b < kBlocks - 1; ++b) multiply_columns(before, now[b], w + 32 * b * stride, stride);
+    }
+    float4 outputs[kBlocks][2][2];  // asked for ahead of the last products; rows that there are not read the last one
+#pragma unroll
+    for (int r = 0; r < 2; ++r) {
+      const float* row = hidden + (start + (rows[r] < count ? rows[r] : count - 1)) * kWidth + 4 * place.quad;
+#pragma unroll
+      for (int i = 0; i < 2 * kBlocks; ++i) outputs[i / 2][r][i % 2] = *reinterpret_cast<const float4*>(row + 16 * i);
+    }
+    if (layer < net.layers - 1) multiply_columns(before, now[kBlocks - 1], w + 32 * (kBlocks - 1) * stride, stride);
+#pragma unroll
+    for (int r = 0; r < 2; ++r) {
+      float* row = v_hidden + (start + rows[r]) * kWidth + 4 * place.quad;
+#pragma unroll
+      for (int i = 0; i < 2 * kBlocks; ++i) {
+        before[i / 2].rectify(r, i % 2, outputs[i / 2][r][i % 2]);
+        if (rows[r] < count) *reinterpret_cast<float4*>(row + 16 * i) = before[i / 2].at(r, i % 2);
+      }
     }
 #pragma unroll
-    for (int t = 0; t < kBlocks; ++t)
-#pragma unroll
-      for (int i = 0; i < 4; ++i) {
-        const int column = 8 * t + 2 * place.quad + i % 2;
-        const bool inside = rows[i / 2] < count && column < net.width;
-        const int64_t at = ((layer - 1) * count + rows[i / 2]) * net.width + column;
-        now[t][i] = inside && hidden[at] > 0.0f ? sums[t][i] : 0.0f;
-        if (inside) v_hidden[at] = now[t][i];
-      }
+    for (int b = 0; b < kBlocks; ++b) now[b] = before[b];
   }
-  for (int column = 0; column < net.features; column += 8 * kColumnBlocks) {
-    float sums[kColumnBlocks][4] = {};
-    previous_layer(now, sums, weights + column, layout.first_stride(), place);
+  for (int first_column = 0; first_column < net.features; first_column += kFeatureColumns) {
+    Columns out[kFeatureColumns / 32] = {};
 #pragma unroll
-    for (int t = 0; t < kColumnBlocks; ++t)
-      for (int r = 0; r < 2; ++r) {
-        const int at = column + 8 * t + 2 * place.quad;
-        if (rows[r] < count && at < net.features)
-          *reinterpret_cast<float2*>(v_features + rows[r] * net.features + at) = make_float2(sums[t][2 * r], sums[t][2 * r + 1]);
+    for (int b = 0; b < kBlocks; ++b)
+      multiply_columns(out, now[b], weights + first_column + (32 * b + place.quad) * layout.first_stride(),
+                       layout.first_stride());
+#pragma unroll
+    for (int r = 0; r < 2; ++r)
+#pragma unroll
+      for (int i = 0; i < kFeatureColumns / 16; ++i) {
+        const int column = first_column + 16 * i + 4 * place.quad;
+        if (rows[r] < count && column < net.features)
+          *reinterpret_cast<float4*>(v_features + rows[r] * net.features + column) = out[i / 2].at(r, i % 2);
       }
   }
 }

@@ -75,6 +75,6 @@ struct FieldInput {
 void prepare_field(const FieldTimePlanes& planes, const FieldInput& input, const float* time, const FieldNetwork* network,
                    void* packed, bool half, cudaStream_t stream);
 
-// deltas [N, 16]; `hidden`, if not null, keeps the trunk's outputs [layers - 1, N, width].
+// deltas [N, 16]; `hidden`, if not null, keeps the trunk's outputs [layers - 1, N, padded width].
 void field_deltas(const FieldInput& input, const FieldNetwork& network, const void* packed, bool half, float* deltas,
                   float* hidden, cudaStream_t stream);

@@ -1,106 +1,155 @@
-// The gradient of the network's weights: outer products of what went into a layer and what came back to it, summed over
-// Gaussians. Every block sums a tile of one layer over its share of the Gaussians; the shares are then added in their order.
+// The gradient of the network's weights on the matrix units: outer products of what came back to a layer and what went into it,
+// summed over Gaussians. A block sums a tile of one layer over its share of the Gaussians; the shares are then added in their
+// order.
+#include "matrix_units.cuh"
 #include "network_cuda.h"
 #include "training_cuda.h"
 
 namespace {
 
-constexpr int kShares = 256;
-constexpr int kOutputs = 32, kInputs = 64, kDeep = 16, kTileThreads = 128;
+constexpr int kTile = 64;           // outputs, and inputs, of a block: a quarter for each of its warps
+constexpr int kPart = kTile / 2;    // outputs, and inputs, of a warp
+constexpr int kDeep = 16;           // Gaussians whose values are copied together
+constexpr int kStages = 4;          // of copies, of which the last one is multiplied
+constexpr int kStride = kTile + 8;  // floats: no two lanes meet in a bank
+constexpr int kTileThreads = 128;
+constexpr int kBlocks = 512;  // about what a large GPU holds at once
+constexpr int kMostShares = 128;
 
 struct LayerTiles {
-  const float *inputs[kFieldLayers], *v_outputs[kFieldLayers];  // [N, input_count], [N, output_count] (the head's in columns)
-  int32_t input_count[kFieldLayers], output_count[kFieldLayers];
+  const float *inputs[kFieldLayers], *v_outputs[kFieldLayers];    // [N, input_count], [N, output_count]
+  int32_t input_count[kFieldLayers], output_count[kFieldLayers];  // padded
   int32_t first_tile[kFieldLayers + 1];
   int32_t first_value[kFieldLayers + 1];  // of a layer in a share: weights [outputs, inputs], then biases
-  int32_t layers;
+  int32_t layers, shares;
+
+  __device__ int layer_of(const int32_t (&first)[kFieldLayers + 1], int at) const {
+    int layer = 0;
+    while (at >= first[layer + 1]) ++layer;
+    return layer;
+  }
 };
 
-__global__ void __launch_bounds__(kTileThreads, 8) sum_shares(LayerTiles tiles, float* __restrict__ shares, int64_t count) {
-  __shared__ __align__(16) float v[kDeep][kOutputs], x[kDeep][kInputs];
-  int layer = 0;
-  while (int(blockIdx.x) >= tiles.first_tile[layer + 1]) ++layer;
-  const int inputs = tiles.input_count[layer], outputs = tiles.output_count[layer], across = (inputs + kInputs - 1) / kInputs;
-  const int tile = int(blockIdx.x) - tiles.first_tile[layer], first_output = tile / across * kOutputs,
-            first_input = tile % across * kInputs;
-  const int64_t begin = count * blockIdx.y / kShares, end = count * (blockIdx.y + 1) / kShares;
-  const int o = int(threadIdx.x) / 16 * 4, i = int(threadIdx.x) % 16 * 4;
-  constexpr int kV = kDeep * kOutputs / kTileThreads, kX = kDeep * kInputs / kTileThreads;
-  float sums[4][4] = {}, bias = 0.0f, next_v[kV], next_x[kX];
-  // A thread has one column of each operand. The next rows are on their way while these are multiplied.
-  const int v_row = int(threadIdx.x) / kOutputs, v_output = first_output + int(threadIdx.x) % kOutputs;
-  const int x_row = int(threadIdx.x) / kInputs, x_input = first_input + int(threadIdx.x) % kInputs;
-  const float* v_from = tiles.v_outputs[layer] + (begin + v_row) * outputs + v_output;
-  const float* x_from = tiles.inputs[layer] + (begin + x_row) * inputs + x_input;
-  const auto fetch = [&](int64_t row) {
-    const int left = int(end - row);
+struct Stage {
+  float v[kDeep][kStride], x[kDeep][kStride];
+};
+
+// Four neighbouring columns of the lane's Gaussians, `quad` and `quad + 4` of eight. Which output or input a row or column of the
+// product stands for is free, so these 16 bytes are operands of four products.
+struct Operand {
+  float v[2][4];
+
+  __device__ Operand(const float (&rows)[kDeep][kStride], int row, int column) {
 #pragma unroll
-    for (int k = 0; k < kV; ++k) {
-      const int down = k * (kTileThreads / kOutputs);
-      next_v[k] = v_row + down < left && v_output < outputs ? v_from[down * outputs] : 0.0f;
-    }
-#pragma unroll
-    for (int k = 0; k < kX; ++k) {
-      const int down = k * (kTileThreads / kInputs);
-      next_x[k] = x_row + down < left && x_input < inputs ? x_from[down * inputs] : 0.0f;
-    }
-    v_from += kDeep * outputs;
-    x_from += kDeep * inputs;
-  };
-  fetch(begin);
-  for (int64_t row = begin; row < end; row += kDeep) {
-    __syncthreads();
-#pragma unroll
-    for (int k = 0; k < kV; ++k) (&v[0][0])[k * kTileThreads + threadIdx.x] = next_v[k];
-#pragma unroll
-    for (int k = 0; k < kX; ++k) (&x[0][0])[k * kTileThreads + threadIdx.x] = next_x[k];
-    __syncthreads();
-    if (row + kDeep < end) fetch(row + kDeep);
-#pragma unroll
-    for (int k = 0; k < kDeep; ++k) {
-      const float4 a = *reinterpret_cast<const float4*>(&v[k][o]), b = *reinterpret_cast<const float4*>(&x[k][i]);
-      const float left[4] = {a.x, a.y, a.z, a.w}, right[4] = {b.x, b.y, b.z, b.w};
-#pragma unroll
-      for (int p = 0; p < 4; ++p)
-#pragma unroll
-        for (int q = 0; q < 4; ++q) sums[p][q] += left[p] * right[q];
-      if (threadIdx.x < kOutputs) bias += v[k][threadIdx.x];
+    for (int k = 0; k < 2; ++k) {
+      const float4 x = *reinterpret_cast<const float4*>(&rows[row + 4 * k][column]);
+      v[k][0] = x.x, v[k][1] = x.y, v[k][2] = x.z, v[k][3] = x.w;
     }
   }
+};
+
+__global__ void __launch_bounds__(kTileThreads, 4) sum_shares(LayerTiles tiles, float* __restrict__ shares, int64_t count) {
+  __shared__ __align__(16) Stage stages[kStages];
+  const int layer = tiles.layer_of(tiles.first_tile, int(blockIdx.x)), tile = int(blockIdx.x) - tiles.first_tile[layer];
+  const int inputs = tiles.input_count[layer], outputs = tiles.output_count[layer], across = (inputs + kTile - 1) / kTile;
+  const int first_output = tile / across * kTile, first_input = tile % across * kTile;
+  const int64_t begin = count * blockIdx.y / tiles.shares, end = count * (blockIdx.y + 1) / tiles.shares;
+  const int steps = int((end - begin + kDeep - 1) / kDeep);
+
+  // A thread copies 16 bytes of some rows; what lies outside is zero.
+  constexpr int kPieces = kTile / 4, kRows = kTileThreads / kPieces;
+  const int row = int(threadIdx.x) / kPieces, column = int(threadIdx.x) % kPieces * 4;
+  const bool has_v = first_output + column < outputs, has_x = first_input + column < inputs;
+  const float* v_from = tiles.v_outputs[layer] + (has_v ? first_output + column : 0);
+  const float* x_from = tiles.inputs[layer] + (has_x ? first_input + column : 0);
+  const auto copy = [&](int step) {
+    Stage& to = stages[step % kStages];
+#pragma unroll
+    for (int r = row; r < kDeep; r += kRows) {
+      const int64_t at = begin + int64_t(step) * kDeep + r, inside = at < end ? at : begin;
+      copy_16(&to.v[r][column], v_from + inside * outputs, has_v && at < end);
+      copy_16(&to.x[r][column], x_from + inside * inputs, has_x && at < end);
+    }
+  };
+
+  const WarpPlace place;
+  const int warp = int(threadIdx.x) / 32, output = warp / 2 * kPart, input = warp % 2 * kPart;
+  const bool idle = first_output + output >= outputs || first_input + input >= inputs;
+  float sums[2][4][4] = {}, bias[4] = {};
+#pragma unroll
+  for (int step = 0; step < kStages - 1; ++step) {
+    if (step < steps) copy(step);
+    commit_copies();
+  }
+  for (int step = 0; step < steps; ++step) {
+    wait_for_copies<kStages - 2>();
+    __syncthreads();  // the copies of all threads are there, and nobody reads the stage before any more
+    if (step + kStages - 1 < steps) copy(step + kStages - 1);
+    commit_copies();
+    if (idle) continue;
+    const Stage& stage = stages[step % kStages];
+#pragma unroll
+    for (int k = 0; k < kDeep; k += 8) {
+      const Operand v(stage.v, k + place.quad, output + 4 * place.group), x(stage.x, k + place.quad, input + 4 * place.group);
+#pragma unroll
+      for (int m = 0; m < 2; ++m) {
+        const SplitLeft a(v.v[0][2 * m], v.v[0][2 * m + 1], v.v[1][2 * m], v.v[1][2 * m + 1]);
+#pragma unroll
+        for (int t = 0; t < 4; ++t) multiply_split(sums[m][t], a, x.v[0][t], x.v[1][t]);
+      }
+#pragma unroll
+      for (int i = 0; i < 4; ++i) bias[i] += v.v[0][i] + v.v[1][i];
+    }
+  }
+  if (idle) return;
+
   float* to = shares + int64_t(blockIdx.y) * tiles.first_value[tiles.layers] + tiles.first_value[layer];
-  for (int p = 0; p < 4; ++p)
-    for (int q = 0; q < 4; ++q)
-      if (first_output + o + p < outputs && first_input + i + q < inputs)
-        to[(first_output + o + p) * inputs + first_input + i + q] = sums[p][q];
-  if (first_input == 0 && threadIdx.x < kOutputs && first_output + int(threadIdx.x) < outputs)
-    to[outputs * inputs + first_output + threadIdx.x] = bias;
+#pragma unroll
+  for (int i = 0; i < 4; ++i) {
+    const int lane_output = first_output + output + 4 * place.group + i;
+    bias[i] += __shfl_xor_sync(0xffffffffu, bias[i], 1);
+    bias[i] += __shfl_xor_sync(0xffffffffu, bias[i], 2);
+    if (lane_output >= outputs) continue;
+    if (first_input + input == 0 && place.quad == 0) to[outputs * inputs + lane_output] = bias[i];
+#pragma unroll
+    for (int k = 0; k < 2; ++k) {
+      const int at = first_input + input + 8 * place.quad + 4 * k, c = i % 2 * 2 + k;
+      const auto& sum = sums[i / 2];
+      if (at < inputs)
+        *reinterpret_cast<float4*>(to + lane_output * inputs + at) = make_float4(sum[0][c], sum[1][c], sum[2][c], sum[3][c]);
+    }
+  }
 }
 
-// The head's outputs leave their columns here.
-__global__ void __launch_bounds__(kThreads) add_shares(LayerTiles tiles, const float* __restrict__ shares, float* gradient) {
-  __shared__ float partial[4][kThreads / 4];
-  const int at = int(blockIdx.x) * (kThreads / 4) + int(threadIdx.x) % (kThreads / 4),
-            quarter = int(threadIdx.x) / (kThreads / 4);
-  const int total = tiles.first_value[tiles.layers];
+// Where the gradient has the value that a share has at `at`, or -1: padding.
+__device__ int place_in_gradient(const FieldNetwork& net, const LayerTiles& tiles, int at) {
+  const int layer = tiles.layer_of(tiles.first_value, at);
+  at -= tiles.first_value[layer];
+  const int stride = tiles.input_count[layer], weights = tiles.output_count[layer] * stride;
+  const bool is_bias = at >= weights, head = layer == net.layers - 1;
+  const int row = is_bias ? at - weights : at / stride, input = is_bias ? 0 : at % stride;
+  const int inputs = layer == 0 ? net.features : net.width, outputs = head ? kHeadOutputs : net.width;
+  const int output = head ? head_output(row) : row;
+  if (output < 0 || output >= outputs || input >= inputs) return -1;
+  const int start = layer == 0 ? 0 : net.width * (net.features + 1 + (layer - 1) * (net.width + 1));
+  return start + (is_bias ? outputs * inputs + output : output * inputs + input);
+}
+
+__global__ void __launch_bounds__(kThreads)
+    add_shares(FieldNetwork net, LayerTiles tiles, const float* __restrict__ shares, float* gradient) {
+  constexpr int kParts = 4, kValues = kThreads / kParts;
+  __shared__ float partial[kParts][kValues];
+  const int value = int(threadIdx.x) % kValues, part = int(threadIdx.x) / kValues;
+  const int at = int(blockIdx.x) * kValues + value, total = tiles.first_value[tiles.layers];
   float sum = 0.0f;
   if (at < total)
 #pragma unroll 8
-    for (int share = quarter * (kShares / 4); share < (quarter + 1) * (kShares / 4); ++share)
-      sum += shares[int64_t(share) * total + at];
-  partial[quarter][threadIdx.x % (kThreads / 4)] = sum;
+    for (int share = part; share < tiles.shares; share += kParts) sum += shares[int64_t(share) * total + at];
+  partial[part][value] = sum;
   __syncthreads();
-  if (quarter != 0 || at >= total) return;
-  const int place = int(threadIdx.x);
-  sum = partial[0][place] + partial[1][place] + partial[2][place] + partial[3][place];
-  const int head = tiles.layers - 1, in_head = at - tiles.first_value[head], width = tiles.input_count[head];
-  if (in_head < 0) {
-    gradient[at] = sum;
-    return;
-  }
-  const bool is_bias = in_head >= kDeltaColumns * width;
-  const int output = head_output(is_bias ? in_head - kDeltaColumns * width : in_head / width);
-  if (output < 0) return;
-  gradient[tiles.first_value[head] + (is_bias ? kHeadOutputs * width + output : output * width + in_head % width)] = sum;
+  if (part != 0 || at >= total) return;
+  const int place = place_in_gradient(net, tiles, at);
+  if (place >= 0) gradient[place] = partial[0][value] + partial[1][value] + partial[2][value] + partial[3][value];
 }
 
 }  // namespace
@@ -109,18 +158,20 @@ void network_weight_gradient(const FieldNetwork& net, const float* features, con
                              const float* v_head, float* gradient, int64_t count, CudaScratch& scratch, cudaStream_t stream) {
   LayerTiles tiles = {};
   tiles.layers = net.layers;
+  const int width = net.padded_width();
   for (int layer = 0; layer < net.layers; ++layer) {
     const bool head = layer == net.layers - 1;
-    const int inputs = layer == 0 ? net.features : net.width, outputs = head ? kDeltaColumns : net.width;
-    tiles.inputs[layer] = layer == 0 ? features : hidden + (layer - 1) * count * net.width;
-    tiles.v_outputs[layer] = head ? v_head : v_hidden + layer * count * net.width;
+    const int inputs = layer == 0 ? net.features : width, outputs = head ? kDeltaColumns : width;
+    tiles.inputs[layer] = layer == 0 ? features : hidden + (layer - 1) * count * width;
+    tiles.v_outputs[layer] = head ? v_head : v_hidden + layer * count * width;
     tiles.input_count[layer] = inputs, tiles.output_count[layer] = outputs;
-    const int across = (inputs + kInputs - 1) / kInputs, down = (outputs + kOutputs - 1) / kOutputs;
-    tiles.first_tile[layer + 1] = tiles.first_tile[layer] + across * down;
+    tiles.first_tile[layer + 1] = tiles.first_tile[layer] + int32_t(blocks_for(inputs, kTile) * blocks_for(outputs, kTile));
     tiles.first_value[layer + 1] = tiles.first_value[layer] + outputs * (inputs + 1);
   }
   const int total = tiles.first_value[net.layers];
-  float* shares = scratch.array<float>(int64_t(kShares) * total);
-  sum_shares<<<dim3(unsigned(tiles.first_tile[net.layers]), kShares), kTileThreads, 0, stream>>>(tiles, shares, count);
-  add_shares<<<blocks_for(total, kThreads / 4), kThreads, 0, stream>>>(tiles, shares, gradient);
+  const int blocks = tiles.first_tile[net.layers];
+  tiles.shares = blocks * kMostShares < kBlocks ? kMostShares : (kBlocks + blocks - 1) / blocks;
+  float* shares = scratch.array<float>(int64_t(tiles.shares) * total);
+  sum_shares<<<dim3(unsigned(blocks), unsigned(tiles.shares)), kTileThreads, 0, stream>>>(tiles, shares, count);
+  add_shares<<<blocks_for(total, kThreads / 4), kThreads, 0, stream>>>(net, tiles, shares, gradient);
 }

@@ -5,7 +5,8 @@
 
 namespace hexplane {
 
-constexpr int kSegment = 32;   // sorted Gaussians whose sums are kept when they are all in one cell
+constexpr int kCrowded = 8;    // Gaussians of a cell whose rows are added up ahead, once for its four corners
+constexpr int kCrowdRun = 32;  // sorted Gaussians whose sums are taken together
 constexpr int kNodeBatch = 2;  // rows of a node that are on their way at once: few, so that many nodes are
 
 // One plane's Gaussians, sorted by cell = along the major axis * minor size + along the minor axis.
@@ -13,7 +14,7 @@ struct SortedCells {
   const int32_t* starts;  // of the plane's first cell
   const float* rows;      // [all planes' items, C], sorted: gradient of the plane's sample
   const float* shares;    // [items, 2]: of the way to the right node along the major and the minor axis
-  const float* segments;  // [items / kSegment, 4, C]: sums of full segments for the corners of their cell; null: none
+  const float* crowds;    // crowded cells' sums for their corners (training_cuda.h); null: none
   int32_t minor_size;
 };
 
@@ -42,33 +43,36 @@ __device__ __forceinline__ void for_rows(const SortedCells& cells, int32_t begin
   }
 }
 
+// Where the sums of a crowded cell's rows in run `run` are: [runs, 5, 4, C], the first of five for the cell that begins in an
+// earlier run, the others for those that begin in one of the run's quarters, where no two do.
+__device__ __forceinline__ int64_t crowd_place(int run, bool begins, int32_t begin, int corner) {
+  return (int64_t(run) * 5 + (begins ? 1 + begin % kCrowdRun / kCrowded : 0)) * 4 + corner;
+}
+
 template <int kLane>
 __device__ Channels<kLane> node_gradient(const SortedCells& cells, int major, int minor, int channel, int channels) {
   Channels<kLane> sum = Channels<kLane>::all(0.0f);
+#pragma unroll 1
   for (int left = 0; left < 2; ++left) {  // the cell that the node is the left corner of along the major axis comes last
     const int cell_major = major - 1 + left;
     if (cell_major < 0) continue;
-    const int32_t* starts = cells.starts + int64_t(cell_major) * cells.minor_size;
-    const int32_t bounds[3] = {starts[minor > 0 ? minor - 1 : 0], starts[minor], starts[minor + 1]};
+    const int32_t* starts = cells.starts + int64_t(cell_major) * cells.minor_size + minor;
+    const int32_t bounds[3] = {starts[minor > 0 ? -1 : 0], starts[0], starts[1]};
     if (bounds[0] == bounds[2]) continue;
+#pragma unroll
     for (int low = 0; low < 2; ++low) {
       const int32_t begin = bounds[low], end = bounds[low + 1];
-      const auto add = [&](int32_t from, int32_t to) {
-        for_rows<kLane, kNodeBatch>(cells, from, to, channel, channels,
-                                    [&](int32_t, float along, float across, const Channels<kLane>& row) {
-                                      sum = plus(sum, (left ? 1.0f - along : along) * (low ? 1.0f - across : across), row);
-                                    });
-      };
-      const int32_t first = (begin + kSegment - 1) / kSegment, last = end / kSegment;
-      if (cells.segments == nullptr || first >= last) {
-        add(begin, end);
+      if (cells.crowds != nullptr && end - begin >= kCrowded) {
+        const int first = begin / kCrowdRun, corner = 2 * (1 - left) + (1 - low);
+        for (int run = first; run <= (end - 1) / kCrowdRun; ++run)
+          sum = plus(sum, 1.0f,
+                     Channels<kLane>::load(cells.crowds + crowd_place(run, run == first, begin, corner) * channels + channel));
         continue;
       }
-      add(begin, first * kSegment);
-      const float* corner = cells.segments + (2 * (1 - left) + (1 - low)) * channels + channel;
-#pragma unroll 4
-      for (int64_t s = first; s < last; ++s) sum = plus(sum, 1.0f, Channels<kLane>::load(corner + s * 4 * channels));
-      add(last * kSegment, end);
+      for_rows<kLane, kNodeBatch>(cells, begin, end, channel, channels,
+                                  [&](int32_t, float along, float across, const Channels<kLane>& row) {
+                                    sum = plus(sum, (left ? 1.0f - along : along) * (low ? 1.0f - across : across), row);
+                                  });
     }
   }
   return sum;

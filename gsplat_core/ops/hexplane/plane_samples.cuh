@@ -83,13 +83,12 @@ struct Corners {
   int32_t right, below;  // to the neighbours; 0 where there is one cell only
   LinePosition u, v;
 
-  __device__ Corners(const FeaturePlane& plane, float at_u, float at_v, int channels)
-      : right(plane.width > 1 ? channels : 0),
-        below(plane.height > 1 ? plane.width * channels : 0),
-        u(position_on(at_u, plane.width)),
-        v(position_on(at_v, plane.height)) {
-    start = (v.cell * plane.width + u.cell) * channels;
+  __device__ Corners(const FeaturePlane& plane, const LinePosition& along_u, const LinePosition& along_v, int channels)
+      : right(plane.width > 1 ? channels : 0), below(plane.height > 1 ? plane.width * channels : 0), u(along_u), v(along_v) {
+    start = (int64_t(int32_t(v.cell)) * plane.width + int32_t(u.cell)) * channels;
   }
+  __device__ Corners(const FeaturePlane& plane, float at_u, float at_v, int channels)
+      : Corners(plane, position_on(at_u, plane.width), position_on(at_v, plane.height), channels) {}
 };
 
 template <int kLane>
@@ -106,6 +105,14 @@ struct Sample {
   }
   __device__ Channels<kLane> along_u(const Corners& at) const { return between(p10 - p00, p11 - p01, at.v.fraction); }
   __device__ Channels<kLane> along_v(const Corners& at) const { return between(p01 - p00, p11 - p10, at.u.fraction); }
+  // All three, which share most of their work: the value, and its derivatives per cell.
+  __device__ void value_and_slopes(const Corners& at, Channels<kLane>& value, Channels<kLane>& along_u,
+                                   Channels<kLane>& along_v) const {
+    const Channels<kLane> upper = p10 - p00, lower = p11 - p01, top = plus(p00, at.u.fraction, upper);
+    along_u = between(upper, lower, at.v.fraction);
+    along_v = plus(p01, at.u.fraction, lower) - top;
+    value = plus(top, at.v.fraction, along_v);
+  }
 };
 
 // The sum over the lanes of a team, in a fixed order; every lane has it.

@@ -6,19 +6,28 @@
 
 namespace hexplane {
 
-// `gradient` is called after the moments' loads are on their way.
-template <int kLane, class Gradient>
-__device__ __forceinline__ void update(const PlaneMoments& plane, int64_t at, const Channels<kLane>& value,
-                                       const Gradient& gradient_of, const AdamStep& step) {
-  Channels<kLane> p = value, m = Channels<kLane>::load(plane.first + at), v = Channels<kLane>::load(plane.second + at);
+// `gradient_of` is called after the moments' loads are on their way, and `value_of` where the update changes anything: most nodes
+// of a fine grid have no Gaussian near and never had, and cost two reads.
+template <int kLane, class Value, class Gradient>
+__device__ __forceinline__ void update(const PlaneMoments& plane, int64_t at, const Value& value_of, const Gradient& gradient_of,
+                                       const AdamStep& told) {
+  Channels<kLane> m = Channels<kLane>::load(plane.first + at), v = Channels<kLane>::load(plane.second + at);
   const Channels<kLane> gradient = gradient_of();
+  bool idle = true;
+#pragma unroll
+  for (int i = 0; i < kLane; ++i) idle = idle && gradient.v[i] == 0.0f && m.v[i] == 0.0f && v.v[i] == 0.0f;
+  if (idle) return;
+  Channels<kLane> p = value_of();
+  const AdamStep step = told;  // read once, and after the gradient, which needs the registers
 #pragma unroll
   for (int i = 0; i < kLane; ++i) {
     const float g = gradient.v[i];
-    if (!isfinite(g * g)) continue;  // it would poison the moments for good
-    m.v[i] += step.fresh1 * (g - m.v[i]);
-    v.v[i] += step.fresh2 * (g * g - v.v[i]);
-    p.v[i] -= step.rate * m.v[i] / (sqrtf(v.v[i]) * step.inv_bias2 + step.epsilon);
+    const bool finite = isfinite(g * g);  // otherwise it would poison the moments for good
+    const float m_new = m.v[i] + step.fresh1 * (g - m.v[i]), v_new = v.v[i] + step.fresh2 * (g * g - v.v[i]);
+    const float p_new = p.v[i] - step.rate * m_new / (sqrtf(v_new) * step.inv_bias2 + step.epsilon);
+    m.v[i] = finite ? m_new : m.v[i];
+    v.v[i] = finite ? v_new : v.v[i];
+    p.v[i] = finite ? p_new : p.v[i];
   }
   p.store(plane.values + at);
   m.store(plane.first + at);
@@ -41,7 +50,7 @@ __device__ __forceinline__ int slot_of_block(const Slots& slots) {
 __device__ __forceinline__ SortedCells sorted_cells(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows,
                                                     int slot) {
   const int level = slot / 3, p = slot % 3;
-  return {cells.starts + cells.first[level][p], rows.space, rows.shares, rows.segments, planes.sizes[level][minor_axis(p)]};
+  return {cells.starts + cells.first[level][p], rows.space, rows.shares, rows.crowds, planes.sizes[level][minor_axis(p)]};
 }
 
 template <int kLane>

@@ -1,3 +1,4 @@
+#include "cuda_branch.h"
 #include "plane_update.cuh"
 
 using namespace hexplane;
@@ -24,7 +25,9 @@ __global__ void __launch_bounds__(kThreads) update_network(NetworkParameters par
   while (i >= parameters.starts[tensor + 1]) ++tensor;
   const int start = parameters.starts[tensor];
   const PlaneMoments shifted = {parameters.values[tensor] - start, first, second};  // the moments of all tensors are one
-  update<1>(shifted, i, Channels<1>::load(shifted.values + i), [&] { return Channels<1>::load(gradient + i); }, scalars.step);
+  update<1>(
+      shifted, i, [&] { return Channels<1>::load(shifted.values + i); }, [&] { return Channels<1>::load(gradient + i); },
+      scalars.step);
 }
 
 // A thread has the neighbouring channels of one node.
@@ -35,9 +38,9 @@ __global__ void __launch_bounds__(kThreads, 5)
   const int width = planes.sizes[level][u_axis(p)], height = planes.sizes[level][v_axis(p)];
   const int64_t at = (int64_t(int(blockIdx.x) - slots.first_block[slot]) * kThreads + threadIdx.x) * kLane;
   if (at >= int64_t(width) * height * channels) return;
-  const int node = int(at / channels);
   sink.template take<kLane>(level, p, false, at, [&] {
-    return space_gradient<kLane>(planes, cells, rows, slot, node % width, node / width, int(at % channels));
+    const int node = int(at / channels), channel = int(at - int64_t(node) * channels), v = node / width;
+    return space_gradient<kLane>(planes, cells, rows, slot, node - v * width, v, channel);
   });
 }
 
@@ -65,7 +68,7 @@ struct UpdateSink {
   __device__ void take(int level, int p, bool time, int64_t at, const Gradient& gradient) const {
     if (scalars->leave) return;
     const PlaneMoments& plane = time ? state.time[level][p] : state.space[level][p];
-    update<kLane>(plane, at, Channels<kLane>::load(plane.values + at), gradient, scalars->step);
+    update<kLane>(plane, at, [&] { return Channels<kLane>::load(plane.values + at); }, gradient, scalars->step);
   }
 };
 
@@ -96,14 +99,15 @@ void visit_nodes(const FieldPlanes& planes, const FieldLines& lines, const Field
   }
   const unsigned space_blocks = unsigned(slots.first_block[slots.count]),
                  time_blocks = unsigned(time_slots.first_block[slots.count]);
+  const CudaBranch branch(stream);
   if (space) space_nodes<kLane><<<space_blocks, kThreads, 0, stream>>>(planes, cells, rows, slots, sink);
   if (times)
-    time_nodes<kLane><<<time_blocks, kThreads, 0, stream>>>(lines, line_gradient, time, planes.channels, time_slots, sink);
+    time_nodes<kLane><<<time_blocks, kThreads, 0, branch.stream>>>(lines, line_gradient, time, planes.channels, time_slots, sink);
 }
 
 // Whether all planes and rows can be read 16 bytes at a time.
 uintptr_t alignment(const FieldPlanes& planes, const FieldRows& rows, const float* line_gradient) {
-  return uintptr_t(planes.channels) * 4 | uintptr_t(rows.space) | uintptr_t(rows.segments) | uintptr_t(line_gradient);
+  return uintptr_t(planes.channels) * 4 | uintptr_t(rows.space) | uintptr_t(rows.crowds) | uintptr_t(line_gradient);
 }
 
 }  // namespace

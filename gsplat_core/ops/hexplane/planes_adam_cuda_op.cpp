@@ -13,26 +13,26 @@ int64_t gaussians_of(const Tensor& rows, const Tensors& planes) {
 
 // What hexplane_train_backward left, as the pass over the planes takes it.
 struct Backward {
-  Tensor time, rows, shares, segments, starts, v_lines;
+  Tensor time, rows, shares, crowds, starts, v_lines;
   FieldRows raw = {};
 
   Backward(const CudaCall& call, Field& field, const Tensor& time_, const Tensor& rows_, const Tensor& shares_,
-           const Tensor& segments_, const Tensor& starts_, const Tensor& v_lines_)
+           const Tensor& crowds_, const Tensor& starts_, const Tensor& v_lines_)
       : time(call.floats(time_, "time")),
         rows(call.floats(rows_, "rows")),
         shares(call.floats(shares_, "shares")),
-        segments(call.floats(segments_, "segments")),
+        crowds(call.floats(crowds_, "crowds")),
         starts(call.ints(starts_, "starts")),
         v_lines(call.floats(v_lines_, "line gradient")) {
     const int64_t values = 3 * field.planes.levels * field.cells.count;
     STD_TORCH_CHECK(shares.numel() == 2 * values && rows.numel() == 2 * values * field.planes.channels &&
-                        segments.numel() == values / 32 * 4 * field.planes.channels && starts.numel() == field.cells.cells + 1 &&
-                        v_lines.numel() == field.line_size && time.numel() == 1,
-                    "rows, shares, segments, starts and line gradient must be those that hexplane_train_backward gave");
+                        crowds.numel() == (values + 31) / 32 * 20 * field.planes.channels &&
+                        starts.numel() == field.cells.cells + 1 && v_lines.numel() == field.line_size && time.numel() == 1,
+                    "rows, shares, crowds, starts and line gradient must be those that hexplane_train_backward gave");
     field.cells.starts = const_cast<int32_t*>(starts.const_data_ptr<int32_t>());
     raw.space = const_cast<float*>(data(rows));
     raw.shares = const_cast<float*>(data(shares));
-    raw.segments = const_cast<float*>(data(segments));
+    raw.crowds = const_cast<float*>(data(crowds));
     raw.lines = raw.space + values * field.planes.channels;
   }
 };
@@ -59,11 +59,11 @@ struct UpdateOptions {
   }
 };
 
-Tensors hexplane_planes_gradient(Tensor time, Tensor rows, Tensor shares, Tensor segments, Tensor starts, Tensor v_lines,
+Tensors hexplane_planes_gradient(Tensor time, Tensor rows, Tensor shares, Tensor crowds, Tensor starts, Tensor v_lines,
                                  Tensors planes) {
   CudaCall call(rows);
   Field field(call, planes, gaussians_of(rows, planes));
-  const Backward backward(call, field, time, rows, shares, segments, starts, v_lines);
+  const Backward backward(call, field, time, rows, shares, crowds, starts, v_lines);
   PlaneGradients gradients = {};
   Tensors out;
   for (size_t i = 0; i < planes.size(); ++i) {
@@ -78,13 +78,12 @@ Tensors hexplane_planes_gradient(Tensor time, Tensor rows, Tensor shares, Tensor
   return out;
 }
 
-void hexplane_planes_adam_(Tensors planes, Tensors first, Tensors second, Tensor time, Tensor rows, Tensor shares,
-                           Tensor segments, Tensor starts, Tensor v_lines, Tensor rate, Tensor step, std::optional<Tensor> status,
-                           double beta1, double beta2, double epsilon, double smoothness, double time_smoothness,
-                           double sparsity) {
+void hexplane_planes_adam_(Tensors planes, Tensors first, Tensors second, Tensor time, Tensor rows, Tensor shares, Tensor crowds,
+                           Tensor starts, Tensor v_lines, Tensor rate, Tensor step, std::optional<Tensor> status, double beta1,
+                           double beta2, double epsilon, double smoothness, double time_smoothness, double sparsity) {
   CudaCall call(rows);
   Field field(call, planes, gaussians_of(rows, planes));
-  const Backward backward(call, field, time, rows, shares, segments, starts, v_lines);
+  const Backward backward(call, field, time, rows, shares, crowds, starts, v_lines);
   STD_TORCH_CHECK(first.size() == planes.size() && second.size() == planes.size(), "every plane needs its two moments");
   PlanesState state = {};
   for (size_t i = 0; i < planes.size(); ++i) {

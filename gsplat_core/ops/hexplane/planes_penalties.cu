@@ -68,7 +68,7 @@ __global__ void __launch_bounds__(kTileThreads) copy_borders(FieldPlanes planes,
 }
 
 template <int kLane>
-__global__ void __launch_bounds__(kTileThreads)
+__global__ void __launch_bounds__(kTileThreads, 2)
     space_tiles(FieldPlanes planes, FieldCells cells, FieldRows rows, PlanesState state, Tiles tiles, float smoothness,
                 const AdamScalars* scalars) {
   __shared__ float shown[2][kTileThreads * kLane];
@@ -110,7 +110,7 @@ __global__ void __launch_bounds__(kTileThreads)
     Channels<kLane> gradient = space_gradient<kLane>(planes, cells, rows, tile.slot, tile.u, v, tile.channel);
     gradient = plus(gradient, along_u, (current - left) - (right - current));
     gradient = plus(gradient, along_v, (current - above) - (below - current));
-    update<kLane>(plane, place(v), current, [&] { return gradient; }, step);
+    update<kLane>(plane, place(v), [&] { return current; }, [&] { return gradient; }, step);
     above = current;
     current = below;
   }
@@ -146,7 +146,7 @@ __global__ void __launch_bounds__(kThreads)
       const float apart = window[0].v[i] - 1.0f;
       gradient.v[i] += apart > 0.0f ? away : apart < 0.0f ? -away : 0.0f;
     }
-    update<kLane>(plane, v * size + column, window[0], [&] { return gradient; }, step);
+    update<kLane>(plane, v * size + column, [&] { return window[0]; }, [&] { return gradient; }, step);
     bends[0] = bends[1], bends[1] = bends[2];
     window[0] = window[1], window[1] = window[2], window[2] = next;
   }

@@ -1,7 +1,7 @@
 """Training of the HexPlane field on CUDA without autograd: forward, backward, and Adam over the planes.
 
     state = hexplane_train(means, box, time, planes, weights, biases)           # state.deltas into the frame
-    gradient = hexplane_train_backward(v_raw, means, box, state, planes, weights, biases)
+    gradient = hexplane_train_backward(v_raw, box, state, planes, weights, biases)
     hexplane_planes_adam_(planes, first, second, time, gradient, rate, step, ...)
 
 Nothing waits for the host and every call can be captured in a CUDA graph; time, rate and step are read from device memory. The same
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.ops.hexplane.deltas import DELTA_COLUMNS
+from gsplat_core.ops.hexplane.deltas import DELTA_COLUMNS, padded_width
 
 
 class TrainingState(NamedTuple):
@@ -34,7 +34,12 @@ class TrainingState(NamedTuple):
     features: Tensor
     """[N, levels * C]."""
     hidden: Tensor
-    """[depth, N, width]: what leaves each layer of the trunk."""
+    """[depth, N, padded width]: what leaves each layer of the trunk, and zeros beside it."""
+    order: Tensor
+    """int32 [3, 3 * levels * N]: items (plane after plane, Gaussian after Gaussian) by the cell of the plane, the place of each item
+    among these, and the cells in this order, with their highest bit set where they have 8 items or more."""
+    starts: Tensor
+    """int32 [cells + 1]: where each cell's items start."""
 
 
 class FieldGradient(NamedTuple):
@@ -47,12 +52,12 @@ class FieldGradient(NamedTuple):
     axes (y, x, z), sorted by the cell of the plane."""
     shares: Tensor
     """[3 * levels * N, 2]: fractions of the way to the next node along the major and the minor axis, in the same order."""
-    segments: Tensor
-    """[3 * levels * N / 32, 4, C]: sums of 32 sorted rows each, where these are all in one cell."""
-    starts: Tensor
-    """int32 [cells + 1]: where each cell's rows start."""
+    crowds: Tensor
+    """[3 * levels * N / 32, 5, 4, C]: of 32 sorted rows each, sums for the four corners of those cells that have 8 rows or more."""
     v_lines: Tensor
     """The gradient of the lines."""
+    starts: Tensor
+    """int32 [cells + 1]: where each cell's rows start."""
 
 
 class Penalties(NamedTuple):
@@ -90,7 +95,6 @@ def hexplane_train(
 
 def hexplane_train_backward(
     v_raw: Tensor,
-    means: Tensor,
     box: Tensor,
     state: TrainingState,
     planes: Sequence[Tensor],
@@ -101,11 +105,11 @@ def hexplane_train_backward(
 
     A row of `v_raw` that is not finite counts as zero.
     """
-    _check(v_raw, means, box, *planes, *weights, *biases)
-    gradient = torch.ops.gsplat_core.hexplane_train_backward(
-        v_raw, means, box, state.lines, state.features, state.hidden, list(planes), list(weights), list(biases)
+    _check(v_raw, box, *planes, *weights, *biases)
+    network, rows, shares, crowds, v_lines = torch.ops.gsplat_core.hexplane_train_backward(
+        v_raw, box, *state[1:], list(planes), list(weights), list(biases)
     )
-    return FieldGradient(*gradient)
+    return FieldGradient(network, rows, shares, crowds, v_lines, state.starts)
 
 
 def hexplane_planes_gradient(time: Tensor, gradient: FieldGradient, planes: Sequence[Tensor]) -> list[Tensor]:
@@ -114,7 +118,7 @@ def hexplane_planes_gradient(time: Tensor, gradient: FieldGradient, planes: Sequ
         time,
         gradient.rows,
         gradient.shares,
-        gradient.segments,
+        gradient.crowds,
         gradient.starts,
         gradient.v_lines,
         list(planes),
@@ -146,7 +150,7 @@ def hexplane_planes_adam_(
     """
     _check(*planes, *first, *second, rate)
     torch.ops.gsplat_core.hexplane_planes_adam_(
-        list(planes), list(first), list(second), time, gradient.rows, gradient.shares, gradient.segments, gradient.starts,
+        list(planes), list(first), list(second), time, gradient.rows, gradient.shares, gradient.crowds, gradient.starts,
         gradient.v_lines, rate, step, status, *betas, epsilon, *penalties,
     )  # fmt: skip
 
@@ -185,41 +189,47 @@ def _lines_size(planes: list[Tensor]) -> int:
     return sum(int(plane.shape[1] * plane.shape[2]) for index, plane in enumerate(planes) if index % 6 >= 3)
 
 
+def _cells(planes: list[Tensor]) -> int:
+    return sum(int(plane.shape[0] * plane.shape[1]) for index, plane in enumerate(planes) if index % 6 < 3)
+
+
 @torch.library.register_fake("gsplat_core::hexplane_train")
 def _(
     means: Tensor, box: Tensor, time: Tensor, planes: list[Tensor], weights: list[Tensor], biases: list[Tensor]
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     n, width = means.shape[0], weights[0].shape[0]
     return (
         means.new_empty(n, DELTA_COLUMNS),
         means.new_empty(n, 4),
         means.new_empty(_lines_size(planes)),
         means.new_empty(n, weights[0].shape[1]),
-        means.new_empty(len(weights) - 1, n, width),
+        means.new_empty(len(weights) - 1, n, padded_width(width)),
+        means.new_empty(3, len(planes) // 2 * n, dtype=torch.int32),
+        means.new_empty(_cells(planes) + 1, dtype=torch.int32),
     )
 
 
 @torch.library.register_fake("gsplat_core::hexplane_train_backward")
 def _(
     v_raw: Tensor,
-    means: Tensor,
     box: Tensor,
+    coordinates: Tensor,
     lines: Tensor,
     features: Tensor,
     hidden: Tensor,
+    order: Tensor,
+    starts: Tensor,
     planes: list[Tensor],
     weights: list[Tensor],
     biases: list[Tensor],
 ) -> tuple[Tensor, ...]:
-    n, slots = means.shape[0], len(planes) // 2
-    cells = sum(int(plane.shape[0] * plane.shape[1]) for index, plane in enumerate(planes) if index % 6 < 3)
+    n, slots = v_raw.shape[0], len(planes) // 2
     return (
-        means.new_empty(sum(t.numel() for t in (*weights, *biases))),
-        means.new_empty(2, slots * n, planes[0].shape[2]),
-        means.new_empty(slots * n, 2),
-        means.new_empty(slots * n // 32, 4, planes[0].shape[2]),
-        means.new_empty(cells + 1, dtype=torch.int32),
-        means.new_empty(_lines_size(planes)),
+        v_raw.new_empty(sum(t.numel() for t in (*weights, *biases))),
+        v_raw.new_empty(2, slots * n, planes[0].shape[2]),
+        v_raw.new_empty(slots * n, 2),
+        v_raw.new_empty((slots * n + 31) // 32, 5, 4, planes[0].shape[2]),
+        v_raw.new_empty(_lines_size(planes)),
     )
 
 
@@ -228,7 +238,7 @@ def _(
     time: Tensor,
     rows: Tensor,
     shares: Tensor,
-    segments: Tensor,
+    crowds: Tensor,
     starts: Tensor,
     v_lines: Tensor,
     planes: list[Tensor],
@@ -244,7 +254,7 @@ def _(
     time: Tensor,
     rows: Tensor,
     shares: Tensor,
-    segments: Tensor,
+    crowds: Tensor,
     starts: Tensor,
     v_lines: Tensor,
     rate: Tensor,

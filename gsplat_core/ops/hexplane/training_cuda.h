@@ -29,11 +29,17 @@ struct FieldPlanes {
 struct FieldCells {
   float* coordinates;  // [N, 4] in [-1, 1]; the fourth is 0 for a Gaussian that takes no part because its position is not finite
   int32_t* starts;     // [cells + 1] of the cell's items
+  int32_t* items;      // [slots * N], sorted
   int32_t* ranks;      // [slots * N]: place of an item among the sorted ones
-  uint32_t* keys;      // [slots * N] cells of the sorted items
+  uint32_t* keys;      // [slots * N]: cells of the sorted items, and whether they are crowded
   int64_t first[kFieldLevels][3];  // a slot's first cell
   int64_t cells, count;
 };
+
+// A cell in the keys of its items says whether it is crowded: whether it has so many that their rows are added up ahead.
+constexpr uint32_t kCrowdedBit = uint32_t(1) << 31;
+__host__ __device__ constexpr bool is_crowded(uint32_t key) { return (key & kCrowdedBit) != 0; }
+__host__ __device__ constexpr uint32_t cell_of(uint32_t key) { return key & ~kCrowdedBit; }
 
 constexpr int plane_of_major(int axis) { return axis == 0 ? 1 : axis == 1 ? 0 : 2; }  // x: xz, y: xy, z: yz
 
@@ -41,21 +47,23 @@ struct FieldRows {
   float* space;   // [slots * N, C], sorted: gradient of the plane's sample
   float* lines;   // the same for the line of the plane's major axis
   float* shares;  // [slots * N, 2], sorted: fractions of the way to the next node along the major and the minor axis
-  // [slots * N / 32, 4, C]: of 32 items that are all in one cell, the sums of their rows for its four corners, the second along
-  // the minor axis first; what belongs to other items is not written
-  float* segments;
+  // [slots * N / 32, 5, 4, C]: of the crowded cells in 32 sorted items, the sums of their rows there for their four corners, the
+  // second along the minor axis first; which one has which of five places says crowd_place, and other places are not written
+  float* crowds;
 };
 
-// Coordinates of `means` [N, 3] in `box` [2, 3], and with `cells.starts` the sorted cells.
-void place_gaussians(const FieldPlanes& planes, const float* means, const float* box, FieldCells& cells, CudaScratch& scratch,
-                     cudaStream_t stream);
+// Coordinates of `means` [N, 3] in `box` [2, 3].
+void place_gaussians(const float* means, const float* box, const FieldCells& cells, cudaStream_t stream);
+
+// From the coordinates to everything else in `cells`.
+void sort_gaussians(const FieldPlanes& planes, const FieldCells& cells, CudaScratch& scratch, cudaStream_t stream);
 
 // features [N, levels * C]: products of the samples of space planes and lines; 0 for Gaussians that take no part.
 void field_features(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, float* features,
                     cudaStream_t stream);
 
-// From v_raw [N, 16] to the gradient of the features [N, levels * C] and, layer by layer, of the layers' sums: v_hidden
-// [layers - 1, N, width] and v_head [N, 16]. A row of v_raw that is not finite counts as zero.
+// From v_raw [N, 16] to the gradient of the features [N, levels * C] and, layer by layer, of the layers' sums: v_hidden, of the
+// padded width as `hidden` [layers - 1, N, width], and v_head [N, 16]. A row of v_raw that is not finite counts as zero.
 void network_backward(const FieldNetwork& net, const float* v_raw, const float* hidden, float* v_features, float* v_hidden,
                       float* v_head, int64_t count, CudaScratch& scratch, cudaStream_t stream);
 
@@ -67,8 +75,8 @@ void network_weight_gradient(const FieldNetwork& net, const float* features, con
 void field_rows(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, const float* box,
                 const float* v_features, const FieldRows& rows, float* v_raw, cudaStream_t stream);
 
-// Fills rows.segments, so that a cell with many Gaussians does not hold up the nodes around it.
-void sum_segments(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows, cudaStream_t stream);
+// Fills rows.crowds: the rows of a crowded cell are read once, and do not hold up the nodes around it.
+void sum_crowds(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows, cudaStream_t stream);
 
 // The gradient of the lines, laid out as they are.
 void line_gradient(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, const FieldRows& rows,

@@ -1,5 +1,6 @@
 #include <tuple>
 
+#include "cuda_branch.h"
 #include "training_arguments.h"
 
 namespace {
@@ -13,9 +14,20 @@ FieldNetwork checked_network(const CudaCall& call, Tensors& weights, Tensors& bi
   return net;
 }
 
-// (deltas [N, 16], coordinates [N, 4], lines, features [N, levels * C], hidden [layers - 1, N, width])
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train(Tensor means, Tensor box, Tensor time, Tensors planes,
-                                                                  Tensors weights, Tensors biases) {
+// `order` has the items of FieldCells, their ranks and their keys.
+void set_cells(FieldCells& cells, const Tensor& coordinates, const Tensor& order, const Tensor& starts) {
+  const int64_t items = order.size(1);
+  int32_t* values = const_cast<int32_t*>(order.const_data_ptr<int32_t>());
+  cells.coordinates = const_cast<float*>(data(coordinates));
+  cells.items = values, cells.ranks = values + items, cells.keys = reinterpret_cast<uint32_t*>(values + 2 * items);
+  cells.starts = const_cast<int32_t*>(starts.const_data_ptr<int32_t>());
+}
+
+// (deltas [N, 16], coordinates [N, 4], lines, features [N, levels * C], hidden [layers - 1, N, padded width],
+// order [3, slots * N], starts [cells + 1])
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train(Tensor means, Tensor box, Tensor time,
+                                                                                  Tensors planes, Tensors weights,
+                                                                                  Tensors biases) {
   CudaCall call(means);
   const Tensor m = call.floats(means, "means"), b = call.floats(box, "box"), t = call.floats(time, "time");
   STD_TORCH_CHECK(m.dim() == 2 && m.size(1) == 3 && b.numel() == 6 && t.numel() == 1,
@@ -24,61 +36,66 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train(Tensor means, 
   Field field(call, planes, n);
   const FieldNetwork net = checked_network(call, weights, biases, field);
   Tensor deltas = call.empty({n, kDeltaColumns}), coordinates = call.empty({n, 4}), lines = call.empty({field.line_size});
-  Tensor features = call.empty({n, field.features}), hidden = call.empty({net.layers - 1, n, net.width});
+  Tensor features = call.empty({n, field.features}), hidden = call.empty({net.layers - 1, n, net.padded_width()});
+  Tensor order = call.empty({3, 3 * field.planes.levels * n}, ScalarType::Int);
+  Tensor starts = call.empty({field.cells.cells + 1}, ScalarType::Int);
   field.lines.values = mutable_data(lines);
-  field.cells.coordinates = mutable_data(coordinates);
+  set_cells(field.cells, coordinates, order, starts);
   FieldInput lines_only = {};
   lines_only.lines = field.lines, lines_only.levels = field.planes.levels, lines_only.channels = field.planes.channels;
   void* packed = call.bytes(net.packed_bytes(4));
+  place_gaussians(data(m), data(b), field.cells, call.stream);
+  CudaBranch branch(call.stream);  // sorting, which only the way back needs
+  sort_gaussians(field.planes, field.cells, call, branch.stream);
   prepare_field(field.times, lines_only, data(t), &net, packed, false, call.stream);
-  place_gaussians(field.planes, data(m), data(b), field.cells, call, call.stream);
   field_features(field.planes, field.lines, field.cells, mutable_data(features), call.stream);
   FieldInput in = {};
   in.spaces[0] = data(features), in.count = n, in.levels = 1, in.channels = int32_t(field.features);
   field_deltas(in, net, packed, false, mutable_data(deltas), mutable_data(hidden), call.stream);
   check_cuda(cudaGetLastError(), "hexplane_train");
-  return {deltas, coordinates, lines, features, hidden};
+  return {deltas, coordinates, lines, features, hidden, order, starts};
 }
 
-// (network gradient, rows [2, slots * N, C], shares, segments, starts, line gradient); adds the positions' gradient to v_raw.
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tensor v_raw, Tensor means, Tensor box,
-                                                                                   Tensor lines, Tensor features, Tensor hidden,
-                                                                                   Tensors planes, Tensors weights,
-                                                                                   Tensors biases) {
-  CudaCall call(means);
-  const Tensor m = call.floats(means, "means"), b = call.floats(box, "box");
-  const int64_t n = m.size(0);
+// (network gradient, rows [2, slots * N, C], shares, crowds, line gradient); adds the positions' gradient to v_raw.
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tensor v_raw, Tensor box, Tensor coordinates,
+                                                                           Tensor lines, Tensor features, Tensor hidden,
+                                                                           Tensor order, Tensor starts, Tensors planes,
+                                                                           Tensors weights, Tensors biases) {
+  CudaCall call(v_raw);
+  const Tensor b = call.floats(box, "box"), x = call.floats(coordinates, "coordinates");
+  const Tensor o = call.ints(order, "order"), s = call.ints(starts, "starts");
+  const int64_t n = x.size(0);
   STD_TORCH_CHECK(v_raw.is_contiguous() && v_raw.dim() == 2 && v_raw.size(0) == n && v_raw.size(1) == kDeltaColumns,
                   "v_raw must be contiguous [N, ", kDeltaColumns, "]");
   call.floats(v_raw, "v_raw");
   Field field(call, planes, n);
   const FieldNetwork net = checked_network(call, weights, biases, field);
   const Tensor l = call.floats(lines, "lines"), f = call.floats(features, "features"), h = call.floats(hidden, "hidden");
-  STD_TORCH_CHECK(
-      l.numel() == field.line_size && f.numel() == n * field.features && h.numel() == (net.layers - 1) * n * net.width,
-      "lines, features and hidden must be those that hexplane_train gave");
   const int64_t slots = 3 * field.planes.levels;
+  STD_TORCH_CHECK(x.numel() == 4 * n && l.numel() == field.line_size && f.numel() == n * field.features &&
+                      h.numel() == (net.layers - 1) * n * net.padded_width() && o.dim() == 2 && o.numel() == 3 * slots * n &&
+                      s.numel() == field.cells.cells + 1,
+                  "coordinates, lines, features, hidden, order and starts must be those that hexplane_train gave");
   int64_t parameters = 0;
   for (size_t i = 0; i < weights.size(); ++i) parameters += weights[i].numel() + biases[i].numel();
   Tensor network_gradient = call.empty({parameters}), rows = call.empty({2, slots * n, field.planes.channels});
-  Tensor shares = call.empty({slots * n, 2}), starts = call.empty({field.cells.cells + 1}, ScalarType::Int);
-  Tensor v_lines = call.empty({field.line_size}), segments = call.empty({slots * n / 32, 4, field.planes.channels});
+  Tensor shares = call.empty({slots * n, 2});
+  Tensor v_lines = call.empty({field.line_size}), crowds = call.empty({(slots * n + 31) / 32, 5, 4, field.planes.channels});
   field.lines.values = const_cast<float*>(data(l));
-  field.cells.coordinates = call.array<float>(4 * n);
-  field.cells.ranks = call.array<int32_t>(slots * n), field.cells.keys = call.array<uint32_t>(slots * n);
-  field.cells.starts = starts.mutable_data_ptr<int32_t>();
+  set_cells(field.cells, x, o, s);
   const FieldRows r = {mutable_data(rows), mutable_data(rows) + slots * n * field.planes.channels, mutable_data(shares),
-                       mutable_data(segments)};
-  float *v_features = call.array<float>(n * field.features), *v_hidden = call.array<float>((net.layers - 1) * n * net.width);
+                       mutable_data(crowds)};
+  float *v_features = call.array<float>(n * field.features), *v_hidden = call.array<float>(h.numel());
   float* v_head = call.array<float>(n * kDeltaColumns);
-  place_gaussians(field.planes, data(m), data(b), field.cells, call, call.stream);
   network_backward(net, data(v_raw), data(h), v_features, v_hidden, v_head, n, call, call.stream);
-  network_weight_gradient(net, data(f), data(h), v_hidden, v_head, mutable_data(network_gradient), n, call, call.stream);
+  CudaBranch branch(call.stream);  // the network and the lines, beside the space planes
+  network_weight_gradient(net, data(f), data(h), v_hidden, v_head, mutable_data(network_gradient), n, call, branch.stream);
   field_rows(field.planes, field.lines, field.cells, data(b), v_features, r, mutable_data(v_raw), call.stream);
-  sum_segments(field.planes, field.cells, r, call.stream);
-  line_gradient(field.planes, field.lines, field.cells, r, mutable_data(v_lines), call, call.stream);
+  branch.fork();
+  line_gradient(field.planes, field.lines, field.cells, r, mutable_data(v_lines), call, branch.stream);
+  sum_crowds(field.planes, field.cells, r, call.stream);
   check_cuda(cudaGetLastError(), "hexplane_train_backward");
-  return {network_gradient, rows, shares, segments, starts, v_lines};
+  return {network_gradient, rows, shares, crowds, v_lines};
 }
 
 }  // namespace

@@ -91,7 +91,7 @@ def test_a_position_that_is_not_a_number_shows_and_reads_nothing_outside(gpu):
     assert features[[0, 1, 3, 4]].isfinite().all()
 
 
-@pytest.mark.parametrize("channels", [5, 32])
+@pytest.mark.parametrize("channels", [5, 32, 64])
 @pytest.mark.parametrize("n", [0, 1, 700])
 def test_the_two_halves_equal_the_reference(gpu, n, channels):
     x, planes = points(n), level(channels)
@@ -127,8 +127,12 @@ def deltas_case(n, channels=64, levels=2, width=32, depth=2, sizes=(9, 7, 8, 5))
 CASES = {
     "one level": {"levels": 1},
     "four levels": {"levels": 4},
+    "32 channels": {"channels": 32},
     "64 wide": {"channels": 32, "width": 64, "depth": 3},
+    "64 wide on 64 channels": {"width": 64, "depth": 3},
     "128 wide": {"channels": 32, "width": 128, "depth": 1},
+    "128 wide on 96 channels": {"channels": 96, "levels": 1, "width": 128, "depth": 1},
+    "128 wide on 64 channels": {"width": 128, "depth": 1},
     "odd width": {"width": 27, "depth": 4},
     "96 channels": {"channels": 96, "levels": 1, "width": 33},
     "resolution 2": {"sizes": (2, 2, 2, 2)},
