@@ -21,8 +21,9 @@ from torch import Tensor
 
 import gsplat_core
 from gsplat_core.cameras import Camera
-from gsplat_core.frame_renderer import FrameRenderer, capacity_for
+from gsplat_core.frame_renderer import FrameRenderer
 from gsplat_core.gaussians import Gaussians
+from gsplat_core.list_room import ListRoom, capacity_for
 from gsplat_core.ops.frame.frame import STATUS_MOST, STATUS_NEEDED, Frame, render_frame
 from gsplat_core.ops.frame.frame_gradients import RATES, render_frame_backward, render_frame_backward_adam_
 
@@ -47,19 +48,20 @@ class FramePath:
         self._half_sh = self._gaussians[4].half()
         self._camera, self._size, self._target = scene.camera, scene.size_px, target
         self._capacity = 1 << 16
-        status = self._render().status.tolist()
+        status = self._training().status.tolist()
         self.instances, self.most_in_a_tile = status[STATUS_NEEDED], status[STATUS_MOST]
+        self._room = ListRoom.for_frame(self.instances, self.most_in_a_tile)
         self._capacity = capacity_for(self.instances)
 
     def forward(self) -> Frame:
-        return self._render()
+        return self._render(self._gaussians[4])
 
     def forward_half(self) -> Frame:
         """Harmonics kept and splats blended in half precision."""
-        return render_frame(*self._gaussians[:4], self._half_sh, None, *self._camera, None, *self._size, self._capacity)
+        return self._render(self._half_sh)
 
     def step(self) -> None:
-        frame = self._render(training=True)
+        frame = self._training()
         render_frame_backward(
             self._gaussians, None, *self._camera, None, frame, *l1_gradients(frame.image, frame.alphas, self._target)
         )
@@ -73,7 +75,7 @@ class FramePath:
         skipped = torch.zeros(RATES, dtype=torch.int64, device="cuda")
 
         def work() -> None:
-            frame = self._render(training=True)
+            frame = self._training()
             render_frame_backward_adam_(
                 gaussians, *moments, rates, step, skipped, None, *self._camera, None, frame,
                 *l1_gradients(frame.image, frame.alphas, self._target), needs_raw=False,
@@ -81,8 +83,14 @@ class FramePath:
 
         return work
 
-    def _render(self, training: bool = False) -> Frame:
-        return render_frame(*self._gaussians, None, *self._camera, None, *self._size, self._capacity, training=training)
+    def _render(self, sh: Tensor) -> Frame:
+        return render_frame(
+            *self._gaussians[:4], sh, None, *self._camera, None, *self._size, self._room.capacity,
+            per_tile=self._room.per_tile,
+        )  # fmt: skip
+
+    def _training(self) -> Frame:
+        return render_frame(*self._gaussians, None, *self._camera, None, *self._size, self._capacity, training=True)
 
 
 def l1_gradients(image: Tensor, alphas: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -16,54 +15,29 @@ from gsplat_core.captured import CapturedSequence, GraphMemory
 from gsplat_core.deformation import DeformationField
 from gsplat_core.errors import InvalidInput
 from gsplat_core.gaussians import Gaussians
-from gsplat_core.ops.frame.frame import STATUS_CUT, STATUS_NEEDED, Frame, render_frame
+from gsplat_core.list_room import ListRoom, StatusOnHost
+from gsplat_core.ops.frame.frame import Frame, render_frame
 from gsplat_core.ops.scalars.scalars import store_scalars_
 from gsplat_core.rendering import RenderOutput
-
-CAPACITY_STEP = 1 << 16
-"""Lists grow by multiples of this many instances (a splat in a tile)."""
-HEADROOM = 1.25
-"""Room kept beyond what a frame needed, so that a scene that moves seldom outgrows its lists."""
 
 Precision = Literal["fp32", "fp16"]
 
 
-def capacity_for(needed: int) -> int:
-    """How many instances to make room for where `needed` were seen."""
-    return max(1, math.ceil(needed * HEADROOM / CAPACITY_STEP)) * CAPACITY_STEP
-
-
 class FrameControls:
-    """What changes from frame to frame, in one piece of device memory: pose, intrinsics and the field's time."""
+    """What changes from frame to frame, in one piece of device memory: pose, intrinsics, the field's time, and learning rates where
+    the frame is trained on."""
 
-    def __init__(self, device: torch.device) -> None:
-        self._values = torch.zeros(26, device=device)
+    def __init__(self, device: torch.device, rates: int = 0) -> None:
+        self._values = torch.zeros(26 + rates, device=device)
         self.viewmat = self._values[:16].view(4, 4)
         self.intrinsics = self._values[16:25].view(3, 3)
         self.time = self._values[25:26]
+        self.rates = self._values[26:]
 
-    def set(self, camera: Camera, time: float) -> None:
+    def set(self, camera: Camera, time: float, rates: Sequence[float] = ()) -> None:
         """One launch, with the values in its arguments: nothing is copied from memory that could change meanwhile."""
-        values = [*camera.world_to_camera.ravel().tolist(), *camera.K.ravel().tolist(), time]
+        values = [*camera.world_to_camera.ravel().tolist(), *camera.K.ravel().tolist(), time, *rates]
         store_scalars_(self._values, values)
-
-
-class FrameStatus:
-    """How much room the last frame needed, copied to the host behind its launches and read when it has arrived."""
-
-    def __init__(self) -> None:
-        self._values = torch.zeros(4, dtype=torch.int32, pin_memory=True)
-        self._arrived = torch.cuda.Event()
-
-    def fetch(self, status: Tensor) -> None:
-        """Queue the copy of `status` behind what was launched."""
-        self._values.copy_(status, non_blocking=True)
-        self._arrived.record()
-
-    def wait(self) -> tuple[int, int]:
-        """Instances needed, and how many frames had to leave some out for want of room; waits for them."""
-        self._arrived.synchronize()
-        return int(self._values[STATUS_NEEDED]), int(self._values[STATUS_CUT])
 
 
 @dataclass(frozen=True)
@@ -127,17 +101,17 @@ class FrameRenderer:
             None if field is None else field.frame_deltas(self.gaussians, kept)
         )
         self._controls = FrameControls(gaussians.device)
-        self._status = FrameStatus()
+        self._status = StatusOnHost()
         self._memory = GraphMemory(gaussians.device)
         self._number = 0
         self._asked: tuple[Camera, float] | None = None
-        self._capacity = capacity_for(4 * gaussians.count)
+        self._room = ListRoom.at_first(gaussians.count, camera.width_px, camera.height_px)
         self._captured: CapturedSequence[Frame] | None = None
 
     @property
-    def capacity(self) -> int:
-        """Instances (a splat in a tile) that there is room for now."""
-        return self._capacity
+    def room(self) -> ListRoom:
+        """What there is room for now."""
+        return self._room
 
     def render(self, camera: Camera | None = None, time_s: float = 0.0) -> PendingFrame:
         """Queue the picture of `camera` at `time_s` on the current stream."""
@@ -158,12 +132,13 @@ class FrameRenderer:
         self._controls.set(*self._asked)
         if self._captured is None:
             self._captured = CapturedSequence(self._sequence, self.gaussians.device, self._memory, warm_up=True)
-        self._status.fetch(self._captured.replay().status)
+        self._captured.replay()
+        self._status.mark(self.gaussians.device)
 
     def _sequence(self) -> Frame:
         deltas = None if self._deltas is None else self._deltas(self._controls.time)
         scene = self.gaussians
-        return render_frame(
+        frame = render_frame(
             scene.means,
             scene.quats,
             scene.log_scales,
@@ -175,19 +150,20 @@ class FrameRenderer:
             self._background,
             self._camera.width_px,
             self._camera.height_px,
-            self._capacity,
+            self._room.capacity,
             camera_model=self._camera.model,
+            per_tile=self._room.per_tile,
         )
+        self._status.fetch(frame.status)
+        return frame
 
     def _finish(self, number: int) -> RenderOutput:
         if number != self._number:
             raise InvalidInput("this frame's memory was used for a later one; take result() before the next render()")
-        needed, cut = self._status.wait()
-        while cut:
-            self._capacity = capacity_for(needed)
+        while (needs := self._status.wait()).cut:
+            self._room = ListRoom.for_frame(needs.in_all, needs.in_a_tile)
             self._captured = None
             self._launch()
-            needed, cut = self._status.wait()
         assert self._captured is not None
         frame = self._captured.results
         return RenderOutput(frame.image[..., :3], frame.alphas, frame.image[..., 3])

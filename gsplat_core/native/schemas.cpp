@@ -75,8 +75,8 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_opacities, Tensor sh, Tensor? deltas, "
       "Tensor viewmat, Tensor K, Tensor? background, int width, int height, float eps2d, float near_plane, float far_plane, "
-      "int camera_model, int capacity, bool training) -> (Tensor image, Tensor alphas, Tensor last, Tensor records, "
-      "Tensor tile_offsets, Tensor sorted, Tensor splat_starts, Tensor instance_splats, Tensor status)");
+      "int camera_model, int capacity, bool per_tile, bool training) -> (Tensor image, Tensor alphas, Tensor last, "
+      "Tensor records, Tensor tile_offsets, Tensor sorted, Tensor splat_starts, Tensor instance_splats, Tensor status)");
   // The gradient of render_frame by what its forward pass left: of the raw parameters in one row per Gaussian (position 3,
   // rotation 4, log-scale 3, colour coefficient 3, opacity logit 1, 2 unused), and of sh where it has more than one basis.
   m.def(
@@ -94,6 +94,10 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor(j!) m_sh, Tensor(k!) v_means, Tensor(l!) v_quats, Tensor(m!) v_log_scales, Tensor(n!) v_logit_opacities, "
       "Tensor(o!) v_sh, Tensor rates, Tensor step, Tensor(p!) skipped, int width, int height, float eps2d, int camera_model, "
       "float beta1, float beta2, float epsilon, bool needs_raw, bool deterministic) -> Tensor v_raw");
+
+  // What a series of frames keeps of each one's status: the most of every word [4], but the sum of those that were cut. The step
+  // goes on by one unless this frame was cut; fits [1] is then 0, otherwise 1.
+  m.def("count_frame_(Tensor status, Tensor(a!) most, Tensor(b!) step) -> Tensor fits");
 
   // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
   // tau and the six rates (position, rotation, log-scale, colour, centres, widths) are float32 on the device of the field. Deltas
@@ -122,7 +126,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "frame_loss(Tensor image, Tensor alphas, Tensor target, Tensor? mask, Tensor? target_depth, float ssim_weight, "
       "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
 
-  // Writes up to 32 values, which travel with the launch.
+  // Writes up to 64 values, which travel with the launch.
   m.def("store_scalars_(Tensor(a!) to, float[] values) -> ()");
 
   // HexPlane features of one level: the product of six plane samples [N, C], its gradients, and the parts used for inference.

@@ -22,7 +22,7 @@ class FieldTraining(Protocol):
     """Whether what it adds depends on the canonical positions, which then get a gradient through it too."""
 
     def tensors(self) -> Sequence[Tensor]:
-        """Everything on the device that a step changes."""
+        """Everything on the device that a step changes. The same sequence again says that nothing of it was replaced."""
 
     def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor | None:
         """What the field adds at the time that the device scalar holds: [N, 16], the frame path's layout; None: nothing."""

@@ -9,13 +9,14 @@ from torch import Tensor
 
 from gsplat_core.cameras import Camera
 from gsplat_core.captured import CapturedSequence, GraphMemory
-from gsplat_core.frame_renderer import FrameControls, FrameStatus, capacity_for
+from gsplat_core.frame_renderer import FrameControls
 from gsplat_core.gaussians import Gaussians
+from gsplat_core.list_room import StatusOnHost, capacity_for
 from gsplat_core.ops.adam.adam import adam_step_at_
-from gsplat_core.ops.frame.frame import STATUS_CUT, render_frame
+from gsplat_core.ops.frame.frame import render_frame
+from gsplat_core.ops.frame.frame_count import count_frame_
 from gsplat_core.ops.frame.frame_gradients import render_frame_backward_adam_
 from gsplat_core.ops.image_loss.frame_loss import frame_loss
-from gsplat_core.ops.scalars.scalars import store_scalars_
 from gsplat_core.training.field_training import FieldTraining
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
@@ -40,6 +41,8 @@ class FusedStep:
     ) -> None:
         device = gaussians.device
         self._gaussians, self._field, self._adam = gaussians, field, adam
+        self._field_tensors: Sequence[Tensor] = ()
+        self._field_places: tuple[int, ...] = ()
         self._recorded: tuple[int, ...] = ()
         """Where the tensors were when the graph was recorded."""
         self._weights = weights
@@ -48,14 +51,14 @@ class FusedStep:
         self._image = torch.zeros(*shape, 3, dtype=torch.uint8, device=device)
         self._mask = torch.ones(shape, dtype=torch.uint8, device=device)
         self._depth = torch.zeros(shape, device=device) if weights.depth > 0 else None
-        self._controls = FrameControls(device)
-        self._rates = torch.zeros(len(GAUSSIAN_TENSORS) + 1 + field.rates, device=device)
-        """Of the Gaussians in the frame's pass, of the positions behind it, of the field."""
+        self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + 1 + field.rates)
+        """With the rates of the Gaussians in the frame's pass, of the positions behind it, of the field."""
         self._step = torch.full((1,), adam.steps, dtype=torch.int64, device=device)
         self._skipped = torch.zeros(len(GAUSSIAN_TENSORS), dtype=torch.int64, device=device)
         self._most = torch.zeros(4, dtype=torch.int32, device=device)
         """The frames' status since the last `settle`: the largest of each value, but the sum of those that were cut."""
-        self._status = FrameStatus()
+        self._unread: tuple[Tensor, Tensor] | None = None
+        self._status = StatusOnHost()
         self._memory = GraphMemory(device)
         self._capacity = capacity_for(4 * gaussians.count)
         self._captured: CapturedSequence[Tensor] | None = None
@@ -85,10 +88,9 @@ class FusedStep:
                 self._depth.zero_()  # unknown everywhere: the term is 0
             else:
                 self._depth.copy_(observation.depth, non_blocking=True)
-        self._controls.set(observation.camera, time)
         rates = [gaussian_rates[name] for name in GAUSSIAN_TENSORS]
         in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
-        store_scalars_(self._rates, [*in_frame, rates[0], *field_rates])
+        self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates])
         self._gaussians = gaussians
         self._adam.steps += 1
         if not self._warm:  # kernels are loaded by their first launch, which a recording does not allow
@@ -107,21 +109,24 @@ class FusedStep:
         There is room for them now: take them again.
         """
         self._status.fetch(self._most)
-        needed, lost = self._status.wait()
+        self._status.mark(self._most.device)
+        needs = self._status.wait()
         self._most.zero_()
-        if lost:
-            self._adam.steps -= lost
-            self._capacity = capacity_for(needed)
+        if needs.cut:
+            self._adam.steps -= needs.cut
+            self._capacity = capacity_for(needs.in_all)
             self._captured = None
-        return lost
+        return needs.cut
 
     def _places(self) -> tuple[int, ...]:
         moments = (*self._adam.first_moments.values(), *self._adam.second_moments.values())
-        tensors = (*self._gaussians.tensors().values(), *moments, *self._field.tensors())
-        return tuple(number for tensor in tensors for number in (tensor.data_ptr(), tensor.numel()))
+        of_field = self._field.tensors()
+        if of_field is not self._field_tensors:  # a field has many: those that stay the same are not asked again
+            self._field_tensors, self._field_places = of_field, _places_of(of_field)
+        return *_places_of((*self._gaussians.tensors().values(), *moments)), *self._field_places
 
     def _sequence(self) -> Tensor:
-        in_frame, of_means, of_field = self._rates.split([len(GAUSSIAN_TENSORS), 1, self._field.rates])
+        in_frame, of_means, of_field = self._controls.rates.split([len(GAUSSIAN_TENSORS), 1, self._field.rates])
         scene, controls = self._gaussians, self._controls
         gaussians = tuple(scene.tensors().values())
         deltas = self._field.deltas(scene, controls.time)
@@ -134,8 +139,7 @@ class FusedStep:
         loss = frame_loss(
             frame.image, frame.alphas, self._image, self._mask, self._depth, self._weights.ssim, self._weights.depth
         )
-        fits = 1 - frame.status[STATUS_CUT : STATUS_CUT + 1]
-        self._step.add_(fits)
+        fits = count_frame_(frame.status, self._most, self._step)
         gradient = render_frame_backward_adam_(
             gaussians, *self._moments(), in_frame, self._step, self._skipped, deltas, viewmat, intrinsics, None, frame,
             loss.grad_image, loss.grad_alphas, camera_model=model, betas=self._adam.betas, epsilon=self._adam.epsilon,
@@ -144,18 +148,17 @@ class FusedStep:
         self._field.update(gradient, controls.time, of_field, self._step, frame.status)
         if self._field.reads_positions:
             self._move(scene.means, gradient, of_means, fits)
-        cut_so_far = self._most[STATUS_CUT] + frame.status[STATUS_CUT]
-        torch.maximum(self._most, frame.status, out=self._most)
-        self._most[STATUS_CUT] = cut_so_far
         return loss.loss
 
     def _moments(self) -> tuple[list[Tensor], list[Tensor]]:
         """Adam's moments of the Gaussians in the frame's pass. Where the field has a part in the positions' gradient, they do not move
-        there: their rate is 0, and the moments are not theirs."""
+        there: their rate is 0, and the moments are others that nobody reads."""
         first = [self._adam.first_moments[name] for name in GAUSSIAN_TENSORS]
         second = [self._adam.second_moments[name] for name in GAUSSIAN_TENSORS]
         if self._field.reads_positions:
-            first[0], second[0] = torch.zeros_like(first[0]), torch.zeros_like(second[0])
+            if self._unread is None or self._unread[0].shape != first[0].shape:
+                self._unread = torch.zeros_like(first[0]), torch.zeros_like(second[0])
+            first[0], second[0] = self._unread
         return first, second
 
     def _move(self, means: Tensor, gradient: Tensor, rate: Tensor, fits: Tensor) -> None:
@@ -167,3 +170,7 @@ class FusedStep:
             means, complete, first, second, rate, self._step, self._skipped[:1], *self._adam.betas,
             self._adam.epsilon, row_size=3,
         )  # fmt: skip
+
+
+def _places_of(tensors: Sequence[Tensor]) -> tuple[int, ...]:
+    return tuple(number for tensor in tensors for number in (tensor.data_ptr(), tensor.numel()))

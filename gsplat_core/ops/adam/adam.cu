@@ -3,8 +3,9 @@
 
 namespace {
 
-constexpr int kMostRows = 1024;           // of a block
-constexpr int64_t kChunk = 4 * kThreads;  // values of a block, unless a row is longer
+constexpr int kMostRows = 1024;            // of a block
+constexpr int64_t kChunk = 4 * kThreads;   // values of a block, unless a row is longer
+constexpr int64_t kFew = 1024 * kThreads;  // up to so many values, a block has one for each thread: more blocks wait at once
 
 // The step as it is told by the host.
 __device__ __forceinline__ AdamStep step_of(const AdamStep& told) { return told; }
@@ -55,7 +56,8 @@ __global__ void __launch_bounds__(kThreads)
 template <class Step>
 void launch(float* p, const float* g, float* m, float* v, int64_t rows, const Step& step, int64_t* skipped, cudaStream_t stream) {
   if (rows == 0) return;
-  const int64_t fit = kChunk / step.row_size, per_block = fit < 1 ? 1 : fit < kMostRows ? fit : kMostRows;
+  const int64_t fit = (rows * step.row_size <= kFew ? kThreads : kChunk) / step.row_size;
+  const int64_t per_block = fit < 1 ? 1 : fit < kMostRows ? fit : kMostRows;
   adam_rows<<<blocks_for(rows, per_block), kThreads, 0, stream>>>(p, g, m, v, rows, int(per_block), step,
                                                                   reinterpret_cast<unsigned long long*>(skipped));
 }

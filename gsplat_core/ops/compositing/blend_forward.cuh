@@ -1,8 +1,6 @@
 // Front-to-back blending of one window by one block of kBlockThreads threads.
 #pragma once
 
-#include <type_traits>
-
 #include "blended_pixels.cuh"
 
 namespace {
@@ -48,18 +46,15 @@ __device__ inline int list_hits(const uint4* reached, const StagedSplat<D>* spla
 }
 
 // `fetch(position)` gives the splat at a position in [w.begin, w.end), which are in the order of depth. kCapped: there may be
-// splats with a finite `cap` (an indefinite conic). kLast: `last` is wanted. kHalf: blend in half precision, without either; the
-// last channel must be the depth, or at least not larger than that of the window's last splat. All threads of the block take
-// part.
-template <int D, bool kCapped, bool kLast = true, bool kHalf = false, class Fetch>
+// splats with a finite `cap` (an indefinite conic). kLast: `last` is wanted. All threads of the block take part.
+template <int D, bool kCapped, bool kLast = true, class Fetch>
 __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& fetch, ForwardStage<D>& stage) {
-  static_assert(!kHalf || (!kCapped && !kLast));
   constexpr int kBatch = kForwardBatch;
   constexpr uint32_t kNone = ~0u;
   const int lane = threadIdx.x & 31, warp = threadIdx.x / 32, first_part = warp / 2 * 4 + warp % 2;
   const uint4* const hits = stage.hits[2 * warp + lane / 16];
   const float middle_x = float(w.left + kQuadrant), middle_y = float(w.top + kQuadrant), x = float(w.x) + 0.5f - middle_x;
-  std::conditional_t<kHalf, HalfPixels<D>, FloatPixels<D, kCapped, kLast>> pixels(w);
+  FloatPixels<D, kCapped, kLast> pixels(w);
   BlendedPixels<D> out;
   float y[kPixelsEach];
   for (int p = 0; p < kPixelsEach; ++p) {
@@ -67,11 +62,6 @@ __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& f
     out.last[p] = -1;
   }
 
-  float unit = 1;  // of the last channel: half precision ends at 65,504
-  if constexpr (kHalf) {
-    const float deepest = w.end > w.begin ? fetch(w.end - 1).colors[D - 1] : 0;
-    unit = deepest > 0 ? deepest : 1;
-  }
   const auto fetch_ahead = [&](int left) {  // this thread's splat in the batch that has `left` more and what follows it
     return int(threadIdx.x) < left ? fetch(w.end - left + int(threadIdx.x)) : faint_record<D>();
   };
@@ -79,8 +69,6 @@ __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& f
   Record<D> next = fetch_ahead(w.end - w.begin);
   int now = 0;
   for (int left = w.end - w.begin; left > 0; left -= kBatch, now ^= 1) {
-    if constexpr (kHalf)
-      for (int d = 0; d < D; ++d) next.colors[d] = pixels.both(d + 1 < D ? next.colors[d] : next.colors[d] / unit);
     put_staged<kQuadrant / 2>(int(threadIdx.x), 32 * warp < left, next, w, stage.splats[now], stage.reached[now]);
     bool warp_open = __any_sync(kAll, pixels.open());
     if (!__syncthreads_or(warp_open)) break;
@@ -105,8 +93,6 @@ __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& f
         out.last[p] = w.end - left + int((pixels.last[p] - shared_address(stage.splats[now])) / sizeof(StagedSplat<D>));
   }
   pixels.finish(out);
-  if constexpr (kHalf)
-    for (int p = 0; p < kPixelsEach; ++p) out.sum[p][D - 1] *= unit;
   return out;
 }
 

@@ -19,13 +19,14 @@ __device__ constexpr int row_of_lane(int lane, int p) { return lane / 16 * 4 + l
 struct Window {
   int begin, end;
   int left, top;               // first pixel of the window
+  int right, bottom;           // behind its last pixel in the picture
   int quadrant_x, quadrant_y;  // first pixel of the warp's quadrant
   int x, y[kPixelsEach];       // this thread's pixels
   bool inside[kPixelsEach];
 
   // The window starts at pixel (left, top); pixels at or beyond (right, bottom) are outside.
-  __device__ Window(int begin_, int end_, int left_, int top_, int right, int bottom)
-      : begin(begin_), end(end_), left(left_), top(top_) {
+  __device__ Window(int begin_, int end_, int left_, int top_, int right_, int bottom_)
+      : begin(begin_), end(end_), left(left_), top(top_), right(right_), bottom(bottom_) {
     const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
     quadrant_x = left + warp % 2 * kQuadrant;
     quadrant_y = top + warp / 2 * kQuadrant;

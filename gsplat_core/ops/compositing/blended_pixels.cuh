@@ -1,8 +1,6 @@
 // Front-to-back blending of a lane's two pixels.
 #pragma once
 
-#include <cuda_fp16.h>
-
 #include "staged_splats.cuh"
 
 namespace {
@@ -48,45 +46,6 @@ struct FloatPixels {
       out.through[p] = through[p];
       for (int d = 0; d < D; ++d) out.sum[p][d] = 0.99f * sum[p][d];
     }
-  }
-};
-
-// The same in half precision, both pixels in one instruction, from the weight on; without `last`. The sums lose about three
-// decimals of float32. A splat's colours are pairs of halves.
-template <int D>
-struct HalfPixels {
-  half2 front, weights, sum[D];
-  uint32_t last[kPixelsEach];
-
-  __device__ explicit HalfPixels(const Window& w) {
-    front = __floats2half2_rn(w.inside[0] ? 1 : 0, w.inside[1] ? 1 : 0);
-    weights = __float2half2_rn(0);
-    for (int d = 0; d < D; ++d) sum[d] = __float2half2_rn(0);
-  }
-  __device__ bool open() const { return __low2float(front) > kStop || __high2float(front) > kStop; }
-  __device__ void blend(const StagedSplat<D>& r, const float (&power)[kPixelsEach], uint32_t) {
-    const half2 alpha = __floats2half2_rn(exp2_fast(power[0]), exp2_fast(power[1]));  // of 1 / 0.99
-    const half2 drawn = __hge2(alpha, __float2half2_rn(1 / (0.99f * 255)));
-    const half2 weight = __hmul2(__hmul2_sat(alpha, drawn), front);
-    front = __hfma2(weight, __float2half2_rn(-0.99f), front);
-    const half2 shown = __hmul2(weight, __hgt2(front, __float2half2_rn(kStop)));
-    weights = __hadd2(weights, shown);
-#pragma unroll
-    for (int d = 0; d < D; ++d) sum[d] = __hfma2(shown, pair(r.colors[d]), sum[d]);
-  }
-  __device__ void finish(BlendedPixels<D>& out) const {
-    out.through[0] = fmaf(-0.99f, __low2float(weights), 1.0f);
-    out.through[1] = fmaf(-0.99f, __high2float(weights), 1.0f);
-    for (int d = 0; d < D; ++d) {
-      out.sum[0][d] = 0.99f * __low2float(sum[d]);
-      out.sum[1][d] = 0.99f * __high2float(sum[d]);
-    }
-  }
-
-  __device__ static half2 pair(float bits) { return reinterpret_cast<const half2&>(bits); }
-  __device__ static float both(float value) {
-    const half2 pair = __float2half2_rn(value);
-    return reinterpret_cast<const float&>(pair);
   }
 };
 

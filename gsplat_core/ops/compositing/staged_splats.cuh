@@ -69,31 +69,36 @@ __device__ inline float sqrt_fast(float x) {
 // In which parts of the window the contour alpha = 1/255 may reach a pixel centre; the parts are 8 pixels wide and `kRows` high,
 // numbered from left to right and downwards. (x, y) is the first pixel centre of the window. The ellipse's part in a part's rows
 // reaches in x from the left to the right solution of a dx^2 + 2 b dx dy + c dy^2 = k at the dy of those rows that is nearest to
-// the outermost point; never less than that, for a splat left out would be missing in the image.
+// the outermost point; never less than that, for a splat left out would be missing in the image. Where it does not come to these
+// rows, the solutions are NaN, and compare as false.
+//
+// Each of a warp's threads has a splat, if `shown`. Lane i is told which of them reach part i.
 template <int kRows, int D>
-__device__ inline unsigned parts_reached(const Record<D>& r, float x, float y) {
-  constexpr int kBands = 2 * kQuadrant / kRows;
+__device__ inline unsigned reaching_part(bool shown, const Record<D>& r, float x, float y) {
   constexpr float kBeside = 2e-3f;            // pixels, against rounding
   const float k = r.l + (2e-3f - kFaintest);  // a little outside of the contour, likewise
-  if (!(k >= 0)) return 0;
   const float a = -r.xyab.z, b = -0.5f * r.xyab.w, c = -r.c, ux = r.xyab.x - x, uy = r.xyab.y - y;
   const float ac = a * c, det = fmaf(-b, b, ac) - ac * 5e-7f;
   const float top = -b * sqrt_fast(k * reciprocal(c * det));
-  if (!(a > 0 && c > 0 && det > ac * 1e-6f && fabsf(top) <= 1e30f)) return (1u << 2 * kBands) - 1;  // no proper ellipse
   const float inverse = reciprocal(a), slope = -b * inverse, offset = k * inverse, curve = det * inverse * inverse;
-  unsigned reached = 0;
+  const bool proper = a > 0 && c > 0 && det > ac * 1e-6f && fabsf(top) <= 1e30f;
+  const int lane = threadIdx.x & 31;
+  shown = shown && k >= 0;
+  unsigned mine = 0;
 #pragma unroll
-  for (int band = 0; band < kBands; ++band) {
+  for (int band = 0; band < 2 * kQuadrant / kRows; ++band) {
     const float low = float(band * kRows) - uy, high = low + float(kRows - 1);
     const float at_right = fminf(fmaxf(top, low), high), at_left = fminf(fmaxf(-top, low), high);
-    const float right_square = fmaf(-curve * at_right, at_right, offset), left_square = fmaf(-curve * at_left, at_left, offset);
-    const bool rows = fminf(right_square, left_square) >= 0;
-    const float right = fmaf(slope, at_right, ux) + sqrt_fast(right_square) + kBeside;
-    const float left = fmaf(slope, at_left, ux) - sqrt_fast(left_square) - kBeside;
-    if (rows && right >= 0 && left <= float(kQuadrant - 1)) reached |= 1u << (2 * band);
-    if (rows && right >= float(kQuadrant) && left <= float(2 * kQuadrant - 1)) reached |= 2u << (2 * band);
+    const float right = fmaf(slope, at_right, ux + kBeside) + sqrt_fast(fmaf(-curve * at_right, at_right, offset));
+    const float left = fmaf(slope, at_left, ux - kBeside) - sqrt_fast(fmaf(-curve * at_left, at_left, offset));
+#pragma unroll
+    for (int column = 0; column < 2; ++column) {
+      const float first = float(column * kQuadrant), last = float(column * kQuadrant + kQuadrant - 1);
+      const unsigned reaching = __ballot_sync(kAll, shown && right >= first && left <= last);
+      if (lane == 2 * band + column) mine = reaching;
+    }
   }
-  return reached;
+  return mine | __ballot_sync(kAll, shown && !proper);
 }
 
 // Prepares splat i of a batch, i being the thread's lane in a group of 32, and notes, by part of the window, which of the batch's
@@ -101,19 +106,13 @@ __device__ inline unsigned parts_reached(const Record<D>& r, float x, float y) {
 template <int kRows, int D>
 __device__ inline void put_staged(int i, bool any, const Record<D>& r, const Window& w, StagedSplat<D>* splats,
                                   uint4* reached_by_part) {
-  constexpr int kParts = 4 * kQuadrant / kRows;
   const int lane = threadIdx.x & 31;
-  unsigned mine = 0;
+  unsigned reaching = 0;
   if (any) {
     splats[i] = staged(r, float(w.left + kQuadrant), float(w.top + kQuadrant));
-    const unsigned reached = parts_reached<kRows>(r, float(w.left) + 0.5f, float(w.top) + 0.5f);
-#pragma unroll
-    for (int part = 0; part < kParts; ++part) {
-      const unsigned bits = __ballot_sync(kAll, reached >> part & 1);
-      mine = lane == part ? bits : mine;
-    }
+    reaching = reaching_part<kRows>(true, r, float(w.left) + 0.5f, float(w.top) + 0.5f);
   }
-  if (lane < kParts) reinterpret_cast<unsigned*>(&reached_by_part[lane])[i / 32] = mine;
+  if (lane < 4 * kQuadrant / kRows) reinterpret_cast<unsigned*>(&reached_by_part[lane])[i / 32] = reaching;
 }
 
 }  // namespace

@@ -20,7 +20,7 @@ def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]
     ctx.mark_non_differentiable(last, *lists)
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(*inputs[:TENSORS], alphas, last, *lists)
-    ctx.width, ctx.height, ctx.eps2d, _, _, ctx.camera_model, _, ctx.training = inputs[TENSORS:]
+    ctx.width, ctx.height, ctx.eps2d, _, _, ctx.camera_model, _, _, ctx.training = inputs[TENSORS:]
 
 
 def _backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: Any) -> tuple[Tensor | None, ...]:
@@ -40,7 +40,7 @@ def _backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: Any
     # Copies: autograd may add to what it was given, and these would share their memory.
     columns = raw[:, :3], raw[:, 3:7], raw[:, 7:10], raw[:, 13], raw[:, None, DC] if inputs[4].shape[1] == 1 else sh
     own = [column.clone() if needed else None for column, needed in zip(columns, ctx.needs_input_grad, strict=False)]
-    return (*own, raw if ctx.needs_input_grad[5] else None, *[None] * 11)
+    return (*own, raw if ctx.needs_input_grad[5] else None, *[None] * 12)
 
 
 torch.library.register_autograd("gsplat_core::render_frame", _backward, setup_context=_setup_context)

@@ -1,7 +1,8 @@
 // The fused frame path on CUDA: what the ops' host code asks of the kernels. All pointers are to device memory.
 //
 // Raw Gaussians become a picture in four launches, without a wait of the host: preprocess (deform, activate, project, colour,
-// count tiles), scan, fill (one key per splat and tile), and per tile sort and blend. The gradient takes two: per tile one row
+// count tiles), scan, fill (one key per splat and tile), and per tile sort and blend. Where every tile has a room of its own for
+// its list, preprocess writes the lists at once, and it takes two launches. The gradient takes two: per tile one row
 // per instance, then per splat the sum of its rows and the way back to the raw parameters. Instances of a splat are numbered in
 // the order of the splats, so a splat's rows lie together and every sum has one fixed order.
 #pragma once
@@ -17,6 +18,8 @@ constexpr int kRowQuads = 3;        // float4s of an instance's gradient row: 6 
 constexpr int kStatusNeeded = 0;    // instances that the frame needs
 constexpr int kStatusMost = 1;      // most instances in one tile
 constexpr int kStatusCut = 2;       // 1 where they did not fit and some were left out
+constexpr int kStatusWords = 4;
+constexpr int kMostInTile = 1024;  // for which tiles can have rooms of their own
 constexpr int kMostTilesAcross = 1 << 13;
 
 // One camera's view of N Gaussians.
@@ -37,24 +40,30 @@ struct FrameScene {
   constexpr int64_t tiles() const { return int64_t(tile_width) * tile_height; }
 };
 
+// All tiles' lists behind each other in one room, of splats or, when training, of instances; or each in a room of its own.
+enum ListKind { kShared, kTraining, kPerTile };
+
 // What the forward pass leaves behind: records, and for every tile its instances in depth order. A list that was cut may hold
 // -1: no instance.
 struct FrameLists {
-  void* records;             // Record<4> [N]: colours are red, green, blue, z; of culled Gaussians not written
-  int32_t* tile_offsets;     // [tiles + 1]
-  uint64_t* keys;            // [capacity], scratch: depth bits << 32 | splat, or instance when training
+  void* records;                    // Record<4> [N]: colours are red, green, blue, z; of culled Gaussians not written
+  int32_t* tile_offsets = nullptr;  // [tiles + 1]; null where tiles have rooms of their own
+  uint64_t* keys = nullptr;  // [capacity], scratch: depth bits << 32 | splat, or instance when training; [tiles, tile_capacity]
   int32_t* sorted;           // [capacity], training: instances by tile and depth
   int32_t* splat_starts;     // [N + 1], training: where each splat's instances start; otherwise null
   int32_t* instance_splats;  // [capacity], training: the splat of every instance
-  int32_t* status;           // [4]
+  int32_t* status;           // [kStatusWords]
   int64_t capacity;
+  int32_t tile_capacity = 0;  // 0: lists of any length, in one room
+
+  constexpr ListKind kind() const { return splat_starts != nullptr ? kTraining : tile_capacity > 0 ? kPerTile : kShared; }
 };
 
-// On the way from one kernel to the next. Preprocess counts a tile's instances in the tile's slot; the scan puts there where they
-// start, and the fill counts on from there. Slots lie apart, because atomics on words of the same 32 or 128 bytes wait for each
-// other.
+// On the way from one kernel to the next. Preprocess counts a tile's instances in the tile's slot; where tiles have no rooms of
+// their own, the scan puts there where they start, and the fill counts on from there. Slots lie apart, because atomics on words
+// of the same 32 or 128 bytes wait for each other.
 struct FrameScratch {
-  uint2* footprints;  // [N], see frame_footprint.cuh
+  uint2* footprints;  // [N], see frame_footprint.cuh; like depths null where tiles have rooms of their own
   uint32_t* depths;   // [N], z of visible Gaussians as bits
   uint32_t* slots;    // [tiles, slot_stride], zero before
   uint64_t* states;   // [scan_states], zero before
@@ -74,4 +83,5 @@ struct FramePixels {
 void preprocess_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
 void scan_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
 void fill_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, cudaStream_t stream);
-void blend_frame(const FrameScene& in, const FrameLists& lists, const FramePixels& out, cudaStream_t stream);
+void blend_frame(const FrameScene& in, const FrameLists& lists, const FrameScratch& scratch, const FramePixels& out,
+                 cudaStream_t stream);

@@ -32,8 +32,13 @@ struct FramePass {
         v_image(floats(inputs, v_image_in, 4 * pixels(inputs), "v_image")) {
     if (v_alphas_in) v_alphas = floats(inputs, *v_alphas_in, pixels(inputs), "v_alphas");
     const auto pointer = [](const Tensor& t) { return const_cast<int32_t*>(t.const_data_ptr<int32_t>()); };
-    lists = {const_cast<float*>(data(records)), pointer(tile_offsets), nullptr,       pointer(sorted), pointer(splat_starts),
-             pointer(instance_splats),          pointer(status),       sorted.numel()};
+    lists = {.records = const_cast<float*>(data(records)),
+             .tile_offsets = pointer(tile_offsets),
+             .sorted = pointer(sorted),
+             .splat_starts = pointer(splat_starts),
+             .instance_splats = pointer(instance_splats),
+             .status = pointer(status),
+             .capacity = sorted.numel()};
     from = {data(v_image),
             v_alphas ? data(*v_alphas) : nullptr,
             data(alphas),

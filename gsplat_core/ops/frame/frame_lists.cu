@@ -76,19 +76,15 @@ __global__ void __launch_bounds__(kScanThreads) scan(FrameLists lists, Counts ti
   lists.status[kStatusCut + 1] = 0;
 }
 
-constexpr int kAtOnce = 4;  // reservations of a thread that are on their way together
-
 // One key per splat and tile, in any order within the tile: sorting puts them into the one that they have every time.
 template <bool training>
 __global__ void __launch_bounds__(kFrameThreads) fill(FrameScene in, FrameLists lists, FrameScratch scratch) {
   let_kernel_behind_come();
   wait_for_kernel_in_front();
-  __shared__ uint32_t touched[kFrameThreads / 32][32 * 32];  // by each warp's small splats: lane << 26 | tile
+  __shared__ uint32_t touched[kFrameThreads / 32][kMostSmall];
   const int64_t n = int64_t(blockIdx.x) * kFrameThreads + threadIdx.x;
-  const int lane = threadIdx.x & 31;
   const Footprint footprint = load_footprint(in, scratch, n);
   const uint32_t depth = footprint.y != 0 ? scratch.depths[n] : 0;
-  const int small = footprint.small_count();
   uint32_t start = 0;
   if constexpr (training) {
     __shared__ uint32_t of_warps[32];
@@ -96,33 +92,9 @@ __global__ void __launch_bounds__(kFrameThreads) fill(FrameScene in, FrameLists 
     start = add(scratch.starts[blockIdx.x], sum_over_block(tiles, of_warps).before);
     store_start(in, lists, n, start, add(start, tiles));
   }
-  const auto reserve = [&](int tile) { return atomicAdd(scratch.slots + tile * scratch.slot_stride, 1u); };
-
-  // A splat has one tile or thirty: the warp's are written down first and then dealt out evenly.
-  const int through = int(sum_up_to_lane(uint32_t(small))), first = through - small, all = __shfl_sync(kAll, through, 31);
-  uint32_t* const list = touched[threadIdx.x / 32];
-  for_small_tiles(footprint, in.tile_width, [&](int tile, int j) { list[first + j] = uint32_t(lane) << 26 | uint32_t(tile); });
-  __syncwarp();
-  for (int from = 0; from < all; from += 32 * kAtOnce) {
-    uint32_t position[kAtOnce];
-    int owner[kAtOnce];
-#pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) {
-      const int i = from + 32 * k + lane;
-      const uint32_t entry = i < all ? list[i] : 0;
-      owner[k] = int(entry >> 26);
-      if (i < all) position[k] = reserve(int(entry & 0x3ffffff));
-    }
-#pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) {
-      const int i = from + 32 * k + lane;
-      const uint32_t its_depth = __shfl_sync(kAll, depth, owner[k]);
-      const uint32_t instance = __shfl_sync(kAll, start - uint32_t(first), owner[k]) + uint32_t(i);
-      if (i < all) put_key<training>(lists, position[k], its_depth, n - lane + owner[k], instance);
-    }
-  }
-
-  put_large<training>(in, lists, footprint, n, depth, start, reserve);
+  constexpr ListKind kind = training ? kTraining : kShared;
+  put_small<kind>(in, lists, scratch, footprint, n, depth, start, touched[threadIdx.x / 32]);
+  put_large<kind>(in, lists, scratch, footprint, n, depth, start);
 }
 
 __global__ void no_splats(int32_t* splat_starts) { splat_starts[0] = 0; }

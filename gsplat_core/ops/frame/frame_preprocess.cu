@@ -4,7 +4,6 @@
 #include "frame_emit.cuh"
 #include "frame_gaussian.cuh"
 #include "frame_launch.cuh"
-#include "frame_sums.cuh"
 
 using namespace GSPLAT_ISA;
 
@@ -89,14 +88,22 @@ __device__ inline Projected project_with(const FrameScene& in, const ProjectionI
 
 constexpr float kConstantBase = 0.28209479177387814f;
 
+// A warp's shared memory: the coefficients, and once the colours are known what its small splats touch.
+template <int degree, class Coefficient>
+union WarpRoom {
+  StagedHarmonics<degree, Coefficient> harmonics;
+  uint32_t touched[kMostSmall];
+};
+
 template <int degree, class Coefficient>
 __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
     preprocess(FrameScene in, FrameLists lists, FrameScratch scratch) {
   let_kernel_behind_come();
   __shared__ FrameCamera camera;
-  __shared__ StagedHarmonics<degree, Coefficient> harmonics[kFrameThreads / 32];
+  __shared__ WarpRoom<degree, Coefficient> rooms[kFrameThreads / 32];
   const int64_t n = int64_t(blockIdx.x) * kFrameThreads + threadIdx.x;
-  const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
+  const int lane = threadIdx.x & 31;
+  WarpRoom<degree, Coefficient>& room = rooms[threadIdx.x / 32];
   Record<4>* const records = static_cast<Record<4>*>(lists.records);
   const Coefficient* const sh = reinterpret_cast<const Coefficient*>(in.sh);
 
@@ -113,8 +120,8 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
   }
   const unsigned shown = __ballot_sync(kAll, p.valid);
   if constexpr (degree > 0)
-    harmonics[warp].load(sh + (n - lane) * StagedHarmonics<degree, Coefficient>::kRow, shown,
-                         in.aligned);  // on their way meanwhile
+    room.harmonics.load(sh + (n - lane) * StagedHarmonics<degree, Coefficient>::kRow, shown,
+                        in.aligned);  // on their way meanwhile
 
   Record<4> r = {};
   Footprint footprint = {0, 0};
@@ -133,7 +140,7 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
     for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, g.color[j], 0.5f);
     if constexpr (degree > 0) {
       unit_direction(camera, g.mean, direction);
-      harmonics[warp].color_at(direction, color);
+      room.harmonics.color_at(direction, color);
     } else {
       for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, to_float(sh[3 * n + j]), color[j]);
     }
@@ -141,13 +148,24 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 8 : 5)
       for (int j = 0; j < 3; ++j) r.colors[j] = fmaxf(color[j], 0.0f);
       r.colors[3] = p.depth;
       records[n] = r;
-      scratch.depths[n] = __float_as_uint(p.depth);
     } else {
       footprint = {0, 0};
     }
   }
-  if (n < in.count) scratch.footprints[n] = make_uint2(footprint.x, footprint.y);
-
+  const uint32_t depth = footprint.y != 0 ? __float_as_uint(p.depth) : 0;
+  if (lists.tile_capacity > 0) {
+    // Every tile has a room of its own: the lists can be written before their lengths are known.
+    if (n == 0)
+      for (int i = 0; i < kStatusWords; ++i) lists.status[i] = 0;  // to which the tiles will add
+    __syncwarp();                                                  // the records are written, the coefficients read
+    put_small<kPerTile>(in, lists, scratch, footprint, n, depth, 0, room.touched);
+    put_large<kPerTile>(in, lists, scratch, footprint, n, depth, 0);
+    return;
+  }
+  if (n < in.count) {
+    scratch.footprints[n] = make_uint2(footprint.x, footprint.y);
+    if (footprint.y != 0) scratch.depths[n] = depth;
+  }
   const auto count = [&](int tile, int) { atomicAdd(scratch.slots + tile * scratch.slot_stride, 1u); };
   for_small_tiles(footprint, in.tile_width, count);
   uint32_t tiles = uint32_t(footprint.small_count());

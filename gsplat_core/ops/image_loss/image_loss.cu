@@ -24,6 +24,9 @@ __device__ inline bool knows_depth(const DeviceImageLoss& in, int64_t pixel, flo
 }
 
 __global__ void __launch_bounds__(kThreads) count_pixels(DeviceImageLoss in, int64_t* counts) {
+  __shared__ int totals[kCounts];
+  if (threadIdx.x < kCounts) totals[threadIdx.x] = 0;
+  __syncthreads();
   int tissue = 0, known = 0;
   for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < in.pixels; i += int64_t(gridDim.x) * kThreads) {
     tissue += is_tissue(in, i);
@@ -31,11 +34,14 @@ __global__ void __launch_bounds__(kThreads) count_pixels(DeviceImageLoss in, int
   }
   tissue = __reduce_add_sync(0xffffffffu, tissue);
   known = __reduce_add_sync(0xffffffffu, known);
-  if (threadIdx.x % 32 != 0) return;
-  // Whole numbers: their sum does not depend on the order.
-  auto* const to = reinterpret_cast<unsigned long long*>(counts);
-  atomicAdd(to + kTissue, static_cast<unsigned long long>(tissue));
-  atomicAdd(to + kKnownDepth, static_cast<unsigned long long>(known));
+  // Whole numbers: their sum does not depend on the order. Warps meet in their block first, for all blocks meet in one place.
+  if (threadIdx.x % 32 == 0) {
+    atomicAdd(totals + kTissue, tissue);
+    atomicAdd(totals + kKnownDepth, known);
+  }
+  __syncthreads();
+  if (threadIdx.x < kCounts && totals[threadIdx.x] > 0)
+    atomicAdd(reinterpret_cast<unsigned long long*>(counts) + threadIdx.x, static_cast<unsigned long long>(totals[threadIdx.x]));
 }
 
 __device__ inline double warp_total(double value) {

@@ -11,11 +11,11 @@ from gsplat_core.argument_checks import require_float32
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 
-MOST_SCALARS = 32
+MOST_SCALARS = 64
 
 
 def store_scalars_(to: Tensor, values: Sequence[float]) -> None:
-    """Write `values`, at most 32, into `to`: float32, contiguous, as many elements.
+    """Write `values`, at most 64, into `to`: float32, contiguous, as many elements.
 
     On CUDA they travel in the arguments of a launch on the current stream, so that the host neither waits nor keeps them.
 

@@ -3,7 +3,7 @@
 
 #include <cuda_runtime.h>
 
-constexpr int kMostScalars = 32;
+constexpr int kMostScalars = 64;
 
 struct DeviceScalars {
   float values[kMostScalars];

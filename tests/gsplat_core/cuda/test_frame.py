@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core import InvalidInput, rasterization, reference
-from gsplat_core.ops.frame.frame import STATUS_CUT, STATUS_MOST, STATUS_NEEDED, Frame, render_frame
+from gsplat_core.ops.frame.frame import MOST_IN_TILE, STATUS_CUT, STATUS_MOST, STATUS_NEEDED, Frame, render_frame
 
 pytestmark = pytest.mark.cuda
 
@@ -96,11 +96,15 @@ def assert_near(frame: Frame, exact: tuple[Tensor, Tensor]) -> None:
 
 
 def check(s: Scene, capacity: int = 1 << 16) -> Frame:
-    """Both modes against the reference; returns the training one."""
+    """All modes against the reference; returns the training one."""
     frame = s.render(capacity)
     needed, most, cut = frame.status.tolist()[:3]
     assert needed <= capacity and not cut and most <= needed
     assert_near(frame, s.exact())
+    if most <= MOST_IN_TILE:
+        apart = s.render(max(most, 1), per_tile=True)
+        for name in ("image", "alphas", "status"):
+            assert torch.equal(getattr(apart, name), getattr(frame, name)), name
     training = s.render(capacity, training=True)
     assert_near(training, s.exact(training=True))
     assert torch.equal(frame.status, training.status)
@@ -120,7 +124,9 @@ def check_lists(frame: Frame) -> None:
     assert torch.equal(instances.sort().values, torch.arange(needed))
     owners = frame.instance_splats[:needed].cpu().long()
     assert torch.equal(owners, torch.repeat_interleave(torch.arange(len(starts) - 1), starts.diff()))
-    depths = frame.records.cpu()[owners[instances], 10]
+    depths = frame.records[
+        owners[instances].to(frame.records.device), 10
+    ].cpu()  # rows of culled splats are not written
     tiles = torch.repeat_interleave(torch.arange(len(offsets) - 1), offsets.diff())
     same = tiles[1:] == tiles[:-1]
     ordered = (depths[1:] > depths[:-1]) | ((depths[1:] == depths[:-1]) & (instances[1:] > instances[:-1]))
@@ -236,6 +242,21 @@ def test_depths_that_are_equal_or_next_to_each_other(count: int, far: bool) -> N
     assert check(s).status[STATUS_MOST] == count
 
 
+@pytest.mark.parametrize("clump", [1, 2, 11, 12, 13, 100])
+@pytest.mark.parametrize("count", [120, 250, 500, 1000])
+def test_depths_in_clumps(count: int, clump: int) -> None:
+    """Evenly spread depths are sorted by buckets, and others, with too many in one bucket, in the general way."""
+    s = scene(count, 16, 16, seed=18, deltas=False)
+    g = torch.Generator().manual_seed(3)
+    s.viewmat[:] = torch.eye(4)
+    s.means[:, :2] = 0.1 * torch.randn(count, 2, generator=g)
+    at = torch.randperm(count, generator=g) // clump
+    s.means[:, 2] = 2 + at * clump / count + 1e-6 * torch.rand(count, generator=g)
+    s.log_scales[:] = 3.0  # over the whole tile, so that no pixel is near the cut-off of 1/255
+    s.logit_opacities[:] = -4.6
+    assert check(s).status[STATUS_MOST] == count
+
+
 def test_a_large_scene() -> None:
     s = scene(140_000, 150, 110, degree=0, seed=14, size=0.006)
     s.log_scales[::5000] = 0.5
@@ -301,8 +322,26 @@ def test_too_little_room_is_told_and_a_second_go_is_right(training: bool) -> Non
     assert torch.equal(again.image, wanted.image)
 
 
-@pytest.mark.parametrize("training", [False, True])
-def test_a_captured_frame_follows_camera_and_deltas(training: bool) -> None:
+def test_a_tile_with_too_little_room_is_told_and_a_second_go_is_right() -> None:
+    s = scene(3000, 200, 131, seed=11, size=0.2)
+    s.log_scales[::50] = 1.0
+    wanted = s.render(1 << 20)
+    needed, most = wanted.status.tolist()[:2]
+    for capacity in (1, 50, most - 1):
+        cut = s.render(capacity, per_tile=True)
+        assert cut.status.tolist() == [needed, most, 1, 0]
+        torch.cuda.synchronize()
+    again = s.render(most, per_tile=True)
+    assert again.status.tolist() == [needed, most, 0, 0]
+    assert torch.equal(again.image, wanted.image)
+    with pytest.raises(InvalidInput, match="at most 1024"):
+        s.render(1025, per_tile=True)
+    with pytest.raises(InvalidInput, match="per_tile=False"):
+        s.render(most, training=True, per_tile=True)
+
+
+@pytest.mark.parametrize(("training", "per_tile"), [(False, False), (False, True), (True, False)])
+def test_a_captured_frame_follows_camera_and_deltas(training: bool, per_tile: bool) -> None:
     s = scene(2000, 160, 120, degree=3, seed=12)
     tensors = s.tensors("cuda", torch.float32)
     controls = torch.empty(1 + 16 + 9 + 3, device="cuda")  # views that begin anywhere
@@ -312,7 +351,10 @@ def test_a_captured_frame_follows_camera_and_deltas(training: bool) -> None:
     deltas = tensors[5]
 
     def render() -> Frame:
-        return render_frame(*tensors[:6], viewmat, K, background, s.width, s.height, 1 << 16, training=training)
+        capacity = MOST_IN_TILE if per_tile else 1 << 16
+        return render_frame(
+            *tensors[:6], viewmat, K, background, s.width, s.height, capacity, training=training, per_tile=per_tile
+        )
 
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
@@ -349,38 +391,17 @@ def test_strided_and_misaligned_inputs_and_a_side_stream() -> None:
         assert torch.equal(frame.last, wanted.last)
 
 
-@pytest.mark.parametrize("size", [0.03, 0.2])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_half_precision_shows_nearly_the_same_picture(degree: int, size: float) -> None:
-    s = scene(3000, 320, 240, degree=degree, seed=17, size=size)
-    tensors = s.tensors("cuda", torch.float32)
-    full = s.render(1 << 20)
-    tensors[4] = tensors[4].half()
-    shifted = torch.cat([tensors[4].new_zeros(1), tensors[4].flatten()])[1:].view(tensors[4].shape)
-    half, again = (render_frame(*tensors[:4], sh, *tensors[5:], 320, 240, 1 << 20) for sh in (tensors[4], shifted))
-    assert torch.equal(half.image, again.image)
-    assert torch.equal(full.status, half.status)
-    for seen, wanted in ((half.image[..., :3], full.image[..., :3]), (half.alphas, full.alphas)):
-        assert (seen - wanted).square().mean() <= 1e-5  # 50 dB
-    dense = full.alphas > 0.5
-    assert ((half.image - full.image)[..., 3][dense] / full.image[..., 3][dense]).abs().mean() <= 0.01
-
-
-def test_coefficients_in_half_precision_are_refused_for_training() -> None:
-    s = scene(10)
-    tensors = s.tensors("cuda", torch.float32)
-    with pytest.raises(InvalidInput, match="sh must be float32"):
-        render_frame(*tensors[:4], tensors[4].half(), *tensors[5:], s.width, s.height, 100, training=True)
-
-
-@pytest.mark.parametrize(("training", "half"), [(False, False), (True, False), (False, True)])
+@pytest.mark.parametrize(
+    ("training", "half", "per_tile"),
+    [(False, False, False), (True, False, False), (False, True, False), (False, False, True)],
+)
 @pytest.mark.parametrize("optional", [False, True])
-def test_op_passes_opcheck(training: bool, half: bool, optional: bool) -> None:
+def test_op_passes_opcheck(training: bool, half: bool, per_tile: bool, optional: bool) -> None:
     s = scene(30, 20, 18, deltas=optional, background=optional)
     tensors = s.tensors("cuda", torch.float32)
     if half:
         tensors[4] = tensors[4].half()
-    arguments = (*tensors, 20, 18, 0.3, 0.01, 1e10, 0, 1000, training)
+    arguments = (*tensors, 20, 18, 0.3, 0.01, 1e10, 0, 1000, per_tile, training)
     # What is not written (rows of culled Gaussians, the room behind the lists) differs from call to call.
     torch.library.opcheck(
         torch.ops.gsplat_core.render_frame.default, arguments, test_utils=["test_schema", "test_faketensor"]

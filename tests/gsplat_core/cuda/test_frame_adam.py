@@ -56,7 +56,7 @@ class AdamState:
 
 
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_fused_adam_is_the_gradient_and_then_adam(degree: int, dtype: torch.dtype) -> None:
     scene = on_gpu(frame_scene(333, degree=degree, deltas=True))
     scene.logit_opacities[5] = math.nan

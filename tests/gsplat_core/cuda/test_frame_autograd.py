@@ -30,7 +30,7 @@ def test_autograd_takes_the_same_way(degree: int) -> None:
 def test_autograd_is_registered_as_it_should_be() -> None:
     scene = on_gpu(frame_scene(30, 20, 18, deltas=True))
     leaves = [t.clone().requires_grad_() for t in (*scene.gaussians, scene.deltas)]
-    arguments = (*leaves, scene.viewmat, scene.K, scene.background, 20, 18, 0.3, 0.01, 1e10, 0, 1000, True)
+    arguments = (*leaves, scene.viewmat, scene.K, scene.background, 20, 18, 0.3, 0.01, 1e10, 0, 1000, False, True)
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
     torch.library.opcheck(torch.ops.gsplat_core.render_frame.default, arguments, test_utils=checks)
 

@@ -10,7 +10,7 @@ import torch
 
 from gsplat_core import Camera, Gaussians, InvalidInput, render
 from gsplat_core.deformation import BasisField
-from gsplat_core.frame_renderer import CAPACITY_STEP, FrameRenderer
+from gsplat_core.frame_renderer import FrameRenderer
 
 pytestmark = pytest.mark.cuda
 
@@ -66,14 +66,17 @@ def test_parameters_changed_in_place_are_seen(scene, camera):
     assert_same_picture(renderer.render().result(), render(scene, camera))
 
 
-def test_lists_that_are_too_short_are_made_longer(make_gaussians, camera):
+@pytest.mark.parametrize(("count", "per_tile"), [(300, True), (3000, False)])
+def test_lists_that_are_too_short_are_made_longer(make_gaussians, camera, count, per_tile):
     # Each of these covers most of the picture: far more instances than the four per Gaussian that are expected.
-    scene = make_gaussians(3000).to("cuda")
+    scene = make_gaussians(count).to("cuda")
     scene = dataclasses.replace(scene, log_scales=torch.full_like(scene.log_scales, 2.3))
     renderer = FrameRenderer(scene, camera)
-    assert renderer.capacity == CAPACITY_STEP
+    first = renderer.room
     output = renderer.render().result()
-    assert renderer.capacity > CAPACITY_STEP
+    assert first.per_tile
+    assert renderer.room.per_tile == per_tile
+    assert renderer.room.capacity > first.capacity
     assert_same_picture(output, render(scene, camera))
 
 

@@ -29,8 +29,8 @@ def test_later_values_do_not_reach_earlier_launches():
 
 
 def test_what_does_not_fit_is_refused():
-    with pytest.raises(InvalidInput, match="got 33 values"):
-        store_scalars_(torch.zeros(33, device="cuda"), [0.0] * 33)
+    with pytest.raises(InvalidInput, match="got 65 values"):
+        store_scalars_(torch.zeros(65, device="cuda"), [0.0] * 65)
     with pytest.raises(InvalidInput, match="got 2 values"):
         store_scalars_(torch.zeros(3, device="cuda"), [0.0] * 2)
     with pytest.raises(InvalidInput, match="float64"):

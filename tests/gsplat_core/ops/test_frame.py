@@ -91,7 +91,13 @@ def test_wrong_shapes_are_named(index, name):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"width": 0}, "at least 1x1"), ({"capacity": 0}, "capacity"), ({"camera_model": "ftheta"}, "camera_model")],
+    [
+        ({"width": 0}, "at least 1x1"),
+        ({"capacity": 0}, "capacity"),
+        ({"camera_model": "ftheta"}, "camera_model"),
+        ({"per_tile": True, "training": True}, "per_tile=False"),
+        ({"per_tile": True, "capacity": 1025}, "at most 1024"),
+    ],
 )
 def test_wrong_options_are_refused(options, message):
     arguments = {"width": WIDTH, "height": HEIGHT, "capacity": 100} | options
@@ -99,16 +105,18 @@ def test_wrong_options_are_refused(options, message):
         render_frame(*raw_gaussians(dtype=torch.float32), **arguments)
 
 
-@pytest.mark.parametrize("training", [False, True])
-def test_fake_kernel_has_the_shapes_of_a_frame(training):
+@pytest.mark.parametrize(("training", "per_tile"), [(False, False), (False, True), (True, False)])
+def test_fake_kernel_has_the_shapes_of_a_frame(training, per_tile):
     with FakeTensorMode():
         inputs = [torch.empty_like(t, device="cpu") for t in raw_gaussians(dtype=torch.float32)]
-        frame = Frame(*torch.ops.gsplat_core.render_frame(*inputs, WIDTH, HEIGHT, 0.3, 0.01, 1e10, 0, 100, training))
+        frame = Frame(
+            *torch.ops.gsplat_core.render_frame(*inputs, WIDTH, HEIGHT, 0.3, 0.01, 1e10, 0, 100, per_tile, training)
+        )
     assert frame.image.shape == (HEIGHT, WIDTH, 4)
     assert frame.alphas.shape == (HEIGHT, WIDTH)
     assert frame.last.shape == ((HEIGHT, WIDTH) if training else (0, 0))
     assert frame.records.shape == (40, 12)
-    assert frame.tile_offsets.shape == (3 * 2 + 1,)
+    assert frame.tile_offsets.shape == ((0,) if per_tile else (3 * 2 + 1,))
     assert frame.sorted.shape == frame.instance_splats.shape == ((100,) if training else (0,))
     assert frame.splat_starts.shape == ((41,) if training else (0,))
     assert frame.status.shape == (4,)
