@@ -10,12 +10,12 @@ endif()
 if(CMAKE_CUDA_COMPILER MATCHES "^${CUDA_PACKAGES}/")
   set(ENV{LIBRARY_PATH} "${CUDA_PACKAGES}/lib:$ENV{LIBRARY_PATH}")  # CMake links a program to try the compiler
 endif()
-# portable: what a library for others has, and what CI compiles. The front end runs once for all of compute capability 8.x and once
-# for 10.0 and 12.0, whose instructions are the same to it; the PTX is for GPUs to come.
+# portable: what a library for others has, and what CI compiles. The front end runs once for compute capability 8.x and once for
+# 9.0 and all that come later, whose instructions are the same to it: what the kernels ask is only whether a GPU has those of 9.0.
 if(INTRASPLAT_CUDA_ARCHITECTURES STREQUAL "portable")
   set(CMAKE_CUDA_ARCHITECTURES OFF)
-  set(PORTABLE_CODE "--generate-code=arch=compute_80,code=[sm_80,sm_86,sm_89]" "--generate-code=arch=compute_90,code=[sm_90]"
-      "--generate-code=arch=compute_100,code=[sm_100,sm_120,compute_100]")
+  set(PORTABLE_CODE "--generate-code=arch=compute_80,code=[sm_80,sm_86,sm_89]"
+      "--generate-code=arch=compute_90,code=[sm_90,sm_100,sm_120,compute_90]")
 else()
   set(CMAKE_CUDA_ARCHITECTURES ${INTRASPLAT_CUDA_ARCHITECTURES})
 endif()
