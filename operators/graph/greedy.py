@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from operators.graph.clock import Clock, ManualClock, RealtimeClock
 from operators.graph.conditions import SchedulingStatus
+from operators.graph.interrupts import interruptible_wait
 from operators.graph.queues import Edge
 from operators.graph.spec import QueuePolicy
 
@@ -72,9 +73,9 @@ class GreedyScheduler:
             if isinstance(self.clock, ManualClock):
                 self.clock.advance_to(due_ns)
             else:
-                self._woken.wait(max(0, due_ns - self.clock.timestamp()) * 1e-9)
+                interruptible_wait(self._woken, (due_ns - self.clock.timestamp()) * 1e-9)
         elif event_awaited:
-            self._woken.wait()
+            interruptible_wait(self._woken)
         else:
             return False
         return True

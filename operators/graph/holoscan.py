@@ -25,6 +25,7 @@ from operators.graph.clock import ManualClock
 from operators.graph.conditions import SchedulingStatus
 from operators.graph.graph import Graph, Scheduler
 from operators.graph.greedy import GreedyScheduler
+from operators.graph.interrupts import interruptible_wait
 from operators.graph.multithread import MultiThreadScheduler
 from operators.graph.queues import CarriedEdge
 from operators.graph.sdk import keep_signals, load_sdk
@@ -148,14 +149,18 @@ class HoloscanScheduler:
 
     def execute(self, graph: Graph) -> None:
         """Run the SDK in a thread of its own, so that Ctrl-C reaches the thread that waits here."""
-        thread = threading.Thread(target=self._run, args=(self._application(graph),), name="holoscan", daemon=True)
-        thread.start()
+        begin = threading.Event()
+        thread = threading.Thread(target=self._run, args=(graph, begin), name="holoscan", daemon=True)
         try:
-            self._over.wait()  # not join: interrupted, it takes the thread for ended (Python 3.11)
+            thread.start()
+            begin.set()
+            interruptible_wait(self._over)  # not join: interrupted, it takes the thread for ended (Python 3.11)
         finally:
-            stopped = graph.stopping
+            stopped, begun = graph.stopping, begin.is_set()
             graph.stop()
-            self._over.wait()
+            begin.set()
+            if begun:  # otherwise an interrupt came before, and there may be no thread
+                interruptible_wait(self._over)
         if self.error is not None:
             raise self.error
         now_ns = self.clock.timestamp()
@@ -165,9 +170,11 @@ class HoloscanScheduler:
                 raise EngineError(f"the Holoscan SDK ended the run while {', '.join(able)} could go on; run it again")
             graph.declare_deadlock(now_ns)
 
-    def _run(self, app: Any) -> None:
+    def _run(self, graph: Graph, begin: threading.Event) -> None:
+        begin.wait()
         try:
-            app.run()
+            if not graph.stopping:
+                self._application(graph).run()
         except Exception as error:  # noqa: BLE001 - raised by execute
             self.error = self.error or error
         finally:

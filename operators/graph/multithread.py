@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from operators.errors import GraphInvalid, OperatorStuck
 from operators.graph.clock import Clock, ManualClock, RealtimeClock
 from operators.graph.conditions import SchedulingStatus
+from operators.graph.interrupts import interruptible_wait
 from operators.graph.queues import LockedEdge
 from operators.graph.spec import QueuePolicy
 
@@ -72,7 +73,7 @@ class MultiThreadScheduler:
         try:
             for thread in threads:
                 thread.start()
-            self._over.wait()
+            interruptible_wait(self._over)
         finally:
             graph.stop()
             self._join(threads)
@@ -128,6 +129,8 @@ class MultiThreadScheduler:
     def _join(self, threads: list[threading.Thread]) -> None:
         deadline_ns = self.clock.timestamp() + int(self.stop_timeout_s * 1e9)
         for thread in threads:
+            if not thread.is_alive():  # or never started, because an interrupt came before
+                continue
             thread.join(max(0, deadline_ns - self.clock.timestamp()) * 1e-9)
         stuck = [thread.name for thread in threads if thread.is_alive()]
         if stuck:

@@ -199,7 +199,7 @@ INTERRUPTED = """
         def stop(self):
             print("stopped", flush=True)
 
-    ENGINE, SCHEDULER, MODE = sys.argv[1:]
+    ENGINE, SCHEDULER, MODE, WHERE = sys.argv[1:]
     ticked = threading.Event()
 
     class App(Application):
@@ -208,11 +208,13 @@ INTERRUPTED = """
 
     def interrupt():
         ticked.wait()
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.pthread_kill(THREAD, signal.SIGINT)
 
     app = App()
     app.scheduler((GreedyScheduler if SCHEDULER == "GreedyScheduler" else MultiThreadScheduler)(app))
-    threading.Thread(target=interrupt, daemon=True).start()
+    interrupter = threading.Thread(target=interrupt, daemon=True)
+    interrupter.start()
+    THREAD = threading.main_thread().ident if WHERE == "main thread" else interrupter.ident
     try:
         run(app, ENGINE)
     except KeyboardInterrupt:
@@ -221,8 +223,9 @@ INTERRUPTED = """
 
 
 @pytest.mark.parametrize("mode", ["busy", "idle"])
-def test_ctrl_c_stops_every_operator_and_comes_out_of_run(runner, mode):
-    command = [sys.executable, "-c", textwrap.dedent(INTERRUPTED), runner.engine, runner.kind.__name__, mode]
+@pytest.mark.parametrize("where", ["main thread", "other thread"])  # the main one sleeps through what another is handed
+def test_ctrl_c_stops_every_operator_and_comes_out_of_run(runner, mode, where):
+    command = [sys.executable, "-c", textwrap.dedent(INTERRUPTED), runner.engine, runner.kind.__name__, mode, where]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=os.environ, check=False)
     assert done.stdout.split("\n")[:2] == ["stopped", "interrupted stopped"], done.stderr
     assert done.returncode == 0

@@ -1,0 +1,22 @@
+"""Waiting so that Ctrl-C is noticed."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+_LOOK_S = 0.25
+
+
+def interruptible_wait(event: threading.Event, timeout_s: float | None = None) -> bool:
+    """`event.wait`, in steps. Raises KeyboardInterrupt within one of them.
+
+    Python looks for signals and then blocks; one that comes in between, or in another thread, is seen when it looks again.
+    """
+    due_s = None if timeout_s is None else time.monotonic() + timeout_s
+    while True:
+        left_s = _LOOK_S if due_s is None else min(_LOOK_S, due_s - time.monotonic())
+        if event.wait(max(0.0, left_s)):
+            return True
+        if left_s < _LOOK_S:
+            return False
