@@ -12,6 +12,9 @@ Hazards of the SDK (4.6) and what is done about them:
 - Its schedulers give up before they have seen what a check or a thread just changed: they wait half a second first.
 - An exception in compute can end a run silently: none ever reaches the SDK.
 - It takes over SIGINT and SIGTERM, for good: the handlers are put back once it runs.
+- Its EventBasedScheduler starts an operator anew that it has just stopped, when it was looking at it in another thread, and fails:
+  there a finished operator waits for ever, which does not keep the run from ending.
+- It checks an operator that computes: such a check decides nothing.
 - It drops without counting: edges keep the policy themselves, and the SDK's queues never overflow.
 """
 
@@ -50,6 +53,9 @@ class Gate(_Condition):
         self.task, self.scheduler = task, scheduler
         self.ready_at_ns = 0
         self.checked = False
+        self.waits_for_room = False
+        self.computing = False
+        self._turn = threading.Lock()
         super().__init__(fragment, name=f"{task.name}_gate")
 
     def check(self, timestamp: int) -> tuple[Any, int | None]:
@@ -59,19 +65,43 @@ class Gate(_Condition):
             self.scheduler.restore_signals()
         task, now_ns = self.task, self.scheduler.now_ns(timestamp)
         status, due_ns = task.consent(now_ns)
-        if task.finished or task.graph.stopping:
-            status = SchedulingStatus.NEVER
-        elif status is SchedulingStatus.NEVER or task.exhausted():
-            task.finish()
-            self.scheduler.wake()
-            status = SchedulingStatus.NEVER
-        elif not task.has_room():
+        if task.finished or task.graph.stopping or self._finishes(status):
+            status = self.scheduler.done
+        elif self.computing or not self._sees_room():  # after each compute the SDK checks again
             status = SchedulingStatus.WAIT
         elif status is SchedulingStatus.WAIT_TIME:
             manual = isinstance(self.scheduler.clock, ManualClock)
             return _STATUS[status], timestamp + (due_ns - now_ns if manual else min(due_ns - now_ns, _APPOINTMENT_NS))
         self.ready_at_ns = now_ns
         return _STATUS[status], None
+
+    def _finishes(self, status: SchedulingStatus) -> bool:
+        """Finish the task if it can do nothing more."""
+        with self._turn:  # an operator that computes has taken its last message, but not sent its last one
+            if self.computing or not (status is SchedulingStatus.NEVER or self.task.exhausted()):
+                return False
+            self.task.finish()
+        self.scheduler.wake()
+        return True
+
+    def begins(self) -> bool:
+        """Whether the operator may compute; until `computing` is taken back, it does not finish."""
+        with self._turn:
+            self.computing = not (self.task.finished or self.task.graph.stopping)
+            return self.computing
+
+    def _sees_room(self) -> bool:
+        if self.task.has_room():
+            return True
+        self.waits_for_room = True
+        return self.task.has_room()  # again: what was taken before this was noted is told to nobody
+
+    def room_made(self) -> None:
+        """Have the SDK check the operator again if it waits for room. The SDK does so by itself when it hands out a message, but
+        then the edge still counts it."""
+        if self.waits_for_room:
+            self.waits_for_room = False
+            self.notify_scheduler()
 
 
 class Bridge(_Operator):
@@ -99,18 +129,19 @@ class Bridge(_Operator):
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         """Execute the task; nothing is raised into the SDK."""
-        task = self.task
-        if task.finished or task.graph.stopping:
+        if not self.gate.begins():
             return
         for edge in self.in_edges:
             edge.receiver = op_input
         for edge in self.out_edges:
             edge.sender = op_output
         try:
-            task.tick(self.gate.ready_at_ns)
+            self.task.tick(self.gate.ready_at_ns)
         except BaseException as error:  # noqa: BLE001 - raised again by HoloscanScheduler.execute
             self.gate.scheduler.error = error
-            task.graph.stop()
+            self.task.graph.stop()
+        finally:
+            self.gate.computing = False
 
 
 class HoloscanScheduler:
@@ -123,6 +154,7 @@ class HoloscanScheduler:
         self.error: BaseException | None = None
         self.restore_signals = keep_signals()
         self._threads = isinstance(scheduler, MultiThreadScheduler)
+        self.done = SchedulingStatus.WAIT if self._threads else SchedulingStatus.NEVER
         self._lock = threading.RLock()
         self._over = threading.Event()
         self._gates: list[Gate] = []
@@ -184,6 +216,7 @@ class HoloscanScheduler:
     def _application(self, graph: Graph) -> Any:
         """The graph as an application of the SDK."""
         outer, tasks = self, graph.tasks
+        edges = cast("list[CarriedEdge]", [edge for _, edge, _ in graph.ends])
 
         class Composed(_Application):
             def compose(self) -> None:
@@ -191,9 +224,9 @@ class HoloscanScheduler:
                 bridges = {gate.task: Bridge(self, gate.task, gate) for gate in outer._gates}
                 for bridge in bridges.values():
                     self.add_operator(bridge)
-                for producer, edge, consumer in graph.ends:
-                    port = cast("CarriedEdge", edge).port
-                    self.add_flow(bridges[producer], bridges[consumer], {(port, port)})
+                for (producer, _, consumer), edge in zip(graph.ends, edges, strict=True):
+                    edge.wake_producer = bridges[producer].gate.room_made
+                    self.add_flow(bridges[producer], bridges[consumer], {(edge.port, edge.port)})
 
         app = Composed()
         app.enable_metadata(False)
