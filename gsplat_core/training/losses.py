@@ -10,6 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation import regularisers
 from gsplat_core.reference.image_loss import inverse_depth_l1, masked_l1, masked_ssim_loss, valid_depth
 
 __all__ = [
@@ -56,9 +57,9 @@ def total_variation(plane: Tensor) -> Tensor:
 
 def plane_smoothness(plane: Tensor) -> Tensor:
     """Mean squared first difference along height plus that along width of [C, H, W] (K-Planes, Fridovich-Keil et al. 2023, eq. 5)."""
-    return _mean_or_zero(plane.diff(dim=-2).square()) + _mean_or_zero(plane.diff(dim=-1).square())
+    return regularisers.total_variation(plane.movedim(0, -1))
 
 
 def time_smoothness(plane: Tensor, time_dim: int = -2) -> Tensor:
     """Mean squared second difference along the time axis of [C, T, X] (K-Planes, eq. 6): zero for steady motion."""
-    return _mean_or_zero(plane.diff(n=2, dim=time_dim).square()) if plane.shape[time_dim] > 2 else (plane * 0).sum()
+    return regularisers.second_difference_in_time(plane.movedim(time_dim, 0))
