@@ -15,7 +15,7 @@ CUDA_TOOLKIT := build/cuda-toolkit
 # On the NVIDIA GPU where there is one that torch can use: the CUDA kernels are built for it first. A build that fails ends it.
 demo: native
 	$(BIN)/intrasplat synthesize --out out/recording
-	@set -e; if $(BIN)/python -m services.cli.graphics; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
+	@set -e; if $(BIN)/python -m services.cli.gpu_check; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
 	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --device $$device
 
 test: native .venv/.development

@@ -18,8 +18,8 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.deformation import BasisField, BasisRates, HexPlaneField
-from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.native import instruction_set
+from gsplat_core.scene.gaussians import Gaussians
 
 WINDOW_S = (0.0, 6.0)
 

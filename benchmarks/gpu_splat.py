@@ -20,12 +20,12 @@ from gpu_timing import Times, Work, captured, compare, extra_mib, gsplat, measur
 from torch import Tensor
 
 import gsplat_core
-from gsplat_core.cameras import Camera
-from gsplat_core.frame_renderer import FrameRenderer
-from gsplat_core.gaussians import Gaussians
-from gsplat_core.list_room import ListRoom, capacity_for
 from gsplat_core.ops.frame.frame import STATUS_MOST, STATUS_NEEDED, Frame, render_frame
 from gsplat_core.ops.frame.frame_gradients import RATES, render_frame_backward, render_frame_backward_adam_
+from gsplat_core.render.frame_renderer import FrameRenderer
+from gsplat_core.render.tile_capacity import ListRoom, capacity_for
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
 
 ASKED_MS = {
     "surgical50k_640x512": (0.06, 0.30),

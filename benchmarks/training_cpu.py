@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsplat_core.cameras import Camera
 from gsplat_core.deformation import BasisField, BasisRates, DeformationField, HexPlaneField
-from gsplat_core.frames import Frame
-from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.native import instruction_set
-from gsplat_core.rendering import render
+from gsplat_core.render.rasterization import render
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation

@@ -15,7 +15,7 @@ import torch
 
 import gsplat_core
 from gsplat_core import Camera, Gaussians
-from gsplat_core.gaussians import SH_C0
+from gsplat_core.scene.gaussians import SH_C0
 
 
 def sphere(count: int, radius_mm: float, z_mm: float) -> Gaussians:

@@ -14,7 +14,6 @@ from typing import Any
 
 from gsplat_core import Frame
 from gsplat_core.io.recordings import Recording, open_recording, synthesize
-from operators.display import CallbackSinkOp
 from operators.graph import (
     DISABLE_BRANCH,
     Application,
@@ -25,6 +24,7 @@ from operators.graph import (
     run,
 )
 from operators.ingest import SourceOp
+from operators.sinks.display import CallbackSinkOp
 from operators.tool_mask import RecordedToolMaskOp
 
 

@@ -10,22 +10,22 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gsplat_core.cameras import Camera
     from gsplat_core.deformation import DeformationField
     from gsplat_core.errors import CoreError, InvalidInput
-    from gsplat_core.frame_renderer import FrameRenderer
-    from gsplat_core.frames import Frame, FrameStatus
-    from gsplat_core.gaussians import Gaussians
     from gsplat_core.io.bundle import load_bundle, save_bundle
     from gsplat_core.io.ply import load_ply, save_ply
     from gsplat_core.io.recordings import open_recording
-    from gsplat_core.model import Model
     from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
     from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
     from gsplat_core.ops.projection.projection import fully_fused_projection
     from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
     from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
-    from gsplat_core.rendering import RenderOutput, rasterization, render
+    from gsplat_core.render.frame_renderer import FrameRenderer
+    from gsplat_core.render.rasterization import RenderOutput, rasterization, render
+    from gsplat_core.scene.cameras import Camera
+    from gsplat_core.scene.frames import Frame, FrameStatus
+    from gsplat_core.scene.gaussians import Gaussians
+    from gsplat_core.scene.model import Model
     from gsplat_core.training.config import ReconstructorConfig
     from gsplat_core.training.reconstructor import Reconstructor
 
@@ -58,18 +58,18 @@ __all__ = [
 ]
 
 _HOME = {
-    "Camera": "cameras",
+    "Camera": "scene.cameras",
     "CoreError": "errors",
     "DeformationField": "deformation",
-    "Frame": "frames",
-    "FrameRenderer": "frame_renderer",
-    "FrameStatus": "frames",
-    "Gaussians": "gaussians",
+    "Frame": "scene.frames",
+    "FrameRenderer": "render.frame_renderer",
+    "FrameStatus": "scene.frames",
+    "Gaussians": "scene.gaussians",
     "InvalidInput": "errors",
-    "Model": "model",
+    "Model": "scene.model",
     "Reconstructor": "training.reconstructor",
     "ReconstructorConfig": "training.config",
-    "RenderOutput": "rendering",
+    "RenderOutput": "render.rasterization",
     "fully_fused_projection": "ops.projection.projection",
     "isect_offset_encode": "ops.tiles.tiles",
     "isect_tiles": "ops.tiles.tiles",
@@ -77,9 +77,9 @@ _HOME = {
     "load_ply": "io.ply",
     "open_recording": "io.recordings",
     "quat_scale_to_covar_preci": "ops.covariance.covariance",
-    "rasterization": "rendering",
+    "rasterization": "render.rasterization",
     "rasterize_to_pixels": "ops.compositing.compositing",
-    "render": "rendering",
+    "render": "render.rasterization",
     "save_bundle": "io.bundle",
     "save_ply": "io.ply",
     "spherical_harmonics": "ops.spherical_harmonics.spherical_harmonics",

@@ -10,20 +10,22 @@ OperatorsError
 │   ├── OperatorStuck                      an operator did not return from compute when the graph stopped
 │   ├── GraphDeadlock                      nothing can go on although not everything is done; says who waits on what
 │   └── GraphBusy                          run() while the application already runs
-├── EngineError
+├── EngineError (UserError)
 │   ├── EngineMissing                      the engine's package is not installed or cannot be loaded
 │   └── EngineUnsupported                  the engine cannot run this graph faithfully
-├── OutputError                            what a run writes cannot be written
+├── OutputError (UserError)                what a run writes cannot be written
 │   ├── OutputFolderInUse                  the folder holds something that is not ours
 │   └── StorageFull                        the disk has no room left
 └── RunError
-    ├── DeviceMissing                      the device asked for is not there or not supported
+    ├── DeviceMissing (UserError)          the device asked for is not there or not supported
     └── RunFailed                          a run ended early; carries what it had reached
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+
+from gsplat_core.errors import UserError
 
 
 class OperatorsError(Exception):
@@ -84,7 +86,7 @@ class GraphBusy(GraphError):
     """The application already runs."""
 
 
-class EngineError(OperatorsError):
+class EngineError(OperatorsError, UserError):
     """An engine cannot run the graph."""
 
 
@@ -96,7 +98,7 @@ class EngineUnsupported(EngineError):
     """The engine cannot run this graph faithfully."""
 
 
-class OutputError(OperatorsError):
+class OutputError(OperatorsError, UserError):
     """What a run writes cannot be written."""
 
 
@@ -112,7 +114,7 @@ class RunError(OperatorsError):
     """An application cannot run, or ended early."""
 
 
-class DeviceMissing(RunError):
+class DeviceMissing(RunError, UserError):
     """The device asked for is not there, or this version cannot use it."""
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from gsplat_core.frames import Frame
 from gsplat_core.io.recordings import Recording
+from gsplat_core.scene.frames import Frame
 from operators.graph import Operator, OperatorSpec
 
 

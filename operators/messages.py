@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.cameras import Camera
 from gsplat_core.errors import InvalidInput
-from gsplat_core.frames import Frame
-from gsplat_core.gaussians import Gaussians
-from gsplat_core.model import Model
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.model import Model
 
 
 @dataclass(frozen=True)

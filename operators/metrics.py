@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsplat_core.frames import Frame
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import FrameQuality, QualityTracker, psnr_tissue_db
 from operators.graph import Operator, OperatorSpec
 from operators.messages import RenderedFrame

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from gsplat_core.frames import Frame
-from gsplat_core.model import Model
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.model import Model
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.graph import Operator, OperatorSpec
 from operators.messages import Reconstruction

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from gsplat_core.cameras import Camera
-from gsplat_core.frames import Frame
-from operators.display import write_png
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
 from operators.graph import Operator, OperatorSpec
+from operators.sinks.display import write_png
 from operators.storage import StorageReserve, storage_errors, write_whole
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gsplat_core.frames import Frame
+from gsplat_core.scene.frames import Frame
 from operators.graph import Operator, OperatorSpec
 
 log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from gsplat_core.deformation.basis import BasisField, BasisRates
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.deformation.hexplane import HexPlaneField
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import Gaussians
+from gsplat_core.scene.gaussians import Gaussians
 
 __all__ = [
     "FIELD_KINDS",

@@ -21,11 +21,11 @@ from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField, checked_window, count_of
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.reference import deformation as reference
 from gsplat_core.reference.deformation import BUMP_REACH, CHANNEL_GROUPS
+from gsplat_core.scene.gaussians import Gaussians
 
 CHANNELS = sum(CHANNEL_GROUPS)
 BUMPS_PER_SPACING = math.sqrt(math.pi)

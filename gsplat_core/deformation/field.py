@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import Gaussians
+from gsplat_core.scene.gaussians import Gaussians
 
 
 class DeformationField(torch.nn.Module):

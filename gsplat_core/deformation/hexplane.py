@@ -18,12 +18,12 @@ from torch import Tensor
 from gsplat_core.deformation import regularisers
 from gsplat_core.deformation.field import DeformationField, checked_window
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.hexplane import hexplane as compiled
 from gsplat_core.ops.hexplane.deltas import hexplane_deltas, takes_layers
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.reference import deformation as reference
 from gsplat_core.reference.deformation import HEAD_COLUMNS, PLANE_AXES
+from gsplat_core.scene.gaussians import Gaussians
 
 HEAD_CHANNELS = (3, 3, 4, 1)
 """Outputs of the head: position, log-scale, rotation (wxyz), opacity logit."""

@@ -20,10 +20,10 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
-from gsplat_core.gaussians import Gaussians
 from gsplat_core.io.atomic_files import replace_durably, write_durably
 from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, Manifest, manifest_bytes, parse_manifest
-from gsplat_core.model import Model
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.model import Model
 
 TENSORS, NEXT_TENSORS = "model.safetensors", "model.next.safetensors"
 MANIFEST, NEXT_MANIFEST = "manifest.json", "manifest.next.json"

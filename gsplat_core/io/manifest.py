@@ -9,11 +9,11 @@ from typing import Any, cast
 
 import torch
 
-from gsplat_core.cameras import CAMERA_MODELS, Camera, CameraModel
 from gsplat_core.deformation import DeformationField, field_from_config
 from gsplat_core.errors import BundleCorrupt, InvalidInput, UnknownFormatVersion
-from gsplat_core.gaussians import MAX_SH_DEGREE, Gaussians
-from gsplat_core.model import Model
+from gsplat_core.scene.cameras import CAMERA_MODELS, Camera, CameraModel
+from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
+from gsplat_core.scene.model import Model
 
 FORMAT_VERSION = 1
 MAX_MANIFEST_BYTES = 1 << 20

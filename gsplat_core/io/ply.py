@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import MAX_SH_DEGREE, Gaussians
 from gsplat_core.io.atomic_files import replace_durably, write_durably
+from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 
 MAX_HEADER_BYTES = 1 << 16
 SCALAR_TYPES = {

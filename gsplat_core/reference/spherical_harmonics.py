@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsplat_core.argument_checks import require_same_kind, require_trailing
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import MAX_SH_DEGREE
+from gsplat_core.scene.gaussians import MAX_SH_DEGREE
 
 
 def check_spherical_harmonics_arguments(

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.frames import Frame
 from gsplat_core.io.recordings.split import is_heldout
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import mean_of_scored, psnr_tissue_db
 
 

@@ -8,8 +8,8 @@ from typing import Protocol
 from torch import Tensor
 
 from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
-from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.hexplane.deltas import takes_layers
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.hexplane_training import HexPlaneTraining
 
 

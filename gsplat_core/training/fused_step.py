@@ -7,16 +7,16 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.cameras import Camera
-from gsplat_core.captured import CapturedSequence, GraphMemory
-from gsplat_core.frame_renderer import FrameControls
-from gsplat_core.gaussians import Gaussians
-from gsplat_core.list_room import StatusOnHost, capacity_for
 from gsplat_core.ops.adam.adam import adam_step_at_
 from gsplat_core.ops.frame.frame import render_frame
 from gsplat_core.ops.frame.frame_count import count_frame_
 from gsplat_core.ops.frame.frame_gradients import render_frame_backward_adam_
 from gsplat_core.ops.image_loss.frame_loss import frame_loss
+from gsplat_core.render.capture import CapturedSequence, GraphMemory
+from gsplat_core.render.frame_renderer import FrameControls
+from gsplat_core.render.tile_capacity import StatusOnHost, capacity_for
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.field_training import FieldTraining
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam

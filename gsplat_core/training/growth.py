@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import torch
 
-from gsplat_core.frames import Frame
-from gsplat_core.gaussians import Gaussians
-from gsplat_core.rendering import render
+from gsplat_core.render.rasterization import render
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.initialisation import gaussians_at_pixels, tissue_colours, tissue_depth
 from gsplat_core.training.observations import Observation

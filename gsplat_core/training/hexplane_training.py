@@ -9,7 +9,6 @@ from torch import Tensor
 
 from gsplat_core.deformation import HexPlaneField
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.hexplane.deltas import takes_layers
 from gsplat_core.ops.hexplane.training import (
     FieldGradient,
@@ -20,6 +19,7 @@ from gsplat_core.ops.hexplane.training import (
     hexplane_train_backward,
     network_adam_,
 )
+from gsplat_core.scene.gaussians import Gaussians
 
 
 class HexPlaneTraining:

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.cameras import Camera
-from gsplat_core.frames import Frame
-from gsplat_core.gaussians import SH_C0, Gaussians
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 SIGMA_IN_SPACINGS = 0.7
 """Standard deviation of a fresh Gaussian in grid spacings: neighbours overlap and leave no holes."""

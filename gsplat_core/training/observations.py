@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.cameras import Camera
 from gsplat_core.errors import InvalidInput
-from gsplat_core.frames import Frame
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
 from gsplat_core.transfers import tensor_of
 
 

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_core.cameras import Camera
 from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
 from gsplat_core.errors import InvalidInput
-from gsplat_core.frames import Frame
-from gsplat_core.gaussians import Gaussians
-from gsplat_core.model import Model
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.model import Model
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth import gaussians_for_uncovered_tissue
 from gsplat_core.training.initialisation import gaussians_from_frame

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from gsplat_core.cameras import Camera
 from gsplat_core.deformation import BasisField, BasisRates, DeformationField
-from gsplat_core.gaussians import Gaussians
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.field_training import training_of
 from gsplat_core.training.fused_step import FusedStep

@@ -11,10 +11,10 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any, Literal
 
 from gsplat_core.errors import CoreError
-from gsplat_core.frames import Frame
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.recordings import Recording
-from gsplat_core.model import Model
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.model import Model
 from gsplat_core.training.baselines import Baselines, measure_baselines
 from operators.applications.device import seeded
 from operators.applications.result import RunOutcome, peak_memory_bytes

@@ -12,9 +12,9 @@ from dataclasses import replace
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.frames import Frame
 from gsplat_core.io.recordings import Recording, is_heldout
-from gsplat_core.model import Model
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.model import Model
 from gsplat_core.training.reconstructor import ObserveReport, Reconstructor
 from operators.applications.device import seeded
 from operators.applications.execution import Execution, Start

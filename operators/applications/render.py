@@ -10,12 +10,12 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.io.bundle import load_bundle
 from operators.applications.device import check_device
 from operators.applications.progress import Progress, ProgressCallback
-from operators.display import write_png
 from operators.errors import OutputError
 from operators.output_folder import check_output_folder, claim_output_folder
 from operators.rasterize import displayed
+from operators.sinks.display import write_png
+from operators.sinks.video_file import VideoFile
 from operators.storage import StorageReserve
-from operators.video_file import VideoFile
 
 RESERVE_BYTES = 2**20
 VIDEO_SUFFIX = ".mp4"

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, get_args
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.frames import Frame
 from gsplat_core.io.recordings import Recording, is_heldout, open_recording
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import FieldChoice, ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, scheduler_for
@@ -26,14 +26,14 @@ from operators.applications.execution import Execution
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.result import RunOutcome
 from operators.deform import DeformOp
-from operators.display import CallbackSinkOp, VideoSinkOp
 from operators.graph import Application, Engine
 from operators.ingest import SourceOp
-from operators.keyframes import KeyframesOp
 from operators.metrics import MetricsOp, ScoredFrame
 from operators.output_folder import check_output_folder, claim_output_folder
 from operators.rasterize import RasterizeOp
 from operators.reconstruct import ReconstructOp
+from operators.sinks.display import CallbackSinkOp, VideoSinkOp
+from operators.sinks.keyframes import KeyframesOp
 from operators.storage import StorageReserve
 from operators.tool_mask import RecordedToolMaskOp
 

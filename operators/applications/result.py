@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from gsplat_core.io.recordings import Recording
-from gsplat_core.model import Model
+from gsplat_core.scene.model import Model
 from gsplat_core.training.baselines import Baselines
 from gsplat_core.training.metrics import QualityTracker
 from operators.graph import DurationSummary

@@ -121,7 +121,7 @@ def _core() -> list[Check]:
 def _cuda(ops: list[str]) -> list[Check]:
     """The GPU, the kernels that were built for one, and whether the two fit together."""
     from gsplat_core.ops.native import CUDA_MISSING, cuda_build, cuda_refusal
-    from services.cli.graphics import look
+    from services.cli.gpu_check import look
 
     graphics = look()
     gpu = Check("GPU", graphics.found, graphics.usable, graphics.advice, needed=False)
@@ -152,7 +152,7 @@ def _video() -> list[Check]:
     import numpy as np
 
     from operators.errors import OutputError
-    from operators.video_file import CODEC, VideoFile
+    from operators.sinks.video_file import CODEC, VideoFile
 
     try:
         with tempfile.TemporaryDirectory() as folder, VideoFile(Path(folder) / "probe.mp4", 64, 48, 30.0) as video:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.metrics import ScoredFrame
-from operators.pictures import depth_map, depth_range, error_map
+from operators.sinks.pictures import depth_map, depth_range, error_map
 
 WIDTH_PX = 420
 """Pictures are shrunk to this width, never enlarged by more than whole factors."""

@@ -9,12 +9,12 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from gsplat_core.cameras import Camera
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import BundleCorrupt, BundleError, UnknownFormatVersion
-from gsplat_core.gaussians import Gaussians
 from gsplat_core.io.bundle import load_bundle, save_bundle
-from gsplat_core.model import Model
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.model import Model
 
 
 @pytest.fixture

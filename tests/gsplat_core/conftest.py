@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsplat_core.gaussians import Gaussians
+from gsplat_core.scene.gaussians import Gaussians
 
 
 @dataclass(frozen=True)

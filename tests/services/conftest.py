@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.frames import Frame
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import FrameQuality
 from operators.messages import RenderedFrame
 from operators.metrics import ScoredFrame

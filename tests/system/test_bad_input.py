@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from operators.video_file import VideoFile
+from operators.sinks.video_file import VideoFile
 from services.reports.schema import RunReport
 
 QUICK = ("--steps-per-frame", "2")
@@ -169,7 +169,7 @@ def test_a_disk_that_is_full_from_the_start(small_disk, tiny, refused):
 
 def test_a_disk_that_fills_up_on_the_way(small_disk, tiny, refused, monkeypatch):
     """Somebody else takes the room after three frames: video, model and report of these are still written, and whole."""
-    from operators.display import VideoSinkOp
+    from operators.sinks.display import VideoSinkOp
 
     compute = VideoSinkOp.compute
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.cameras import CAMERA_MODELS, Camera
 from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.scene.cameras import CAMERA_MODELS, Camera
 
 DEFAULT_FOCAL_FACTOR = 0.9
 """Focal length in units of the longer image side where nothing is known: 58° across, as common endoscopes have."""

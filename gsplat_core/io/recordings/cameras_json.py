@@ -13,7 +13,7 @@ import numpy as np
 
 from gsplat_core.io.recordings.calibration import Calibration, invert_poses, number, read_json, read_pinhole
 from gsplat_core.io.recordings.findings import Findings
-from gsplat_core.io.recordings.planes import ImageFiles, check_sizes
+from gsplat_core.io.recordings.frame_files import ImageFiles, check_sizes
 
 
 def read_cameras_json(root: Path, findings: Findings) -> tuple[ImageFiles, Calibration] | None:

@@ -12,10 +12,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.frames import Frame
 from gsplat_core.io.recordings.calibration import Calibration
 from gsplat_core.io.recordings.findings import Findings
-from gsplat_core.io.recordings.planes import DepthFiles, MaskFiles
+from gsplat_core.io.recordings.frame_files import DepthFiles, MaskFiles
+from gsplat_core.scene.frames import Frame
 
 
 class FrameImages(Protocol):

@@ -31,8 +31,8 @@ from gsplat_core.io.recordings.calibration import (
 from gsplat_core.io.recordings.cameras_json import read_cameras_json
 from gsplat_core.io.recordings.contents import Contents, FrameImages
 from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.recordings.frame_files import DepthFiles, ImageFiles, MaskFiles, check_pairing, check_sizes
 from gsplat_core.io.recordings.image_files import UnreadableImage, decode_image, list_images
-from gsplat_core.io.recordings.planes import DepthFiles, ImageFiles, MaskFiles, check_pairing, check_sizes
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES, open_video
 
 RECORDING_FORMAT = "intrasplat-recording"

@@ -10,13 +10,13 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from gsplat_core.cameras import Camera
 from gsplat_core.errors import InvalidInput
-from gsplat_core.frames import Frame
 from gsplat_core.io.recordings.contents import Contents
 from gsplat_core.io.recordings.findings import Findings, ValidationReport
+from gsplat_core.io.recordings.frame_files import resize_area, resize_nearest
 from gsplat_core.io.recordings.layouts import inspect
-from gsplat_core.io.recordings.planes import resize_area, resize_nearest
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
 
 MAX_REPORTED_PROBLEMS = 100
 

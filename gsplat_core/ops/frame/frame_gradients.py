@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_float32, require_shape
-from gsplat_core.cameras import CAMERA_MODELS
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.reference.frame import RAW_COLUMNS
-from gsplat_core.render_settings import EPS2D
+from gsplat_core.render.settings import EPS2D
+from gsplat_core.scene.cameras import CAMERA_MODELS
 
 if TYPE_CHECKING:
     from gsplat_core.ops.frame.frame import Frame

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_same_kind, require_shape, require_trailing
-from gsplat_core.cameras import CAMERA_MODELS
 from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.cameras import CAMERA_MODELS
 
 MAX_EXTENT_SIGMAS = 3.33
 """Beyond this many standard deviations a fully opaque Gaussian falls below the alpha cut-off of 1/255."""

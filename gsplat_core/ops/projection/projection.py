@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_float32
-from gsplat_core.cameras import CAMERA_MODELS
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, check_projection_arguments, pack
+from gsplat_core.scene.cameras import CAMERA_MODELS
 
 
 def fully_fused_projection(

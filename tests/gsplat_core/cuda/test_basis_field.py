@@ -6,8 +6,8 @@ import torch
 from gsplat_core import reference
 from gsplat_core.deformation import BasisField, BasisRates
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.basis_field.basis_field import basis_field, basis_field_backward, basis_field_backward_adam_
+from gsplat_core.scene.gaussians import Gaussians
 
 pytestmark = pytest.mark.cuda
 

@@ -7,12 +7,12 @@ import os
 import pytest
 import torch
 
-from gsplat_core.cameras import Camera
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
 from gsplat_core.io import atomic_files, bundle
 from gsplat_core.io.bundle import load_bundle, save_bundle
-from gsplat_core.model import Model
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.model import Model
 
 CAMERA = Camera([[812.5, 0, 319.25], [0, 811.0, 255.75], [0, 0, 1]], 640, 512)
 

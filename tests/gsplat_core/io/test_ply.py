@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import Gaussians
 from gsplat_core.io.ply import load_ply, save_ply
+from gsplat_core.scene.gaussians import Gaussians
 
 HEADER_START = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
 DEGREE_1 = (

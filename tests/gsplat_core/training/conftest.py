@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsplat_core.cameras import Camera
-from gsplat_core.frames import Frame
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
 
 WIDTH_PX, HEIGHT_PX = 48, 40
 

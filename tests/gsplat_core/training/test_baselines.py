@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.frames import Frame
 from gsplat_core.io.recordings import is_heldout
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.baselines import measure_baselines
 
 RECORDINGS = Path(

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.cameras import Camera
 from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.observations import Observation, ObservationWindow
 
 

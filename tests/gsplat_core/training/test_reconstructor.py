@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.cameras import Camera
 from gsplat_core.deformation import BasisField, HexPlaneField
 from gsplat_core.errors import InvalidInput
-from gsplat_core.frames import Frame
 from gsplat_core.io.recordings.synthetic.synthesize import SyntheticScene
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training import reconstructor
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db

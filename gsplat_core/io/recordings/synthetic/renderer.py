@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.cameras import Camera
 from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM, SurfacePoints, Tissue, Tug
 from gsplat_core.io.recordings.synthetic.tool import RING, SHAFT, Part, distance, trace
+from gsplat_core.scene.cameras import Camera
 
 Array = NDArray[np.floating]
 

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.cameras import Camera
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.renderer import cast_tissue, pixel_rays
 from gsplat_core.io.recordings.synthetic.synthesize import BASELINE_MM, SyntheticScene
 from gsplat_core.io.recordings.synthetic.tool import distance
+from gsplat_core.scene.cameras import Camera
 
 TIMES_S = (0.0, 0.9, 1.2, 2.2)
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import RecordingInvalid, RecordingMissing
-from gsplat_core.frames import FrameStatus
 from gsplat_core.io.recordings import Recording, open_recording, validate_recording
+from gsplat_core.scene.frames import FrameStatus
 
 Refused = Callable[..., str]
 

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_shape
-from gsplat_core.cameras import Camera
-from gsplat_core.gaussians import Gaussians
 from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
 from gsplat_core.ops.frame.frame import STATUS_CUT, STATUS_NEEDED, render_frame
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.tiles import bin_splats, isect_tiles
-from gsplat_core.pipeline import Operations
+from gsplat_core.render.pipeline import Operations
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.transfers import HostCopy
 
 __all__ = ["RenderOutput", "rasterization", "render"]

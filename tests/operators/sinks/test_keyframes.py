@@ -6,8 +6,8 @@ import itertools
 
 import pytest
 
-from operators.keyframes import KeyframesOp
 from operators.metrics import MetricsOp
+from operators.sinks.keyframes import KeyframesOp
 
 
 def keep(count, length, rendered, compute, worst=None):

@@ -12,12 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.cameras import Camera
 from gsplat_core.deformation import BasisField, DeformationField
 from gsplat_core.deformation.field import checked_window
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import Gaussians
-from gsplat_core.rendering import RenderOutput, render
+from gsplat_core.render.rasterization import RenderOutput, render
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_shape
-from gsplat_core.cameras import Camera
-from gsplat_core.captured import CapturedSequence, GraphMemory
 from gsplat_core.deformation import DeformationField
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import Gaussians
-from gsplat_core.list_room import ListRoom, StatusOnHost
 from gsplat_core.ops.frame.frame import Frame, render_frame
 from gsplat_core.ops.scalars.scalars import store_scalars_
-from gsplat_core.rendering import RenderOutput
+from gsplat_core.render.capture import CapturedSequence, GraphMemory
+from gsplat_core.render.rasterization import RenderOutput
+from gsplat_core.render.tile_capacity import ListRoom, StatusOnHost
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
 
 Precision = Literal["fp32", "fp16"]
 

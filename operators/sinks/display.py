@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from operators.errors import OutputError
 from operators.graph import Operator, OperatorSpec
 from operators.messages import RenderedFrame
-from operators.pictures import side_by_side
+from operators.sinks.pictures import side_by_side
+from operators.sinks.video_file import VideoFile
 from operators.storage import StorageReserve, storage_errors, write_whole
-from operators.video_file import VideoFile
 
 
 class VideoSinkOp(Operator):

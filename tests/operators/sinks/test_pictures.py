@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from operators.pictures import depth_map, depth_range, error_map
+from operators.sinks.pictures import depth_map, depth_range, error_map
 
 GREY = (70, 74, 80)
 

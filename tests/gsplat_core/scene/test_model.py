@@ -5,10 +5,10 @@ import dataclasses
 import pytest
 import torch
 
-from gsplat_core.cameras import Camera
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import InvalidInput
-from gsplat_core.model import Model
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.model import Model
 
 CAMERA = Camera.from_focal(40.0, 32, 24)
 KINDS = pytest.mark.parametrize("kind", ["basis", "hexplane", None])

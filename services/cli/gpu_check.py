@@ -1,6 +1,6 @@
 """Is there an NVIDIA GPU that this program can use, and if not, what is in the way? For `intrasplat doctor` and `make demo`.
 
-python -m services.cli.graphics     # prints the answer; exit code 0 when there is one, 1 when there is none
+python -m services.cli.gpu_check     # prints the answer; exit code 0 when there is one, 1 when there is none
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.gaussians import MAX_SH_DEGREE
+from gsplat_core.scene.gaussians import MAX_SH_DEGREE
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]

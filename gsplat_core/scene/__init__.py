@@ -1,0 +1,1 @@
+"""What is rendered and who looks at it: Gaussians, cameras, frames, models."""

@@ -1,0 +1,1 @@
+"""Where frames end: videos, pictures, functions."""
