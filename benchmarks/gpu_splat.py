@@ -22,8 +22,8 @@ from torch import Tensor
 import gsplat_core
 from gsplat_core.ops.frame.frame import STATUS_MOST, STATUS_NEEDED, Frame, render_frame
 from gsplat_core.ops.frame.frame_gradients import RATES, render_frame_backward, render_frame_backward_adam_
-from gsplat_core.render.frame_renderer import FrameRenderer
-from gsplat_core.render.tile_capacity import ListRoom, capacity_for
+from gsplat_core.rendering.frame_renderer import FrameRenderer
+from gsplat_core.rendering.tile_capacity import ListRoom, capacity_for
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 

@@ -24,7 +24,7 @@ import torch
 
 from gsplat_core.deformation import BasisField, BasisRates, DeformationField, HexPlaneField
 from gsplat_core.ops.native import instruction_set
-from gsplat_core.render.rasterization import render
+from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from gsplat_core.ops.projection.projection import fully_fused_projection
     from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
     from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
-    from gsplat_core.render.frame_renderer import FrameRenderer
-    from gsplat_core.render.rasterization import RenderOutput, rasterization, render
+    from gsplat_core.rendering.frame_renderer import FrameRenderer
+    from gsplat_core.rendering.rasterization import RenderOutput, rasterization, render
     from gsplat_core.scene.cameras import Camera
     from gsplat_core.scene.frames import Frame, FrameStatus
     from gsplat_core.scene.gaussians import Gaussians
@@ -62,14 +62,14 @@ _HOME = {
     "CoreError": "errors",
     "DeformationField": "deformation",
     "Frame": "scene.frames",
-    "FrameRenderer": "render.frame_renderer",
+    "FrameRenderer": "rendering.frame_renderer",
     "FrameStatus": "scene.frames",
     "Gaussians": "scene.gaussians",
     "InvalidInput": "errors",
     "Model": "scene.model",
     "Reconstructor": "training.reconstructor",
     "ReconstructorConfig": "training.config",
-    "RenderOutput": "render.rasterization",
+    "RenderOutput": "rendering.rasterization",
     "fully_fused_projection": "ops.projection.projection",
     "isect_offset_encode": "ops.tiles.tiles",
     "isect_tiles": "ops.tiles.tiles",
@@ -77,9 +77,9 @@ _HOME = {
     "load_ply": "io.ply",
     "open_recording": "io.recordings",
     "quat_scale_to_covar_preci": "ops.covariance.covariance",
-    "rasterization": "render.rasterization",
+    "rasterization": "rendering.rasterization",
     "rasterize_to_pixels": "ops.compositing.compositing",
-    "render": "render.rasterization",
+    "render": "rendering.rasterization",
     "save_bundle": "io.bundle",
     "save_ply": "io.ply",
     "spherical_harmonics": "ops.spherical_harmonics.spherical_harmonics",

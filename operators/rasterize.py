@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.render.rasterization import render
+from gsplat_core.rendering.rasterization import render
 from gsplat_core.transfers import HostCopy
 from operators.graph import Operator, OperatorSpec
 from operators.messages import DeformedScene, RenderedFrame

@@ -53,7 +53,7 @@ assert "torch.utils.cpp_extension" not in sys.modules
 """
 
 
-@pytest.mark.parametrize("package", [*MAY_IMPORT, "gsplat_core.render.rasterization", "gsplat_core.reference"])
+@pytest.mark.parametrize("package", [*MAY_IMPORT, "gsplat_core.rendering.rasterization", "gsplat_core.reference"])
 def test_import_opens_no_socket_starts_no_process_and_compiles_nothing(package):
     done = subprocess.run([sys.executable, "-c", PROGRAM, package], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr

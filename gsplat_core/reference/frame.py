@@ -10,7 +10,7 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.reference.rendering import rasterization
-from gsplat_core.render.settings import EPS2D, FAR_PLANE, NEAR_PLANE, RenderMode
+from gsplat_core.rendering.settings import EPS2D, FAR_PLANE, NEAR_PLANE, RenderMode
 
 RAW_COLUMNS = 16
 """Columns of a Gaussian's row of deltas: position 3, rotation 4 (wxyz), log-scale 3, colour 3, opacity logit, 2 unused."""

@@ -11,7 +11,7 @@ from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
-from gsplat_core.render.pipeline import Operations
+from gsplat_core.rendering.pipeline import Operations
 
 
 def bin_splats(

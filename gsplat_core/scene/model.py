@@ -15,7 +15,7 @@ from torch import Tensor
 from gsplat_core.deformation import BasisField, DeformationField
 from gsplat_core.deformation.field import checked_window
 from gsplat_core.errors import InvalidInput
-from gsplat_core.render.rasterization import RenderOutput, render
+from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 

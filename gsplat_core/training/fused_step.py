@@ -12,9 +12,9 @@ from gsplat_core.ops.frame.frame import render_frame
 from gsplat_core.ops.frame.frame_count import count_frame_
 from gsplat_core.ops.frame.frame_gradients import render_frame_backward_adam_
 from gsplat_core.ops.image_loss.frame_loss import frame_loss
-from gsplat_core.render.capture import CapturedSequence, GraphMemory
-from gsplat_core.render.frame_renderer import FrameControls
-from gsplat_core.render.tile_capacity import StatusOnHost, capacity_for
+from gsplat_core.rendering.capture import CapturedSequence, GraphMemory
+from gsplat_core.rendering.frame_renderer import FrameControls
+from gsplat_core.rendering.tile_capacity import StatusOnHost, capacity_for
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.field_training import FieldTraining

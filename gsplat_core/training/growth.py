@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import torch
 
-from gsplat_core.render.rasterization import render
+from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.image_loss.image_loss import image_loss
-from gsplat_core.render.settings import EPS2D, FAR_PLANE, NEAR_PLANE, TILE_SIZE
+from gsplat_core.rendering.settings import EPS2D, FAR_PLANE, NEAR_PLANE, TILE_SIZE
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.observations import Observation

@@ -15,7 +15,7 @@ from gsplat_core.argument_checks import require_float32, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native
 from gsplat_core.ops.frame import frame_autograd  # noqa: F401  registers the gradient
-from gsplat_core.render.settings import EPS2D, FAR_PLANE, NEAR_PLANE
+from gsplat_core.rendering.settings import EPS2D, FAR_PLANE, NEAR_PLANE
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE
 

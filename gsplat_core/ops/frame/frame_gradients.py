@@ -16,7 +16,7 @@ from gsplat_core.argument_checks import require_float32, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.reference.frame import RAW_COLUMNS
-from gsplat_core.render.settings import EPS2D
+from gsplat_core.rendering.settings import EPS2D
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 if TYPE_CHECKING:

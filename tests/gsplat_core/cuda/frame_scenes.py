@@ -13,7 +13,7 @@ from gsplat_core.ops.frame.frame import Frame, render_frame
 from gsplat_core.ops.frame.frame_gradients import DC, RawGradients, render_frame_backward
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.reference.frame import render_frame as reference_frame
-from gsplat_core.render.settings import FAR_PLANE, NEAR_PLANE
+from gsplat_core.rendering.settings import FAR_PLANE, NEAR_PLANE
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
 TILE = 16

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsplat_core import InvalidInput
 from gsplat_core.ops.frame.frame import MOST_IN_TILE, STATUS_CUT, STATUS_MOST, STATUS_NEEDED, Frame, render_frame
 from gsplat_core.reference.frame import render_frame as reference_frame
-from gsplat_core.render.settings import EPS2D
+from gsplat_core.rendering.settings import EPS2D
 from tests.gsplat_core.cuda.frame_scenes import FrameScene, frame_scene
 
 pytestmark = pytest.mark.cuda

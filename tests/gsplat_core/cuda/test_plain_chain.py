@@ -18,7 +18,7 @@ from gsplat_core import (
     spherical_harmonics,
 )
 from gsplat_core.ops.tiles.tiles import bin_splats
-from gsplat_core.render.view_colors import camera_centers
+from gsplat_core.rendering.view_colors import camera_centers
 
 pytestmark = pytest.mark.cuda
 

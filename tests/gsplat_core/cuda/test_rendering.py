@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-
 from gsplat_core.render import rasterization as rendering
-from gsplat_core.render.rasterization import render
+
+from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 
 pytestmark = pytest.mark.cuda

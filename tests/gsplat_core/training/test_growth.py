@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.render.rasterization import render
+from gsplat_core.rendering.rasterization import render
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth import gaussians_for_uncovered_tissue
 from gsplat_core.training.initialisation import gaussians_from_frame

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.render.rasterization import render
+from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.initialisation import facing, gaussians_from_frame, tissue_colours, tissue_depth
 from gsplat_core.training.metrics import psnr_frame_db

@@ -14,9 +14,9 @@ from gsplat_core.deformation import DeformationField
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.frame.frame import Frame, render_frame
 from gsplat_core.ops.scalars.scalars import store_scalars_
-from gsplat_core.render.capture import CapturedSequence, GraphMemory
-from gsplat_core.render.rasterization import RenderOutput
-from gsplat_core.render.tile_capacity import ListRoom, StatusOnHost
+from gsplat_core.rendering.capture import CapturedSequence, GraphMemory
+from gsplat_core.rendering.rasterization import RenderOutput
+from gsplat_core.rendering.tile_capacity import ListRoom, StatusOnHost
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 

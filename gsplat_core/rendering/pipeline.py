@@ -13,8 +13,8 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, pack
-from gsplat_core.render.meta import Deferred, Meta
-from gsplat_core.render.settings import (
+from gsplat_core.rendering.meta import Deferred, Meta
+from gsplat_core.rendering.settings import (
     EPS2D,
     FAR_PLANE,
     NEAR_PLANE,
@@ -24,7 +24,7 @@ from gsplat_core.render.settings import (
     RenderSettings,
     refuse_unsupported,
 )
-from gsplat_core.render.view_colors import view_colors
+from gsplat_core.rendering.view_colors import view_colors
 
 Rasterized = tuple[Tensor, Tensor, Meta]
 """Colours [..., C, H, W, X], alphas [..., C, H, W, 1] and what was computed on the way."""

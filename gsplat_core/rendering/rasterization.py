@@ -13,7 +13,7 @@ from gsplat_core.ops.frame.frame import STATUS_CUT, STATUS_NEEDED, render_frame
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.tiles import bin_splats, isect_tiles
-from gsplat_core.render.pipeline import Operations
+from gsplat_core.rendering.pipeline import Operations
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.transfers import HostCopy

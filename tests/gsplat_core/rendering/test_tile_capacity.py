@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from gsplat_core.ops.frame.frame import MOST_IN_TILE
-from gsplat_core.render.tile_capacity import HEADROOM, TILE_STEP, ListRoom, capacity_for
+from gsplat_core.rendering.tile_capacity import HEADROOM, TILE_STEP, ListRoom, capacity_for
 
 
 def test_tiles_have_rooms_of_their_own_with_some_to_spare():

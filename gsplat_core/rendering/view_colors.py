@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.projection.arguments import DenseProjection
-from gsplat_core.render.settings import RenderSettings
+from gsplat_core.rendering.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from gsplat_core.render.pipeline import Operations
+    from gsplat_core.rendering.pipeline import Operations
 
 
 def view_colors(
