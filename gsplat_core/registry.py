@@ -1,0 +1,57 @@
+"""Implementations that are chosen by name: deformation fields, renderers, sources, sinks."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping
+from typing import Any, Generic, TypeVar, cast
+
+from gsplat_core.errors import InvalidInput, InvalidSetting
+
+Kind = TypeVar("Kind")
+
+
+class Registry(Generic[Kind]):
+    """Names and what they stand for, in the order in which they were added.
+
+    An entry is the implementation itself or where it is, as `"package.module:attribute"`; that module is imported when the name is first
+    used, so that listing the names loads nothing.
+    """
+
+    def __init__(self, what: str, entries: Mapping[str, Kind | str] | None = None) -> None:
+        """`what` names the kind of thing in messages: "renderer"."""
+        self.what = what
+        self._entries: dict[str, Any] = dict(entries or {})
+
+    def add(self, name: str, kind: Kind | str) -> None:
+        """Register `kind` as `name`. Raises InvalidInput when the name is taken."""
+        if name in self._entries:
+            raise InvalidInput(f"there is a {self.what} {name!r} already; choose another name")
+        self._entries[name] = kind
+
+    def remove(self, name: str) -> None:
+        """Forget `name`. Raises InvalidSetting when it is not registered."""
+        self._check(name)
+        del self._entries[name]
+
+    def __getitem__(self, name: str) -> Kind:
+        """What `name` stands for. Raises InvalidSetting, with the known names, when it is not registered."""
+        self._check(name)
+        entry = self._entries[name]
+        if isinstance(entry, str):
+            module, attribute = entry.split(":")
+            entry = self._entries[name] = getattr(importlib.import_module(module), attribute)
+        return cast(Kind, entry)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._entries
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def _check(self, name: str) -> None:
+        if name not in self._entries:
+            raise InvalidSetting(f"unknown {self.what} {name!r}; known are {', '.join(self._entries) or 'none'}")
