@@ -93,8 +93,8 @@ void hexplane_planes_adam_(Tensors planes, Tensors first, Tensors second, Tensor
                       "moments must be contiguous and of their plane's size");
     }
     const size_t level = i / 6, p = i % 6;
-    (p < 3 ? state.space[level][p] : state.time[level][p - 3]) = {mutable_data(planes[i]), mutable_data(first[i]),
-                                                                  mutable_data(second[i])};
+    auto& plane = p < 3 ? state.space[level][p] : state.time[level][p - 3];
+    plane = {mutable_data(planes[i]), mutable_data(first[i]), mutable_data(second[i])};
     if (p >= 3) state.time_rows[level][p - 3] = int32_t(planes[i].size(0));
   }
   STD_TORCH_CHECK(smoothness == 0 || field.planes.channels <= 512, "the penalty on space planes takes up to 512 channels, got ",
