@@ -22,12 +22,13 @@ from torch import Tensor
 from gsplat_core.deformation.field import DeformationField, checked_window, count_of
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
+from gsplat_core.ops.basis_field import plain_torch
+from gsplat_core.ops.basis_field.plain_torch import BUMP_REACH
 from gsplat_core.ops.native import CUDA_MISSING
-from gsplat_core.reference import deformation as reference
-from gsplat_core.reference.deformation import BUMP_REACH, CHANNEL_GROUPS
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.layout import BASIS_CHANNELS as CHANNELS
+from gsplat_core.scene.layout import BASIS_GROUPS, width_of
 
-CHANNELS = sum(CHANNEL_GROUPS)
 BUMPS_PER_SPACING = math.sqrt(math.pi)
 """What a row of equal bumps of width 1, one per spacing, adds up to at any time (within 0.02 %)."""
 
@@ -118,7 +119,7 @@ class BasisField(DeformationField):
                 f"the field holds bumps for {deltas.shape[0]} Gaussians, got {gaussians.count}; keep them in step with"
                 " select and append"
             )
-        position, rotation, log_scale, colour = torch.split(deltas, list(CHANNEL_GROUPS), dim=1)
+        position, rotation, log_scale, colour = torch.split(deltas, [width_of(group) for group in BASIS_GROUPS], dim=1)
         sh = gaussians.sh
         base = sh[:, :1] + colour[:, None]
         return Gaussians(
@@ -307,7 +308,7 @@ class BasisField(DeformationField):
         """The compiled ops where they exist, plain torch for other dtypes and devices."""
         device = self.weights.device.type
         has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
-        return compiled if has_kernels and self.weights.dtype == torch.float32 else reference
+        return compiled if has_kernels and self.weights.dtype == torch.float32 else plain_torch
 
     def _moments_in_use(self) -> _Moments:
         if self._moments is None:
