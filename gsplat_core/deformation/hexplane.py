@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gsplat_core.deformation import regularisers
 from gsplat_core.deformation.field import DeformationField, checked_window
+from gsplat_core.deformation.field_slots import WholeFieldSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane import hexplane as compiled
 from gsplat_core.ops.hexplane.deltas import hexplane_deltas, takes_layers
@@ -226,6 +227,10 @@ class HexPlaneField(DeformationField):
 
     def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
         """The field holds no state per Gaussian; nothing to do."""
+
+    def slot(self, rows: int) -> WholeFieldSlot:
+        """See `DeformationField.slot`; the field has no tensors per Gaussian."""
+        return WholeFieldSlot(self)
 
     def config(self) -> dict[str, Any]:
         """Kind, window and architecture; the box is stored with the tensors."""
