@@ -6,6 +6,8 @@
 
 namespace {
 
+using namespace GSPLAT_ISA::projection;
+
 // The camera in shared memory: its matrices are in device memory, so that a captured graph sees new ones.
 struct FrameCamera {
   float viewmat[16], intrinsics[9], center[3];
@@ -71,9 +73,9 @@ __device__ inline RawGaussian load_gaussian(const FrameScene& in, int64_t n) {
 
 __device__ inline float opacity_of(const RawGaussian& g) { return 1.0f / (1.0f + expf(-g.logit)); }
 
-__device__ inline GSPLAT_ISA::Geometry geometry_of(const RawGaussian& g) {
+__device__ inline Geometry geometry_of(const RawGaussian& g) {
   const float scales[3] = {expf(g.log_scale[0]), expf(g.log_scale[1]), expf(g.log_scale[2])};
-  return GSPLAT_ISA::geometry_of(g.quat, scales);
+  return GSPLAT_ISA::projection::geometry_of(g.quat, scales);
 }
 
 // The unit vector from the camera to the Gaussian, and one over their distance.
