@@ -20,7 +20,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings import Recording, is_heldout, open_recording
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.config import FieldChoice, ReconstructorConfig
+from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, scheduler_for
 from operators.applications.execution import Execution
@@ -52,7 +52,7 @@ class ReplaySettings:
     out: Path
     device: str = "cpu"
     engine: Engine = "embedded"
-    field: FieldChoice = "auto"
+    field: str = "auto"
     renderer: str = "alpha"
     """A name in `gsplat_core.rendering.registry.RENDERERS`."""
     seed: int = 0
