@@ -2,7 +2,6 @@
 #pragma once
 
 #include <cuda_runtime.h>
-#include <torch/csrc/stable/accelerator.h>
 
 #include <vector>
 
@@ -12,7 +11,7 @@
 extern "C" AOTITorchError aoti_torch_get_current_cuda_stream(int32_t device_index, void** ret_stream);
 
 inline void check_cuda(cudaError_t error, const char* what) {
-  STD_TORCH_CHECK(error == cudaSuccess, what, ": CUDA says ", cudaGetErrorString(error));
+  check(error == cudaSuccess, what, ": CUDA says ", cudaGetErrorString(error));
 }
 
 // Makes the device of a tensor current and takes torch's current stream there. Scratch memory comes from torch's allocator, which
@@ -21,7 +20,7 @@ class CudaCall final : public CudaScratch {
  public:
   explicit CudaCall(const Tensor& on) : on_(on), guard_(on.get_device_index()) {
     void* current = nullptr;
-    STD_TORCH_CHECK(aoti_torch_get_current_cuda_stream(on.get_device_index(), &current) == 0, "torch has no current CUDA stream");
+    check(aoti_torch_get_current_cuda_stream(on.get_device_index(), &current) == 0, "torch has no current CUDA stream");
     stream = static_cast<cudaStream_t>(current);
   }
 
@@ -29,9 +28,9 @@ class CudaCall final : public CudaScratch {
 
   // A contiguous tensor of this type on the device of the call.
   Tensor take(const Tensor& t, ScalarType type, const char* name) const {
-    STD_TORCH_CHECK(t.is_cuda() && t.get_device_index() == on_.get_device_index(), name,
-                    " must be on the same CUDA device as the other tensors");
-    STD_TORCH_CHECK(t.scalar_type() == type, name, " has the wrong type for the CUDA implementation");
+    check(t.is_cuda() && t.get_device_index() == on_.get_device_index(), name,
+          " must be on the same CUDA device as the other tensors");
+    check(t.scalar_type() == type, name, " has the wrong type for the CUDA implementation");
     return t.is_contiguous() ? t : torch::stable::contiguous(t);
   }
   Tensor floats(const Tensor& t, const char* name) const { return take(t, ScalarType::Float, name); }

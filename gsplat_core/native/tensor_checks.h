@@ -1,27 +1,24 @@
 // Checks and typed access shared by the op files: what was expected, what came, in one sentence.
 #pragma once
 
-#include <torch/csrc/stable/library.h>
-#include <torch/csrc/stable/ops.h>
-#include <torch/csrc/stable/tensor.h>
-#include <torch/headeronly/core/ScalarType.h>
-#include <torch/headeronly/util/Exception.h>
-
 #include <initializer_list>
 
+#include "torch_abi.h"
+
+using gsplat::check;
 using torch::stable::Tensor;
 using ScalarType = torch::headeronly::ScalarType;
 
 // A float32 CPU tensor, made contiguous; the wrappers in Python have checked shapes and broadcast already.
 inline Tensor floats(const Tensor& t, const char* name) {
-  STD_TORCH_CHECK(t.is_cpu(), name, " must be on the CPU for this implementation");
-  STD_TORCH_CHECK(t.scalar_type() == ScalarType::Float, name, " must be float32");
+  check(t.is_cpu(), name, " must be on the CPU for this implementation");
+  check(t.scalar_type() == ScalarType::Float, name, " must be float32");
   return t.is_contiguous() ? t : torch::stable::contiguous(t);
 }
 
 inline Tensor ints(const Tensor& t, const char* name) {
-  STD_TORCH_CHECK(t.is_cpu(), name, " must be on the CPU for this implementation");
-  STD_TORCH_CHECK(t.scalar_type() == ScalarType::Int, name, " must be int32");
+  check(t.is_cpu(), name, " must be on the CPU for this implementation");
+  check(t.scalar_type() == ScalarType::Int, name, " must be int32");
   return t.is_contiguous() ? t : torch::stable::contiguous(t);
 }
 

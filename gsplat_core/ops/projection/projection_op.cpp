@@ -57,7 +57,7 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians_back
                        v_conics = floats(v_conics_in, "v_conics"),
                        v_compensations = floats(v_compensations_in, "v_compensations");
   const auto fits = [&](const OptionalTensor& t, int64_t columns) { return !t.has_value() || t->numel() == B * C * N * columns; };
-  STD_TORCH_CHECK(
+  check(
       radii.numel() == B * C * N * 2 && fits(v_means2d, 2) && fits(v_depths, 1) && fits(v_conics, 3) && fits(v_compensations, 1),
       "projection backward: the sizes of the gradients do not fit the inputs");
   const bool from_covars = scene.covars.has_value();
@@ -106,6 +106,6 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians_back
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) {
-  m.impl("project_gaussians", TORCH_BOX(&project_gaussians));
-  m.impl("project_gaussians_backward", TORCH_BOX(&project_gaussians_backward));
+  m.impl("project_gaussians", GSPLAT_BOX(&project_gaussians));
+  m.impl("project_gaussians_backward", GSPLAT_BOX(&project_gaussians_backward));
 }

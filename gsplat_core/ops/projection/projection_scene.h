@@ -33,18 +33,16 @@ struct ProjectionScene {
         scales(optional_floats(floats, scales_in, "scales")),
         opacities(optional_floats(floats, opacities_in, "opacities")),
         settings{} {
-    STD_TORCH_CHECK(means.dim() == 3 && viewmats.dim() == 4, "projection takes means [B, N, 3] and viewmats [B, C, 4, 4]");
-    STD_TORCH_CHECK(covars.has_value() != (quats.has_value() && scales.has_value()),
-                    "projection takes covars, or quats and scales");
+    check(means.dim() == 3 && viewmats.dim() == 4, "projection takes means [B, N, 3] and viewmats [B, C, 4, 4]");
+    check(covars.has_value() != (quats.has_value() && scales.has_value()), "projection takes covars, or quats and scales");
     batches = means.size(0);
     gaussians = means.size(1);
     cameras = viewmats.size(1);
     const int64_t rows = batches * gaussians, views = batches * cameras;
-    STD_TORCH_CHECK(
-        means.numel() == 3 * rows && viewmats.numel() == 16 * views && intrinsics.numel() == 9 * views &&
-            (!covars.has_value() || covars->numel() == 6 * rows) && (!quats.has_value() || quats->numel() == 4 * rows) &&
-            (!scales.has_value() || scales->numel() == 3 * rows) && (!opacities.has_value() || opacities->numel() == rows),
-        "projection: the sizes of the inputs do not fit together");
+    check(means.numel() == 3 * rows && viewmats.numel() == 16 * views && intrinsics.numel() == 9 * views &&
+              (!covars.has_value() || covars->numel() == 6 * rows) && (!quats.has_value() || quats->numel() == 4 * rows) &&
+              (!scales.has_value() || scales->numel() == 3 * rows) && (!opacities.has_value() || opacities->numel() == rows),
+          "projection: the sizes of the inputs do not fit together");
   }
 
   ProjectionInput view(int64_t batch, int64_t camera) const {

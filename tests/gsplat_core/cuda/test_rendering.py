@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from gsplat_core.render import rasterization as rendering
+from gsplat_core.rendering import rasterization as rendering
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
