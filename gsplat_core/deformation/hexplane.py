@@ -66,6 +66,7 @@ class HexPlaneField(DeformationField):
     """
 
     kind = "hexplane"
+    has_frame_deltas = True
 
     def __init__(
         self,
@@ -97,6 +98,12 @@ class HexPlaneField(DeformationField):
         torch.nn.init.zeros_(self.head.bias)
         if not gaussians.means.is_meta:
             self.to(self.box.device)
+
+    @classmethod
+    def for_gaussians(
+        cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any
+    ) -> HexPlaneField:
+        return cls(gaussians, time_window_s, **architecture)
 
     def coordinates(self, means: Tensor, time_s: float) -> Tensor:
         """[N, 4] in [-1, 1]: the one place where space and time are normalised. Outside the box or window: clamped."""
@@ -219,12 +226,6 @@ class HexPlaneField(DeformationField):
         weights, biases = self._network()
         return [weight.data for weight in weights], [bias.data for bias in biases]
 
-    def select(self, index: Tensor) -> None:
-        """The field holds no state per Gaussian; nothing to do."""
-
-    def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
-        """The field holds no state per Gaussian; nothing to do."""
-
     def config(self) -> dict[str, Any]:
         """Kind, window and architecture; the box is stored with the tensors."""
         return {
@@ -236,13 +237,6 @@ class HexPlaneField(DeformationField):
             "width": self.width,
             "depth": self.depth,
         }
-
-    @classmethod
-    def from_config(cls, config: dict[str, Any], gaussians: Gaussians) -> HexPlaneField:
-        """An untrained field of the architecture that `config` describes."""
-        start, end = config["time_window_s"]
-        names = ("channels", "resolution", "levels", "width", "depth")
-        return cls(gaussians, (start, end), **{name: config[name] for name in names})
 
     def check_state(self) -> None:
         """InvalidInput when the box is not one: its lower corner must be below its upper one."""

@@ -6,6 +6,8 @@
 
 #include <type_traits>
 
+#include "cuda_check.h"
+
 namespace {
 
 // What the preceding kernels wrote is visible after this. Every thread of a kernel started by `launch_dependent` calls it.
@@ -26,7 +28,7 @@ template <class... Parameters>
 void launch_dependent(void (*kernel)(Parameters...), unsigned blocks, int threads, cudaStream_t stream, size_t shared_bytes,
                       std::type_identity_t<Parameters>... parameters) {
   cudaFuncAttributes code = {};
-  cudaFuncGetAttributes(&code, kernel);
+  check_cuda(cudaFuncGetAttributes(&code, kernel), "asking for a kernel's attributes");
   cudaLaunchAttribute attribute = {};
   attribute.id = cudaLaunchAttributeProgrammaticStreamSerialization;
   attribute.val.programmaticStreamSerializationAllowed = 1;
@@ -36,8 +38,8 @@ void launch_dependent(void (*kernel)(Parameters...), unsigned blocks, int thread
   config.dynamicSmemBytes = shared_bytes;
   config.stream = stream;
   config.attrs = &attribute;
-  config.numAttrs = code.ptxVersion >= 90 ? 1 : 0;     // code for earlier GPUs has no wait in it
-  cudaLaunchKernelEx(&config, kernel, parameters...);  // the caller checks cudaGetLastError
+  config.numAttrs = code.ptxVersion >= 90 ? 1 : 0;  // code for earlier GPUs has no wait in it
+  check_cuda(cudaLaunchKernelEx(&config, kernel, parameters...), "launching a dependent kernel");
 }
 
 }  // namespace

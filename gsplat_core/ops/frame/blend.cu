@@ -7,7 +7,7 @@
 #include "frame.h"
 #include "tile_sort.cuh"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
 using Splat = Record<4>;
@@ -159,4 +159,4 @@ void blend(const Scene& in, const Lists& lists, const Scratch& scratch, const Pi
   launch_dependent(kernel, unsigned(in.tiles()), kBlockThreads, stream, 0, in, lists, scratch, out);
 }
 
-}  // namespace frame
+}  // namespace gsplat::frame

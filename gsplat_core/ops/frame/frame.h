@@ -15,7 +15,7 @@
 #include "cuda_scratch.h"
 #include "raw_layout.h"
 
-namespace frame {
+namespace gsplat::frame {
 
 constexpr int kTile = 16;                 // pixels on a side
 constexpr int kGaussianThreads = 128;     // threads of a block that has one Gaussian per thread
@@ -96,4 +96,4 @@ void blend(const Scene& in, const Lists& lists, const Scratch& scratch, const Pi
 // frames. Unless the frame overflowed, `step` is incremented and `fits` set to 1; else `fits` is 0.
 void accumulate_status(const int32_t* status, int32_t* totals, int64_t* step, float* fits, cudaStream_t stream);
 
-}  // namespace frame
+}  // namespace gsplat::frame

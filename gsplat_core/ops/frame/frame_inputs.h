@@ -7,7 +7,7 @@
 #include "cuda_call.h"
 #include "frame.h"
 
-namespace frame {
+namespace gsplat::frame {
 
 constexpr const char* kGaussianTensors[] = {"means", "quats", "log_scales", "logit_opacities", "sh"};
 
@@ -21,12 +21,11 @@ struct Inputs {
   CudaCall call;
   std::vector<Tensor> gaussians;  // means, quats, log_scales, logit_opacities, sh
   Tensor viewmat, intrinsics;
-  std::optional<Tensor> deltas, background;
+  OptionalTensor deltas, background;
   Scene scene;
 
-  Inputs(const std::vector<Tensor>& gaussians_in, const std::optional<Tensor>& deltas_in, const Tensor& viewmat_in,
-         const Tensor& intrinsics_in, const std::optional<Tensor>& background_in, const ViewArguments& view,
-         bool takes_half_sh = false)
+  Inputs(const std::vector<Tensor>& gaussians_in, const OptionalTensor& deltas_in, const Tensor& viewmat_in,
+         const Tensor& intrinsics_in, const OptionalTensor& background_in, const ViewArguments& view, bool takes_half_sh = false)
       : call(first_of(gaussians_in)), viewmat(call.floats(viewmat_in, "viewmat")), intrinsics(call.floats(intrinsics_in, "K")) {
     for (size_t i = 0; i < gaussians_in.size(); ++i) {
       const Tensor& t = gaussians_in[i];
@@ -104,4 +103,4 @@ struct Inputs {
   }
 };
 
-}  // namespace frame
+}  // namespace gsplat::frame

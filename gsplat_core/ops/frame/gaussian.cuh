@@ -4,8 +4,10 @@
 #include "../projection/projection_math.h"
 #include "frame.h"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
+
+using namespace GSPLAT_ISA::projection;
 
 // The camera in shared memory. Its matrices come from device memory, so that a captured graph reads the current ones.
 struct Camera {
@@ -72,9 +74,9 @@ __device__ inline RawGaussian load_gaussian(const Scene& in, int64_t n) {
 
 __device__ inline float opacity_of(const RawGaussian& g) { return 1.0f / (1.0f + expf(-g.logit)); }
 
-__device__ inline GSPLAT_ISA::Geometry geometry_of(const RawGaussian& g) {
+__device__ inline Geometry geometry_of(const RawGaussian& g) {
   const float scales[3] = {expf(g.log_scale[0]), expf(g.log_scale[1]), expf(g.log_scale[2])};
-  return GSPLAT_ISA::geometry_of(g.quat, scales);
+  return GSPLAT_ISA::projection::geometry_of(g.quat, scales);
 }
 
 // The unit vector from the camera to the Gaussian, and one over their distance.
@@ -91,4 +93,4 @@ __device__ inline float unit_direction(const Camera& camera, const float mean[3]
 
 }  // namespace
 
-}  // namespace frame
+}  // namespace gsplat::frame

@@ -5,7 +5,7 @@
 #include "../tiles/tile_ellipse.cuh"
 #include "frame.h"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
 constexpr uint32_t kMaxSum = 0x7fffffffu;  // sums saturate here; min(a + b, kMaxSum) is associative
@@ -212,4 +212,4 @@ __device__ inline void emit_large(const Scene& in, const Lists& lists, const Scr
 
 }  // namespace
 
-}  // namespace frame
+}  // namespace gsplat::frame

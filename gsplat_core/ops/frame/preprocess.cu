@@ -6,7 +6,7 @@
 #include "gaussian.cuh"
 #include "instances.cuh"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
 using namespace GSPLAT_ISA;
@@ -198,4 +198,4 @@ void preprocess(const Scene& in, const Lists& lists, const Scratch& scratch, cud
   run(in, lists, scratch, stream);
 }
 
-}  // namespace frame
+}  // namespace gsplat::frame

@@ -2,7 +2,7 @@
 #include "dependent_launch.cuh"
 #include "instances.cuh"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
 // A prefix sum in one pass (decoupled look-back, Merrill and Garland 2016): a block publishes the sum of its kScanThreads counts,
@@ -135,4 +135,4 @@ void accumulate_status(const int32_t* status, int32_t* totals, int64_t* step, fl
   accumulate<<<1, kStatusSize, 0, stream>>>(status, totals, step, fits);
 }
 
-}  // namespace frame
+}  // namespace gsplat::frame

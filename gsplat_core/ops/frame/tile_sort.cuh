@@ -4,7 +4,7 @@
 
 #include "../compositing/blend_window.cuh"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
 constexpr int kSortKeys = 2048;      // keys that a block sorts in shared memory
@@ -227,4 +227,4 @@ __device__ inline bool sort_by_buckets(const uint64_t (&keys)[kEach], int count,
 
 }  // namespace
 
-}  // namespace frame
+}  // namespace gsplat::frame

@@ -5,7 +5,7 @@
 #include "../spherical_harmonics/spherical_harmonics_bases.h"
 #include "frame_gradients.h"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
 using namespace GSPLAT_ISA;
@@ -113,4 +113,4 @@ __device__ inline void harmonics_gradient(const Camera& camera, const RawGaussia
 
 }  // namespace
 
-}  // namespace frame
+}  // namespace gsplat::frame

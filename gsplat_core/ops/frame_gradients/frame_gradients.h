@@ -3,7 +3,7 @@
 
 #include "../frame/frame.h"
 
-namespace frame {
+namespace gsplat::frame {
 
 constexpr int kTensors = 5;  // of the Gaussians: means, quats, log-scales, logit opacities, spherical harmonics
 
@@ -41,4 +41,4 @@ void splat_gradients(const Scene& scene, const Lists& lists, const PictureGradie
 void splat_adam(const Scene& scene, const Lists& lists, const PictureGradient& from, const RawGradients& to, const Adam& adam,
                 cudaStream_t stream);
 
-}  // namespace frame
+}  // namespace gsplat::frame

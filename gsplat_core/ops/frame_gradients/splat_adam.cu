@@ -1,7 +1,7 @@
 // As splat_gradients.cu with Adam over the Gaussians at the end: their gradients never go through global memory.
 #include "warp_rows.cuh"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
 // The factors of Adam's update in this step, as in ../adam/adam.h.
@@ -198,4 +198,4 @@ void splat_adam(const Scene& scene, const Lists& lists, const PictureGradient& f
   });
 }
 
-}  // namespace frame
+}  // namespace gsplat::frame

@@ -1,7 +1,7 @@
 // Per Gaussian: the sum of its gradient rows, and the chain rule to its raw parameters.
 #include "warp_rows.cuh"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
 template <int kDegree>
@@ -32,4 +32,4 @@ void splat_gradients(const Scene& scene, const Lists& lists, const PictureGradie
   });
 }
 
-}  // namespace frame
+}  // namespace gsplat::frame

@@ -3,9 +3,10 @@
 // A row is the sum over the tile's pixels in a fixed order. Unless `atomic`, every instance has a row of its own and nothing is
 // added atomically, so results are bitwise reproducible.
 #include "../compositing/blend_backward.cuh"
+#include "cuda_check.h"
 #include "frame_gradients.h"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
 constexpr int kChannels = 4;  // red, green, blue, z
@@ -74,10 +75,11 @@ __global__ void __launch_bounds__(kBlockThreads, 5) backward_tiles(Scene scene, 
 }  // namespace
 
 void tile_gradients(const Scene& scene, const Lists& lists, const PictureGradient& from, cudaStream_t stream) {
-  if (from.atomic) cudaMemsetAsync(from.rows, 0, size_t(scene.count) * kRowQuads * sizeof(float4), stream);
+  if (from.atomic)
+    check_cuda(cudaMemsetAsync(from.rows, 0, size_t(scene.count) * kRowQuads * sizeof(float4), stream), "clearing gradient rows");
   if (scene.tiles() == 0) return;
   const auto kernel = from.atomic ? backward_tiles<true> : backward_tiles<false>;
   kernel<<<unsigned(scene.tiles()), kBlockThreads, 0, stream>>>(scene, lists, from);
 }
 
-}  // namespace frame
+}  // namespace gsplat::frame

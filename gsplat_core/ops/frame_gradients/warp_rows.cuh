@@ -6,7 +6,7 @@
 
 #include "chain_rule.cuh"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
@@ -213,4 +213,4 @@ void with_degree(int bases, const Run& run) {
 
 }  // namespace
 
-}  // namespace frame
+}  // namespace gsplat::frame

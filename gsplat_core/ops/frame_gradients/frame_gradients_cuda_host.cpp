@@ -5,10 +5,9 @@
 #include "../frame/frame_inputs.h"
 #include "frame_gradients.h"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
-using OptionalTensor = std::optional<Tensor>;
 using Tensors = std::vector<Tensor>;
 
 // The results of render_frame after the image, in their order.
@@ -98,7 +97,7 @@ std::tuple<Tensor, Tensor> render_frame_backward(Tensors gaussians, OptionalTens
   Tensor v_raw = call.empty({n, kRawColumns}), v_sh = bases > 1 ? call.empty({n, bases, 3}) : call.empty({0});
   tile_gradients(scene, pass.lists, pass.from, call.stream);
   splat_gradients(scene, pass.lists, pass.from, {mutable_data(v_raw), bases > 1 ? mutable_data(v_sh) : nullptr}, call.stream);
-  check_cuda(cudaGetLastError(), "render_frame_backward");
+  call.finish("render_frame_backward");
   return {v_raw, v_sh};
 }
 
@@ -134,14 +133,15 @@ Tensor render_frame_backward_adam_(Tensors gaussians, Tensors first, Tensors sec
   Tensor v_raw = needs_raw ? call.empty({inputs.scene.count, kRawColumns}) : call.empty({0});
   tile_gradients(inputs.scene, pass.lists, pass.from, call.stream);
   splat_adam(inputs.scene, pass.lists, pass.from, {needs_raw ? mutable_data(v_raw) : nullptr, nullptr}, adam, call.stream);
-  check_cuda(cudaGetLastError(), "render_frame_backward_adam_");
+  call.finish("render_frame_backward_adam_");
   return v_raw;
 }
 
 }  // namespace
-}  // namespace frame
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("render_frame_backward", GSPLAT_BOX(&frame::render_frame_backward));
-  m.impl("render_frame_backward_adam_", GSPLAT_BOX(&frame::render_frame_backward_adam_));
+  m.impl("render_frame_backward", GSPLAT_BOX(&render_frame_backward));
+  m.impl("render_frame_backward_adam_", GSPLAT_BOX(&render_frame_backward_adam_));
 }
+
+}  // namespace gsplat::frame

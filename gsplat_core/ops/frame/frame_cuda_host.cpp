@@ -4,7 +4,7 @@
 
 #include "frame_inputs.h"
 
-namespace frame {
+namespace gsplat::frame {
 namespace {
 
 constexpr int64_t kMaxInts = (int64_t(1) << 31) - 1;
@@ -22,9 +22,9 @@ void check_capacity(int64_t capacity, int64_t tiles, Mode mode) {
   }
 }
 
-Frame render_frame(std::vector<Tensor> gaussians, std::optional<Tensor> deltas, Tensor viewmat, Tensor intrinsics,
-                   std::optional<Tensor> background, int64_t width, int64_t height, double eps2d, double near_plane,
-                   double far_plane, int64_t camera_model, int64_t capacity, int64_t mode) {
+Frame render_frame(std::vector<Tensor> gaussians, OptionalTensor deltas, Tensor viewmat, Tensor intrinsics,
+                   OptionalTensor background, int64_t width, int64_t height, double eps2d, double near_plane, double far_plane,
+                   int64_t camera_model, int64_t capacity, int64_t mode) {
   check(mode >= kShared && mode <= kSegments, "render_frame: mode must be 0 (shared), 1 (training) or 2 (segments), got ", mode);
   const bool training = mode == kTraining, segments = mode == kSegments;
   Inputs inputs(gaussians, deltas, viewmat, intrinsics, background, {width, height, eps2d, near_plane, far_plane, camera_model},
@@ -69,7 +69,7 @@ Frame render_frame(std::vector<Tensor> gaussians, std::optional<Tensor> deltas, 
     check_cuda(cudaMemsetAsync(lists.status, 0, kStatusSize * sizeof(int32_t), call.stream), "clearing the frame's status");
   }
   blend(in, lists, scratch, out, call.stream);
-  check_cuda(cudaGetLastError(), "render_frame");
+  call.finish("render_frame");
   return {image, alphas, last, records, tile_offsets, sorted, splat_starts, instance_splats, status};
 }
 
@@ -85,14 +85,15 @@ Tensor accumulate_status_(Tensor status, Tensor totals, Tensor step) {
   Tensor fits = call.empty({1});
   accumulate_status(status.const_data_ptr<int32_t>(), totals.mutable_data_ptr<int32_t>(), step.mutable_data_ptr<int64_t>(),
                     mutable_data(fits), call.stream);
-  check_cuda(cudaGetLastError(), "accumulate_status_");
+  call.finish("accumulate_status_");
   return fits;
 }
 
 }  // namespace
-}  // namespace frame
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("render_frame", GSPLAT_BOX(&frame::render_frame));
-  m.impl("accumulate_status_", GSPLAT_BOX(&frame::accumulate_status_));
+  m.impl("render_frame", GSPLAT_BOX(&render_frame));
+  m.impl("accumulate_status_", GSPLAT_BOX(&accumulate_status_));
 }
+
+}  // namespace gsplat::frame
