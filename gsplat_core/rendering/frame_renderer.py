@@ -12,7 +12,7 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_shape
 from gsplat_core.deformation import DeformationField
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.frame.frame import Frame, render_frame
+from gsplat_core.ops.frame.frame import Frame, FrameMode, View, render_frame
 from gsplat_core.ops.scalars.scalars import store_scalars_
 from gsplat_core.rendering.capture import CapturedSequence, GraphMemory
 from gsplat_core.rendering.rasterization import RenderOutput
@@ -137,23 +137,13 @@ class FrameRenderer:
 
     def _sequence(self) -> Frame:
         deltas = None if self._deltas is None else self._deltas(self._controls.time)
-        scene = self.gaussians
-        frame = render_frame(
-            scene.means,
-            scene.quats,
-            scene.log_scales,
-            scene.logit_opacities,
-            self._sh,
-            deltas,
-            self._controls.viewmat,
-            self._controls.intrinsics,
-            self._background,
-            self._camera.width_px,
-            self._camera.height_px,
-            self._room.capacity,
-            camera_model=self._camera.model,
-            per_tile=self._room.per_tile,
+        scene, camera, controls = self.gaussians, self._camera, self._controls
+        tensors = scene.means, scene.quats, scene.log_scales, scene.logit_opacities, self._sh
+        view = View(
+            controls.viewmat, controls.intrinsics, camera.width_px, camera.height_px, self._background, camera.model
         )
+        mode = FrameMode.SEGMENTS if self._room.per_tile else FrameMode.SHARED
+        frame = render_frame(tensors, deltas, view, self._room.capacity, mode)
         self._status.fetch(frame.status)
         return frame
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.frame.frame import MOST_IN_TILE, STATUS_CUT, STATUS_MOST, STATUS_NEEDED, TILE_SIZE
+from gsplat_core.ops.frame.frame import MAX_SEGMENT, STATUS_LONGEST, STATUS_NEEDED, STATUS_OVERFLOW, TILE_SIZE
 
 CAPACITY_STEP = 1 << 16
 """Lists in one room grow by multiples of this many instances (a splat in a tile)."""
@@ -38,7 +38,7 @@ class ListRoom:
         Rooms of their own are faster. They take up to 32 bytes a pixel; where a tile has more than fits then, all lists share one.
         """
         of_tile = max(1, math.ceil(most * HEADROOM / TILE_STEP)) * TILE_STEP
-        if of_tile <= MOST_IN_TILE:
+        if of_tile <= MAX_SEGMENT:
             return ListRoom(of_tile, per_tile=True)
         return ListRoom(capacity_for(needed), per_tile=False)
 
@@ -85,4 +85,4 @@ class StatusOnHost:
         """What the copy in front of the last mark has brought; waits for it."""
         self._arrived.synchronize()
         values = self._values.tolist()
-        return FrameNeeds(values[STATUS_NEEDED], values[STATUS_MOST], values[STATUS_CUT])
+        return FrameNeeds(values[STATUS_NEEDED], values[STATUS_LONGEST], values[STATUS_OVERFLOW])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from gsplat_core.ops.frame.frame import MOST_IN_TILE
+from gsplat_core.ops.frame.frame import MAX_SEGMENT
 from gsplat_core.rendering.tile_capacity import HEADROOM, TILE_STEP, ListRoom, capacity_for
 
 
@@ -15,8 +15,8 @@ def test_tiles_have_rooms_of_their_own_with_some_to_spare():
 
 
 def test_lists_share_one_room_where_a_tile_has_too_many():
-    most = math.floor(MOST_IN_TILE / HEADROOM)
-    assert ListRoom.for_frame(needed=120_000, most=most) == ListRoom(MOST_IN_TILE, per_tile=True)
+    most = math.floor(MAX_SEGMENT / HEADROOM)
+    assert ListRoom.for_frame(needed=120_000, most=most) == ListRoom(MAX_SEGMENT, per_tile=True)
     room = ListRoom.for_frame(needed=120_000, most=most + 1)
     assert room == ListRoom(capacity_for(120_000), per_tile=False)
     assert room.capacity >= 120_000
