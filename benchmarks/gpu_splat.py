@@ -28,7 +28,7 @@ from gsplat_core.ops.frame_gradients.frame_gradients import (
     render_frame_backward_adam_,
 )
 from gsplat_core.rendering.frame_renderer import FrameRenderer
-from gsplat_core.rendering.tile_capacity import ListRoom, capacity_for
+from gsplat_core.rendering.tile_capacity import TileListCapacity, capacity_for
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 
@@ -46,7 +46,7 @@ they are stored, as the peer's are; a training step of ours, whose Adam is in th
 
 
 class FramePath:
-    """The frame path on one scene, with as much room as its owner (`FrameRenderer`) would keep for it."""
+    """The frame path on one scene, with the list capacity that `FrameRenderer` would choose for it."""
 
     def __init__(self, scene: Scene, target: Tensor) -> None:
         self._gaussians = scene.raw()
@@ -55,7 +55,7 @@ class FramePath:
         self._capacity = 1 << 16
         status = self._training().status.tolist()
         self.instances, self.most_in_a_tile = status[STATUS_NEEDED], status[STATUS_LONGEST]
-        self._room = ListRoom.for_frame(self.instances, self.most_in_a_tile)
+        self._lists = TileListCapacity.for_frame(self.instances, self.most_in_a_tile)
         self._capacity = capacity_for(self.instances)
 
     def forward(self) -> Frame:
@@ -89,8 +89,7 @@ class FramePath:
         return work
 
     def _render(self, sh: Tensor) -> Frame:
-        mode = FrameMode.SEGMENTS if self._room.per_tile else FrameMode.SHARED
-        return render_frame((*self._gaussians[:4], sh), None, self._view, self._room.capacity, mode)
+        return render_frame((*self._gaussians[:4], sh), None, self._view, self._lists.capacity, self._lists.mode)
 
     def _training(self) -> Frame:
         return render_frame(self._gaussians, None, self._view, self._capacity, FrameMode.TRAINING)

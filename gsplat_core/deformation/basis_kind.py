@@ -13,7 +13,7 @@ from gsplat_core.deformation.basis_adam import BasisRates
 from gsplat_core.deformation.kind import FieldKind, NewField
 from gsplat_core.deformation.rates import FieldRates
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import BASIS_CHANNELS as CHANNELS
+from gsplat_core.scene.layout import BASIS_CHANNELS
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 
@@ -101,7 +101,7 @@ KIND = FieldKind(
     new=new_basis_field,
     config={
         "bumps": IntegerIn(4, 1 << 20),
-        "channels": IntegerIn(CHANNELS, CHANNELS),
+        "channels": IntegerIn(BASIS_CHANNELS, BASIS_CHANNELS),
         "origin_s": NumberIn(-2e10, 2e10),
         "spacing_s": NumberIn(1e-6, 1e6),
     },
