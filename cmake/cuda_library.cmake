@@ -37,9 +37,11 @@ find_path(CUDA_INCLUDE cuda_runtime.h PATHS ${CUDA_ROOT}/include ${CUDA_ROOT}/ta
 find_library(CUDA_RUNTIME NAMES libcudart_static.a PATHS ${CUDA_ROOT}/lib ${CUDA_ROOT}/lib64
              ${CUDA_ROOT}/targets/x86_64-linux/lib ${CUDA_ROOT}/targets/sbsa-linux/lib REQUIRED NO_DEFAULT_PATH)
 
-file(GLOB CUDA_SOURCES CONFIGURE_DEPENDS gsplat_core/ops/*/*.cu gsplat_core/ops/*/*_cuda_op.cpp)
-add_library(gsplat_core_cuda SHARED ${CUDA_SOURCES} gsplat_core/native/cuda_build.cu)
-target_compile_definitions(gsplat_core_cuda PRIVATE ${CORE_DEFINITIONS} GSPLAT_ISA=device)
+file(GLOB_RECURSE CUDA_SOURCES CONFIGURE_DEPENDS gsplat_core/*.cu gsplat_core/*_cuda_op.cpp)
+set(CUDA_HOST_SOURCES ${HOST_SOURCES})
+list(FILTER CUDA_HOST_SOURCES EXCLUDE REGEX "_cpu_host\\.cpp$")
+add_core_library(gsplat_core_cuda ${CUDA_SOURCES} ${CUDA_HOST_SOURCES})
+target_compile_definitions(gsplat_core_cuda PRIVATE ${CORE_DEFINITIONS} GSPLAT_CUDA GSPLAT_ISA=device)
 target_compile_options(gsplat_core_cuda PRIVATE
   $<$<COMPILE_LANGUAGE:CXX>:${CORE_FLAGS}>
   $<$<COMPILE_LANGUAGE:CUDA>:${PORTABLE_CODE} --expt-relaxed-constexpr --extended-lambda -Xcompiler=-fvisibility=hidden,-Wall>)
@@ -49,5 +51,5 @@ target_include_directories(gsplat_core_cuda SYSTEM PRIVATE ${TORCH_ROOT}/include
 find_package(Threads REQUIRED)
 target_link_libraries(gsplat_core_cuda PRIVATE ${TORCH_CPU_LIBRARY} ${TORCH_CUDA_LIBRARY} ${CUDA_RUNTIME} Threads::Threads dl rt)
 # The static runtime is linked by its path: every toolkit then gives a library that needs no CUDA but the driver.
-set_target_properties(gsplat_core_cuda PROPERTIES PREFIX "" SKIP_BUILD_RPATH ON LINKER_LANGUAGE CXX CUDA_RUNTIME_LIBRARY None
+set_target_properties(gsplat_core_cuda PROPERTIES LINKER_LANGUAGE CXX CUDA_RUNTIME_LIBRARY None
                       CUDA_VISIBILITY_PRESET hidden)

@@ -1,16 +1,133 @@
-"""Writing files so that a crash or a full disk leaves what was there before."""
+"""Writing files and folders so that a crash or a full disk leaves what was there before, and nobody sees half of anything.
+
+What is being written lies beside its target under a name that cannot be guessed, created with O_EXCL and O_NOFOLLOW: a link that somebody
+has planted there is never followed. It gets its own name when it is complete.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import errno
 import os
+import secrets
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
+from typing import BinaryIO
+
+_RENAME_EXCHANGE = 2
+_AT_FDCWD = -100
+_NO_HARD_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
+
+_unfinished: set[Path] = set()
+"""Files and folders of this process that have not got their name yet."""
+
+
+def remove_unfinished() -> None:
+    """Remove every file and folder that this process has begun and not finished; for a program that is about to end at once."""
+    for path in list(_unfinished):
+        _remove(path)
+        _unfinished.discard(path)
+
+
+class PartialFile:
+    """A file that is written beside `target` and gets its name when it is complete.
+
+    `file` is open for reading and writing bytes; `path` is for libraries that open a file by its name (it has the target's suffix, by
+    which they choose a format). Use as a context manager, which finishes the file or, after an exception, removes it; or call `finish()` or
+    `discard()`. Raises OSError when the folder does not take the file.
+    """
+
+    def __init__(self, target: Path, *, overwrite: bool = True) -> None:
+        """overwrite: whether a file that lies at `target` when this one is finished is replaced; if not, FileExistsError."""
+        self.target, self.overwrite = target, overwrite
+        self.path = beside(target, ".part" + target.suffix[:16])
+        self.file: BinaryIO = os.fdopen(_create(self.path), "w+b")
+        _unfinished.add(self.path)
+
+    def finish(self) -> None:
+        """Force the file to the disk and give it its name; when that fails it is removed and the OSError passed on."""
+        try:
+            self.file.flush()
+            os.fsync(self.file.fileno())
+            self.file.close()
+            if self.overwrite:
+                os.replace(self.path, self.target)
+            else:
+                _rename_to_new(self.path, self.target)
+            sync_folder(self.target.parent)
+        except BaseException:
+            self.discard()
+            raise
+        _unfinished.discard(self.path)
+
+    def discard(self) -> None:
+        """Remove what was written."""
+        with contextlib.suppress(OSError):  # buffered bytes of a full disk: they are given up anyway
+            self.file.close()
+        self.path.unlink(missing_ok=True)
+        _unfinished.discard(self.path)
+
+    def __enter__(self) -> PartialFile:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.finish()
+        else:
+            self.discard()
+
+
+class PartialFolder:
+    """A folder that is filled beside `target` and then takes its place. Use as a context manager, which removes it unless `finish()` was called."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+        self.path = beside(target, ".part")
+        self.path.mkdir()
+        _unfinished.add(self.path)
+
+    def finish(self) -> Path | None:
+        """Give the folder its name, in one step where the system can exchange two names.
+
+        Returns where the folder is now that lay at `target` before, for the caller to remove; None when there was none.
+        """
+        earlier = None
+        if os.path.lexists(self.target):
+            if _exchanged(self.path, self.target):
+                earlier = self.path
+            else:
+                earlier = beside(self.target, ".old")
+                os.rename(self.target, earlier)
+        if earlier != self.path:
+            os.rename(self.path, self.target)
+        _unfinished.discard(self.path)
+        sync_folder(self.target.parent)
+        return earlier
+
+    def __enter__(self) -> PartialFolder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.path in _unfinished:
+            _remove(self.path)
+            _unfinished.discard(self.path)
+
+
+def beside(target: Path, suffix: str) -> Path:
+    """A name in the folder of `target` that cannot be guessed. It holds none of the target's name, which may already be as long as names can be."""
+    return target.with_name(f".intrasplat-{secrets.token_hex(8)}{suffix}")
 
 
 def write_durably(path: Path, pieces: Iterable[bytes | memoryview]) -> None:
-    """Write a new file and force it to the disk; when that fails the file is removed and the OSError passed on."""
+    """Write a new file and force it to the disk; when that fails the file is removed and the OSError passed on.
+
+    A file or link that is there already is removed first, never written through.
+    """
+    path.unlink(missing_ok=True)
     try:
-        with open(path, "wb") as file:
+        with os.fdopen(_create(path), "wb") as file:
             for piece in pieces:
                 file.write(piece)
             file.flush()
@@ -35,3 +152,42 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _create(path: Path) -> int:
+    """A descriptor of a file that did not exist, with the rights that the user's umask gives."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+    return os.open(path, flags, 0o666)
+
+
+def _rename_to_new(source: Path, target: Path) -> None:
+    """Rename where nothing may be replaced. A hard link fails when its name is taken, which a rename does not."""
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError as error:
+        if error.errno not in _NO_HARD_LINKS:
+            raise
+        if os.path.lexists(target):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target)) from error
+        os.rename(source, target)
+    else:
+        os.unlink(source)
+
+
+def _exchanged(first: Path, second: Path) -> bool:
+    """Exchange two names in one step (Linux, renameat2); False where the system or the file system cannot."""
+    try:
+        renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError, TypeError):
+        return False
+    names = os.fsencode(first), os.fsencode(second)
+    return bool(renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE) == 0)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, or a folder with all that is in it; what cannot be removed stays."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)

@@ -2,12 +2,12 @@
 // chunks, so it does not depend on the number of threads.
 #pragma once
 
-#include <torch/csrc/stable/ops.h>
-
 #include <algorithm>
 #include <cstdint>
 #include <memory>
 #include <vector>
+
+#include "torch_abi.h"
 
 // Storage for results that are written before they are read: no time is spent on zeros.
 template <class T>

@@ -1,5 +1,5 @@
 // Every op's schema, in one place. Autograd and fake kernels are attached in Python (gsplat_core/ops/*/).
-#include <torch/csrc/stable/library.h>
+#include "torch_abi.h"
 
 STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // The instruction set in use: 0 baseline, 1 AVX2, 2 AVX-512.

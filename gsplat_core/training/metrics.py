@@ -12,8 +12,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -29,58 +30,82 @@ PSNR_CAP_DB = 100.0
 """PSNR of equal images, and the highest that is reported (a mean squared error of 1e-10)."""
 
 
-def _image(image: ImageLike, name: str) -> Tensor:
+_UNIT_OF_BYTE: NDArray[np.float32] = (torch.arange(256, dtype=torch.float32) / 255).numpy()
+"""What each byte stands for."""
+
+
+@dataclass(frozen=True)
+class _MaskedPair:
+    """Two images [H, W, 3] that are 0 where there is no tissue: both uint8, or both float32 in 0..1.
+
+    Bytes are compared as they are. OpenCV lets other threads run meanwhile, which counts beside a GPU: there a thread scores frames while
+    another one queues the training on the next.
+    """
+
+    image: NDArray[Any]
+    target: NDArray[Any]
+    tissue_pixels: int
+
+    @property
+    def pixels(self) -> int:
+        """Of the whole frame."""
+        return int(self.image.shape[0] * self.image.shape[1])
+
+    def squared_error(self) -> float:
+        """Sum over all pixels and channels, for values in 0..1; exact for bytes."""
+        if self.image.dtype == np.uint8:
+            return float(cv2.norm(self.image, self.target, cv2.NORM_L2SQR)) / 255**2
+        error = torch.from_numpy(self.image) - torch.from_numpy(self.target)
+        # Summed in float64: a frame has a million terms.
+        return float(error.mul_(error).sum(dtype=torch.float64))
+
+    def mean_ssim(self) -> float:
+        """Mean of the similarity of every pixel and channel."""
+        image, target = (torch.from_numpy(_unit(values)) for values in (self.image, self.target))
+        return float(ssim_map(image, target).mean(dtype=torch.float64))
+
+
+def _image(image: ImageLike, name: str) -> NDArray[Any]:
     """The image [H, W, 3] on the CPU, uint8 or floating point."""
-    tensor = _host_tensor(image)
-    if tensor.ndim != 3 or tensor.shape[2] != 3:
-        raise InvalidInput(f"{name} must be RGB [H, W, 3], got {list(tensor.shape)}")
-    if tensor.dtype != torch.uint8 and not tensor.is_floating_point():
-        raise InvalidInput(f"{name} must be uint8 (0..255) or floating point (0..1), got {tensor.dtype}")
-    return tensor
+    array = _host_array(image)
+    if array.ndim != 3 or array.shape[2] != 3:
+        raise InvalidInput(f"{name} must be RGB [H, W, 3], got {list(array.shape)}")
+    if array.dtype != np.uint8 and not np.issubdtype(array.dtype, np.floating):
+        raise InvalidInput(f"{name} must be uint8 (0..255) or floating point (0..1), got {array.dtype}")
+    return array
 
 
-def _host_tensor(values: ImageLike) -> Tensor:
-    if isinstance(values, Tensor):
-        return values.detach().cpu()
-    return torch.from_numpy(np.ascontiguousarray(values))
+def _host_array(values: ImageLike) -> NDArray[Any]:
+    return np.ascontiguousarray(values.detach().cpu().numpy() if isinstance(values, Tensor) else values)
 
 
-def _unit(image: Tensor, tissue: Tensor | None) -> Tensor:
-    """The image as float32 in 0..1, 0 where there is no tissue."""
-    if tissue is not None:  # while it is still as small as it came
-        image = torch.where(tissue[..., None], image, torch.zeros((), dtype=image.dtype))
-    if image.dtype == torch.uint8:
-        return image.to(torch.float32).div_(255)
-    return image.to(torch.float32).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+def _unit(image: NDArray[Any]) -> NDArray[np.float32]:
+    """The image as float32 in 0..1."""
+    if image.dtype == np.uint8:
+        return np.asarray(cv2.LUT(image, _UNIT_OF_BYTE), dtype=np.float32)
+    return np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _masked_pair(image: ImageLike, target: ImageLike, mask: ImageLike | None) -> tuple[Tensor, Tensor, int]:
-    """Both images as floats, 0 where there is no tissue, and the number of tissue pixels."""
+def _masked_pair(image: ImageLike, target: ImageLike, mask: ImageLike | None) -> _MaskedPair:
     x, y = _image(image, "image"), _image(target, "target")
     if x.shape != y.shape:
         raise InvalidInput(f"image {list(x.shape)} and target {list(y.shape)} must have one size")
+    if x.dtype != np.uint8 or y.dtype != np.uint8:
+        x, y = _unit(x), _unit(y)
     if mask is None:
-        return _unit(x, None), _unit(y, None), x.shape[0] * x.shape[1]
-    values = _host_tensor(mask)
-    if values.shape != x.shape[:2]:
-        raise InvalidInput(f"mask must be [H, W] = {list(x.shape[:2])}, got {list(values.shape)}")
-    tissue = values != 0
-    return _unit(x, tissue), _unit(y, tissue), int(torch.count_nonzero(tissue))
-
-
-def _squared_error(x: Tensor, y: Tensor) -> float:
-    error = x - y
-    # Summed in float64: a frame has a million terms.
-    return float(error.mul_(error).sum(dtype=torch.float64))
+        return _MaskedPair(x, y, x.shape[0] * x.shape[1])
+    tissue = _host_array(mask)
+    if tissue.shape != x.shape[:2]:
+        raise InvalidInput(f"mask must be [H, W] = {list(x.shape[:2])}, got {list(tissue.shape)}")
+    if tissue.dtype != np.uint8:
+        tissue = (tissue != 0).astype(np.uint8)
+    # Without a destination, what the mask leaves out is 0.
+    return _MaskedPair(cv2.copyTo(x, tissue), cv2.copyTo(y, tissue), cv2.countNonZero(tissue))
 
 
 def _psnr_db(squared_error: float, pixels: int) -> float:
     """PSNR of the squared error shared out over `pixels`; NaN over none."""
     return _decibels(squared_error / (3 * pixels)) if pixels else math.nan
-
-
-def _mean_ssim(x: Tensor, y: Tensor) -> float:
-    return float(ssim_map(x, y).mean(dtype=torch.float64))
 
 
 def _decibels(mean_squared_error: float) -> float:
@@ -100,8 +125,8 @@ def psnr_tissue_db(image: ImageLike, target: ImageLike, mask: ImageLike | None =
     Returns:
         At most PSNR_CAP_DB; NaN when the mask has no tissue.
     """
-    x, y, pixels = _masked_pair(image, target, mask)
-    return _psnr_db(_squared_error(x, y), pixels)
+    pair = _masked_pair(image, target, mask)
+    return _psnr_db(pair.squared_error(), pair.tissue_pixels)
 
 
 def psnr_frame_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
@@ -110,8 +135,8 @@ def psnr_frame_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = 
     The variant that most papers print; it rises with the tool's size, so it stands beside `psnr_tissue_db`, never alone.
     Arguments and return as there.
     """
-    x, y, pixels = _masked_pair(image, target, mask)
-    return _psnr_db(_squared_error(x, y), x.shape[0] * x.shape[1] if pixels else 0)
+    pair = _masked_pair(image, target, mask)
+    return _psnr_db(pair.squared_error(), pair.pixels if pair.tissue_pixels else 0)
 
 
 def ssim(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
@@ -120,8 +145,8 @@ def ssim(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> 
     11x11 Gaussian of sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, range 1: the convention of the field's tables. The masked-out
     part counts as equal. Arguments as in `psnr_tissue_db`; NaN when the mask has no tissue.
     """
-    x, y, pixels = _masked_pair(image, target, mask)
-    return _mean_ssim(x, y) if pixels else math.nan
+    pair = _masked_pair(image, target, mask)
+    return pair.mean_ssim() if pair.tissue_pixels else math.nan
 
 
 @dataclass(frozen=True)
@@ -145,13 +170,13 @@ class QualityTracker:
 
     def observe(self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> FrameQuality:
         """Score one frame and keep the result; arguments as in `psnr_tissue_db`."""
-        x, y, pixels = _masked_pair(image, target, mask)
-        squared_error = _squared_error(x, y)
+        pair = _masked_pair(image, target, mask)
+        squared_error = pair.squared_error()
         quality = FrameQuality(
             seq,
-            psnr_tissue_db=_psnr_db(squared_error, pixels),
-            psnr_frame_db=_psnr_db(squared_error, x.shape[0] * x.shape[1] if pixels else 0),
-            ssim=_mean_ssim(x, y) if pixels else math.nan,
+            psnr_tissue_db=_psnr_db(squared_error, pair.tissue_pixels),
+            psnr_frame_db=_psnr_db(squared_error, pair.pixels if pair.tissue_pixels else 0),
+            ssim=pair.mean_ssim() if pair.tissue_pixels else math.nan,
         )
         self.frames.append(quality)
         return quality

@@ -12,10 +12,10 @@ Tensor adam_(Tensor parameter, Tensor gradient, Tensor first_moment, Tensor seco
   const Tensor g = call.floats(gradient, "gradient");
   for (const Tensor* t : {&parameter, &first_moment, &second_moment}) {
     call.floats(*t, "what adam_ updates");
-    STD_TORCH_CHECK(t->is_contiguous() && t->numel() == g.numel(),
-                    "adam_ updates contiguous float32 tensors of the gradient's size in place");
+    check(t->is_contiguous() && t->numel() == g.numel(),
+          "adam_ updates contiguous float32 tensors of the gradient's size in place");
   }
-  STD_TORCH_CHECK(row_size >= 1 && g.numel() % row_size == 0, "row_size must divide the number of values");
+  check(row_size >= 1 && g.numel() % row_size == 0, "row_size must divide the number of values");
   const AdamStep options = adam_step_of(step, learning_rate, beta1, beta2, epsilon, row_size);
   Tensor skipped = call.empty({}, ScalarType::Long);
   int64_t* count = skipped.mutable_data_ptr<int64_t>();
@@ -33,12 +33,12 @@ void adam_at_(Tensor parameter, Tensor gradient, Tensor first_moment, Tensor sec
                steps = call.take(step, ScalarType::Long, "step");
   for (const Tensor* t : {&parameter, &first_moment, &second_moment}) {
     call.floats(*t, "what adam_at_ updates");
-    STD_TORCH_CHECK(t->is_contiguous() && t->numel() == g.numel(),
-                    "adam_at_ updates contiguous float32 tensors of the gradient's size in place");
+    check(t->is_contiguous() && t->numel() == g.numel(),
+          "adam_at_ updates contiguous float32 tensors of the gradient's size in place");
   }
-  STD_TORCH_CHECK(row_size >= 1 && g.numel() % row_size == 0, "row_size must divide the number of values");
+  check(row_size >= 1 && g.numel() % row_size == 0, "row_size must divide the number of values");
   call.take(skipped, ScalarType::Long, "skipped");
-  STD_TORCH_CHECK(rate.numel() == 1 && step.numel() == 1 && skipped.numel() == 1, "rate, step and skipped hold one number each");
+  check(rate.numel() == 1 && step.numel() == 1 && skipped.numel() == 1, "rate, step and skipped hold one number each");
   const AdamAt at = {data(learning_rate), steps.const_data_ptr<int64_t>(),
                      std::log(beta1),     std::log(beta2),
                      float(1 - beta1),    float(1 - beta2),
@@ -51,6 +51,6 @@ void adam_at_(Tensor parameter, Tensor gradient, Tensor first_moment, Tensor sec
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("adam_", TORCH_BOX(&adam_));
-  m.impl("adam_at_", TORCH_BOX(&adam_at_));
+  m.impl("adam_", GSPLAT_BOX(&adam_));
+  m.impl("adam_at_", GSPLAT_BOX(&adam_at_));
 }

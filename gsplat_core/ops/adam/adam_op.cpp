@@ -1,7 +1,7 @@
 #include <atomic>
 
 #include "adam_options.h"
-#include "tensor_checks.h"
+#include "cpu_call.h"
 
 static int64_t active_isa_op() { return int64_t(active_isa()); }
 
@@ -9,9 +9,9 @@ static Tensor adam_(Tensor parameter, Tensor gradient, Tensor first_moment, Tens
                     double learning_rate, double beta1, double beta2, double epsilon, int64_t row_size) {
   const Tensor g = floats(gradient, "gradient");
   for (const Tensor* t : {&parameter, &first_moment, &second_moment})
-    STD_TORCH_CHECK(t->is_cpu() && t->scalar_type() == ScalarType::Float && t->is_contiguous() && t->numel() == g.numel(),
-                    "adam_ updates contiguous float32 CPU tensors of the gradient's size in place");
-  STD_TORCH_CHECK(row_size >= 1 && g.numel() % row_size == 0, "row_size must divide the number of values");
+    check(t->is_cpu() && t->scalar_type() == ScalarType::Float && t->is_contiguous() && t->numel() == g.numel(),
+          "adam_ updates contiguous float32 CPU tensors of the gradient's size in place");
+  check(row_size >= 1 && g.numel() % row_size == 0, "row_size must divide the number of values");
   const AdamStep options = adam_step_of(step, learning_rate, beta1, beta2, epsilon, row_size);
   float *p = mutable_data(parameter), *m = mutable_data(first_moment), *v = mutable_data(second_moment);
   const float* gp = data(g);
@@ -30,16 +30,16 @@ static void adam_at_(Tensor parameter, Tensor gradient, Tensor first_moment, Ten
                      double beta1, double beta2, double epsilon, int64_t row_size, Tensor skipped) {
   const Tensor learning_rate = floats(rate, "rate");
   for (const Tensor* t : {&step, &skipped})
-    STD_TORCH_CHECK(t->is_cpu() && t->scalar_type() == ScalarType::Long && t->numel() == 1,
-                    "step and skipped must be one int64 each, on the CPU for this implementation");
-  STD_TORCH_CHECK(learning_rate.numel() == 1, "rate must be one float32");
+    check(t->is_cpu() && t->scalar_type() == ScalarType::Long && t->numel() == 1,
+          "step and skipped must be one int64 each, on the CPU for this implementation");
+  check(learning_rate.numel() == 1, "rate must be one float32");
   const Tensor count = adam_(parameter, gradient, first_moment, second_moment, *step.const_data_ptr<int64_t>(),
                              double(*data(learning_rate)), beta1, beta2, epsilon, row_size);
   *skipped.mutable_data_ptr<int64_t>() += *count.const_data_ptr<int64_t>();
 }
 
-STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CompositeExplicitAutograd, m) { m.impl("active_isa", TORCH_BOX(&active_isa_op)); }
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CompositeExplicitAutograd, m) { m.impl("active_isa", GSPLAT_BOX(&active_isa_op)); }
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) {
-  m.impl("adam_", TORCH_BOX(&adam_));
-  m.impl("adam_at_", TORCH_BOX(&adam_at_));
+  m.impl("adam_", GSPLAT_BOX(&adam_));
+  m.impl("adam_at_", GSPLAT_BOX(&adam_at_));
 }

@@ -8,7 +8,7 @@
 namespace {
 
 Tensor scalars(const CudaCall& call, const Tensor& t, int64_t count, const char* name) {
-  STD_TORCH_CHECK(t.numel() == count, name, " must hold ", count, " float32, got ", t.numel());
+  check(t.numel() == count, name, " must hold ", count, " float32, got ", t.numel());
   return call.floats(t, name);
 }
 
@@ -74,7 +74,7 @@ void basis_field_backward_adam_(Tensor gradient, Tensor tau, Tensor centers, Ten
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("basis_field", TORCH_BOX(&basis_field));
-  m.impl("basis_field_backward", TORCH_BOX(&basis_field_backward));
-  m.impl("basis_field_backward_adam_", TORCH_BOX(&basis_field_backward_adam_));
+  m.impl("basis_field", GSPLAT_BOX(&basis_field));
+  m.impl("basis_field_backward", GSPLAT_BOX(&basis_field_backward));
+  m.impl("basis_field_backward_adam_", GSPLAT_BOX(&basis_field_backward_adam_));
 }

@@ -6,12 +6,13 @@
 
 #include "basis_field.h"
 #include "basis_field_checks.h"
+#include "cpu_call.h"
 
 static constexpr int64_t kGrain = 1024;
 
 static float value_of(const Tensor& tau) {
   const Tensor t = floats(tau, "tau");
-  STD_TORCH_CHECK(t.numel() == 1, "tau must be one float32");
+  check(t.numel() == 1, "tau must be one float32");
   return data(t)[0];
 }
 
@@ -78,10 +79,10 @@ static void basis_field_backward_adam_(Tensor gradient, Tensor tau, Tensor cente
   check_gradient(gradient, centers);
   check_state({&centers, &log_widths, &weights, &m_centers, &m_log_widths, &m_weights, &v_centers, &v_log_widths, &v_weights},
               steps);
-  STD_TORCH_CHECK(centers.is_cpu() && steps.is_cpu(), "basis_field_backward_adam_ updates CPU tensors in this implementation");
+  check(centers.is_cpu() && steps.is_cpu(), "basis_field_backward_adam_ updates CPU tensors in this implementation");
   const Tensor g = floats(gradient, "gradient");
   const Tensor learning_rates = floats(rates, "rates");
-  STD_TORCH_CHECK(learning_rates.numel() == kBasisRates, "rates must be float32 [6]");
+  check(learning_rates.numel() == kBasisRates, "rates must be float32 [6]");
   const float* rate = data(learning_rates);
   const std::shared_ptr<const BiasTable> table = bias_table(beta1, beta2);
   BasisAdam field = {};
@@ -102,7 +103,7 @@ static void basis_field_backward_adam_(Tensor gradient, Tensor tau, Tensor cente
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) {
-  m.impl("basis_field", TORCH_BOX(&basis_field));
-  m.impl("basis_field_backward", TORCH_BOX(&basis_field_backward));
-  m.impl("basis_field_backward_adam_", TORCH_BOX(&basis_field_backward_adam_));
+  m.impl("basis_field", GSPLAT_BOX(&basis_field));
+  m.impl("basis_field_backward", GSPLAT_BOX(&basis_field_backward));
+  m.impl("basis_field_backward_adam_", GSPLAT_BOX(&basis_field_backward_adam_));
 }

@@ -28,14 +28,14 @@ struct Compositing {
         flatten_ids(call.ints(flatten_ids_, "flatten_ids")) {
     const int64_t channels = colors.size(-1), images = offsets.size(0), count = opacities.numel();
     const int64_t tile_height = offsets.size(1), tile_width = offsets.size(2), tiles = offsets.numel();
-    STD_TORCH_CHECK(means2d.numel() == 2 * count && conics.numel() == 3 * count && colors.numel() == channels * count,
-                    "composite: means2d, conics, colors and opacities must be of the same splats");
-    STD_TORCH_CHECK(tile_size > 0 && width >= 0 && height >= 0 && width < kMostInts && height < kMostInts &&
-                        tile_size < kMostInts && tile_width * tile_size >= width && tile_height * tile_size >= height,
-                    "composite: the tiles of isect_offsets do not cover the image");
+    check(means2d.numel() == 2 * count && conics.numel() == 3 * count && colors.numel() == channels * count,
+          "composite: means2d, conics, colors and opacities must be of the same splats");
+    check(tile_size > 0 && width >= 0 && height >= 0 && width < kMostInts && height < kMostInts && tile_size < kMostInts &&
+              tile_width * tile_size >= width && tile_height * tile_size >= height,
+          "composite: the tiles of isect_offsets do not cover the image");
     if (backgrounds_) backgrounds = call.floats(*backgrounds_, "backgrounds");
     if (masks_) {
-      STD_TORCH_CHECK(masks_->numel() == tiles, "composite: masks must have one bool per tile");
+      check(masks_->numel() == tiles, "composite: masks must have one bool per tile");
       masks = call.take(*masks_, ScalarType::Bool, "masks");
     }
     in = {data(means2d),
@@ -55,8 +55,8 @@ struct Compositing {
           int32_t(tile_size),
           int32_t(tile_width),
           int32_t(tile_height)};
-    STD_TORCH_CHECK(count < kMostInts && in.instances <= kMostInts && in.tiles() * in.windows() <= kMostInts,
-                    "composite: more than 2^31 - 1 splats, instances or windows of 16x16 pixels");
+    check(count < kMostInts && in.instances <= kMostInts && in.tiles() * in.windows() <= kMostInts,
+          "composite: more than 2^31 - 1 splats, instances or windows of 16x16 pixels");
   }
 };
 
@@ -82,9 +82,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
   const int64_t count = c.in.count, channels = c.in.channels, images = c.in.images, pixels = images * height * width;
   const Tensor alphas_ = c.call.floats(alphas, "alphas"), last_ = c.call.ints(last, "last");
   const Tensor v_colors_ = c.call.floats(v_colors, "v_colors"), v_alphas_ = c.call.floats(v_alphas, "v_alphas");
-  STD_TORCH_CHECK(alphas_.numel() == pixels && last_.numel() == pixels && v_alphas_.numel() == pixels &&
-                      v_colors_.numel() == pixels * channels,
-                  "composite_backward: alphas, last, v_colors and v_alphas must be of the image's size");
+  check(alphas_.numel() == pixels && last_.numel() == pixels && v_alphas_.numel() == pixels &&
+            v_colors_.numel() == pixels * channels,
+        "composite_backward: alphas, last, v_colors and v_alphas must be of the image's size");
   Tensor v_means2d = c.call.empty({count, 2}), v_conics = c.call.empty({count, 3}), v_splats = c.call.empty({count, channels});
   Tensor v_opacities = c.call.empty({count}), v_absolute = c.call.empty({absgrad ? count : 0, 2});
   Tensor v_backgrounds = c.call.empty({backgrounds ? images : 0, channels});
@@ -106,6 +106,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("composite", TORCH_BOX(&composite));
-  m.impl("composite_backward", TORCH_BOX(&composite_backward));
+  m.impl("composite", GSPLAT_BOX(&composite));
+  m.impl("composite_backward", GSPLAT_BOX(&composite_backward));
 }

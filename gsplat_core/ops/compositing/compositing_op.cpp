@@ -5,7 +5,7 @@
 
 #include "compositing.h"
 #include "counting_sort.h"
-#include "tensor_checks.h"
+#include "cpu_call.h"
 
 namespace {
 
@@ -36,15 +36,15 @@ struct Call {
     const int64_t tile_height = offsets.size(1), tile_width = offsets.size(2);
     count = opacities.numel();
     tiles = offsets.numel();
-    STD_TORCH_CHECK(means2d.numel() == 2 * count && conics.numel() == 3 * count && colors.numel() == channels * count,
-                    "composite: means2d, conics, colors and opacities must be of the same splats");
-    STD_TORCH_CHECK(tile_size > 0 && width >= 0 && height >= 0 && width < kMostInts && height < kMostInts &&
-                        tile_size < kMostInts && tile_width * tile_size >= width && tile_height * tile_size >= height,
-                    "composite: the tiles of isect_offsets do not cover the image");
+    check(means2d.numel() == 2 * count && conics.numel() == 3 * count && colors.numel() == channels * count,
+          "composite: means2d, conics, colors and opacities must be of the same splats");
+    check(tile_size > 0 && width >= 0 && height >= 0 && width < kMostInts && height < kMostInts && tile_size < kMostInts &&
+              tile_width * tile_size >= width && tile_height * tile_size >= height,
+          "composite: the tiles of isect_offsets do not cover the image");
     if (backgrounds_) backgrounds = floats(*backgrounds_, "backgrounds");
     if (masks_) {
-      STD_TORCH_CHECK(masks_->is_cpu() && masks_->scalar_type() == ScalarType::Bool && masks_->numel() == tiles,
-                      "composite: masks must have one bool per tile");
+      check(masks_->is_cpu() && masks_->scalar_type() == ScalarType::Bool && masks_->numel() == tiles,
+            "composite: masks must have one bool per tile");
       masks = masks_->is_contiguous() ? *masks_ : torch::stable::contiguous(*masks_);
     }
     check_lists();
@@ -80,11 +80,10 @@ struct Call {
     int32_t before = 0;
     bool ordered = true;
     for (int64_t i = 0; i < tiles; ++i) ordered &= starts[i] >= before, before = starts[i];
-    STD_TORCH_CHECK(ordered && before <= instances, "isect_offsets must rise from 0 to at most the length of flatten_ids");
+    check(ordered && before <= instances, "isect_offsets must rise from 0 to at most the length of flatten_ids");
     uint32_t most = 0;
     for (int64_t i = first_listed(); i < instances; ++i) most = std::max(most, uint32_t(ids[i]));
-    STD_TORCH_CHECK(first_listed() == instances || most < count, "flatten_ids must be in [0, ", count, "), found ",
-                    int32_t(most));
+    check(first_listed() == instances || most < count, "flatten_ids must be in [0, ", count, "), found ", int32_t(most));
   }
 
   // run(tile, scratch) for all tiles: threads take the next free one, and no result depends on which takes which.
@@ -126,9 +125,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
   const int64_t pixels = images * height * width;
   const Tensor alphas_ = floats(alphas, "alphas"), last_ = ints(last, "last");
   const Tensor v_colors_ = floats(v_colors, "v_colors"), v_alphas_ = floats(v_alphas, "v_alphas");
-  STD_TORCH_CHECK(alphas_.numel() == pixels && last_.numel() == pixels && v_alphas_.numel() == pixels &&
-                      v_colors_.numel() == pixels * channels,
-                  "composite_backward: alphas, last, v_colors and v_alphas must be of the image's size");
+  check(alphas_.numel() == pixels && last_.numel() == pixels && v_alphas_.numel() == pixels &&
+            v_colors_.numel() == pixels * channels,
+        "composite_backward: alphas, last, v_colors and v_alphas must be of the image's size");
 
   // A row for every instance, those of one splat next to each other in the order of the lists.
   auto first = uninitialised<int32_t>(count + 1), slots = uninitialised<int32_t>(instances);
@@ -178,6 +177,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) {
-  m.impl("composite", TORCH_BOX(&composite));
-  m.impl("composite_backward", TORCH_BOX(&composite_backward));
+  m.impl("composite", GSPLAT_BOX(&composite));
+  m.impl("composite_backward", GSPLAT_BOX(&composite_backward));
 }

@@ -7,8 +7,8 @@
 namespace {
 
 void check_sizes(const Tensor& q, const Tensor& s) {
-  STD_TORCH_CHECK(q.dim() == 2 && s.dim() == 2 && q.size(1) == 4 && s.size(1) == 3 && q.size(0) == s.size(0),
-                  "covariance takes quats [M, 4] and scales [M, 3]");
+  check(q.dim() == 2 && s.dim() == 2 && q.size(1) == 4 && s.size(1) == 3 && q.size(0) == s.size(0),
+        "covariance takes quats [M, 4] and scales [M, 3]");
 }
 
 std::tuple<Tensor, Tensor> quat_scale_to_covar_preci(Tensor quats, Tensor scales, bool compute_covar, bool compute_preci,
@@ -36,7 +36,7 @@ std::tuple<Tensor, Tensor> quat_scale_to_covar_preci_backward(Tensor quats, Tens
   std::optional<Tensor> v_covars, v_precis;
   if (v_covars_in.has_value()) v_covars = call.floats(*v_covars_in, "v_covars");
   if (v_precis_in.has_value()) v_precis = call.floats(*v_precis_in, "v_precis");
-  STD_TORCH_CHECK(
+  check(
       (!v_covars.has_value() || v_covars->numel() == M * columns) && (!v_precis.has_value() || v_precis->numel() == M * columns),
       "covariance backward: the sizes of the gradients do not fit the inputs");
   Tensor v_quats = call.empty({M, 4}), v_scales = call.empty({M, 3});
@@ -50,6 +50,6 @@ std::tuple<Tensor, Tensor> quat_scale_to_covar_preci_backward(Tensor quats, Tens
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("quat_scale_to_covar_preci", TORCH_BOX(&quat_scale_to_covar_preci));
-  m.impl("quat_scale_to_covar_preci_backward", TORCH_BOX(&quat_scale_to_covar_preci_backward));
+  m.impl("quat_scale_to_covar_preci", GSPLAT_BOX(&quat_scale_to_covar_preci));
+  m.impl("quat_scale_to_covar_preci_backward", GSPLAT_BOX(&quat_scale_to_covar_preci_backward));
 }

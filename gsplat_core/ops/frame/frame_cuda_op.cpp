@@ -20,10 +20,9 @@ Frame render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_o
   CudaCall& call = inputs.call;
   const FrameScene& in = inputs.scene;
   const int64_t tiles = in.tiles(), most = per_tile ? std::min<int64_t>(kMostInTile, kMostInts / tiles) : kMostInts;
-  STD_TORCH_CHECK(!(training && per_tile), "render_frame: training numbers all instances, which needs per_tile=False");
-  STD_TORCH_CHECK(capacity > 0 && capacity <= most, "render_frame: capacity must be 1 to ", most, " instances",
-                  per_tile ? " in each of " : "", per_tile ? std::to_string(tiles) : "", per_tile ? " tiles" : "", ", got ",
-                  capacity);
+  check(!(training && per_tile), "render_frame: training numbers all instances, which needs per_tile=False");
+  check(capacity > 0 && capacity <= most, "render_frame: capacity must be 1 to ", most, " instances",
+        per_tile ? " in each of " : "", per_tile ? std::to_string(tiles) : "", per_tile ? " tiles" : "", ", got ", capacity);
   const auto ints = [&](int64_t when_training) { return call.empty({training ? when_training : 0}, ScalarType::Int); };
   Tensor image = call.empty({height, width, 4}), alphas = call.empty({height, width});
   Tensor last = call.empty({training ? height : 0, training ? width : 0}, ScalarType::Int);
@@ -66,4 +65,4 @@ Frame render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_o
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) { m.impl("render_frame", TORCH_BOX(&render_frame)); }
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) { m.impl("render_frame", GSPLAT_BOX(&render_frame)); }

@@ -51,8 +51,8 @@ struct FramePass {
 
  private:
   static Tensor sized(const Tensor& t, int64_t count, const char* name) {
-    STD_TORCH_CHECK(t.numel() == count, "render_frame_backward: ", name, " must have ", count,
-                    " values for this frame, as render_frame gives with training=True; got ", t.numel());
+    check(t.numel() == count, "render_frame_backward: ", name, " must have ", count,
+          " values for this frame, as render_frame gives with training=True; got ", t.numel());
     return t;
   }
   // The kernels read whole float4s.
@@ -68,9 +68,9 @@ struct FramePass {
 // A tensor that is updated in place, of `count` values.
 float* updated(const CudaCall& call, Tensor& t, int64_t count, const char* name) {
   call.floats(t, name);
-  STD_TORCH_CHECK(t.numel() == count, "render_frame_backward_adam_: ", name, " must have ", count, " values, got ", t.numel());
-  STD_TORCH_CHECK(t.is_contiguous() && starts_on_quad(t), "render_frame_backward_adam_: ", name,
-                  " is updated in place and must be contiguous and start at a multiple of 16 bytes; give it memory of its own");
+  check(t.numel() == count, "render_frame_backward_adam_: ", name, " must have ", count, " values, got ", t.numel());
+  check(t.is_contiguous() && starts_on_quad(t), "render_frame_backward_adam_: ", name,
+        " is updated in place and must be contiguous and start at a multiple of 16 bytes; give it memory of its own");
   return mutable_data(t);
 }
 
@@ -122,11 +122,11 @@ Tensor render_frame_backward_adam_(Tensor means, Tensor quats, Tensor log_scales
     adam.second[i] = updated(call, *second[i], values, "a second moment");
   }
   call.take(skipped, ScalarType::Long, "skipped");
-  STD_TORCH_CHECK(skipped.is_contiguous() && skipped.numel() == kRateCount, "skipped must be contiguous, with 5 counts");
+  check(skipped.is_contiguous() && skipped.numel() == kRateCount, "skipped must be contiguous, with 5 counts");
   adam.step_is_long = step.scalar_type() == ScalarType::Long;
   const Tensor rates_of_step = call.floats(rates, "rates"),
                step_number = call.take(step, adam.step_is_long ? ScalarType::Long : ScalarType::Int, "step");
-  STD_TORCH_CHECK(rates.numel() == kRateCount && step.numel() == 1, "rates must have 5 values and step one");
+  check(rates.numel() == kRateCount && step.numel() == 1, "rates must have 5 values and step one");
   adam.rates = data(rates_of_step);
   adam.step = step_number.const_data_ptr();
   adam.beta1 = beta1;
@@ -144,6 +144,6 @@ Tensor render_frame_backward_adam_(Tensor means, Tensor quats, Tensor log_scales
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("render_frame_backward", TORCH_BOX(&render_frame_backward));
-  m.impl("render_frame_backward_adam_", TORCH_BOX(&render_frame_backward_adam_));
+  m.impl("render_frame_backward", GSPLAT_BOX(&render_frame_backward));
+  m.impl("render_frame_backward_adam_", GSPLAT_BOX(&render_frame_backward_adam_));
 }

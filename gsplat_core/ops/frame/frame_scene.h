@@ -29,19 +29,19 @@ struct FrameInputs {
     constexpr int64_t kMostPixels = int64_t(kMostTilesAcross) * kFrameTile, kMostGaussians = (int64_t(1) << 31) - 2;
     const int64_t count = means.size(0), bases = sh.dim() == 3 ? sh.size(1) : 0;
     const int64_t degree = bases == 1 ? 0 : bases == 4 ? 1 : bases == 9 ? 2 : bases == 16 ? 3 : bases == 25 ? 4 : -1;
-    STD_TORCH_CHECK(degree >= 0, "render_frame: sh must be [N, B, 3] with B one of 1, 4, 9, 16, 25; got B = ", bases);
-    STD_TORCH_CHECK(means.numel() == 3 * count && quats.numel() == 4 * count && log_scales.numel() == 3 * count &&
-                        logit_opacities.numel() == count && sh.numel() == 3 * bases * count && viewmat.numel() == 16 &&
-                        intrinsics.numel() == 9,
-                    "render_frame: the sizes of the inputs do not fit together for ", count, " Gaussians and one camera");
-    STD_TORCH_CHECK(count <= kMostGaussians, "render_frame takes at most 2^31 - 2 Gaussians, got ", count);
-    STD_TORCH_CHECK(width > 0 && height > 0 && width <= kMostPixels && height <= kMostPixels,
-                    "render_frame: the image must have 1 to ", kMostPixels, " pixels on a side, got ", width, " x ", height);
-    STD_TORCH_CHECK(camera_model >= 0 && camera_model <= 2, "render_frame: no camera model ", camera_model);
+    check(degree >= 0, "render_frame: sh must be [N, B, 3] with B one of 1, 4, 9, 16, 25; got B = ", bases);
+    check(means.numel() == 3 * count && quats.numel() == 4 * count && log_scales.numel() == 3 * count &&
+              logit_opacities.numel() == count && sh.numel() == 3 * bases * count && viewmat.numel() == 16 &&
+              intrinsics.numel() == 9,
+          "render_frame: the sizes of the inputs do not fit together for ", count, " Gaussians and one camera");
+    check(count <= kMostGaussians, "render_frame takes at most 2^31 - 2 Gaussians, got ", count);
+    check(width > 0 && height > 0 && width <= kMostPixels && height <= kMostPixels, "render_frame: the image must have 1 to ",
+          kMostPixels, " pixels on a side, got ", width, " x ", height);
+    check(camera_model >= 0 && camera_model <= 2, "render_frame: no camera model ", camera_model);
     if (deltas_in) deltas = call.floats(*deltas_in, "deltas");
     if (background_in) background = call.floats(*background_in, "background");
-    STD_TORCH_CHECK(!deltas || deltas->numel() == kRawColumns * count, "render_frame: deltas must be [N, 16]");
-    STD_TORCH_CHECK(!background || background->numel() == 3, "render_frame: background must be [3]");
+    check(!deltas || deltas->numel() == kRawColumns * count, "render_frame: deltas must be [N, 16]");
+    check(!background || background->numel() == 3, "render_frame: background must be [3]");
     const auto aligned = [](const Tensor& t) { return reinterpret_cast<uintptr_t>(t.data_ptr()) % 16 == 0; };
     scene = {data(means),
              data(quats),

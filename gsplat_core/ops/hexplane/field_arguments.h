@@ -16,9 +16,9 @@ inline Tensor aligned_floats(const CudaCall& call, const Tensor& t, const char* 
 // The network's layers; the tensors are made contiguous in place, and must outlive the result.
 inline FieldNetwork network_of(const CudaCall& call, std::vector<Tensor>& weights, std::vector<Tensor>& biases,
                                int64_t features) {
-  STD_TORCH_CHECK(weights.size() >= 2 && weights.size() <= size_t(kFieldLayers) && weights.size() == biases.size(),
-                  "the network must have 2 to ", kFieldLayers, " layers with a bias each, got ", weights.size(), " weights and ",
-                  biases.size(), " biases");
+  check(weights.size() >= 2 && weights.size() <= size_t(kFieldLayers) && weights.size() == biases.size(),
+        "the network must have 2 to ", kFieldLayers, " layers with a bias each, got ", weights.size(), " weights and ",
+        biases.size(), " biases");
   FieldNetwork net = {};
   net.layers = int32_t(weights.size());
   net.features = int32_t(features);
@@ -27,9 +27,8 @@ inline FieldNetwork network_of(const CudaCall& call, std::vector<Tensor>& weight
   for (size_t i = 0; i < weights.size(); ++i) {
     weights[i] = call.floats(weights[i], "a weight"), biases[i] = call.floats(biases[i], "a bias");
     const int64_t outputs = i + 1 < weights.size() ? net.width : kHeadOutputs;
-    STD_TORCH_CHECK(
-        weights[i].dim() == 2 && weights[i].size(0) == outputs && weights[i].size(1) == inputs && biases[i].numel() == outputs,
-        "layer ", int64_t(i), " must be [", outputs, ", ", inputs, "] with one bias per output");
+    check(weights[i].dim() == 2 && weights[i].size(0) == outputs && weights[i].size(1) == inputs && biases[i].numel() == outputs,
+          "layer ", int64_t(i), " must be [", outputs, ", ", inputs, "] with one bias per output");
     net.weights[i] = data(weights[i]), net.biases[i] = data(biases[i]);
     inputs = outputs;
   }
@@ -43,8 +42,8 @@ inline int64_t lines_of(const CudaCall& call, std::vector<Tensor>& planes, int64
   for (size_t i = 0; i < planes.size(); ++i) {
     Tensor& plane = planes[i];
     plane = call.floats(plane, "a time plane");
-    STD_TORCH_CHECK(plane.dim() == 3 && plane.size(2) == channels && plane.numel() > 0, "every time plane must be [V, U, ",
-                    channels, "], none empty");
+    check(plane.dim() == 3 && plane.size(2) == channels && plane.numel() > 0, "every time plane must be [V, U, ", channels,
+          "], none empty");
     times.values[i / 3][i % 3] = data(plane);
     times.rows[i / 3][i % 3] = int32_t(plane.size(0));
     lines.widths[i / 3][i % 3] = int32_t(plane.size(1));

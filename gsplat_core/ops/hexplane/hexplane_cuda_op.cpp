@@ -18,14 +18,14 @@ struct Level {
 
   Level(const CudaCall& call, const Tensor& points, std::initializer_list<const Tensor*> planes, int64_t dims = 3)
       : coordinates(call.floats(points, "coordinates")) {
-    STD_TORCH_CHECK(coordinates.dim() == 2 && coordinates.size(1) == 4, "coordinates must be [N, 4]");
+    check(coordinates.dim() == 2 && coordinates.size(1) == 4, "coordinates must be [N, 4]");
     count = coordinates.size(0);
     raw.coordinates = data(coordinates);
     raw.channels = (*planes.begin())->size(dims - 1);
     int i = 0;
     for (const Tensor* plane : planes) {
-      STD_TORCH_CHECK(plane->dim() == dims && plane->size(dims - 1) == raw.channels && plane->numel() > 0,
-                      "every plane must be [V, U, C] (a line [U, C]) with the same C, none empty");
+      check(plane->dim() == dims && plane->size(dims - 1) == raw.channels && plane->numel() > 0,
+            "every plane must be [V, U, C] (a line [U, C]) with the same C, none empty");
       tensors[i] = call.floats(*plane, "a plane");
       raw.planes[i] = {data(tensors[i]), int32_t(plane->size(dims - 2)), dims == 3 ? int32_t(plane->size(0)) : 1};
       ++i;
@@ -54,7 +54,7 @@ Tensor hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Tensor yt,
   const CudaCall call(coordinates);
   const Level level(call, coordinates, {&xt, &yt, &zt}, 2);
   const Tensor s = call.floats(space, "space");
-  STD_TORCH_CHECK(s.dim() == 2 && s.size(0) == level.count && s.size(1) == level.raw.channels, "space must be [N, C]");
+  check(s.dim() == 2 && s.size(0) == level.count && s.size(1) == level.raw.channels, "space must be [N, C]");
   Tensor features = call.empty({level.count, level.raw.channels});
   modulate_lines(level.raw, data(s), mutable_data(features), level.count, call.stream);
   check_cuda(cudaGetLastError(), "hexplane_modulate");
@@ -67,7 +67,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_feat
   CudaCall call(coordinates);
   const Level level(call, coordinates, {&xy, &xz, &yz, &xt, &yt, &zt});
   const Tensor g = call.floats(gradient, "gradient");
-  STD_TORCH_CHECK(g.dim() == 2 && g.size(0) == level.count && g.size(1) == level.raw.channels, "the gradient must be [N, C]");
+  check(g.dim() == 2 && g.size(0) == level.count && g.size(1) == level.raw.channels, "the gradient must be [N, C]");
   Tensor points = call.empty({level.count, 4});
   std::array<Tensor, kPlanes> planes;
   std::array<float*, kPlanes> out;
@@ -83,15 +83,15 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_feat
 Tensor hexplane_decode(std::vector<Tensor> spaces, Tensor coordinates, std::vector<Tensor> lines, std::vector<Tensor> weights,
                        std::vector<Tensor> biases) {
   CudaCall call(coordinates);
-  STD_TORCH_CHECK(!spaces.empty() && spaces.size() <= kMaxLevels && !weights.empty() && weights.size() <= kMaxLayers &&
-                      weights.size() == biases.size() && (lines.empty() || lines.size() == 3 * spaces.size()),
-                  "hexplane_decode takes 1 to 16 levels, three lines per level or none, and 1 to 66 layers with a bias each");
+  check(!spaces.empty() && spaces.size() <= kMaxLevels && !weights.empty() && weights.size() <= kMaxLayers &&
+            weights.size() == biases.size() && (lines.empty() || lines.size() == 3 * spaces.size()),
+        "hexplane_decode takes 1 to 16 levels, three lines per level or none, and 1 to 66 layers with a bias each");
   const int64_t n = coordinates.size(0);
   int64_t inputs = 0;
   std::vector<Tensor> values;
   for (size_t l = 0; l < spaces.size(); ++l) {
     const Tensor s = call.floats(spaces[l], "space");
-    STD_TORCH_CHECK(s.dim() == 2 && s.size(0) == n, "every space must be [N, C]");
+    check(s.dim() == 2 && s.size(0) == n, "every space must be [N, C]");
     values.push_back(lines.empty() ? s : hexplane_modulate(s, coordinates, lines[3 * l], lines[3 * l + 1], lines[3 * l + 2]));
     inputs += s.size(1);
   }
@@ -107,8 +107,8 @@ Tensor hexplane_decode(std::vector<Tensor> spaces, Tensor coordinates, std::vect
   }
   for (size_t i = 0; i < weights.size(); ++i) {
     const Tensor weight = call.floats(weights[i], "weight"), bias = call.floats(biases[i], "bias");
-    STD_TORCH_CHECK(weight.dim() == 2 && weight.size(1) == inputs && bias.numel() == weight.size(0), "layer ", int64_t(i),
-                    " must take ", inputs, " inputs and have one bias per output");
+    check(weight.dim() == 2 && weight.size(1) == inputs && bias.numel() == weight.size(0), "layer ", int64_t(i), " must take ",
+          inputs, " inputs and have one bias per output");
     const int64_t outputs = weight.size(0);
     const bool last = i + 1 == weights.size();
     Tensor result;
@@ -125,9 +125,9 @@ Tensor hexplane_decode(std::vector<Tensor> spaces, Tensor coordinates, std::vect
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("hexplane_features", TORCH_BOX(&hexplane_features));
-  m.impl("hexplane_features_backward", TORCH_BOX(&hexplane_features_backward));
-  m.impl("hexplane_space", TORCH_BOX(&hexplane_space));
-  m.impl("hexplane_modulate", TORCH_BOX(&hexplane_modulate));
-  m.impl("hexplane_decode", TORCH_BOX(&hexplane_decode));
+  m.impl("hexplane_features", GSPLAT_BOX(&hexplane_features));
+  m.impl("hexplane_features_backward", GSPLAT_BOX(&hexplane_features_backward));
+  m.impl("hexplane_space", GSPLAT_BOX(&hexplane_space));
+  m.impl("hexplane_modulate", GSPLAT_BOX(&hexplane_modulate));
+  m.impl("hexplane_decode", GSPLAT_BOX(&hexplane_decode));
 }

@@ -3,8 +3,8 @@
 #include <initializer_list>
 #include <tuple>
 
+#include "cpu_call.h"
 #include "hexplane.h"
-#include "tensor_checks.h"
 
 static constexpr int64_t kGrain = 512;
 static constexpr int64_t kChannelChunk = 16;  // channels of one plane that one task adds up: one cache line
@@ -18,14 +18,14 @@ struct Level {
 
   Level(const Tensor& points, std::initializer_list<const Tensor*> planes, int64_t dims = 3)
       : coordinates(floats(points, "coordinates")) {
-    STD_TORCH_CHECK(coordinates.dim() == 2 && coordinates.size(1) == 4, "coordinates must be [N, 4]");
+    check(coordinates.dim() == 2 && coordinates.size(1) == 4, "coordinates must be [N, 4]");
     count = coordinates.size(0);
     raw.coordinates = data(coordinates);
     raw.channels = (*planes.begin())->size(dims - 1);
     int i = 0;
     for (const Tensor* plane : planes) {
-      STD_TORCH_CHECK(plane->dim() == dims && plane->size(dims - 1) == raw.channels && plane->numel() > 0,
-                      "every plane must be [V, U, C] (a line [U, C]) with the same C, none empty");
+      check(plane->dim() == dims && plane->size(dims - 1) == raw.channels && plane->numel() > 0,
+            "every plane must be [V, U, C] (a line [U, C]) with the same C, none empty");
       tensors[i] = floats(*plane, "a plane");
       raw.planes[i] = {data(tensors[i]), int32_t(plane->size(dims - 2)), dims == 3 ? int32_t(plane->size(0)) : 1};
       ++i;
@@ -53,7 +53,7 @@ static Tensor hexplane_space(Tensor coordinates, Tensor xy, Tensor xz, Tensor yz
 static Tensor hexplane_modulate(Tensor space, Tensor coordinates, Tensor xt, Tensor yt, Tensor zt) {
   const Level level(coordinates, {&xt, &yt, &zt}, 2);
   const Tensor s = floats(space, "space");
-  STD_TORCH_CHECK(s.dim() == 2 && s.size(0) == level.count && s.size(1) == level.raw.channels, "space must be [N, C]");
+  check(s.dim() == 2 && s.size(0) == level.count && s.size(1) == level.raw.channels, "space must be [N, C]");
   Tensor features = empty_floats({level.count, level.raw.channels});
   const float* in = data(s);
   float* out = mutable_data(features);
@@ -69,7 +69,7 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexpla
   const Level level(coordinates, {&xy, &xz, &yz, &xt, &yt, &zt});
   const int64_t n = level.count, channels = level.raw.channels;
   const Tensor g = floats(gradient, "gradient");
-  STD_TORCH_CHECK(g.dim() == 2 && g.size(0) == n && g.size(1) == channels, "the gradient must be [N, C]");
+  check(g.dim() == 2 && g.size(0) == n && g.size(1) == channels, "the gradient must be [N, C]");
   Tensor samples = empty_floats({kPlanes, kBackwardBlock, channels}), points = empty_floats({n, 4});
   std::array<Tensor, kPlanes> planes;
   std::array<float*, kPlanes> out;
@@ -97,8 +97,8 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexpla
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) {
-  m.impl("hexplane_features", TORCH_BOX(&hexplane_features));
-  m.impl("hexplane_features_backward", TORCH_BOX(&hexplane_features_backward));
-  m.impl("hexplane_space", TORCH_BOX(&hexplane_space));
-  m.impl("hexplane_modulate", TORCH_BOX(&hexplane_modulate));
+  m.impl("hexplane_features", GSPLAT_BOX(&hexplane_features));
+  m.impl("hexplane_features_backward", GSPLAT_BOX(&hexplane_features_backward));
+  m.impl("hexplane_space", GSPLAT_BOX(&hexplane_space));
+  m.impl("hexplane_modulate", GSPLAT_BOX(&hexplane_modulate));
 }

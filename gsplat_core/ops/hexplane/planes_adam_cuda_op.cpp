@@ -7,7 +7,7 @@ namespace {
 
 // N, by the rows of all slots, three per six planes.
 int64_t gaussians_of(const Tensor& rows, const Tensors& planes) {
-  STD_TORCH_CHECK(rows.dim() == 3 && planes.size() >= 6, "rows must be [2, items, C], and planes six per level");
+  check(rows.dim() == 3 && planes.size() >= 6, "rows must be [2, items, C], and planes six per level");
   return rows.size(1) / int64_t(planes.size() / 2);
 }
 
@@ -25,10 +25,10 @@ struct Backward {
         starts(call.ints(starts_, "starts")),
         v_lines(call.floats(v_lines_, "line gradient")) {
     const int64_t values = 3 * field.planes.levels * field.cells.count;
-    STD_TORCH_CHECK(shares.numel() == 2 * values && rows.numel() == 2 * values * field.planes.channels &&
-                        crowds.numel() == (values + 31) / 32 * 20 * field.planes.channels &&
-                        starts.numel() == field.cells.cells + 1 && v_lines.numel() == field.line_size && time.numel() == 1,
-                    "rows, shares, crowds, starts and line gradient must be those that hexplane_train_backward gave");
+    check(shares.numel() == 2 * values && rows.numel() == 2 * values * field.planes.channels &&
+              crowds.numel() == (values + 31) / 32 * 20 * field.planes.channels && starts.numel() == field.cells.cells + 1 &&
+              v_lines.numel() == field.line_size && time.numel() == 1,
+          "rows, shares, crowds, starts and line gradient must be those that hexplane_train_backward gave");
     field.cells.starts = const_cast<int32_t*>(starts.const_data_ptr<int32_t>());
     raw.space = const_cast<float*>(data(rows));
     raw.shares = const_cast<float*>(data(shares));
@@ -47,8 +47,8 @@ struct UpdateOptions {
                 double beta1, double beta2, double epsilon)
       : rate(call.floats(rate_, "rate")), step(call.take(step_, ScalarType::Long, "step")) {
     if (status_.has_value()) status = call.ints(*status_, "status");
-    STD_TORCH_CHECK(rate.numel() == 1 && step.numel() == 1 && (!status.has_value() || status->numel() >= 3),
-                    "rate and step must be one number each, and status four");
+    check(rate.numel() == 1 && step.numel() == 1 && (!status.has_value() || status->numel() >= 3),
+          "rate and step must be one number each, and status four");
     raw = {data(rate),
            step.const_data_ptr<int64_t>(),
            status.has_value() ? status->const_data_ptr<int32_t>() : nullptr,
@@ -84,21 +84,21 @@ void hexplane_planes_adam_(Tensors planes, Tensors first, Tensors second, Tensor
   CudaCall call(rows);
   Field field(call, planes, gaussians_of(rows, planes));
   const Backward backward(call, field, time, rows, shares, crowds, starts, v_lines);
-  STD_TORCH_CHECK(first.size() == planes.size() && second.size() == planes.size(), "every plane needs its two moments");
+  check(first.size() == planes.size() && second.size() == planes.size(), "every plane needs its two moments");
   PlanesState state = {};
   for (size_t i = 0; i < planes.size(); ++i) {
     for (const Tensor* moment : {&first[i], &second[i]}) {
       call.floats(*moment, "a moment");
-      STD_TORCH_CHECK(moment->is_contiguous() && moment->numel() == planes[i].numel(),
-                      "moments must be contiguous and of their plane's size");
+      check(moment->is_contiguous() && moment->numel() == planes[i].numel(),
+            "moments must be contiguous and of their plane's size");
     }
     const size_t level = i / 6, p = i % 6;
-    (p < 3 ? state.space[level][p] : state.time[level][p - 3]) = {mutable_data(planes[i]), mutable_data(first[i]),
-                                                                  mutable_data(second[i])};
+    auto& plane = p < 3 ? state.space[level][p] : state.time[level][p - 3];
+    plane = {mutable_data(planes[i]), mutable_data(first[i]), mutable_data(second[i])};
     if (p >= 3) state.time_rows[level][p - 3] = int32_t(planes[i].size(0));
   }
-  STD_TORCH_CHECK(smoothness == 0 || field.planes.channels <= 512, "the penalty on space planes takes up to 512 channels, got ",
-                  field.planes.channels);
+  check(smoothness == 0 || field.planes.channels <= 512, "the penalty on space planes takes up to 512 channels, got ",
+        field.planes.channels);
   UpdateOptions options(call, rate, step, status, beta1, beta2, epsilon);
   options.raw.penalties = {float(smoothness), float(time_smoothness), float(sparsity)};
   planes_adam(field.planes, field.lines, field.cells, backward.raw, data(backward.v_lines), data(backward.time), state,
@@ -110,21 +110,21 @@ void network_adam_(Tensors parameters, Tensor gradient, Tensor first, Tensor sec
                    std::optional<Tensor> status, double beta1, double beta2, double epsilon) {
   CudaCall call(gradient);
   const Tensor g = call.floats(gradient, "gradient");
-  STD_TORCH_CHECK(!parameters.empty() && parameters.size() <= size_t(2 * kFieldLayers), "network_adam_ takes 1 to ",
-                  2 * kFieldLayers, " tensors, got ", parameters.size());
+  check(!parameters.empty() && parameters.size() <= size_t(2 * kFieldLayers), "network_adam_ takes 1 to ", 2 * kFieldLayers,
+        " tensors, got ", parameters.size());
   NetworkParameters list = {};
   for (const Tensor& t : parameters) {
     call.floats(t, "a parameter");
-    STD_TORCH_CHECK(t.is_contiguous(), "network_adam_ updates contiguous tensors in place");
+    check(t.is_contiguous(), "network_adam_ updates contiguous tensors in place");
     list.values[list.count] = mutable_data(t);
     list.starts[list.count + 1] = list.starts[list.count] + int32_t(t.numel());
     ++list.count;
   }
   for (const Tensor* t : {&g, static_cast<const Tensor*>(&first), static_cast<const Tensor*>(&second)}) {
     call.floats(*t, "gradient and moments");
-    STD_TORCH_CHECK(t->is_contiguous() && t->numel() == list.starts[list.count],
-                    "gradient and moments must be contiguous, with the parameters one after the other: ", list.starts[list.count],
-                    " values");
+    check(t->is_contiguous() && t->numel() == list.starts[list.count],
+          "gradient and moments must be contiguous, with the parameters one after the other: ", list.starts[list.count],
+          " values");
   }
   const UpdateOptions options(call, rate, step, status, beta1, beta2, epsilon);
   network_adam(list, data(g), mutable_data(first), mutable_data(second), options.raw, call.stream);
@@ -134,7 +134,7 @@ void network_adam_(Tensors parameters, Tensor gradient, Tensor first, Tensor sec
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("hexplane_planes_gradient", TORCH_BOX(&hexplane_planes_gradient));
-  m.impl("hexplane_planes_adam_", TORCH_BOX(&hexplane_planes_adam_));
-  m.impl("network_adam_", TORCH_BOX(&network_adam_));
+  m.impl("hexplane_planes_gradient", GSPLAT_BOX(&hexplane_planes_gradient));
+  m.impl("hexplane_planes_adam_", GSPLAT_BOX(&hexplane_planes_adam_));
+  m.impl("network_adam_", GSPLAT_BOX(&network_adam_));
 }

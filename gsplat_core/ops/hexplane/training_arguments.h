@@ -15,8 +15,8 @@ struct Field {
   int64_t line_size = 0, features = 0;
 
   Field(const CudaCall& call, Tensors& tensors, int64_t count) {
-    STD_TORCH_CHECK(!tensors.empty() && tensors.size() % 6 == 0 && tensors.size() / 6 <= size_t(kFieldLevels),
-                    "planes must be six per level, 1 to ", kFieldLevels, " levels, got ", tensors.size());
+    check(!tensors.empty() && tensors.size() % 6 == 0 && tensors.size() / 6 <= size_t(kFieldLevels),
+          "planes must be six per level, 1 to ", kFieldLevels, " levels, got ", tensors.size());
     planes.levels = int32_t(tensors.size() / 6);
     planes.channels = int32_t(tensors[0].size(2));
     features = int64_t(planes.levels) * planes.channels;
@@ -24,19 +24,19 @@ struct Field {
     for (int l = 0; l < planes.levels; ++l) {
       for (int p = 0; p < 6; ++p) {
         Tensor& plane = tensors[6 * l + p];
-        STD_TORCH_CHECK(plane.is_contiguous(), "planes must be contiguous");
+        check(plane.is_contiguous(), "planes must be contiguous");
         call.floats(plane, "a plane");
-        STD_TORCH_CHECK(plane.dim() == 3 && plane.size(2) == planes.channels && plane.numel() > 0, "every plane must be [V, U, ",
-                        planes.channels, "], none empty");
+        check(plane.dim() == 3 && plane.size(2) == planes.channels && plane.numel() > 0, "every plane must be [V, U, ",
+              planes.channels, "], none empty");
         if (p < 3) planes.space[l][p] = data(plane);
         if (p >= 3) time_planes.push_back(plane);
       }
       const auto size = [&](int p, int dim) { return int32_t(tensors[6 * l + p].size(dim)); };
       int32_t* sizes = planes.sizes[l];
       sizes[0] = size(0, 1), sizes[1] = size(0, 0), sizes[2] = size(1, 0);
-      STD_TORCH_CHECK(size(1, 1) == sizes[0] && size(2, 1) == sizes[1] && size(2, 0) == sizes[2] && size(3, 1) == sizes[0] &&
-                          size(4, 1) == sizes[1] && size(5, 1) == sizes[2],
-                      "the planes of level ", l, " do not share one grid");
+      check(size(1, 1) == sizes[0] && size(2, 1) == sizes[1] && size(2, 0) == sizes[2] && size(3, 1) == sizes[0] &&
+                size(4, 1) == sizes[1] && size(5, 1) == sizes[2],
+            "the planes of level ", l, " do not share one grid");
       for (int p = 0; p < 3; ++p) {
         cells.first[l][p] = cells.cells;
         cells.cells += int64_t(sizes[major_axis(p)]) * sizes[minor_axis(p)];
@@ -44,7 +44,7 @@ struct Field {
     }
     line_size = lines_of(call, time_planes, planes.channels, times, lines);
     cells.count = count;
-    STD_TORCH_CHECK(cells.cells < (int64_t(1) << 31) && 3 * planes.levels * count < (int64_t(1) << 31),
-                    "too many cells or Gaussians for 32-bit places: ", cells.cells, " cells, ", count, " Gaussians");
+    check(cells.cells < (int64_t(1) << 31) && 3 * planes.levels * count < (int64_t(1) << 31),
+          "too many cells or Gaussians for 32-bit places: ", cells.cells, " cells, ", count, " Gaussians");
   }
 };

@@ -7,10 +7,9 @@ namespace {
 
 FieldNetwork checked_network(const CudaCall& call, Tensors& weights, Tensors& biases, const Field& field) {
   const FieldNetwork net = network_of(call, weights, biases, field.features);
-  STD_TORCH_CHECK(field.planes.channels % 16 == 0 && net.fits(4),
-                  "training on CUDA takes a multiple of 16 channels, layers up to 128 ", "wide, and weights that fit into ",
-                  kRoomForWeights, " bytes; got ", field.planes.channels, " channels, width ", net.width, ", ", net.layers,
-                  " layers; train with autograd");
+  check(field.planes.channels % 16 == 0 && net.fits(4), "training on CUDA takes a multiple of 16 channels, layers up to 128 ",
+        "wide, and weights that fit into ", kRoomForWeights, " bytes; got ", field.planes.channels, " channels, width ",
+        net.width, ", ", net.layers, " layers; train with autograd");
   return net;
 }
 
@@ -30,12 +29,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_trai
                                                                                   Tensors biases) {
   CudaCall call(means);
   const Tensor m = call.floats(means, "means"), b = call.floats(box, "box"), t = call.floats(time, "time");
-  STD_TORCH_CHECK(m.dim() == 2 && m.size(1) == 3 && b.numel() == 6 && t.numel() == 1,
-                  "hexplane_train takes means [N, 3], box [2, 3] and one time");
+  check(m.dim() == 2 && m.size(1) == 3 && b.numel() == 6 && t.numel() == 1,
+        "hexplane_train takes means [N, 3], box [2, 3] and one time");
   const int64_t n = m.size(0);
   Field field(call, planes, n);
   const FieldNetwork net = checked_network(call, weights, biases, field);
-  Tensor deltas = call.empty({n, kDeltaColumns}), coordinates = call.empty({n, 4}), lines = call.empty({field.line_size});
+  Tensor deltas = call.empty({n, kRawColumns}), coordinates = call.empty({n, 4}), lines = call.empty({field.line_size});
   Tensor features = call.empty({n, field.features}), hidden = call.empty({net.layers - 1, n, net.padded_width()});
   Tensor order = call.empty({3, 3 * field.planes.levels * n}, ScalarType::Int);
   Tensor starts = call.empty({field.cells.cells + 1}, ScalarType::Int);
@@ -65,17 +64,17 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tenso
   const Tensor b = call.floats(box, "box"), x = call.floats(coordinates, "coordinates");
   const Tensor o = call.ints(order, "order"), s = call.ints(starts, "starts");
   const int64_t n = x.size(0);
-  STD_TORCH_CHECK(v_raw.is_contiguous() && v_raw.dim() == 2 && v_raw.size(0) == n && v_raw.size(1) == kDeltaColumns,
-                  "v_raw must be contiguous [N, ", kDeltaColumns, "]");
+  check(v_raw.is_contiguous() && v_raw.dim() == 2 && v_raw.size(0) == n && v_raw.size(1) == kRawColumns,
+        "v_raw must be contiguous [N, ", kRawColumns, "]");
   call.floats(v_raw, "v_raw");
   Field field(call, planes, n);
   const FieldNetwork net = checked_network(call, weights, biases, field);
   const Tensor l = call.floats(lines, "lines"), f = call.floats(features, "features"), h = call.floats(hidden, "hidden");
   const int64_t slots = 3 * field.planes.levels;
-  STD_TORCH_CHECK(x.numel() == 4 * n && l.numel() == field.line_size && f.numel() == n * field.features &&
-                      h.numel() == (net.layers - 1) * n * net.padded_width() && o.dim() == 2 && o.numel() == 3 * slots * n &&
-                      s.numel() == field.cells.cells + 1,
-                  "coordinates, lines, features, hidden, order and starts must be those that hexplane_train gave");
+  check(x.numel() == 4 * n && l.numel() == field.line_size && f.numel() == n * field.features &&
+            h.numel() == (net.layers - 1) * n * net.padded_width() && o.dim() == 2 && o.numel() == 3 * slots * n &&
+            s.numel() == field.cells.cells + 1,
+        "coordinates, lines, features, hidden, order and starts must be those that hexplane_train gave");
   int64_t parameters = 0;
   for (size_t i = 0; i < weights.size(); ++i) parameters += weights[i].numel() + biases[i].numel();
   Tensor network_gradient = call.empty({parameters}), rows = call.empty({2, slots * n, field.planes.channels});
@@ -86,7 +85,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tenso
   const FieldRows r = {mutable_data(rows), mutable_data(rows) + slots * n * field.planes.channels, mutable_data(shares),
                        mutable_data(crowds)};
   float *v_features = call.array<float>(n * field.features), *v_hidden = call.array<float>(h.numel());
-  float* v_head = call.array<float>(n * kDeltaColumns);
+  float* v_head = call.array<float>(n * kRawColumns);
   network_backward(net, data(v_raw), data(h), v_features, v_hidden, v_head, n, call, call.stream);
   CudaBranch branch(call.stream);  // the network and the lines, beside the space planes
   network_weight_gradient(net, data(f), data(h), v_hidden, v_head, mutable_data(network_gradient), n, call, branch.stream);
@@ -101,6 +100,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tenso
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("hexplane_train", TORCH_BOX(&hexplane_train));
-  m.impl("hexplane_train_backward", TORCH_BOX(&hexplane_train_backward));
+  m.impl("hexplane_train", GSPLAT_BOX(&hexplane_train));
+  m.impl("hexplane_train_backward", GSPLAT_BOX(&hexplane_train_backward));
 }

@@ -10,21 +10,20 @@ constexpr int64_t kMostRows = 65535 * 32;  // a grid's second dimension
 
 const uint8_t* bytes(const CudaCall& call, Tensor& kept, const Tensor& t, int64_t count, const char* name) {
   kept = call.take(t, ScalarType::Byte, name);
-  STD_TORCH_CHECK(kept.numel() == count, name, " must have one value per pixel and channel, ", count, ", got ", kept.numel());
+  check(kept.numel() == count, name, " must have one value per pixel and channel, ", count, ", got ", kept.numel());
   return kept.const_data_ptr<uint8_t>();
 }
 
 const float* plane(const CudaCall& call, Tensor& kept, const Tensor& t, int64_t pixels, const char* name) {
   kept = call.floats(t, name);
-  STD_TORCH_CHECK(kept.numel() == pixels, name, " must be [H, W]");
+  check(kept.numel() == pixels, name, " must be [H, W]");
   return data(kept);
 }
 
 void set_size(DeviceImageLoss& loss, const Tensor& image, int64_t channels) {
-  STD_TORCH_CHECK(image.dim() == 3, "image must be [H, W, C]");
-  STD_TORCH_CHECK(channels >= 1 && channels <= 32, "image must have 1 to 32 channels");
-  STD_TORCH_CHECK(image.size(0) <= kMostRows && image.size(1) <= kMostRows, "image must have at most ", kMostRows,
-                  " pixels on a side");
+  check(image.dim() == 3, "image must be [H, W, C]");
+  check(channels >= 1 && channels <= 32, "image must have 1 to 32 channels");
+  check(image.size(0) <= kMostRows && image.size(1) <= kMostRows, "image must have at most ", kMostRows, " pixels on a side");
   loss.image = data(image);
   loss.height = int32_t(image.size(0)), loss.width = int32_t(image.size(1));
   loss.pixels = image.size(0) * image.size(1);
@@ -47,7 +46,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> image_loss(Tensor image, Tensor targe
   }
   if (mask) loss.mask = bytes(call, tissue, *mask, pixels, "mask");
   if (depth) {
-    STD_TORCH_CHECK(target_depth.has_value(), "depth needs target_depth");
+    check(target_depth.has_value(), "depth needs target_depth");
     loss.depth = plane(call, z, *depth, pixels, "depth");
     loss.target_depth = plane(call, target_z, *target_depth, pixels, "target_depth");
   }
@@ -66,7 +65,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> frame_loss(Tensor image, Tensor alpha
                                                       double depth_weight) {
   CudaCall call(image);
   const Tensor x = call.floats(image, "image");
-  STD_TORCH_CHECK(x.dim() == 3 && x.size(2) == 4, "a frame's image must be [H, W, 4]");
+  check(x.dim() == 3 && x.size(2) == 4, "a frame's image must be [H, W, 4]");
   DeviceImageLoss loss = {};
   set_size(loss, x, 3);
   const int64_t pixels = loss.pixels;
@@ -88,6 +87,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> frame_loss(Tensor image, Tensor alpha
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("image_loss", TORCH_BOX(&image_loss));
-  m.impl("frame_loss", TORCH_BOX(&frame_loss));
+  m.impl("image_loss", GSPLAT_BOX(&image_loss));
+  m.impl("frame_loss", GSPLAT_BOX(&frame_loss));
 }

@@ -4,14 +4,14 @@
 #include <vector>
 
 #include "../ssim/ssim.h"
+#include "cpu_call.h"
 #include "image_loss.h"
-#include "tensor_checks.h"
 
 constexpr int64_t kRows = 16;  // rows a thread takes at least
 
 static Tensor bytes(const Tensor& t, const char* name) {
-  STD_TORCH_CHECK(t.is_cpu(), name, " must be on the CPU for this implementation");
-  STD_TORCH_CHECK(t.scalar_type() == ScalarType::Byte, name, " must be uint8");
+  check(t.is_cpu(), name, " must be on the CPU for this implementation");
+  check(t.scalar_type() == ScalarType::Byte, name, " must be uint8");
   return t.is_contiguous() ? t : torch::stable::contiguous(t);
 }
 
@@ -41,11 +41,11 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor> image_loss(Tensor image, Tenso
   const Tensor x = floats(image, "image");
   const bool is_bytes = target.scalar_type() == ScalarType::Byte;
   const Tensor y = is_bytes ? bytes(target, "target") : floats(target, "target");
-  STD_TORCH_CHECK(x.dim() == 3 && y.dim() == 3 && x.numel() == y.numel(), "image and target must be [H, W, C] of one shape");
+  check(x.dim() == 3 && y.dim() == 3 && x.numel() == y.numel(), "image and target must be [H, W, C] of one shape");
   const int64_t height = x.size(0), width = x.size(1), channels = x.size(2), pixels = height * width;
-  STD_TORCH_CHECK(channels >= 1 && channels <= kSsimMaxChannels, "image must have 1 to 32 channels");
+  check(channels >= 1 && channels <= kSsimMaxChannels, "image must have 1 to 32 channels");
   const Tensor m = mask ? bytes(*mask, "mask") : x;
-  STD_TORCH_CHECK(!mask || m.numel() == pixels, "mask must be [H, W]");
+  check(!mask || m.numel() == pixels, "mask must be [H, W]");
   const uint8_t* tissue = mask ? m.const_data_ptr<uint8_t>() : nullptr;
   const double values = double(channels * (tissue ? image_loss_kernels().count_tissue(tissue, pixels) : pixels));
 
@@ -79,10 +79,10 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor> image_loss(Tensor image, Tenso
   Tensor grad_depth = empty_floats({0});
   double inverse_depth_term = 0;
   if (depth) {
-    STD_TORCH_CHECK(target_depth.has_value(), "depth needs target_depth");
+    check(target_depth.has_value(), "depth needs target_depth");
     const Tensor z = floats(*depth, "depth"), target_z = floats(*target_depth, "target_depth");
-    STD_TORCH_CHECK(z.dim() == 2 && z.size(0) == height && z.size(1) == width && target_z.numel() == pixels,
-                    "depth and target_depth must be [H, W]");
+    check(z.dim() == 2 && z.size(0) == height && z.size(1) == width && target_z.numel() == pixels,
+          "depth and target_depth must be [H, W]");
     grad_depth = empty_floats({height, width});
     inverse_depth_term = depth_term(z, target_z, tissue, depth_weight, grad_depth);
   }
@@ -94,4 +94,4 @@ static std::tuple<Tensor, Tensor, Tensor, Tensor> image_loss(Tensor image, Tenso
   return {loss, terms, grad_image, grad_depth};
 }
 
-STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) { m.impl("image_loss", TORCH_BOX(&image_loss)); }
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) { m.impl("image_loss", GSPLAT_BOX(&image_loss)); }

@@ -7,9 +7,9 @@ void store_scalars_(Tensor to, std::vector<double> values) {
   CudaCall call(to);
   const int64_t count = int64_t(values.size());
   call.floats(to, "store_scalars_'s target");
-  STD_TORCH_CHECK(to.is_contiguous() && to.numel() == count && count <= kMostScalars,
-                  "store_scalars_ writes all of a contiguous tensor of at most ", kMostScalars, " values; got ", count,
-                  " values for ", to.numel());
+  check(to.is_contiguous() && to.numel() == count && count <= kMostScalars,
+        "store_scalars_ writes all of a contiguous tensor of at most ", kMostScalars, " values; got ", count, " values for ",
+        to.numel());
   if (count == 0) return;
   DeviceScalars scalars = {};
   scalars.count = int(count);
@@ -20,4 +20,4 @@ void store_scalars_(Tensor to, std::vector<double> values) {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) { m.impl("store_scalars_", TORCH_BOX(&store_scalars_)); }
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) { m.impl("store_scalars_", GSPLAT_BOX(&store_scalars_)); }

@@ -16,15 +16,15 @@ struct HarmonicsScene {
 
   HarmonicsScene(int64_t degree, const Tensor& dirs_in, const Tensor& coeffs_in, const std::optional<Tensor>& mask_in)
       : call(dirs_in), dirs(call.floats(dirs_in, "dirs")), coeffs(call.floats(coeffs_in, "coeffs")) {
-    STD_TORCH_CHECK(dirs.dim() == 3 && coeffs.dim() == 3 && coeffs.size(0) == dirs.size(1) && dirs.size(2) == 3 &&
-                        coeffs.size(2) == 3 && degree >= 0 && degree <= 4 && coeffs.size(1) >= (degree + 1) * (degree + 1),
-                    "spherical harmonics take dirs [R, M, 3] and coeffs [M, K, 3] with K >= (degree + 1)^2, degree 0 to 4");
+    check(dirs.dim() == 3 && coeffs.dim() == 3 && coeffs.size(0) == dirs.size(1) && dirs.size(2) == 3 && coeffs.size(2) == 3 &&
+              degree >= 0 && degree <= 4 && coeffs.size(1) >= (degree + 1) * (degree + 1),
+          "spherical harmonics take dirs [R, M, 3] and coeffs [M, K, 3] with K >= (degree + 1)^2, degree 0 to 4");
     rows = dirs.size(0);
     sets = dirs.size(1);
     bases = coeffs.size(1);
     if (mask_in.has_value()) {
       mask = call.take(*mask_in, ScalarType::Bool, "masks");
-      STD_TORCH_CHECK(mask->numel() == rows * sets, "masks must be bool [R, M]");
+      check(mask->numel() == rows * sets, "masks must be bool [R, M]");
     }
     input = {data(dirs), data(coeffs), mask.has_value() ? mask->const_data_ptr<bool>() : nullptr, int(degree), bases};
   }
@@ -42,7 +42,7 @@ std::tuple<Tensor, Tensor> spherical_harmonics_backward(int64_t degree, Tensor d
                                                         Tensor v_colors_in, bool needs_dirs) {
   const HarmonicsScene scene(degree, dirs, coeffs, masks);
   const Tensor v_colors = scene.call.floats(v_colors_in, "v_colors");
-  STD_TORCH_CHECK(v_colors.numel() == scene.rows * scene.sets * 3, "v_colors must be [R, M, 3]");
+  check(v_colors.numel() == scene.rows * scene.sets * 3, "v_colors must be [R, M, 3]");
   Tensor v_dirs = needs_dirs ? scene.call.empty({scene.rows, scene.sets, 3}) : scene.call.empty({0});
   Tensor v_coeffs = scene.call.empty({scene.sets, scene.bases, 3});
   harmonics_backward(scene.input, scene.rows, scene.sets, data(v_colors), needs_dirs ? mutable_data(v_dirs) : nullptr,
@@ -54,6 +54,6 @@ std::tuple<Tensor, Tensor> spherical_harmonics_backward(int64_t degree, Tensor d
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("spherical_harmonics", TORCH_BOX(&spherical_harmonics));
-  m.impl("spherical_harmonics_backward", TORCH_BOX(&spherical_harmonics_backward));
+  m.impl("spherical_harmonics", GSPLAT_BOX(&spherical_harmonics));
+  m.impl("spherical_harmonics_backward", GSPLAT_BOX(&spherical_harmonics_backward));
 }

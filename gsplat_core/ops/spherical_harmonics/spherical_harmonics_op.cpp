@@ -1,8 +1,8 @@
 #include <optional>
 #include <tuple>
 
+#include "cpu_call.h"
 #include "spherical_harmonics.h"
-#include "tensor_checks.h"
 
 constexpr int64_t kBlock = 1024;
 
@@ -15,15 +15,15 @@ struct HarmonicsScene {
 
   HarmonicsScene(int64_t degree_in, const Tensor& dirs_in, const Tensor& coeffs_in, const std::optional<Tensor>& mask_in)
       : dirs(floats(dirs_in, "dirs")), coeffs(floats(coeffs_in, "coeffs")), degree(int(degree_in)) {
-    STD_TORCH_CHECK(dirs.dim() == 3 && coeffs.dim() == 3 && coeffs.size(0) == dirs.size(1) && dirs.size(2) == 3 &&
-                        coeffs.size(2) == 3 && degree >= 0 && degree <= 4 && coeffs.size(1) >= (degree + 1) * (degree + 1),
-                    "spherical harmonics take dirs [R, M, 3] and coeffs [M, K, 3] with K >= (degree + 1)^2, degree 0 to 4");
+    check(dirs.dim() == 3 && coeffs.dim() == 3 && coeffs.size(0) == dirs.size(1) && dirs.size(2) == 3 && coeffs.size(2) == 3 &&
+              degree >= 0 && degree <= 4 && coeffs.size(1) >= (degree + 1) * (degree + 1),
+          "spherical harmonics take dirs [R, M, 3] and coeffs [M, K, 3] with K >= (degree + 1)^2, degree 0 to 4");
     rows = dirs.size(0);
     sets = dirs.size(1);
     bases = coeffs.size(1);
     if (mask_in.has_value()) {
-      STD_TORCH_CHECK(mask_in->is_cpu() && mask_in->scalar_type() == ScalarType::Bool && mask_in->numel() == rows * sets,
-                      "masks must be bool [R, M] on the CPU");
+      check(mask_in->is_cpu() && mask_in->scalar_type() == ScalarType::Bool && mask_in->numel() == rows * sets,
+            "masks must be bool [R, M] on the CPU");
       mask = mask_in->is_contiguous() ? *mask_in : torch::stable::contiguous(*mask_in);
     }
   }
@@ -55,7 +55,7 @@ static std::tuple<Tensor, Tensor> spherical_harmonics_backward(int64_t degree, T
   const HarmonicsScene scene(degree, dirs, coeffs, masks);
   const Tensor v_colors = floats(v_colors_in, "v_colors");
   const int64_t blocks = scene.blocks(), M = scene.sets, R = scene.rows;
-  STD_TORCH_CHECK(v_colors.numel() == R * M * 3, "v_colors must be [R, M, 3]");
+  check(v_colors.numel() == R * M * 3, "v_colors must be [R, M, 3]");
   Tensor v_dirs = needs_dirs ? empty_floats({R, M, 3}) : empty_floats({0});
   Tensor v_coeffs = R == 0 ? zero_floats({M, scene.bases, 3}) : empty_floats({M, scene.bases, 3});
   float *to_dirs = mutable_data(v_dirs), *to_coeffs = mutable_data(v_coeffs);
@@ -73,6 +73,6 @@ static std::tuple<Tensor, Tensor> spherical_harmonics_backward(int64_t degree, T
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) {
-  m.impl("spherical_harmonics", TORCH_BOX(&spherical_harmonics));
-  m.impl("spherical_harmonics_backward", TORCH_BOX(&spherical_harmonics_backward));
+  m.impl("spherical_harmonics", GSPLAT_BOX(&spherical_harmonics));
+  m.impl("spherical_harmonics_backward", GSPLAT_BOX(&spherical_harmonics_backward));
 }

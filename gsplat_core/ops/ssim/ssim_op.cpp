@@ -1,8 +1,8 @@
 #include <cmath>
 #include <vector>
 
+#include "cpu_call.h"
 #include "ssim.h"
-#include "tensor_checks.h"
 
 static void fill_taps(float* taps) {
   double weights[kSsimTaps], total = 0;
@@ -25,9 +25,9 @@ void run_ssim(SsimTask& task) {
 }
 
 static SsimTask image_task(const Tensor& image, const Tensor& target) {
-  STD_TORCH_CHECK(image.dim() == 3 && target.dim() == 3, "image and target must be [H, W, C]");
-  for (int d = 0; d < 3; ++d) STD_TORCH_CHECK(image.size(d) == target.size(d), "image and target must have one shape");
-  STD_TORCH_CHECK(image.size(2) >= 1 && image.size(2) <= kSsimMaxChannels, "image must have 1 to 32 channels");
+  check(image.dim() == 3 && target.dim() == 3, "image and target must be [H, W, C]");
+  for (int d = 0; d < 3; ++d) check(image.size(d) == target.size(d), "image and target must have one shape");
+  check(image.size(2) >= 1 && image.size(2) <= kSsimMaxChannels, "image must have 1 to 32 channels");
   SsimTask task{};
   task.image = data(image);
   task.target = data(target);
@@ -50,7 +50,7 @@ static Tensor ssim_map(Tensor image, Tensor target) {
 static Tensor ssim_map_backward(Tensor gradient, Tensor image, Tensor target) {
   const Tensor g = floats(gradient, "gradient"), x = floats(image, "image"), y = floats(target, "target");
   SsimTask task = image_task(x, y);
-  STD_TORCH_CHECK(g.numel() == x.numel(), "the gradient must have the map's shape");
+  check(g.numel() == x.numel(), "the gradient must have the map's shape");
   Tensor result = zero_floats({task.height, task.width, task.channels});
   task.upstream = data(g);
   task.gradient = mutable_data(result);
@@ -59,6 +59,6 @@ static Tensor ssim_map_backward(Tensor gradient, Tensor image, Tensor target) {
 }
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) {
-  m.impl("ssim_map", TORCH_BOX(&ssim_map));
-  m.impl("ssim_map_backward", TORCH_BOX(&ssim_map_backward));
+  m.impl("ssim_map", GSPLAT_BOX(&ssim_map));
+  m.impl("ssim_map_backward", GSPLAT_BOX(&ssim_map_backward));
 }

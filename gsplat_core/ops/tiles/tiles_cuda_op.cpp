@@ -28,10 +28,10 @@ struct Binning {
         depths(call.floats(depths_, "depths")),
         tiles(images * tile_width * tile_height) {
     const int64_t count = depths.numel();
-    STD_TORCH_CHECK(count <= kMostInts, "isect_tiles takes at most 2^31 - 1 splats over all images, got ", count);
-    STD_TORCH_CHECK(tile_size > 0 && tile_width >= 0 && tile_width < 65536 && tile_height >= 0 && tile_height < 65536,
-                    "isect_tiles: tile_size must be positive and the tile grid below 65536 x 65536");
-    STD_TORCH_CHECK(tiles <= kMostInts, "isect_tiles takes at most 2^31 - 1 tiles over all images, got ", tiles);
+    check(count <= kMostInts, "isect_tiles takes at most 2^31 - 1 splats over all images, got ", count);
+    check(tile_size > 0 && tile_width >= 0 && tile_width < 65536 && tile_height >= 0 && tile_height < 65536,
+          "isect_tiles: tile_size must be positive and the tile grid below 65536 x 65536");
+    check(tiles <= kMostInts, "isect_tiles takes at most 2^31 - 1 tiles over all images, got ", tiles);
     if (conics_) conics = call.floats(*conics_, "conics"), opacities = call.floats(opacities_.value(), "opacities");
     if (image_ids_) image_ids = call.ints(*image_ids_, "image_ids");
     boxes = {data(means2d),
@@ -50,7 +50,7 @@ struct Binning {
     TileOrder order = {};
     if (count > 0) order = order_splats(boxes, sort, tile_counts.mutable_data_ptr<int32_t>(), call, call.stream);
     if (capacity) {
-      STD_TORCH_CHECK(*capacity >= 0 && *capacity <= kMostInts, "bin_splats: capacity must be 0 to 2^31 - 1, got ", *capacity);
+      check(*capacity >= 0 && *capacity <= kMostInts, "bin_splats: capacity must be 0 to 2^31 - 1, got ", *capacity);
       instances.capacity = true;
       instances.count = *capacity;
       needed = call.empty({1}, ScalarType::Long);
@@ -64,8 +64,8 @@ struct Binning {
                  "reading the number of instances");
       check_cuda(cudaStreamSynchronize(call.stream), "sorting the splats by depth");
     }
-    STD_TORCH_CHECK(instances.count <= kMostInts, "the splats touch ", instances.count,
-                    " tiles in all, more than 2^31 - 1; render fewer images at a time or with a larger tile_size");
+    check(instances.count <= kMostInts, "the splats touch ", instances.count,
+          " tiles in all, more than 2^31 - 1; render fewer images at a time or with a larger tile_size");
     for (int i = 0; i < (sort ? 2 : 1); ++i) {
       splats[i] = call.empty({instances.count}, ScalarType::Int);
       instances.splats[i] = splats[i].mutable_data_ptr<int32_t>();
@@ -118,7 +118,7 @@ Tensor isect_offset_encode(Tensor isect_ids, int64_t images, int64_t tile_width,
   CudaCall call(isect_ids);
   const Tensor sorted = call.take(isect_ids, ScalarType::Long, "isect_ids");
   const int64_t tiles = tile_width * tile_height;
-  STD_TORCH_CHECK(sorted.numel() <= kMostInts && images * tiles <= kMostInts, "isect_offset_encode: more than 2^31 - 1 entries");
+  check(sorted.numel() <= kMostInts && images * tiles <= kMostInts, "isect_offset_encode: more than 2^31 - 1 entries");
   Tensor offsets = call.empty({images, tile_height, tile_width}, ScalarType::Int);
   encode_offsets(sorted.const_data_ptr<int64_t>(), sorted.numel(), images, tiles, offsets.mutable_data_ptr<int32_t>(),
                  call.stream);
@@ -129,8 +129,8 @@ Tensor isect_offset_encode(Tensor isect_ids, int64_t images, int64_t tile_width,
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("isect_tiles", TORCH_BOX(&isect_tiles));
-  m.impl("bin_splats", TORCH_BOX(&bin_splats));
-  m.impl("bin_splats_within", TORCH_BOX(&bin_splats_within));
-  m.impl("isect_offset_encode", TORCH_BOX(&isect_offset_encode));
+  m.impl("isect_tiles", GSPLAT_BOX(&isect_tiles));
+  m.impl("bin_splats", GSPLAT_BOX(&bin_splats));
+  m.impl("bin_splats_within", GSPLAT_BOX(&bin_splats_within));
+  m.impl("isect_offset_encode", GSPLAT_BOX(&isect_offset_encode));
 }

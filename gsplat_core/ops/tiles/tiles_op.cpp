@@ -2,7 +2,7 @@
 #include <tuple>
 
 #include "counting_sort.h"
-#include "tensor_checks.h"
+#include "cpu_call.h"
 #include "tiles.h"
 
 namespace {
@@ -31,10 +31,10 @@ struct Binning {
       : means2d(floats(means2d_, "means2d")), radii(ints(radii_, "radii")), depths(floats(depths_, "depths")), images(images_) {
     count = depths.numel();
     tiles = images * tile_width * tile_height;
-    STD_TORCH_CHECK(count <= kMostInts, "isect_tiles takes at most 2^31 - 1 splats over all images, got ", count);
-    STD_TORCH_CHECK(tile_size > 0 && tile_width >= 0 && tile_width < 65536 && tile_height >= 0 && tile_height < 65536,
-                    "isect_tiles: tile_size must be positive and the tile grid below 65536 x 65536");
-    STD_TORCH_CHECK(tiles <= kMostInts, "isect_tiles takes at most 2^31 - 1 tiles over all images, got ", tiles);
+    check(count <= kMostInts, "isect_tiles takes at most 2^31 - 1 splats over all images, got ", count);
+    check(tile_size > 0 && tile_width >= 0 && tile_width < 65536 && tile_height >= 0 && tile_height < 65536,
+          "isect_tiles: tile_size must be positive and the tile grid below 65536 x 65536");
+    check(tiles <= kMostInts, "isect_tiles takes at most 2^31 - 1 tiles over all images, got ", tiles);
     if (conics_) conics = floats(*conics_, "conics"), opacities = floats(opacities_.value(), "opacities");
     if (image_ids_) image_ids = ints(*image_ids_, "image_ids");
     boxes = {data(means2d),
@@ -48,16 +48,16 @@ struct Binning {
              int32_t(tile_width),
              int32_t(tile_height)};
     for (int64_t i = 0; image_ids && i < count; ++i)
-      STD_TORCH_CHECK(boxes.image_ids[i] >= 0 && boxes.image_ids[i] < images, "isect_tiles: image_ids[", i, "] is ",
-                      boxes.image_ids[i], " but there are ", images, " images");
+      check(boxes.image_ids[i] >= 0 && boxes.image_ids[i] < images, "isect_tiles: image_ids[", i, "] is ", boxes.image_ids[i],
+            " but there are ", images, " images");
     tile_counts = empty_ints({count});
     spans = uninitialised<TileSpan>(count);
     int32_t* const counts = tile_counts.mutable_data_ptr<int32_t>();
     torch::stable::parallel_for(
         0, count, 2048, [&](int64_t begin, int64_t end) { tiles_kernels().spans(boxes, begin, end, spans.get(), counts); });
     for (int64_t i = 0; i < count; ++i) total += counts[i];
-    STD_TORCH_CHECK(total <= kMostInts, "the splats touch ", total,
-                    " tiles in all, more than 2^31 - 1; render fewer images at a time or with a larger tile_size");
+    check(total <= kMostInts, "the splats touch ", total,
+          " tiles in all, more than 2^31 - 1; render fewer images at a time or with a larger tile_size");
   }
 
   // Visible splats by depth (as bits, so positive depths in front of negative ones, as gsplat sorts), ties by index.
@@ -171,7 +171,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> bin_splats_within(Tensor means2d, Ten
                                                              std::optional<Tensor> conics, std::optional<Tensor> opacities,
                                                              std::optional<Tensor> image_ids, int64_t images, int64_t tile_size,
                                                              int64_t tile_width, int64_t tile_height, int64_t capacity) {
-  STD_TORCH_CHECK(capacity >= 0 && capacity <= kMostInts, "bin_splats: capacity must be 0 to 2^31 - 1, got ", capacity);
+  check(capacity >= 0 && capacity <= kMostInts, "bin_splats: capacity must be 0 to 2^31 - 1, got ", capacity);
   const Binning binning(means2d, radii, depths, conics, opacities, image_ids, images, tile_size, tile_width, tile_height);
   Tensor offsets = empty_ints({images, tile_height, tile_width}), needed = empty_longs(1);
   *needed.mutable_data_ptr<int64_t>() = binning.total;
@@ -180,19 +180,19 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> bin_splats_within(Tensor means2d, Ten
 }
 
 Tensor isect_offset_encode(Tensor isect_ids, int64_t images, int64_t tile_width, int64_t tile_height) {
-  STD_TORCH_CHECK(isect_ids.is_cpu() && isect_ids.scalar_type() == ScalarType::Long, "isect_ids must be int64 on the CPU");
+  check(isect_ids.is_cpu() && isect_ids.scalar_type() == ScalarType::Long, "isect_ids must be int64 on the CPU");
   const Tensor sorted = isect_ids.is_contiguous() ? isect_ids : torch::stable::contiguous(isect_ids);
   const int64_t* const ids = sorted.const_data_ptr<int64_t>();
   const int64_t count = sorted.numel(), tiles = tile_width * tile_height;
-  STD_TORCH_CHECK(count <= kMostInts && images * tiles <= kMostInts, "isect_offset_encode: more than 2^31 - 1 entries");
+  check(count <= kMostInts && images * tiles <= kMostInts, "isect_offset_encode: more than 2^31 - 1 entries");
   Tensor offsets = empty_ints({images, tile_height, tile_width});
   int32_t* const out = offsets.mutable_data_ptr<int32_t>();
   const int tile_bits = tiles > 0 ? 64 - __builtin_clzll(uint64_t(tiles)) : 1;
   int64_t next = 0;  // first tile without an offset
   for (int64_t i = 0; i < count; ++i) {
     const int64_t key = ids[i] >> 32, image = key >> tile_bits, tile = key & ((int64_t(1) << tile_bits) - 1);
-    STD_TORCH_CHECK(image >= 0 && image < images && tile < tiles, "isect_offset_encode: isect_ids[", i, "] is for image ", image,
-                    ", tile ", tile, " but there are ", images, " images of ", tiles, " tiles");
+    check(image >= 0 && image < images && tile < tiles, "isect_offset_encode: isect_ids[", i, "] is for image ", image, ", tile ",
+          tile, " but there are ", images, " images of ", tiles, " tiles");
     for (const int64_t here = image * tiles + tile; next <= here; ++next) out[next] = int32_t(i);
   }
   for (; next < images * tiles; ++next) out[next] = int32_t(count);
@@ -202,8 +202,8 @@ Tensor isect_offset_encode(Tensor isect_ids, int64_t images, int64_t tile_width,
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CPU, m) {
-  m.impl("isect_tiles", TORCH_BOX(&isect_tiles));
-  m.impl("bin_splats", TORCH_BOX(&bin_splats));
-  m.impl("bin_splats_within", TORCH_BOX(&bin_splats_within));
-  m.impl("isect_offset_encode", TORCH_BOX(&isect_offset_encode));
+  m.impl("isect_tiles", GSPLAT_BOX(&isect_tiles));
+  m.impl("bin_splats", GSPLAT_BOX(&bin_splats));
+  m.impl("bin_splats_within", GSPLAT_BOX(&bin_splats_within));
+  m.impl("isect_offset_encode", GSPLAT_BOX(&isect_offset_encode));
 }

@@ -1,0 +1,42 @@
+// Errors of the core: one sentence with what was expected and what came, thrown as std::runtime_error.
+//
+// torch_abi.h hands the sentence to torch, and Python gets a RuntimeError. It is put together without iostreams: in a library
+// that was linked with a static libstdc++ they are a second, uninitialised copy, and formatting a number with them crashes the
+// process.
+#pragma once
+
+#include <cstdio>
+#include <stdexcept>
+#include <string>
+#include <type_traits>
+
+namespace gsplat {
+
+inline void append(std::string& sentence, const char* part) { sentence += part; }
+inline void append(std::string& sentence, const std::string& part) { sentence += part; }
+
+template <class Number, class = std::enable_if_t<std::is_arithmetic_v<Number>>>
+void append(std::string& sentence, Number part) {
+  if constexpr (std::is_floating_point_v<Number>) {
+    char text[32];
+    std::snprintf(text, sizeof(text), "%.9g", double(part));
+    sentence += text;
+  } else {
+    sentence += std::to_string(part);
+  }
+}
+
+template <class... Parts>
+[[noreturn]] __attribute__((noinline, cold)) void fail(const Parts&... parts) {
+  std::string sentence;
+  (append(sentence, parts), ...);
+  throw std::runtime_error(sentence);
+}
+
+// Throws the sentence made of `parts` (texts and numbers) unless `holds`.
+template <class... Parts>
+inline void check(bool holds, const Parts&... parts) {
+  if (__builtin_expect(!holds, false)) fail(parts...);
+}
+
+}  // namespace gsplat

@@ -1,0 +1,78 @@
+// torch's stable ABI without its iostreams; include this instead of <torch/csrc/stable/...> (checks.h says why).
+//
+// Three things in torch's headers would put iostreams into our objects: the messages of STD_TORCH_CHECK inside TORCH_BOX, the
+// functions behind the two macros that check torch's error codes, and the static initialiser that <iostream> brings along.
+// tests/gsplat_core/test_linkage.py fails when a new version of torch brings in another one.
+#pragma once
+
+#define STRIP_ERROR_MESSAGES 1  // STD_TORCH_CHECK then throws the text of its condition
+
+#include <dlfcn.h>
+
+#include "without_iostreams.h"
+
+#if __has_include(<torch/csrc/stable/macros.h>)
+#include <torch/csrc/stable/macros.h>
+#endif
+#include <torch/headeronly/util/shim_utils.h>
+
+#include "checks.h"
+
+namespace gsplat {
+
+// What torch says about a call of its C interface that has failed, without its own backtrace; torch tells it from 2.13 on.
+[[noreturn]] __attribute__((noinline, cold)) inline void torch_call_failed(const char* call) {
+  using What = const char* (*)();
+  const auto what = reinterpret_cast<What>(dlsym(RTLD_DEFAULT, "torch_exception_get_what_without_backtrace"));
+  const char* said = what != nullptr ? what() : nullptr;
+  if (said == nullptr) fail("torch refused ", call);
+  fail(said, " (torch refused ", call, ")");
+}
+
+}  // namespace gsplat
+
+#undef TORCH_ERROR_CODE_CHECK
+#define TORCH_ERROR_CODE_CHECK(call)  \
+  if ((call) != TORCH_SUCCESS) {      \
+    gsplat::torch_call_failed(#call); \
+  }
+#undef STABLE_TORCH_ERROR_CODE_CHECK
+#define STABLE_TORCH_ERROR_CODE_CHECK(call) TORCH_ERROR_CODE_CHECK(call)
+
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+#include <torch/headeronly/core/ScalarType.h>
+
+#if defined(GSPLAT_CUDA)
+#include <torch/csrc/stable/accelerator.h>
+#endif
+
+namespace gsplat {
+
+// A function as torch's dispatcher calls it, in place of TORCH_BOX: no exception of ours leaves this library. One that does is
+// caught by the C++ runtime of torch, which aborts when the exception was thrown by another copy of it. torch throws instead,
+// through a frame that has nothing to clean up.
+template <auto function>
+struct Boxed {
+  static void call(StableIValue* stack, uint64_t arguments, uint64_t results) {
+    if (const char* sentence = sentence_of(stack, arguments, results)) aoti_torch_check(false, "gsplat_core", "", 0, sentence);
+  }
+
+ private:
+  // Null, or why the call failed.
+  __attribute__((noinline)) static const char* sentence_of(StableIValue* stack, uint64_t arguments, uint64_t results) noexcept {
+    static thread_local char sentence[2048];
+    try {
+      torch::stable::detail::boxer<std::remove_pointer_t<decltype(function)>, function>::boxed_fn(stack, arguments, results);
+      return nullptr;
+    } catch (const std::exception& error) {
+      std::snprintf(sentence, sizeof(sentence), "%s", error.what());
+      return sentence;
+    }
+  }
+};
+
+}  // namespace gsplat
+
+#define GSPLAT_BOX(function) gsplat::Boxed<function>::call

@@ -1,0 +1,108 @@
+"""Files and folders appear whole, under names that nobody can plant a link at, or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import pytest
+
+from gsplat_core.io import atomic_files
+from gsplat_core.io.atomic_files import PartialFile, PartialFolder, remove_unfinished, write_durably
+
+
+def test_a_file_appears_when_it_is_complete(tmp_path):
+    with PartialFile(tmp_path / "film.mp4") as partial:
+        partial.file.write(b"whole")
+        assert partial.path.suffix == ".mp4" and not (tmp_path / "film.mp4").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+    assert (tmp_path / "film.mp4").read_bytes() == b"whole"
+
+
+def test_an_error_leaves_the_earlier_file_alone(tmp_path):
+    (tmp_path / "film.mp4").write_bytes(b"earlier")
+    with pytest.raises(RuntimeError), PartialFile(tmp_path / "film.mp4") as partial:
+        partial.file.write(b"half")
+        raise RuntimeError
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+    assert (tmp_path / "film.mp4").read_bytes() == b"earlier"
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_file_that_came_meanwhile_is_not_overwritten(tmp_path, monkeypatch, links):
+    if not links:
+
+        def refuse(*_, **__):
+            raise OSError(errno.EPERM, "no hard links here")
+
+        monkeypatch.setattr(os, "link", refuse)
+    with pytest.raises(FileExistsError), PartialFile(tmp_path / "film.mp4", overwrite=False) as partial:
+        partial.file.write(b"later")
+        (tmp_path / "film.mp4").write_bytes(b"earlier")
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+    assert (tmp_path / "film.mp4").read_bytes() == b"earlier"
+    with PartialFile(tmp_path / "new.mp4", overwrite=False) as partial:
+        partial.file.write(b"new")
+    assert (tmp_path / "new.mp4").read_bytes() == b"new" and len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_planted_link_is_replaced_and_never_written_through(tmp_path):
+    (tmp_path / "diary").write_bytes(b"mine")
+    for name in ("a", "b"):
+        (tmp_path / name).symlink_to(tmp_path / "diary")
+    write_durably(tmp_path / "a", [b"ours"])
+    with PartialFile(tmp_path / "b") as partial:
+        partial.file.write(b"ours")
+    assert (tmp_path / "diary").read_bytes() == b"mine"
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes() == b"ours"
+
+
+def test_a_name_that_was_guessed_is_an_error_and_not_overwritten(tmp_path, monkeypatch):
+    monkeypatch.setattr(atomic_files.secrets, "token_hex", lambda count: "guessed")
+    (tmp_path / "diary").write_bytes(b"mine")
+    (tmp_path / ".intrasplat-guessed.part.mp4").symlink_to(tmp_path / "diary")
+    with pytest.raises(FileExistsError):
+        PartialFile(tmp_path / "film.mp4")
+    assert (tmp_path / "diary").read_bytes() == b"mine"
+
+
+def test_names_of_the_greatest_length_and_the_umask(tmp_path):
+    name = "f" * 251 + ".mp4"
+    before = os.umask(0o027)
+    try:
+        with PartialFile(tmp_path / name) as partial:
+            partial.file.write(b"x")
+    finally:
+        os.umask(before)
+    assert (tmp_path / name).stat().st_mode & 0o777 == 0o640
+
+
+@pytest.mark.parametrize("exchange", [True, False])
+def test_a_folder_takes_the_place_of_an_earlier_one(tmp_path, monkeypatch, exchange):
+    if not exchange:
+        monkeypatch.setattr(atomic_files, "_exchanged", lambda first, second: False)
+    target = tmp_path / "take"
+    target.mkdir()
+    (target / "old").touch()
+    with PartialFolder(target) as partial:
+        (partial.path / "new").touch()
+        earlier = partial.finish()
+    assert [path.name for path in target.iterdir()] == ["new"]
+    assert earlier is not None and [path.name for path in earlier.iterdir()] == ["old"]
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_folder_that_is_not_finished_is_removed(tmp_path):
+    with pytest.raises(RuntimeError), PartialFolder(tmp_path / "take") as partial:
+        (partial.path / "half").touch()
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_program_that_ends_at_once_leaves_nothing_half_done(tmp_path):
+    partial = PartialFile(tmp_path / "film.mp4")
+    folder = PartialFolder(tmp_path / "take")
+    (folder.path / "half").touch()
+    remove_unfinished()
+    assert list(tmp_path.iterdir()) == []
+    partial.file.close()

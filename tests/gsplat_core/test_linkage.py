@@ -1,0 +1,84 @@
+"""What the compiled libraries take from the C++ runtime, and that an op refuses an argument however they were linked."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gsplat_core.ops.native import CUDA_LIBRARY_PATH, CUDA_MISSING, LIBRARY_PATH
+
+ROOT = Path(__file__).resolve().parents[2]
+IOSTREAMS = re.compile(r"std::(ios_base|locale|basic_\w*(stream|streambuf)\b|\w*stream\b|__cxx11::basic_\w*stream)")
+REFUSED = """
+import sys, torch
+torch.ops.load_library(sys.argv[1])
+splat = torch.ones(1, 2), torch.ones(1, 2, dtype=torch.int32), torch.ones(1), None, None
+try:
+    torch.ops.gsplat_core.bin_splats_within(*splat, None, 1, 16, 1, 1, -7)
+except RuntimeError as error:
+    print(error)
+"""
+
+
+@pytest.fixture(params=[LIBRARY_PATH, CUDA_LIBRARY_PATH], ids=["cpu", "cuda"])
+def library(request: pytest.FixtureRequest) -> Path:
+    if request.param == CUDA_LIBRARY_PATH and not CUDA_LIBRARY_PATH.exists():
+        pytest.skip(f"the CUDA kernels are {CUDA_MISSING}")
+    return request.param
+
+
+def symbols(library: Path, *options: str) -> list[str]:
+    text = subprocess.run(["nm", "-C", *options, str(library)], check=True, capture_output=True, text=True).stdout
+    return [line[17:].strip() for line in text.splitlines()]
+
+
+def test_no_iostreams(library):
+    """In a library with a libstdc++ of its own they are a second copy that nothing initialises."""
+    found = sorted({name for name in symbols(library) if IOSTREAMS.search(name)})
+    assert not found, (
+        f"{library.name} needs iostreams: {found}; native/torch_abi.h says how torch's headers bring them in"
+    )
+
+
+def test_the_pattern_knows_iostreams():
+    for name in (
+        "U std::ios_base::Init::Init()@GLIBCXX_3.4",
+        "U std::__cxx11::basic_ostringstream<char, std::char_traits<char>, std::allocator<char> >::basic_ostringstream()",
+        "U std::ostream& std::ostream::_M_insert<long>(long)",
+        "U std::locale::~locale()",
+    ):
+        assert IOSTREAMS.search(name)
+
+
+def test_only_our_own_names_are_exported(library):
+    exported = {name.split(maxsplit=1)[1] for name in symbols(library, "-D", "--defined-only")}
+    assert {name for name in exported if not name.startswith("gsplat_core_")} == set()
+
+
+def test_our_sources_throw_by_our_own_check():
+    """torch's macros format through iostreams and let exceptions out; torch_abi.h has what takes their place."""
+    sources = [path for ending in ("cpp", "h", "cu", "cuh") for path in (ROOT / "gsplat_core").rglob(f"*.{ending}")]
+    assert len(sources) > 50
+    for theirs in ("STD_TORCH_CHECK(", "TORCH_BOX(", "#include <torch/"):
+        assert [p.name for p in sources if p.name != "torch_abi.h" and theirs in p.read_text()] == []
+
+
+def test_an_argument_is_refused_with_a_static_runtime():
+    """The objects of the CPU library, linked with the static libstdc++ and libgcc of this toolchain, in a process of its own."""
+    build = ROOT / "build" / "editable"
+    if not (build / "CMakeCache.txt").exists():
+        pytest.skip("the library was not built in this folder: there are no objects to link anew")
+    cmake = Path(sys.executable).parent / "cmake"
+    subprocess.run(
+        [cmake, "--build", build, "--target", "gsplat_core_cpu_static_runtime"], check=True, capture_output=True
+    )
+    (linked,) = build.rglob("gsplat_core_cpu_static_runtime.so")
+    needed = subprocess.run(["readelf", "-d", linked], check=True, capture_output=True, text=True).stdout
+    assert "libstdc++" not in needed and "libgcc_s" not in needed
+    result = subprocess.run([sys.executable, "-c", REFUSED, linked], capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    assert "capacity must be 0 to 2^31 - 1, got -7" in result.stdout
