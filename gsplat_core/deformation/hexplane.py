@@ -67,6 +67,7 @@ class HexPlaneField(DeformationField):
     """
 
     kind = "hexplane"
+    slot_type = WholeFieldSlot
     has_frame_deltas = True
 
     def __init__(
@@ -226,10 +227,6 @@ class HexPlaneField(DeformationField):
         """Weights and biases of the trunk and the head, layer by layer, outside of autograd."""
         weights, biases = self._network()
         return [weight.data for weight in weights], [bias.data for bias in biases]
-
-    def slot(self, rows: int) -> WholeFieldSlot:
-        """See `DeformationField.slot`; the field has no tensors per Gaussian."""
-        return WholeFieldSlot(self)
 
     def config(self) -> dict[str, Any]:
         """Kind, window and architecture; the box is stored with the tensors."""

@@ -177,7 +177,7 @@ class SnapshotSlots:
     @staticmethod
     def can_hold(field: DeformationField | None) -> bool:
         """Whether snapshots of this kind of field can lie in slots."""
-        return field is None or type(field).slot is not DeformationField.slot
+        return field is None or field.slot_type is not None
 
     def publish(
         self,
