@@ -45,6 +45,7 @@ class BasisField(DeformationField):
     """
 
     kind = "basis"
+    slot_type = BasisSlot
 
     def __init__(
         self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26, spacing_s: float | None = None
@@ -143,6 +144,11 @@ class BasisField(DeformationField):
             rates, beta1, beta2, epsilon,
         )  # fmt: skip
 
+    @property
+    def has_frame_deltas(self) -> bool:
+        """Always."""
+        return True
+
     def frame_time(self, time_s: float) -> float:
         """What `frame_deltas` takes for a time: its `tau`."""
         return self.tau(time_s)
@@ -216,20 +222,6 @@ class BasisField(DeformationField):
             ]
         self._set_parameters(*(torch.cat([p.data, n]) for p, n in zip(self._parameters_in_order(), new, strict=True)))
         self._change_moments(lambda t: torch.cat([t, t.new_zeros(count, *t.shape[1:])]))
-
-    def slot(self, rows: int) -> BasisSlot:
-        """See `DeformationField.slot`; it has capacity for more bumps too."""
-        return BasisSlot(self, rows)
-
-    def adopt_layout(self, other: BasisField) -> None:
-        """Take over window, origin and spacing of the columns of `other`."""
-        self._time_window_s, self._origin_s, self._spacing_s = other._time_window_s, other._origin_s, other._spacing_s
-
-    def cropped(self, count: int, bumps: int) -> BasisField:
-        """A detached copy of the first `count` Gaussians and `bumps` columns."""
-        copied = self.detached_copy()
-        copied._set_parameters(*(p.data[:count, :bumps] for p in self._parameters_in_order()))
-        return copied
 
     def config(self) -> dict[str, Any]:
         """Kind, window and the layout of the columns."""

@@ -34,6 +34,8 @@ class DeformationField(torch.nn.Module):
 
     kind: ClassVar[str] = ""
     """The name in the registry, in reports and in a bundle's manifest."""
+    slot_type: ClassVar[type[Any] | None] = None
+    """The `FieldSlot` for `slot`, made from a field and a number of rows. None: every snapshot of such a field gets memory of its own."""
 
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__()
@@ -88,6 +90,11 @@ class DeformationField(torch.nn.Module):
 
         return at
 
+    @property
+    def has_frame_deltas(self) -> bool:
+        """Whether `frame_time` and `frame_deltas` are there for this architecture, so that a CUDA graph can hold the field."""
+        return False
+
     def frame_time(self, time_s: float) -> float:
         """`time_s` as `frame_deltas` counts it. Raises InvalidInput as that does."""
         raise InvalidInput(f"a {self.kind} field cannot be captured in a CUDA graph; use cached")
@@ -110,11 +117,9 @@ class DeformationField(torch.nn.Module):
         return copied.requires_grad_(False)
 
     def slot(self, rows: int) -> FieldSlot | None:
-        """A copy for `rows` Gaussians that newer states of this field can be written over, at the same addresses.
-
-        None: this kind of field has no such copy, and every snapshot of it gets memory of its own.
-        """
-        return None
+        """A copy for `rows` Gaussians that newer states of this field can be written over, at the same addresses; see `slot_type`."""
+        made: FieldSlot | None = None if self.slot_type is None else self.slot_type(self, rows)
+        return made
 
     def check_state(self) -> None:
         """InvalidInput when loaded tensors, finite and of the right shapes, still make no field."""

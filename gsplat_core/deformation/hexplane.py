@@ -65,6 +65,7 @@ class HexPlaneField(DeformationField):
     """
 
     kind = "hexplane"
+    slot_type = WholeFieldSlot
 
     def __init__(
         self,
@@ -108,6 +109,11 @@ class HexPlaneField(DeformationField):
         low, high = self.box.to(means.dtype)
         space = (2 * (means - low) / (high - low) - 1).clamp(-1, 1)
         return torch.cat([space, torch.full_like(space[:, :1], self.frame_time(time_s))], dim=1)
+
+    @property
+    def has_frame_deltas(self) -> bool:
+        """Whether the kernel takes the network's sizes; plain torch, which others fall back to, cannot be captured."""
+        return takes_layers(self.channels, len(self.levels), self.width, self.depth)
 
     def frame_time(self, time_s: float) -> float:
         """What `frame_deltas` takes for a time: it, clamped to the window, in [-1, 1]."""
@@ -211,10 +217,6 @@ class HexPlaneField(DeformationField):
         """Weights and biases of the trunk and the head, layer by layer, outside of autograd."""
         weights, biases = self._network()
         return [weight.data for weight in weights], [bias.data for bias in biases]
-
-    def slot(self, rows: int) -> WholeFieldSlot:
-        """See `DeformationField.slot`; the field has no tensors per Gaussian."""
-        return WholeFieldSlot(self)
 
     def config(self) -> dict[str, Any]:
         """Kind, window and architecture; the box is stored with the tensors."""
