@@ -27,7 +27,7 @@ def synthesize_command(
                 raise KeyboardInterrupt
             show(Progress("synthesize", done, total))
 
-        with storage_errors(out.parent):
+        with storage_errors(out):
             check_folder_path(out)
             synthesize(
                 out,

@@ -24,8 +24,11 @@ _WRITTEN = {
 
 
 def check_target(target: Path) -> None:
-    """Raises InvalidSetting unless `target` can be replaced whole without losing anything that `synthesize` did not write."""
-    if not os.path.lexists(target):
+    """Raises InvalidSetting unless `target` can be replaced whole without losing anything that `synthesize` did not write; OSError for a
+    name that cannot be one."""
+    try:
+        os.lstat(target)
+    except FileNotFoundError:
         return
     if target.is_symlink():
         raise InvalidSetting(f"{target} is a link; give the folder itself, or one that does not exist yet")
