@@ -9,9 +9,8 @@ from torch import Tensor
 
 from gsplat_core.deformation.kind import CapturedTraining
 from gsplat_core.ops.adam.adam import adam_step_at_
-from gsplat_core.ops.frame.frame import render_frame
-from gsplat_core.ops.frame.frame_count import count_frame_
-from gsplat_core.ops.frame.frame_gradients import render_frame_backward_adam_
+from gsplat_core.ops.frame.frame import GAUSSIAN_TENSORS, FrameMode, View, accumulate_status_, render_frame
+from gsplat_core.ops.frame_gradients.frame_gradients import GaussianAdam, render_frame_backward_adam_
 from gsplat_core.ops.image_loss.frame_loss import frame_loss
 from gsplat_core.rendering.capture import CapturedSequence, GraphMemory
 from gsplat_core.rendering.frame_renderer import FrameControls
@@ -21,9 +20,6 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
 from gsplat_core.training.photometric import LossWeights
-
-GAUSSIAN_TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh")
-"""The Gaussians' tensors in the order in which the ops take them, their moments and their learning rates."""
 
 
 class FusedStep:
@@ -55,8 +51,8 @@ class FusedStep:
         """With the rates of the Gaussians in the frame's pass, of the positions behind it, of the field."""
         self._step = torch.full((1,), adam.steps, dtype=torch.int64, device=device)
         self._skipped = torch.zeros(len(GAUSSIAN_TENSORS), dtype=torch.int64, device=device)
-        self._most = torch.zeros(4, dtype=torch.int32, device=device)
-        """The frames' status since the last `settle`: the largest of each value, but the sum of those that were cut."""
+        self._totals = torch.zeros(4, dtype=torch.int32, device=device)
+        """The frames' status since the last `settle`, as `accumulate_status_` folds it."""
         self._unread: tuple[Tensor, Tensor] | None = None
         self._status = FrameStatusCopy()
         self._memory = GraphMemory(device)
@@ -113,10 +109,10 @@ class FusedStep:
 
         The tile lists have more capacity now: take those steps again.
         """
-        self._status.queue(self._most)
-        self._status.launched(self._most.device)
+        self._status.queue(self._totals)
+        self._status.launched(self._totals.device)
         needs = self._status.wait()
-        self._most.zero_()
+        self._totals.zero_()
         if needs.overflowed:
             self._adam.steps -= needs.overflowed
             self._capacity = capacity_for(needs.instances)
@@ -139,20 +135,17 @@ class FusedStep:
         scene, controls = self._gaussians, self._controls
         gaussians = tuple(scene.tensors().values())
         deltas = self._field.deltas(scene, controls.time)
-        viewmat, intrinsics = controls.viewmat, controls.intrinsics
-        size, model = (self._camera.width_px, self._camera.height_px), self._camera.model
-        frame = render_frame(
-            scene.means, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh, deltas, viewmat,
-            intrinsics, None, *size, self._capacity, camera_model=model, training=True,
-        )  # fmt: skip
+        camera = self._camera
+        view = View(controls.viewmat, controls.intrinsics, camera.width_px, camera.height_px, camera_model=camera.model)
+        frame = render_frame(gaussians, deltas, view, self._capacity, FrameMode.TRAINING)
         loss = frame_loss(
             frame.image, frame.alphas, self._image, self._mask, self._depth, self._weights.ssim, self._weights.depth
         )
-        fits = count_frame_(frame.status, self._most, self._step)
-        gradient = render_frame_backward_adam_(
-            gaussians, *self._moments(), in_frame, self._step, self._skipped, deltas, viewmat, intrinsics, None, frame,
-            loss.grad_image, loss.grad_alphas, camera_model=model, betas=self._adam.betas, epsilon=self._adam.epsilon,
-        )  # fmt: skip
+        fits = accumulate_status_(frame.status, self._totals, self._step)
+        adam = GaussianAdam(
+            *self._moments(), in_frame, self._step, self._skipped, betas=self._adam.betas, epsilon=self._adam.epsilon
+        )
+        gradient = render_frame_backward_adam_(gaussians, adam, deltas, view, frame, loss.grad_image, loss.grad_alphas)
         assert gradient is not None
         self._field.update(gradient, controls.time, of_field, self._step, frame.status)
         if self._field.reads_positions:

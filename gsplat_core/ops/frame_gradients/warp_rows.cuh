@@ -1,26 +1,30 @@
-// The rows of a warp's 32 Gaussians in shared memory, so that tensors with many columns are read and written as they lie.
+// Gradient rows summed and taken back to raw parameters by a warp for its 32 Gaussians. Rows go through shared memory, so that
+// tensors with many columns are read and written coalesced.
 #pragma once
 
-#include "frame_gradients_splat.cuh"
+#include <type_traits>
 
+#include "chain_rule.cuh"
+
+namespace gsplat::frame {
 namespace {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
-// Of a block: as many warps as its shared memory has room for.
+// Threads of a block: as many warps as fit into its shared memory.
 template <int kDegree>
 constexpr int kSplatThreads = kDegree < 4 ? 128 : 64;
 
-// 32 rows of kColumns floats. Rows of whole float4s are kept an odd number of them apart: then neither the rows of eight threads
-// nor eight float4s in a row meet in a bank.
+// 32 rows of kColumns floats in shared memory. Rows of whole float4s are padded to an odd number of them: then neither eight
+// threads that access their rows nor eight that access consecutive float4s have bank conflicts.
 template <int kColumns>
 struct WarpRows {
   static constexpr bool kQuads = kColumns % 4 == 0;
   static constexpr int kGap = kQuads && kColumns / 4 % 2 == 0 ? 4 : 0, kStride = kColumns + kGap;
   alignas(16) float values[32 * kStride];
 
-  // Where value i of the 32 rows is.
-  __device__ static int place(int i) { return kGap == 0 ? i : i + i / kColumns * kGap; }
-  __device__ float4& quad(int i) { return *reinterpret_cast<float4*>(values + place(4 * i)); }
+  // The index of value i of the unpadded rows.
+  __device__ static int index_of(int i) { return kGap == 0 ? i : i + i / kColumns * kGap; }
+  __device__ float4& quad(int i) { return *reinterpret_cast<float4*>(values + index_of(4 * i)); }
 
   __device__ void get(int row, float (&v)[kColumns]) const {
     const float* const from = values + row * kStride;
@@ -48,9 +52,9 @@ struct WarpRows {
   }
 };
 
-// Runs over the values of `rows` rows of the warp: whole float4s, then what is left of the last one.
+// Calls quad(i) for the whole float4s of the warp's `rows` rows and single(i) for the values that remain, over all lanes.
 template <int kColumns, class Quad, class Single>
-__device__ inline void each_value(int rows, int lane, const Quad& quad, const Single& single) {
+__device__ inline void for_each_value(int rows, int lane, const Quad& quad, const Single& single) {
   const int values = rows * kColumns;
 #pragma unroll 4
   for (int i = lane; i < values / 4; i += 32) quad(i);
@@ -60,7 +64,7 @@ __device__ inline void each_value(int rows, int lane, const Quad& quad, const Si
   }
 }
 
-// Starts copying to shared memory; what was started is there after copies_done().
+// Starts an asynchronous copy of kBytes to shared memory, which wait_for_copies completes.
 template <int kBytes>
 __device__ inline void start_copy(void* to, const void* from) {
   const unsigned at = unsigned(__cvta_generic_to_shared(to));
@@ -70,21 +74,22 @@ __device__ inline void start_copy(void* to, const void* from) {
     asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(at), "l"(from) : "memory");
   }
 }
-__device__ inline void copies_done() {
+__device__ inline void wait_for_copies() {
   asm volatile("cp.async.wait_all;" ::: "memory");
   __syncwarp();
 }
 
-// The rows that `wanted` has a bit for; `aligned`: `from` is at a multiple of 16 bytes.
+// Starts copying the rows with a bit in `selected`; `aligned`: `from` is aligned to 16 bytes.
 template <int kColumns>
-__device__ inline void start_copy(WarpRows<kColumns>& to, const float* from, int rows, unsigned wanted, bool aligned, int lane) {
-  const auto wants = [&](int value) { return (wanted >> (value / kColumns) & 1) != 0; };
+__device__ inline void start_copy(WarpRows<kColumns>& to, const float* from, int rows, unsigned selected, bool aligned,
+                                  int lane) {
+  const auto is_selected = [&](int value) { return (selected >> (value / kColumns) & 1) != 0; };
   const auto quad = [&](int i) {
-    if (wants(4 * i) || (kColumns % 4 != 0 && wants(4 * i + 3))) start_copy<16>(&to.quad(i), from + 4 * i);
+    if (is_selected(4 * i) || (kColumns % 4 != 0 && is_selected(4 * i + 3))) start_copy<16>(&to.quad(i), from + 4 * i);
   };
-  const auto single = [&](int i) { start_copy<4>(to.values + to.place(i), from + i); };
+  const auto single = [&](int i) { start_copy<4>(to.values + to.index_of(i), from + i); };
   if (aligned) {
-    each_value<kColumns>(rows, lane, quad, single);
+    for_each_value<kColumns>(rows, lane, quad, single);
   } else {
     for (int i = lane; i < rows * kColumns; i += 32) single(i);
   }
@@ -92,11 +97,11 @@ __device__ inline void start_copy(WarpRows<kColumns>& to, const float* from, int
 
 template <int kColumns>
 __device__ inline void write_rows(WarpRows<kColumns>& from, float* to, int rows, int lane) {
-  each_value<kColumns>(
+  for_each_value<kColumns>(
       rows, lane, [&](int i) { reinterpret_cast<float4*>(to)[i] = from.quad(i); }, [&](int i) { to[i] = from.values[i]; });
 }
 
-// Rows of instances on their way to a warp's sums: those of a warp's Gaussians lie together.
+// Gradient rows staged in shared memory; those of a warp's Gaussians are contiguous.
 struct StagedRows {
   static constexpr int kCount = 96;
   float4 quads[kCount * kRowQuads];
@@ -110,31 +115,32 @@ __device__ inline void add_row(const float4* row, SplatRow& sum) {
   for (int i = 0; i < 4; ++i) sum.colors[i] += values[6 + i];
 }
 
-// The sum of `count` rows from `start` on for each lane, in an order that depends on their number alone: one after the other, but
-// where there are very many the whole warp adds them up. Lanes without any have the start of the next one that has.
+// For each lane, the sum of `count` rows from `start` on, in an order that depends on the counts alone: one after the other, but
+// rows of a splat with very many are added up by the whole warp. A lane without rows has the start of the next lane that has
+// some.
 __device__ inline SplatRow sum_rows(const float4* rows, int start, int count, int lane, StagedRows& staged) {
-  constexpr int kMany = 64;
+  constexpr int kManyRows = 64;
   SplatRow sum = {};
-  const unsigned many = __ballot_sync(kAllLanes, count > kMany);
-  if (many == 0) {
+  const unsigned long_splats = __ballot_sync(kAllLanes, count > kManyRows);
+  if (long_splats == 0) {
     const int first = __shfl_sync(kAllLanes, start, 0), end = __reduce_max_sync(kAllLanes, start + count);
     for (int base = first; base < end; base += StagedRows::kCount) {
       const int staged_count = min(end - base, StagedRows::kCount);
       __syncwarp();
       for (int i = lane; i < staged_count * kRowQuads; i += 32)
         start_copy<16>(staged.quads + i, rows + int64_t(base) * kRowQuads + i);
-      copies_done();
+      wait_for_copies();
       const int to = min(start + count, base + staged_count);
       for (int i = max(start, base); i < to; ++i) add_row(staged.quads + (i - base) * kRowQuads, sum);
     }
     __syncwarp();
     return sum;
   }
-  if (count <= kMany) {
+  if (count <= kManyRows) {
 #pragma unroll 4
     for (int i = 0; i < count; ++i) add_row(rows + int64_t(start + i) * kRowQuads, sum);
   }
-  for (unsigned left = many; left != 0; left &= left - 1) {
+  for (unsigned left = long_splats; left != 0; left &= left - 1) {
     const int owner = __ffs(int(left)) - 1;
     const int first = __shfl_sync(kAllLanes, start, owner), all = __shfl_sync(kAllLanes, count, owner);
     SplatRow part = {};
@@ -149,7 +155,7 @@ __device__ inline SplatRow sum_rows(const float4* rows, int start, int count, in
   return sum;
 }
 
-// What a warp computes: the raw gradients of its Gaussians, and those of their coefficients in the place of these.
+// What a warp computes: the raw gradients of its 32 Gaussians, and in place of their coefficients the coefficients' gradients.
 template <int kDegree>
 struct WarpGradients {
   static constexpr int kHarmonics = 3 * kBasesOf<kDegree>;
@@ -159,24 +165,24 @@ struct WarpGradients {
     WarpRows<kRawColumns> raw;
   };
 
-  // `rows` Gaussians from `first` on.
-  __device__ void compute(const FrameScene& scene, const FrameCamera& camera, const FrameLists& lists, const FrameGradients& from,
+  // For `rows` Gaussians from `first` on.
+  __device__ void compute(const Scene& scene, const Camera& camera, const Lists& lists, const PictureGradient& from,
                           int64_t first, int rows, int lane) {
     const int64_t n = first + min(lane, rows - 1);
-    const bool cut = lists.status[kStatusCut] != 0;
+    const bool cut = lists.status[kStatusOverflow] != 0;
     const int start = lists.splat_starts[n], end = lists.splat_starts[n + 1], count = lane < rows && !cut ? end - start : 0;
     const RawGaussian gaussian = load_gaussian(scene, n);
-    const unsigned seen = __ballot_sync(kAllLanes, count > 0);
-    start_copy(sh, scene.sh + first * kHarmonics, rows, seen, scene.aligned, lane);
+    const unsigned visible = __ballot_sync(kAllLanes, count > 0);
+    start_copy(sh, scene.sh + first * kHarmonics, rows, visible, scene.aligned, lane);
     SplatRow sum = {};
-    if (from.by_arrival) {
+    if (from.atomic) {
       if (count > 0) add_row(from.rows + n * kRowQuads, sum);
-    } else if (seen != 0) {
+    } else if (visible != 0) {
       sum = sum_rows(from.rows, start, count, lane, instances);
     }
     RawGradient g = {};
     if (count > 0) g = projection_gradient(scene, camera, gaussian, sum);
-    copies_done();
+    wait_for_copies();
     float c[kHarmonics] = {};
     if (count > 0) {
       sh.get(lane, c);
@@ -193,7 +199,7 @@ struct WarpGradients {
   }
 };
 
-// run(degree) for the number of bases; the host has checked it.
+// run(degree as a constant) for a number of bases, which the host has checked.
 template <class Run>
 void with_degree(int bases, const Run& run) {
   switch (bases) {
@@ -206,3 +212,5 @@ void with_degree(int bases, const Run& run) {
 }
 
 }  // namespace
+
+}  // namespace gsplat::frame

@@ -1,20 +1,21 @@
-// One Gaussian of the frame path, from its raw parameters: forward and gradient begin with it.
+// One Gaussian of the frame path from its raw parameters, as the forward pass and the gradient both start.
 #pragma once
 
 #include "../projection/projection_math.h"
-#include "frame_cuda.h"
+#include "frame.h"
 
+namespace gsplat::frame {
 namespace {
 
 using namespace GSPLAT_ISA::projection;
 
-// The camera in shared memory: its matrices are in device memory, so that a captured graph sees new ones.
-struct FrameCamera {
+// The camera in shared memory. Its matrices come from device memory, so that a captured graph reads the current ones.
+struct Camera {
   float viewmat[16], intrinsics[9], center[3];
 };
 
-// By all threads of a block, 32 at least; ends with a barrier. The centre is -R^T t.
-__device__ inline void load_camera(const FrameScene& in, FrameCamera& camera) {
+// Called by all threads of a block of at least 32; ends with a barrier. The centre is -R^T t.
+__device__ inline void load_camera(const Scene& in, Camera& camera) {
   const int i = threadIdx.x;
   if (i < 16) camera.viewmat[i] = in.viewmat[i];
   if (i >= 16 && i < 25) camera.intrinsics[i - 16] = in.intrinsics[i - 16];
@@ -26,7 +27,7 @@ __device__ inline void load_camera(const FrameScene& in, FrameCamera& camera) {
   __syncthreads();
 }
 
-__device__ inline ProjectionInput projection_input(const FrameScene& in, const FrameCamera& camera) {
+__device__ inline ProjectionInput projection_input(const Scene& in, const Camera& camera) {
   ProjectionInput p = {};
   p.viewmat = camera.viewmat;
   p.intrinsics = camera.intrinsics;
@@ -38,9 +39,9 @@ __device__ inline ProjectionInput projection_input(const FrameScene& in, const F
   return p;
 }
 
-// Parameters with the deltas added. Not usable: something is not finite, whatever would become of it.
+// Raw parameters with the deltas added. Usable: all of them are finite.
 struct RawGaussian {
-  float mean[3], quat[4], log_scale[3], color[3], logit;  // the colour is the delta of the first coefficient alone
+  float mean[3], quat[4], log_scale[3], color[3], logit;  // color: the delta of the first coefficient alone
   bool usable;
 };
 
@@ -48,7 +49,7 @@ __device__ inline float4 load_four(const float* p, bool aligned) {
   return aligned ? *reinterpret_cast<const float4*>(p) : make_float4(p[0], p[1], p[2], p[3]);
 }
 
-__device__ inline RawGaussian load_gaussian(const FrameScene& in, int64_t n) {
+__device__ inline RawGaussian load_gaussian(const Scene& in, int64_t n) {
   RawGaussian g;
   const float4 quat = load_four(in.quats + 4 * n, in.aligned);
   const float4 zero = make_float4(0, 0, 0, 0);
@@ -79,7 +80,7 @@ __device__ inline Geometry geometry_of(const RawGaussian& g) {
 }
 
 // The unit vector from the camera to the Gaussian, and one over their distance.
-__device__ inline float unit_direction(const FrameCamera& camera, const float mean[3], float direction[3]) {
+__device__ inline float unit_direction(const Camera& camera, const float mean[3], float direction[3]) {
   float squared = 0;
   for (int k = 0; k < 3; ++k) {
     direction[k] = mean[k] - camera.center[k];
@@ -91,3 +92,5 @@ __device__ inline float unit_direction(const FrameCamera& camera, const float me
 }
 
 }  // namespace
+
+}  // namespace gsplat::frame

@@ -1,16 +1,17 @@
-// From the sum of a Gaussian's rows to the gradient of its raw parameters, one Gaussian per thread.
+// From the sum of a Gaussian's gradient rows to the gradient of its raw parameters, one Gaussian per thread.
 #pragma once
 
+#include "../frame/gaussian.cuh"
 #include "../spherical_harmonics/spherical_harmonics_bases.h"
-#include "frame_gaussian.cuh"
-#include "frame_gradients_cuda.h"
+#include "frame_gradients.h"
 
+namespace gsplat::frame {
 namespace {
 
 using namespace GSPLAT_ISA;
 using namespace GSPLAT_ISA::spherical_harmonics;
 
-// The sum of a Gaussian's rows.
+// The sum of a Gaussian's gradient rows.
 struct SplatRow {
   float moments[6];  // sums over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
   float colors[4];   // red, green, blue, z
@@ -21,15 +22,15 @@ struct RawGradient {
   float mean[3], quat[4], log_scales[3], color[3], logit;
 };
 
-// a b - c d without the loss of digits where they are nearly the same (Kahan; Jeannerod et al. 2013).
+// a b - c d without cancellation where the products are nearly equal (Kahan; Jeannerod et al. 2013).
 __device__ inline float difference_of_products(float a, float b, float c, float d) {
   const float cd = __fmul_rn(c, d);
   return fmaf(a, b, -cd) + fmaf(-c, d, cd);
 }
 
-// Gradients of the mean and of the blurred covariance S, as a symmetric matrix: S^-1 m and 1/2 S^-1 M S^-1, with m and M the
-// moments of first and second order. Taken along the axes u and w of the ellipse: in x and y a thin splat's share along its
-// length, smaller by the square of the ratio of its axes, would be lost in rounding.
+// Gradients of the projected mean and of the blurred covariance S (symmetric): S^-1 m and 1/2 S^-1 M S^-1, with m and M the
+// moments of first and second order. Computed along the axes u and w of the ellipse: in x and y, a thin splat's component along
+// its length, which is smaller by the squared ratio of the axes, would be lost to rounding.
 struct EllipseGradient {
   float mean[2], covariance[3];
 };
@@ -50,7 +51,7 @@ __device__ inline EllipseGradient ellipse_gradient(float a, float b, float c, co
 }
 
 template <CameraModel model>
-__device__ inline RawGradient projection_gradient(const FrameScene& scene, const FrameCamera& camera, const RawGaussian& gaussian,
+__device__ inline RawGradient projection_gradient(const Scene& scene, const Camera& camera, const RawGaussian& gaussian,
                                                   const SplatRow& sum) {
   const ProjectionInput in = projection_input(scene, camera);
   const View<model> view(in);
@@ -69,7 +70,7 @@ __device__ inline RawGradient projection_gradient(const FrameScene& scene, const
   return to;
 }
 
-__device__ inline RawGradient projection_gradient(const FrameScene& scene, const FrameCamera& camera, const RawGaussian& gaussian,
+__device__ inline RawGradient projection_gradient(const Scene& scene, const Camera& camera, const RawGaussian& gaussian,
                                                   const SplatRow& sum) {
   switch (scene.camera_model) {
     case kOrtho: return projection_gradient<kOrtho>(scene, camera, gaussian, sum);
@@ -81,10 +82,10 @@ __device__ inline RawGradient projection_gradient(const FrameScene& scene, const
 template <int kDegree>
 constexpr int kBasesOf = (kDegree + 1) * (kDegree + 1);
 
-// The colour's way back: to the direction, and so to the mean, and to the coefficients c, which their gradient replaces. A
-// channel that was raised to zero passes nothing on.
+// Chain rule of the colour: to the view direction and so to the mean, and to the coefficients c, which are replaced by their
+// gradient. A channel that was clamped at zero has no gradient.
 template <int kDegree>
-__device__ inline void harmonics_gradient(const FrameCamera& camera, const RawGaussian& gaussian, const float* v_color,
+__device__ inline void harmonics_gradient(const Camera& camera, const RawGaussian& gaussian, const float* v_color,
                                           float (&c)[3 * kBasesOf<kDegree>], RawGradient& to) {
   constexpr int kBases = kBasesOf<kDegree>;
   float direction[3], b[kBases];
@@ -112,3 +113,5 @@ __device__ inline void harmonics_gradient(const FrameCamera& camera, const RawGa
 }
 
 }  // namespace
+
+}  // namespace gsplat::frame

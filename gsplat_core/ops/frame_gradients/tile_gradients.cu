@@ -1,18 +1,20 @@
-// The gradient of a frame's blending: per tile, from the back to the front, one row of sums for every instance.
+// The gradient of compositing: per tile, back to front, one row of sums for every instance.
 //
-// A row is the sum over the tile's pixels in a fixed order, and every instance has its own: nothing is added up by arrival, so
-// the bits are the same every time.
+// A row is the sum over the tile's pixels in a fixed order. Unless `atomic`, every instance has a row of its own and nothing is
+// added atomically, so results are bitwise reproducible.
 #include "../compositing/blend_backward.cuh"
-#include "frame_gradients_cuda.h"
+#include "cuda_check.h"
+#include "frame_gradients.h"
 
+namespace gsplat::frame {
 namespace {
 
 constexpr int kChannels = 4;  // red, green, blue, z
 static_assert(quads_of(shape_size(kChannels, false), kChannels) == kRowQuads);
 
-// A pixel behind the last splat, and dL/d(its colour). The background is behind everything, and so is its part of dL/dalpha.
-__device__ inline Pixel start_pixel(const FrameScene& scene, const FrameGradients& from, int x, int y,
-                                    float (&v_color)[kChannels]) {
+// The state of a pixel behind its last splat, and dL/d(its colour). The background lies behind everything, with its part of
+// dL/dalpha.
+__device__ inline Pixel start_pixel(const Scene& scene, const PictureGradient& from, int x, int y, float (&v_color)[kChannels]) {
   const int64_t at = int64_t(y) * scene.width + x;
   const float4 v = reinterpret_cast<const float4*>(from.v_image)[at];
   v_color[0] = v.x, v_color[1] = v.y, v_color[2] = v.z, v_color[3] = v.w;
@@ -23,8 +25,8 @@ __device__ inline Pixel start_pixel(const FrameScene& scene, const FrameGradient
   return {left, left * v_left, from.last[at]};
 }
 
-// A splat's row, which others add to as well.
-struct SharedRow {
+// A splat's row, which several tiles add to with atomics; written as an array of float4.
+struct AtomicRow {
   float4* row;
 
   struct Quad {
@@ -44,13 +46,13 @@ struct SharedRow {
   __device__ Quad operator[](int q) const { return {row + q}; }
 };
 
-template <bool kByArrival>
-__global__ void __launch_bounds__(kBlockThreads, 5) gradients_of_tiles(FrameScene scene, FrameLists lists, FrameGradients from) {
+template <bool kAtomic>
+__global__ void __launch_bounds__(kBlockThreads, 5) backward_tiles(Scene scene, Lists lists, PictureGradient from) {
   __shared__ BackwardStage<kChannels, false> stage;
-  if (lists.status[kStatusCut] != 0) return;
-  const int tile = blockIdx.x, left = tile % scene.tile_width * kFrameTile, top = tile / scene.tile_width * kFrameTile;
-  const Window w(lists.tile_offsets[tile], lists.tile_offsets[tile + 1], left, top, min(left + kFrameTile, scene.width),
-                 min(top + kFrameTile, scene.height));
+  if (lists.status[kStatusOverflow] != 0) return;
+  const int tile = blockIdx.x, left = tile % scene.tile_width * kTile, top = tile / scene.tile_width * kTile;
+  const Window w(lists.tile_offsets[tile], lists.tile_offsets[tile + 1], left, top, min(left + kTile, scene.width),
+                 min(top + kTile, scene.height));
   Pixel pixels[kPixelsEach];
   float v_color[kPixelsEach][kChannels] = {};
   for (int p = 0; p < kPixelsEach; ++p) {
@@ -59,9 +61,9 @@ __global__ void __launch_bounds__(kBlockThreads, 5) gradients_of_tiles(FrameScen
   }
   const auto* const records = static_cast<const Record<kChannels>*>(lists.records);
   const auto fetch = [&](int position) { return records[lists.instance_splats[lists.sorted[position]]]; };
-  if constexpr (kByArrival) {
+  if constexpr (kAtomic) {
     const auto row = [&](int position) {
-      return SharedRow{from.rows + int64_t(lists.instance_splats[lists.sorted[position]]) * kRowQuads};
+      return AtomicRow{from.rows + int64_t(lists.instance_splats[lists.sorted[position]]) * kRowQuads};
     };
     blend_backward<kChannels, false, false>(w, fetch, pixels, v_color, row, stage);
   } else {
@@ -72,10 +74,12 @@ __global__ void __launch_bounds__(kBlockThreads, 5) gradients_of_tiles(FrameScen
 
 }  // namespace
 
-void instance_gradients_on_device(const FrameScene& scene, const FrameLists& lists, const FrameGradients& from,
-                                  cudaStream_t stream) {
-  if (from.by_arrival) cudaMemsetAsync(from.rows, 0, size_t(scene.count) * kRowQuads * sizeof(float4), stream);
+void tile_gradients(const Scene& scene, const Lists& lists, const PictureGradient& from, cudaStream_t stream) {
+  if (from.atomic)
+    check_cuda(cudaMemsetAsync(from.rows, 0, size_t(scene.count) * kRowQuads * sizeof(float4), stream), "clearing gradient rows");
   if (scene.tiles() == 0) return;
-  const auto kernel = from.by_arrival ? gradients_of_tiles<true> : gradients_of_tiles<false>;
+  const auto kernel = from.atomic ? backward_tiles<true> : backward_tiles<false>;
   kernel<<<unsigned(scene.tiles()), kBlockThreads, 0, stream>>>(scene, lists, from);
 }
+
+}  // namespace gsplat::frame

@@ -1,15 +1,14 @@
-// Per Gaussian: the sum of its rows, and from there to the gradient of its raw parameters.
-#include <type_traits>
+// Per Gaussian: the sum of its gradient rows, and the chain rule to its raw parameters.
+#include "warp_rows.cuh"
 
-#include "frame_gradients_warp.cuh"
-
+namespace gsplat::frame {
 namespace {
 
 template <int kDegree>
 __global__ void __launch_bounds__(kSplatThreads<kDegree>)
-    gradients_of_splats(FrameScene scene, FrameLists lists, FrameGradients from, RawGradients to) {
+    backward_splats(Scene scene, Lists lists, PictureGradient from, RawGradients to) {
   __shared__ WarpGradients<kDegree> warps[kSplatThreads<kDegree> / 32];
-  __shared__ FrameCamera camera;
+  __shared__ Camera camera;
   load_camera(scene, camera);
   const int lane = threadIdx.x & 31;
   const int64_t first = int64_t(blockIdx.x) * kSplatThreads<kDegree> + threadIdx.x / 32 * 32;
@@ -24,11 +23,13 @@ __global__ void __launch_bounds__(kSplatThreads<kDegree>)
 
 }  // namespace
 
-void splat_gradients_on_device(const FrameScene& scene, const FrameLists& lists, const FrameGradients& from,
-                               const RawGradients& to, cudaStream_t stream) {
+void splat_gradients(const Scene& scene, const Lists& lists, const PictureGradient& from, const RawGradients& to,
+                     cudaStream_t stream) {
   if (scene.count == 0) return;
   with_degree(scene.bases, [&](auto degree) {
     constexpr int kDegree = decltype(degree)::value, kBlock = kSplatThreads<kDegree>;
-    gradients_of_splats<kDegree><<<blocks_for(scene.count, kBlock), kBlock, 0, stream>>>(scene, lists, from, to);
+    backward_splats<kDegree><<<blocks_for(scene.count, kBlock), kBlock, 0, stream>>>(scene, lists, from, to);
   });
 }
+
+}  // namespace gsplat::frame
