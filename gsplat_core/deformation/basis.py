@@ -20,12 +20,11 @@ from torch import Tensor
 
 from gsplat_core.deformation.basis_adam import BasisRates, Moments
 from gsplat_core.deformation.basis_columns import INERT, bump_capacity, columns_to_change, laid_out, with_columns
-from gsplat_core.deformation.field import DeformationField, checked_window, count_of
+from gsplat_core.deformation.field import DeformationField, checked_window, count_of, ops_for
 from gsplat_core.deformation.field_slots import BasisSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
-from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import BASIS_CHANNELS, BASIS_GROUPS, width_of
 
@@ -47,7 +46,6 @@ class BasisField(DeformationField):
 
     kind = "basis"
     slot_type = BasisSlot
-    has_frame_deltas = True
 
     def __init__(
         self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26, spacing_s: float | None = None
@@ -144,17 +142,14 @@ class BasisField(DeformationField):
         """
         moments = self._moments_in_use()
         self._ops.basis_field_backward_adam_(
-            gradient,
-            tau,
-            *(p.data for p in self._parameters_in_order()),
-            moments.first,
-            moments.second,
-            moments.steps,
-            rates,
-            beta1,
-            beta2,
-            epsilon,
-        )
+            gradient, tau, *(p.data for p in self._parameters_in_order()), moments.first, moments.second, moments.steps,
+            rates, beta1, beta2, epsilon,
+        )  # fmt: skip
+
+    @property
+    def has_frame_deltas(self) -> bool:
+        """Always."""
+        return True
 
     def frame_time(self, time_s: float) -> float:
         """What `frame_deltas` takes for a time: its `tau`."""
@@ -277,10 +272,7 @@ class BasisField(DeformationField):
 
     @property
     def _ops(self) -> ModuleType:
-        """The compiled ops where they exist, plain torch for other dtypes and devices."""
-        device = self.weights.device.type
-        has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
-        return compiled if has_kernels and self.weights.dtype == torch.float32 else plain_torch
+        return ops_for(self.weights, compiled, plain_torch)
 
     def _moments_in_use(self) -> Moments:
         if self._moments is None:
