@@ -1,20 +1,28 @@
-"""Where frames are shown: a video file, a folder of images, a function."""
+"""The video of a run: every frame beside its reconstruction."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
-from numpy.typing import NDArray
-
-from operators.errors import OutputError
 from operators.graph import Operator, OperatorSpec
 from operators.messages import RenderedFrame
+from operators.outcome import OutcomeBuilder
 from operators.sinks.pictures import side_by_side
+from operators.sinks.registry import SinkOptions
 from operators.sinks.video_file import VideoFile
-from operators.storage import StorageReserve, storage_errors, write_whole
+from operators.storage import StorageReserve
+
+VIDEO_FILE = "reconstruction.mp4"
+
+
+@dataclass(frozen=True)
+class DisplayResult:
+    """What a run has shown."""
+
+    frames: int
+    """How many frames were displayed."""
 
 
 class VideoSinkOp(Operator):
@@ -58,76 +66,15 @@ class VideoSinkOp(Operator):
         self._video.write(picture)
         self.displayed += 1
 
-
-class ImageFolderSinkOp(Operator):
-    """Writes each reconstructed frame as `NNNNNN.png`, lossless.
-
-    Inputs:
-        rendered: `RenderedFrame`.
-
-    Params:
-        folder: created at start.
-        reserve: room that must stay free on the disk.
-    """
-
-    def __init__(
-        self, fragment: Any, *args: Any, folder: Path, reserve: StorageReserve | None = None, **kwargs: Any
-    ) -> None:
-        self.folder = folder
-        self.reserve = reserve
-        self.displayed = 0
-        super().__init__(fragment, *args, **kwargs)
-
-    def setup(self, spec: OperatorSpec) -> None:
-        spec.input("rendered", type=RenderedFrame)
-
-    def start(self) -> None:
-        self.displayed = 0
-        with storage_errors(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
-
-    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        rendered: RenderedFrame = op_input.receive("rendered")
-        write_png(self.folder / f"{rendered.frame.seq:06d}.png", rendered.image, self.reserve)
-        self.displayed += 1
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        outcome.add(DisplayResult(self.displayed))
+        if self.displayed and self.path.exists():
+            outcome.output("video", self.path)
 
 
-class CallbackSinkOp(Operator):
-    """Calls a function with each message, on the graph's thread; what it raises stops the graph.
-
-    Inputs:
-        message: anything.
-
-    Params:
-        callback: takes the message.
-    """
-
-    def __init__(self, fragment: Any, *args: Any, callback: Callable[[Any], None], **kwargs: Any) -> None:
-        self.callback = callback
-        self.displayed = 0
-        super().__init__(fragment, *args, **kwargs)
-
-    def setup(self, spec: OperatorSpec) -> None:
-        spec.input("message")
-
-    def start(self) -> None:
-        self.displayed = 0
-
-    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        self.callback(op_input.receive("message"))
-        self.displayed += 1
-
-
-def write_png(path: Path, image: NDArray[Any], reserve: StorageReserve | None = None) -> None:
-    """Write an RGB uint8 [H, W, 3] or a one-channel image [H, W] as PNG, whole or not at all.
-
-    Raises:
-        StorageFull: there is no room.
-        OutputError: the image cannot be coded.
-    """
-    coded, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
-    if not coded:
-        raise OutputError(
-            f"{path}: an image {list(image.shape)} of {image.dtype} cannot be coded as PNG; give uint8 or uint16"
-        )
-    write_whole(path, data.tobytes(), reserve)
+def video_sink(fragment: Any, name: str, options: SinkOptions) -> VideoSinkOp:
+    """The run's video, at the source's rate."""
+    return VideoSinkOp(
+        fragment, name=name, path=options.out / VIDEO_FILE, fps=options.source.fps, reserve=options.reserve
+    )
