@@ -20,6 +20,7 @@ from torch import Tensor
 
 from gsplat_core.deformation.basis_adam import BasisRates, Moments
 from gsplat_core.deformation.field import DeformationField, checked_window, count_of
+from gsplat_core.deformation.field_slots import BasisSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
@@ -226,6 +227,20 @@ class BasisField(DeformationField):
             ]
         self._set_parameters(*(torch.cat([p.data, n]) for p, n in zip(self._parameters_in_order(), new, strict=True)))
         self._change_moments(lambda t: torch.cat([t, t.new_zeros(count, *t.shape[1:])]))
+
+    def slot(self, rows: int) -> BasisSlot:
+        """See `DeformationField.slot`; it has capacity for more bumps too."""
+        return BasisSlot(self, rows)
+
+    def adopt_layout(self, other: BasisField) -> None:
+        """Take over window, origin and spacing of the columns of `other`."""
+        self._time_window_s, self._origin_s, self._spacing_s = other._time_window_s, other._origin_s, other._spacing_s
+
+    def cropped(self, count: int, bumps: int) -> BasisField:
+        """A detached copy of the first `count` Gaussians and `bumps` columns."""
+        copied = self.detached_copy()
+        copied._set_parameters(*(p.data[:count, :bumps] for p in self._parameters_in_order()))
+        return copied
 
     def config(self) -> dict[str, Any]:
         """Kind, window and the layout of the columns."""

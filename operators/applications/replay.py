@@ -18,6 +18,7 @@ from typing import Any, get_args
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import Recording, is_heldout, open_recording
+from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
@@ -53,6 +54,8 @@ class ReplaySettings:
     device: str = "cpu"
     engine: Engine = "embedded"
     field: str = "auto"
+    renderer: str = "alpha"
+    """A name in `gsplat_core.rendering.registry.RENDERERS`."""
     seed: int = 0
     steps_per_frame: int | None = None
     """Optimiser steps per frame; None is the reconstructor's default."""
@@ -118,7 +121,7 @@ class ReplayApplication(Application):
             self, name="reconstruct", make_reconstructor=self._make_reconstructor, held_out=self._held_out
         )
         self.deform = DeformOp(self, name="deform")
-        self.rasterize = RasterizeOp(self, name="rasterize")
+        self.rasterize = RasterizeOp(self, name="rasterize", renderer=self.settings.renderer)
         self.video = VideoSinkOp(self, name="video", path=self.video_path, fps=self.recording.fps, reserve=reserve)
         self.metrics = MetricsOp(self, name="metrics")
         self.keyframes = KeyframesOp(self, name="keyframes", count=KEYFRAMES)
@@ -134,7 +137,7 @@ class ReplayApplication(Application):
 
     def room_to_finish(self) -> int:
         """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
-        model = self.reconstruct.model
+        model = self.reconstruct.newest
         return self._reserve_bytes + (0 if model is None else 4 * model.parameter_count)
 
     def _new_reconstructor(self) -> Reconstructor:
@@ -193,6 +196,7 @@ def prepare(settings: ReplaySettings, notes: list[str]) -> Recording:
     Raises as `replay` does before anything is written.
     """
     check_device(settings.device)
+    check_renderer(settings.renderer, settings.device)
     config = settings.reconstructor_config()
     recording = open_recording(settings.recording, scale=settings.scale, max_frames=settings.max_frames)
     check_picture(recording.camera, settings.scale)
