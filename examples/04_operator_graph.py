@@ -12,6 +12,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from operators.sinks.display import CallbackSinkOp
+
 from gsplat_core import Frame
 from gsplat_core.io.recordings import Recording, open_recording, synthesize
 from operators.graph import (
@@ -24,7 +26,6 @@ from operators.graph import (
     run,
 )
 from operators.ingest import SourceOp
-from operators.sinks.display import CallbackSinkOp
 from operators.tool_mask import RecordedToolMaskOp
 
 

@@ -92,7 +92,9 @@ def series(entries: Iterable[Entry], per_entry: int) -> Iterator[Entry]:
 
 def _summed_up(bins: Mapping[bool, list[Entry]]) -> Iterator[Entry]:
     for frames in bins.values():
-        means = {name: _mean(frames, name) for name, value in frames[0].items() if name.endswith("_db") or name == "ssim"}
+        means = {
+            name: _mean(frames, name) for name, value in frames[0].items() if name.endswith("_db") or name == "ssim"
+        }
         worst = [value for entry in frames if (value := entry["psnr_tissue_db"]) is not None]
         yield {**frames[0], **means, "frames": len(frames), "psnr_tissue_min_db": min(worst, default=None)}
 

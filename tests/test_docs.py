@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 import typer
+from operators.sinks.display import CallbackSinkOp
 
 from gsplat_core import Frame, Gaussians
 from gsplat_core.io.manifest import manifest_bytes, parse_manifest
@@ -21,7 +22,6 @@ from gsplat_core.io.recordings import open_recording
 from gsplat_core.scene.model import Model
 from operators.graph import Application, Operator, OperatorSpec
 from operators.ingest import SourceOp
-from operators.sinks.display import CallbackSinkOp
 from services.cli.app import app
 
 ROOT = Path(__file__).resolve().parent.parent

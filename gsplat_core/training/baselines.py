@@ -73,8 +73,8 @@ def measure_baselines(recording: Iterable[Frame]) -> Baselines:
         before = frame
     mean_image = train_mean.image()
     heldout_train_mean = ScoredMean()
-    for frame in recording if mean_image is not None else ():
-        if is_heldout(frame.seq):
+    for frame in recording:
+        if mean_image is not None and is_heldout(frame.seq):
             heldout_train_mean.add(psnr_tissue_db(mean_image, frame.image, frame.mask))
     return Baselines(
         previous_frame_db=previous.mean,

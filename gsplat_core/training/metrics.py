@@ -205,13 +205,13 @@ class QualityTracker:
 
     def observe(self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> FrameQuality:
         """Score one frame and take the result into the means; arguments as in `psnr_tissue_db`."""
-        x, y, pixels = _masked_pair(image, target, mask)
-        squared_error = _squared_error(x, y)
+        pair = _masked_pair(image, target, mask)
+        squared_error = pair.squared_error()
         quality = FrameQuality(
             seq,
-            psnr_tissue_db=_psnr_db(squared_error, pixels),
-            psnr_frame_db=_psnr_db(squared_error, x.shape[0] * x.shape[1] if pixels else 0),
-            ssim=_mean_ssim(x, y) if pixels else math.nan,
+            psnr_tissue_db=_psnr_db(squared_error, pair.tissue_pixels),
+            psnr_frame_db=_psnr_db(squared_error, pair.pixels if pair.tissue_pixels else 0),
+            ssim=pair.mean_ssim() if pair.tissue_pixels else math.nan,
         )
         self.count += 1
         for name, mean in self._means.items():

@@ -10,8 +10,8 @@ from typing import Any
 from gsplat_core.errors import InvalidInput
 from gsplat_core.registry import Registry
 from operators.graph import Operator
-from operators.metrics import ScoredFrame
 from operators.messages import RenderedFrame
+from operators.metrics import ScoredFrame
 from operators.sources.source import SourceDescription
 from operators.storage import StorageReserve
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from operators.sinks.display import CallbackSinkOp, ImageFolderSinkOp, VideoSinkOp
 
 from operators.errors import OutputError, StorageFull
-from operators.sinks.display import CallbackSinkOp, ImageFolderSinkOp, VideoSinkOp
 from operators.storage import StorageReserve
 
 
