@@ -12,8 +12,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from operators.sinks.display import CallbackSinkOp
-
 from gsplat_core import Frame
 from gsplat_core.io.recordings import Recording, open_recording, synthesize
 from operators.graph import (
@@ -26,6 +24,8 @@ from operators.graph import (
     run,
 )
 from operators.ingest import SourceOp
+from operators.sinks.callback import CallbackSinkOp
+from operators.sources.recording import RecordingSource
 from operators.tool_mask import RecordedToolMaskOp
 
 
@@ -66,7 +66,7 @@ class ToolShareApplication(Application):
         self.scheduler(GreedyScheduler(self, clock=ManualClock()))  # one thread: the same order each time
 
     def compose(self) -> None:
-        source = SourceOp(self, name="source", recording=self.recording)
+        source = SourceOp(self, name="source", source=RecordingSource(self.recording))
         mask = RecordedToolMaskOp(self, name="tool_mask")
         share = ToolShareOp(self, name="tool_share")
         show = CallbackSinkOp(self, name="show", callback=self.shares.append)

@@ -67,7 +67,7 @@ def read_frames(path: Path) -> Iterator[Entry]:
                 yield json.loads(line)
 
 
-def frames_per_entry(frames: int, most: int = MAX_SERIES) -> int:
+def frames_per_entry(frames: int, most: int) -> int:
     """How many of `frames` frames one entry of a series sums up, so that there are at most `most` bins."""
     return max(1, -(-frames // most))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import FrameQuality, QualityTracker, psnr_tissue_db
-from operators.frame_log import Entry, FrameLog, frames_per_entry, read_frames, series
+from operators.frame_log import MAX_SERIES, Entry, FrameLog, frames_per_entry, read_frames, series
 from operators.graph import Operator, OperatorSpec
 from operators.messages import RenderedFrame
 from operators.outcome import OutcomeBuilder
@@ -122,12 +122,12 @@ class MetricsOp(Operator):
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
-        frames = self.frames
         entries: tuple[Entry, ...] = ()
-        if self.log is not None and frames:
-            entries = tuple(series(read_frames(self.log.path), frames_per_entry(frames)))
+        per_entry = frames_per_entry(self.frames, MAX_SERIES)
+        if self.log is not None and self.frames:
+            entries = tuple(series(read_frames(self.log.path), per_entry))
             outcome.output("frames", self.log.path)
-        outcome.add(QualityResult(self.live, self.held_out, entries, frames_per_entry(frames), self.frames_sha256))
+        outcome.add(QualityResult(self.live, self.held_out, entries, per_entry, self.frames_sha256))
 
     @property
     def frames(self) -> int:

@@ -28,7 +28,7 @@ SourceFactory = Callable[[str, SourceOptions], FrameSource]
 SOURCES: Registry[SourceFactory] = Registry("source", {"recording": "operators.sources.recording:recording_source"})
 
 # Two letters at least: one is a drive. One slash is as good as two: a Path keeps only one of them.
-_ADDRESS = re.compile(r"(?P<scheme>[a-z][a-z0-9+.-]+):(?P<rest>/.*)", re.DOTALL)
+_ADDRESS = re.compile(r"(?P<scheme>[a-z][a-z0-9+.-]+)://?(?P<rest>.*)", re.DOTALL)
 
 
 def open_source(address: str | os.PathLike[str], options: SourceOptions | None = None) -> FrameSource:
@@ -40,4 +40,4 @@ def open_source(address: str | os.PathLike[str], options: SourceOptions | None =
     match = None if Path(text).exists() else _ADDRESS.fullmatch(text)
     if match is None:
         return SOURCES["recording"](text, options or SourceOptions())
-    return SOURCES[match["scheme"]](match["rest"].lstrip("/"), options or SourceOptions())
+    return SOURCES[match["scheme"]](match["rest"], options or SourceOptions())
