@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.basis import CHANNELS, COLUMNS_AHEAD, BasisField
+from gsplat_core.deformation.basis import COLUMNS_AHEAD, BasisField
 from gsplat_core.deformation.basis_adam import BasisRates
 from gsplat_core.deformation.kind import FieldKind, NewField
 from gsplat_core.deformation.rates import FieldRates
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.layout import BASIS_CHANNELS
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 
@@ -72,12 +73,17 @@ class CapturedBasisTraining:
 
     def __init__(self, field: BasisField) -> None:
         self._field = field
+        self._tensors: Sequence[Tensor] = ()
+        self._tensors_of: object = None
 
     def rate_values(self, rates: Mapping[str, float]) -> Sequence[float]:
         return list(vars(basis_rates(rates)).values())
 
     def tensors(self) -> Sequence[Tensor]:
-        return self._field.training_tensors()
+        # Asked for at every step; a field that is extended or appended to gets other parameters.
+        if self._tensors_of is not self._field.weights:
+            self._tensors, self._tensors_of = self._field.training_tensors(), self._field.weights
+        return self._tensors
 
     def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor:
         return self._field.frame_deltas(gaussians)(time)
@@ -100,7 +106,7 @@ KIND = FieldKind(
     new=new_basis_field,
     config={
         "bumps": IntegerIn(4, 1 << 20),
-        "channels": IntegerIn(CHANNELS, CHANNELS),
+        "channels": IntegerIn(BASIS_CHANNELS, BASIS_CHANNELS),
         "origin_s": NumberIn(-2e10, 2e10),
         "spacing_s": NumberIn(1e-6, 1e6),
     },
