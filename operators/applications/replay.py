@@ -53,7 +53,7 @@ PIXELS_PER_GAUSSIAN = 4
 class ReplaySettings:
     """What to replay, how, and where the results go."""
 
-    recording: Path
+    recording: Path | str
     """A recording, or a source with an end: `scheme://address` (see `open_source`)."""
     out: Path
     device: str = "cpu"
