@@ -26,7 +26,7 @@ class FusedStep:
     """Training steps for one set of tensors and one camera size, captured once and replayed.
 
     Parameters, moments and the field's state change in place. Where any of them was replaced by another tensor (Gaussians added, the
-    field's window moved), the next step is recorded anew.
+    field's window moved), the next step captures a new graph.
 
     A frame whose splats do not fit its lists changes nothing: the device sees it and leaves every parameter and moment alone. `settle`
     notices, makes room and says how many steps were lost, which the owner then takes again.
@@ -37,10 +37,10 @@ class FusedStep:
     ) -> None:
         device = gaussians.device
         self._gaussians, self._field, self._adam = gaussians, field, adam
-        self._field_tensors: Sequence[Tensor] = ()
-        self._field_places: tuple[int, ...] = ()
-        self._recorded: tuple[int, ...] = ()
-        """Where the tensors were when the graph was recorded."""
+        self._in_use: tuple[object, object, object] = None, None, None
+        self._addresses: tuple[int, ...] = ()
+        """Of all tensors when the graph was captured."""
+        self._taken: Observation | None = None
         self._weights = weights
         self._camera = camera
         shape = (camera.height_px, camera.width_px)
@@ -77,6 +77,25 @@ class FusedStep:
             gaussian_rates: Adam's learning rates of the Gaussians' tensors, by name.
             field_rates: those of the field, as many as it takes.
         """
+        self._take(observation)
+        rates = [gaussian_rates[name] for name in GAUSSIAN_TENSORS]
+        in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
+        self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates])
+        self._gaussians = gaussians
+        self._adam.steps += 1
+        if not self._warm:  # kernels are loaded by their first launch, which is not possible during a capture
+            self._warm = True
+            return self._sequence()
+        if self._was_replaced() or self._captured is None:
+            self._captured = None  # its memory serves the next capture
+            self._captured = CapturedSequence(self._sequence, self._image.device, self._memory, warm_up=False)
+        return self._captured.replay().clone()
+
+    def _take(self, observation: Observation) -> None:
+        """Copy an observation to where the graph reads it."""
+        if observation is self._taken:
+            return
+        self._taken = observation
         self._image.copy_(observation.image, non_blocking=True)
         self._mask.copy_(observation.mask, non_blocking=True)
         if self._depth is not None:
@@ -84,25 +103,11 @@ class FusedStep:
                 self._depth.zero_()  # unknown everywhere: the term is 0
             else:
                 self._depth.copy_(observation.depth, non_blocking=True)
-        rates = [gaussian_rates[name] for name in GAUSSIAN_TENSORS]
-        in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
-        self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates])
-        self._gaussians = gaussians
-        self._adam.steps += 1
-        if not self._warm:  # kernels are loaded by their first launch, which a recording does not allow
-            self._warm = True
-            return self._sequence()
-        in_use = self._places()
-        if self._captured is None or in_use != self._recorded:
-            self._captured = None  # its memory serves the next recording
-            self._captured = CapturedSequence(self._sequence, self._image.device, self._memory, warm_up=False)
-            self._recorded = in_use
-        return self._captured.replay().clone()
 
     def settle(self) -> int:
         """Wait for the steps since the last call; returns how many of them changed nothing because their splats did not fit.
 
-        There is room for them now: take them again.
+        The tile lists have more capacity now: take those steps again.
         """
         self._status.queue(self._totals)
         self._status.launched(self._totals.device)
@@ -114,12 +119,16 @@ class FusedStep:
             self._captured = None
         return needs.overflowed
 
-    def _places(self) -> tuple[int, ...]:
+    def _was_replaced(self) -> bool:
+        """Whether any tensor lies at another address, or has another size, than when the graph was captured."""
+        in_use = self._gaussians, self._adam.first_moments["means"], self._field.tensors()
+        if all(now is before for now, before in zip(in_use, self._in_use, strict=True)):
+            return False  # the same objects: they need not be asked for their addresses
+        self._in_use = in_use
         moments = (*self._adam.first_moments.values(), *self._adam.second_moments.values())
-        of_field = self._field.tensors()
-        if of_field is not self._field_tensors:  # a field has many: those that stay the same are not asked again
-            self._field_tensors, self._field_places = of_field, _places_of(of_field)
-        return *_places_of((*self._gaussians.tensors().values(), *moments)), *self._field_places
+        before = self._addresses
+        self._addresses = _addresses_of((*self._gaussians.tensors().values(), *moments, *in_use[2]))
+        return self._addresses != before
 
     def _sequence(self) -> Tensor:
         in_frame, of_means, of_field = self._controls.rates.split([len(GAUSSIAN_TENSORS), 1, self._field.rates])
@@ -165,5 +174,5 @@ class FusedStep:
         )  # fmt: skip
 
 
-def _places_of(tensors: Sequence[Tensor]) -> tuple[int, ...]:
+def _addresses_of(tensors: Sequence[Tensor]) -> tuple[int, ...]:
     return tuple(number for tensor in tensors for number in (tensor.data_ptr(), tensor.numel()))

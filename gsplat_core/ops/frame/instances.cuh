@@ -8,6 +8,8 @@
 namespace gsplat::frame {
 namespace {
 
+using namespace gsplat::tiles;
+
 constexpr uint32_t kMaxSum = 0x7fffffffu;  // sums saturate here; min(a + b, kMaxSum) is associative
 
 __device__ inline uint32_t saturating_add(uint32_t a, uint32_t b) { return min(a + b, kMaxSum); }

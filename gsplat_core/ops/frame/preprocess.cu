@@ -10,6 +10,7 @@ namespace gsplat::frame {
 namespace {
 
 using namespace GSPLAT_ISA;
+using namespace GSPLAT_ISA::spherical_harmonics;
 
 template <int bytes>
 __device__ inline void copy_async(void* to, const void* from) {

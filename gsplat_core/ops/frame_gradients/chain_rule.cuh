@@ -9,6 +9,7 @@ namespace gsplat::frame {
 namespace {
 
 using namespace GSPLAT_ISA;
+using namespace GSPLAT_ISA::spherical_harmonics;
 
 // The sum of a Gaussian's gradient rows.
 struct SplatRow {
