@@ -1,0 +1,228 @@
+// `rasterization()` in one call: what gsplat's chain of projection, tiles and compositing returns, from the Gaussians.
+#include "rasterization_scene.h"
+
+namespace rasterization {
+namespace {
+
+constexpr int64_t kFewTiles = 4096;  // for so many a counter may have 128 bytes of its own
+
+// Scratch memory that is needed until the length of the lists is known.
+struct ListScratch {
+  Arena arena;
+  FrameScratch frame;
+  int32_t* status;           // [2, kStatusWords]: of the lists, and of the packed rows
+  uint32_t* visible_counts;  // [images * blocks], packed
+  int32_t* visible_starts;   // [images * blocks + 1], packed
+  uint64_t* visible_states;
+
+  ListScratch(const Allocator& memory, const Scene& scene, bool packed, cudaStream_t stream) {
+    const int64_t tiles = scene.images() * scene.tiles(), blocks = scene.images() * scene.blocks();
+    const int64_t splats = scene.images() * scene.gaussians;
+    const int32_t stride = tiles <= kFewTiles ? 32 : 8;
+    const int64_t states = scan_states(tiles, blocks), visible = packed ? scan_states(blocks, 0) : 0;
+    const size_t zeros = arena.place<uint64_t>(states + visible + tiles * stride / 2);
+    const size_t zeros_end = arena.place<int32_t>(2 * kStatusWords), status_at = zeros_end;
+    const size_t footprints = arena.place<uint2>(splats), depths = arena.place<uint32_t>(splats);
+    const size_t sums = arena.place<uint32_t>(blocks), starts = arena.place<uint32_t>(blocks);
+    const size_t counts = arena.place<uint32_t>(packed ? blocks : 0), of_visible = arena.place<int32_t>(packed ? blocks + 1 : 0);
+    arena.make(memory);
+    status = arena.at<int32_t>(status_at);
+    visible_counts = arena.at<uint32_t>(counts);
+    visible_starts = arena.at<int32_t>(of_visible);
+    uint64_t* const first = arena.at<uint64_t>(zeros);
+    visible_states = first + states;
+    frame = {.footprints = arena.at<uint2>(footprints),
+             .depths = arena.at<uint32_t>(depths),
+             .slots = reinterpret_cast<uint32_t*>(visible_states + visible),
+             .states = first,
+             .sums = arena.at<uint32_t>(sums),
+             .starts = arena.at<uint32_t>(starts),
+             .slot_stride = stride};
+    check_cuda(cudaMemsetAsync(first, 0, zeros_end - zeros, stream), "clearing the counts");
+  }
+};
+
+// Counts the visible splats; their number becomes status[kStatusWords + kStatusNeeded].
+void scan_visible(const Scene& scene, const Splats& splats, const ListScratch& scratch, cudaStream_t stream) {
+  const int64_t blocks = scene.images() * scene.blocks();
+  if (blocks == 0) {
+    check_cuda(cudaMemsetAsync(scratch.status + kStatusWords, 0, sizeof(int32_t), stream), "counting no splats");
+    return;
+  }
+  count_visible(scene, splats, scratch.visible_counts, stream);
+  FrameScene counters = {};
+  counters.tile_width = int32_t(blocks);
+  counters.tile_height = 1;
+  FrameLists lists = {};
+  lists.tile_offsets = scratch.visible_starts;
+  lists.status = scratch.status + kStatusWords;
+  lists.capacity = kMostInts;
+  FrameScratch of_counters = {};
+  of_counters.slots = scratch.visible_counts;
+  of_counters.states = scratch.visible_states;
+  of_counters.slot_stride = 1;
+  scan_frame(counters, lists, of_counters, stream);
+}
+
+// One forward pass: every tensor that it returns, in the order of `outputs`.
+struct Pass {
+  const CudaCall& call;
+  const Allocator memory;
+  const Scene& scene;
+  const Sizes image_dims;
+  const bool packed, training;
+  const Tensor none;
+  Tensor means2d, depths, conics, opacities, radii, tiles_per_gauss, records, splat_starts, offsets;
+  Tensor image, alphas, expected, last;
+  Tensor flatten_ids, isect_ids, sorted;
+  Tensor batch_ids, camera_ids, gaussian_ids, row_of, dense_radii, splat_ids;
+
+  Pass(const CudaCall& call_, const Tensor& on, const Scene& scene_, const Sizes& image_dims_, bool packed_, bool training_)
+      : call(call_), memory(on), scene(scene_), image_dims(image_dims_), packed(packed_), training(training_),
+        none(memory.floats({0})) {
+    for (Tensor* t : {&opacities, &expected, &last, &sorted, &batch_ids, &camera_ids, &gaussian_ids, &row_of, &dense_radii,
+                      &splat_ids})
+      *t = none;
+  }
+
+  Sizes of_images(std::initializer_list<int64_t> more) const {
+    Sizes sizes = image_dims;
+    sizes.insert(sizes.end(), more);
+    return sizes;
+  }
+
+  void run() {
+    const int64_t n = scene.gaussians;
+    const bool own_opacities = scene.antialiased;
+    means2d = memory.floats(of_images({n, 2}));
+    depths = memory.floats(of_images({n}));
+    conics = memory.floats(of_images({n, 3}));
+    radii = memory.ints(of_images({n, 2}));
+    tiles_per_gauss = memory.ints(of_images({n}));
+    if (own_opacities) opacities = memory.floats(of_images({n}));
+    records = memory.floats({scene.images() * n, kSplatFloats});
+    const ListScratch scratch(memory, scene, packed, call.stream);
+    const Splats splats = {float_data(means2d),  float_data(depths), float_data(conics),          float_data(opacities),
+                           int_data(radii), int_data(tiles_per_gauss), float_data(records)};
+    project(scene, splats, scratch.frame, call.stream);
+
+    offsets = memory.ints({scene.images() * scene.tiles() + 1});
+    splat_starts = memory.ints({scene.images() * n + 1});
+    Lists lists = {};
+    lists.tile_offsets = int_data(offsets);
+    lists.splat_starts = int_data(splat_starts);
+    lists.tiles = scene.images() * scene.tiles();
+    scan(scene, lists, scratch.status, scratch.frame, call.stream);
+    if (packed) scan_visible(scene, splats, scratch, call.stream);
+    PinnedWords& words = PinnedWords::of_thread();
+    words.read(scratch.status, 2 * kStatusWords, call.stream);
+    const Pixels pixels = make_pixels();  // while the device is at work
+    // The host waits here, once, for the lengths: what is returned is exactly as long.
+    check_cuda(cudaStreamSynchronize(call.stream), "projecting the Gaussians");
+    lists.length = words[kStatusNeeded];
+    STD_TORCH_CHECK(lists.length < kMostInts, "the splats touch more than 2^31 - 2 tiles in all; render fewer images at a time");
+
+    Arena of_lists;
+    const size_t keys = of_lists.place<uint64_t>(lists.length), instances = of_lists.place<int32_t>(lists.length);
+    of_lists.make(memory);
+    lists.keys = of_lists.at<uint64_t>(keys);
+    lists.instance_splats = of_lists.at<int32_t>(instances);
+    flatten_ids = memory.ints({lists.length});
+    isect_ids = memory.longs({lists.length});
+    lists.flatten_ids = int_data(flatten_ids);
+    lists.isect_ids = long_data(isect_ids);
+    if (training) {
+      sorted = memory.ints({lists.length});
+      lists.sorted = int_data(sorted);
+    }
+    fill(scene, splats, lists, scratch.frame, call.stream);
+    blend(scene, splats, lists, pixels, call.stream);
+    if (packed) pack_rows(splats, scratch, words[kStatusWords + kStatusNeeded], lists);
+  }
+
+  Pixels make_pixels() {
+    image = memory.floats(of_images({scene.height, scene.width, scene.image_channels()}));
+    alphas = memory.floats(of_images({scene.height, scene.width, 1}));
+    if (training) last = memory.ints(of_images({scene.height, scene.width}));
+    if (training && scene.expected) expected = memory.floats(of_images({scene.height, scene.width}));
+    return {float_data(image), float_data(alphas), float_data(expected), training ? int_data(last) : nullptr};
+  }
+
+  // Replaces the splats by their packed rows, and remembers what the gradient needs of them.
+  void pack_rows(const Splats& splats, const ListScratch& scratch, int64_t rows, const Lists& lists) {
+    const Tensor dense[] = {means2d, depths, conics, opacities, tiles_per_gauss};  // until the kernels are queued
+    dense_radii = radii;
+    splat_ids = flatten_ids;
+    row_of = memory.ints({scene.images() * scene.gaussians});
+    batch_ids = memory.longs({rows});
+    camera_ids = memory.longs({rows});
+    gaussian_ids = memory.longs({rows});
+    means2d = memory.floats({rows, 2});
+    depths = memory.floats({rows});
+    conics = memory.floats({rows, 3});
+    opacities = memory.floats({rows});
+    radii = memory.ints({rows, 2});
+    tiles_per_gauss = memory.ints({rows});
+    flatten_ids = memory.ints({lists.length});
+    const PackedSplats out = {long_data(batch_ids), long_data(camera_ids), long_data(gaussian_ids),
+                              {float_data(means2d), float_data(depths), float_data(conics), float_data(opacities),
+                               int_data(radii), int_data(tiles_per_gauss), nullptr},
+                              int_data(row_of)};
+    pack(scene, splats, scratch.visible_starts, out, call.stream);
+    renumber(lists.length, out.row_of, lists.flatten_ids, int_data(flatten_ids), call.stream);
+  }
+
+  Tensor isect_offsets() const {
+    const Sizes sizes = of_images({scene.tile_height, scene.tile_width});
+    Sizes strides(sizes.size());
+    int64_t stride = 1;
+    for (size_t i = sizes.size(); i-- > 0;) {
+      strides[i] = stride;
+      stride *= sizes[i];
+    }
+    AtenTensorHandle handle = nullptr;
+    STD_TORCH_CHECK(aoti_torch__reinterpret_tensor(offsets.get(), int64_t(sizes.size()), sizes.data(), strides.data(), 0,
+                                                   &handle) == 0,
+                    "torch could not make a view");
+    return Tensor(handle);
+  }
+
+  std::vector<Tensor> outputs() const {
+    std::vector<Tensor> all = {image, alphas, means2d, depths, conics, opacities, radii, tiles_per_gauss, isect_offsets(),
+                               flatten_ids, isect_ids};
+    if (packed) all.insert(all.end(), {batch_ids, camera_ids, gaussian_ids});
+    if (training) all.insert(all.end(), {records, splat_starts, sorted, last, expected});
+    if (training && packed) all.insert(all.end(), {row_of, dense_radii, splat_ids});
+    return all;
+  }
+};
+
+std::vector<Tensor> rasterize(Tensor means, OptionalTensor covars, OptionalTensor quats, OptionalTensor scales, Tensor opacities,
+                              OptionalTensor colors, Tensor viewmats, Tensor intrinsics, OptionalTensor centers,
+                              OptionalTensor backgrounds, std::vector<int64_t> image_dims, int64_t width, int64_t height,
+                              int64_t camera_model, int64_t degree, int64_t depth_mode, bool antialiased, bool packed,
+                              bool training, double eps2d, double near_plane, double far_plane, double radius_clip) {
+  const CudaCall call(means);
+  const PictureSize size(image_dims, width, height);
+  SceneInputs inputs(call, size, means, covars, quats, scales, opacities, colors, viewmats, intrinsics, centers, camera_model,
+                     degree, antialiased, eps2d);
+  Scene& scene = inputs.scene;
+  scene.projection.near_plane = float(near_plane);
+  scene.projection.far_plane = float(far_plane);
+  scene.projection.radius_clip = float(radius_clip);
+  scene.depth = depth_mode != kNoDepth;
+  scene.expected = depth_mode == kExpectedDepth;
+  STD_TORCH_CHECK(scene.image_channels() > 0, "rasterize: there is neither a colour nor a depth to render");
+  const OptionalTensor behind = optional_floats(call, backgrounds, "backgrounds");
+  STD_TORCH_CHECK(!behind || behind->numel() == size.images * scene.channels, "rasterize: backgrounds must be [..., C, D]");
+  scene.backgrounds = optional_data(behind);
+  Pass pass(call, means, scene, image_dims, packed, training);
+  pass.run();
+  check_cuda(cudaGetLastError(), "rasterize");
+  return pass.outputs();
+}
+
+}  // namespace
+}  // namespace rasterization
+
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) { m.impl("rasterize", TORCH_BOX(&rasterization::rasterize)); }
