@@ -12,8 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation import BasisField, DeformationField
-from gsplat_core.deformation.field import checked_window
+from gsplat_core.deformation.field import DeformationField, checked_window
 from gsplat_core.errors import InvalidInput
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.scene.cameras import Camera
@@ -53,7 +52,7 @@ class Model:
             raise InvalidInput(
                 f"a model is published with detached copies, but {', '.join(learning)} require gradients"
             )
-        if isinstance(self.field, BasisField) and self.field.count != self.gaussians.count:
+        if self.field is not None and self.field.count not in (None, self.gaussians.count):
             raise InvalidInput(f"the field deforms {self.field.count} Gaussians, the model has {self.gaussians.count}")
 
     def tensors(self) -> dict[str, Tensor]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation.kind import CapturedTraining
 from gsplat_core.ops.adam.adam import adam_step_at_
 from gsplat_core.ops.frame.frame import render_frame
 from gsplat_core.ops.frame.frame_count import count_frame_
@@ -17,7 +18,6 @@ from gsplat_core.rendering.frame_renderer import FrameControls
 from gsplat_core.rendering.tile_capacity import StatusOnHost, capacity_for
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.field_training import FieldTraining
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
 from gsplat_core.training.photometric import LossWeights
@@ -37,7 +37,7 @@ class FusedStep:
     """
 
     def __init__(
-        self, gaussians: Gaussians, field: FieldTraining, adam: FusedAdam, weights: LossWeights, camera: Camera
+        self, gaussians: Gaussians, field: CapturedTraining, adam: FusedAdam, weights: LossWeights, camera: Camera
     ) -> None:
         device = gaussians.device
         self._gaussians, self._field, self._adam = gaussians, field, adam

@@ -2,7 +2,7 @@
 #include "covariance_math.h"
 #include "cuda_scratch.h"
 
-using namespace GSPLAT_ISA;
+using namespace GSPLAT_ISA::covariance;
 
 namespace {
 

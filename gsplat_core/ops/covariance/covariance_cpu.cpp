@@ -5,6 +5,8 @@
 
 namespace GSPLAT_ISA {
 
+using namespace covariance;
+
 static void forward(const float* quats, const float* scales, float* out, bool inverse, bool triu, int64_t begin, int64_t end) {
   for (int64_t first = begin; first < end; first += kLanes) {
     const int count = int(end - first < kLanes ? end - first : kLanes);

@@ -2,7 +2,7 @@
 #include <tuple>
 
 #include "covariance.h"
-#include "tensor_checks.h"
+#include "cpu_call.h"
 
 constexpr int64_t kGrain = 4096;
 

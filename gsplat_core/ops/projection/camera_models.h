@@ -4,7 +4,9 @@
 #include "projection.h"
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::projection {
+
+using namespace gsplat::projection;
 
 struct Point3 {
   vfloat x, y, z;
@@ -119,4 +121,4 @@ struct Projector<kFisheye> {
   }
 };
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::projection

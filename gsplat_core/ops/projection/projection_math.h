@@ -6,7 +6,10 @@
 #include "projection.h"
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::projection {
+
+using namespace gsplat::projection;
+using namespace covariance;
 
 constexpr float kAlphaCutoff = 1.0f / 255.0f;
 constexpr float kMaxExtentSigmas = 3.33f;
@@ -223,4 +226,4 @@ GSPLAT_INLINE BackProjected project_backward(const ProjectionInput& in, const Vi
   return project_backward(in, view, mean, geometry, p, image, e, g, v.means2d, v.depth, needs_viewmat);
 }
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::projection

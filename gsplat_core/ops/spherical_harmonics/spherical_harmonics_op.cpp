@@ -1,8 +1,8 @@
 #include <optional>
 #include <tuple>
 
+#include "cpu_call.h"
 #include "spherical_harmonics.h"
-#include "tensor_checks.h"
 
 constexpr int64_t kBlock = 1024;
 

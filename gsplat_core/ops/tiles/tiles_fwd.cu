@@ -1,6 +1,5 @@
-#include <cub/device/device_radix_sort.cuh>
-#include <cub/device/device_scan.cuh>
 
+#include "cub_device.cuh"
 #include "tile_ellipse.cuh"
 
 namespace {

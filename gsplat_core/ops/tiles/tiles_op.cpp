@@ -2,7 +2,7 @@
 #include <tuple>
 
 #include "counting_sort.h"
-#include "tensor_checks.h"
+#include "cpu_call.h"
 #include "tiles.h"
 
 namespace {
