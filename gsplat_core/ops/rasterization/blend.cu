@@ -2,9 +2,9 @@
 #include "../compositing/blend_forward.cuh"
 #include "../frame/frame_launch.cuh"
 #include "../frame/frame_tile_sort.cuh"
-#include "rasterization_cuda.h"
+#include "rasterization.h"
 
-namespace rasterization {
+namespace gsplat::rasterization {
 namespace {
 
 using Splat = Record<4>;
@@ -115,4 +115,4 @@ void blend(const Scene& scene, const Splats& splats, const Lists& lists, const P
   launch_behind(blend_tiles, unsigned(tiles), kBlockThreads, stream, 0, scene, splats, lists, tile_bits, out);
 }
 
-}  // namespace rasterization
+}  // namespace gsplat::rasterization

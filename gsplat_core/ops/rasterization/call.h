@@ -2,13 +2,11 @@
 // numbers read from the device.
 #pragma once
 
-#include <torch/csrc/inductor/aoti_torch/c/shim.h>
-
 #include <vector>
 
 #include "cuda_call.h"
 
-namespace rasterization {
+namespace gsplat::rasterization {
 
 using Sizes = std::vector<int64_t>;
 
@@ -26,7 +24,7 @@ class Allocator {
       stride *= sizes[i] > 1 ? sizes[i] : 1;
     }
     AtenTensorHandle handle = nullptr;
-    STD_TORCH_CHECK(aoti_torch_empty_strided(int64_t(sizes.size()), sizes.data(), strides.data(), int32_t(type),
+    check(aoti_torch_empty_strided(int64_t(sizes.size()), sizes.data(), strides.data(), int32_t(type),
                                              aoti_torch_device_type_cuda(), device_, &handle) == 0,
                     "torch could not allocate device memory");
     return Tensor(handle);
@@ -92,4 +90,4 @@ class PinnedWords {
   int32_t* words_ = nullptr;
 };
 
-}  // namespace rasterization
+}  // namespace gsplat::rasterization

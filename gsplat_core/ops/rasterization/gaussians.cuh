@@ -3,12 +3,13 @@
 
 #include "../projection/projection_math.h"
 #include "../spherical_harmonics/spherical_harmonics_bases.h"
-#include "rasterization_cuda.h"
+#include "rasterization.h"
 
-namespace rasterization {
+namespace gsplat::rasterization {
 namespace {
 
-using namespace GSPLAT_ISA;
+using namespace GSPLAT_ISA::projection;
+using namespace GSPLAT_ISA::spherical_harmonics;
 
 constexpr unsigned kWholeWarp = 0xffffffffu;
 
@@ -165,4 +166,4 @@ void with_degree(int degree, const Run& run) {
 }
 
 }  // namespace
-}  // namespace rasterization
+}  // namespace gsplat::rasterization

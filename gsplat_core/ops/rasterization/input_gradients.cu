@@ -1,7 +1,7 @@
 // Per Gaussian: from the gradients of its splats, in the order of the cameras, to those of its parameters.
 #include "gaussians.cuh"
 
-namespace rasterization {
+namespace gsplat::rasterization {
 namespace {
 
 constexpr int kWarps = kFrameThreads / 32;
@@ -289,4 +289,4 @@ void input_gradients(const Scene& scene, const ProjectedGradients& from, const I
     sum_over_blocks<<<unsigned(scene.images()), 32 * kViewSums, 0, stream>>>(to.view_sums, scene.blocks(), to.viewmats, to.centers);
 }
 
-}  // namespace rasterization
+}  // namespace gsplat::rasterization

@@ -4,15 +4,15 @@
 #include "../frame/frame_launch.cuh"
 #include "gaussians.cuh"
 
-namespace rasterization {
+namespace gsplat::rasterization {
 namespace {
 
 __device__ inline Projected project_one(const ProjectionInput& in, const float* mean, const Geometry& geometry, float opacity,
                                         bool antialiased) {
   switch (in.model) {
-    case kOrtho: return ::GSPLAT_ISA::project(in, View<kOrtho>(in), mean, geometry, &opacity, antialiased);
-    case kFisheye: return ::GSPLAT_ISA::project(in, View<kFisheye>(in), mean, geometry, &opacity, antialiased);
-    default: return ::GSPLAT_ISA::project(in, View<kPinhole>(in), mean, geometry, &opacity, antialiased);
+    case kOrtho: return GSPLAT_ISA::projection::project(in, View<kOrtho>(in), mean, geometry, &opacity, antialiased);
+    case kFisheye: return GSPLAT_ISA::projection::project(in, View<kFisheye>(in), mean, geometry, &opacity, antialiased);
+    default: return GSPLAT_ISA::projection::project(in, View<kPinhole>(in), mean, geometry, &opacity, antialiased);
   }
 }
 
@@ -175,4 +175,4 @@ void renumber(int64_t length, const int32_t* row_of, const int32_t* from, int32_
   if (length > 0) renumber_splats<<<blocks_for(length), kThreads, 0, stream>>>(length, row_of, from, to);
 }
 
-}  // namespace rasterization
+}  // namespace gsplat::rasterization

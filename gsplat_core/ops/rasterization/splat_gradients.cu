@@ -2,9 +2,9 @@
 // splat the sum of its rows. Every row is a sum over the tile's pixels in a fixed order, and rows are added in the order of the
 // instances: the bits are the same every time.
 #include "../compositing/blend_backward.cuh"
-#include "rasterization_cuda.h"
+#include "rasterization.h"
 
-namespace rasterization {
+namespace gsplat::rasterization {
 namespace {
 
 constexpr int kChannels = 4;  // red, green, blue, z
@@ -142,4 +142,4 @@ void splat_gradients(const Scene& scene, const int32_t* splat_starts, const floa
     sums_of_splats<<<blocks_for(4 * splats), kThreads, 0, stream>>>(splats, splat_starts, reinterpret_cast<const float4*>(rows), out);
 }
 
-}  // namespace rasterization
+}  // namespace gsplat::rasterization

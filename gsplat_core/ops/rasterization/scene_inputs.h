@@ -1,23 +1,13 @@
 // The inputs of the op, checked, and what the kernels are told about them.
 #pragma once
 
-#include <optional>
-
 #include "call.h"
-#include "rasterization_cuda.h"
+#include "rasterization.h"
 
-namespace rasterization {
-
-using OptionalTensor = std::optional<Tensor>;
+namespace gsplat::rasterization {
 
 constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
 enum DepthMode : int64_t { kNoDepth = 0, kDepthSum = 1, kExpectedDepth = 2 };
-
-inline OptionalTensor optional_floats(const CudaCall& call, const OptionalTensor& t, const char* name) {
-  if (!t.has_value()) return std::nullopt;
-  return call.floats(*t, name);
-}
-inline const float* optional_data(const OptionalTensor& t) { return t.has_value() ? data(*t) : nullptr; }
 
 // The size of the pictures: `image_dims` are the batch dimensions and the number of cameras.
 struct PictureSize {
@@ -27,17 +17,17 @@ struct PictureSize {
       : cameras(image_dims.empty() ? 0 : image_dims.back()), width(width_), height(height_) {
     constexpr int64_t kMostPixels = int64_t(kMostTilesAcross) * kFrameTile;
     for (const int64_t size : image_dims) images *= size;
-    STD_TORCH_CHECK(images > 0, "rasterize: there must be at least one camera");
-    STD_TORCH_CHECK(width > 0 && height > 0 && width <= kMostPixels && height <= kMostPixels, "rasterize: images must have 1 to ",
+    check(images > 0, "rasterize: there must be at least one camera");
+    check(width > 0 && height > 0 && width <= kMostPixels && height <= kMostPixels, "rasterize: images must have 1 to ",
                     kMostPixels, " pixels on a side, got ", width, " x ", height);
-    STD_TORCH_CHECK(images * tile_width() * tile_height() < kMostInts / 32, "rasterize: too many tiles in all images");
+    check(images * tile_width() * tile_height() < kMostInts / 32, "rasterize: too many tiles in all images");
   }
   int64_t tile_width() const { return (width + kFrameTile - 1) / kFrameTile; }
   int64_t tile_height() const { return (height + kFrameTile - 1) / kFrameTile; }
 
   // What it says about a scene; all else is left empty.
   Scene scene(int64_t gaussians) const {
-    STD_TORCH_CHECK(gaussians * images <= kMostInts - 1, "rasterize takes at most 2^31 - 2 Gaussians times cameras, got ",
+    check(gaussians * images <= kMostInts - 1, "rasterize takes at most 2^31 - 2 Gaussians times cameras, got ",
                     gaussians * images);
     Scene s = {};
     s.gaussians = gaussians;
@@ -65,45 +55,45 @@ struct SceneInputs {
         opacities(call.floats(opacities_in, "opacities")),
         viewmats(call.floats(viewmats_in, "viewmats")),
         intrinsics(call.floats(intrinsics_in, "Ks")),
-        covars(rasterization::optional_floats(call, covars_in, "covars")),
-        quats(rasterization::optional_floats(call, quats_in, "quats")),
-        scales(rasterization::optional_floats(call, scales_in, "scales")),
-        colors(rasterization::optional_floats(call, colors_in, "colors")),
-        centers(rasterization::optional_floats(call, centers_in, "centers")),
+        covars(call.floats(covars_in, "covars")),
+        quats(call.floats(quats_in, "quats")),
+        scales(call.floats(scales_in, "scales")),
+        colors(call.floats(colors_in, "colors")),
+        centers(call.floats(centers_in, "centers")),
         scene(size.scene(means_in.dim() >= 2 ? means_in.size(-2) : 0)) {
     const int64_t images = size.images, rows = images / size.cameras * scene.gaussians;
     const auto fits = [](const OptionalTensor& t, int64_t numbers) { return !t.has_value() || t->numel() == numbers; };
-    STD_TORCH_CHECK(covars.has_value() != (quats.has_value() && scales.has_value()),
+    check(covars.has_value() != (quats.has_value() && scales.has_value()),
                     "rasterize takes covars, or quats and scales");
-    STD_TORCH_CHECK(means.numel() == 3 * rows && opacities.numel() == rows && fits(covars, 6 * rows) && fits(quats, 4 * rows) &&
+    check(means.numel() == 3 * rows && opacities.numel() == rows && fits(covars, 6 * rows) && fits(quats, 4 * rows) &&
                         fits(scales, 3 * rows) && viewmats.numel() == 16 * images && intrinsics.numel() == 9 * images &&
                         fits(centers, 3 * images),
                     "rasterize: the sizes of the inputs do not fit together");
-    STD_TORCH_CHECK(camera_model >= 0 && camera_model <= 2, "rasterize: no camera model ", camera_model);
+    check(camera_model >= 0 && camera_model <= 2, "rasterize: no camera model ", camera_model);
     scene.antialiased = antialiased;
     scene.degree = kPlainColors;
     if (colors) set_colors(degree, images, rows);
-    ProjectionInput& in = scene.projection;
-    in = {data(means), optional_data(covars), optional_data(quats), optional_data(scales), data(opacities), data(viewmats),
-          data(intrinsics), float(size.width), float(size.height), float(eps2d), 0, 0, 0, CameraModel(camera_model)};
-    scene.colors = optional_data(colors);
-    scene.centers = optional_data(centers);
+    projection::ProjectionInput& in = scene.projection;
+    in = {data(means), data(covars), data(quats), data(scales), data(opacities), data(viewmats),
+          data(intrinsics), float(size.width), float(size.height), float(eps2d), 0, 0, 0, projection::CameraModel(camera_model)};
+    scene.colors = data(colors);
+    scene.centers = data(centers);
   }
 
  private:
   void set_colors(int64_t degree, int64_t images, int64_t rows) {
     const bool harmonics = degree >= 0;
     const int64_t last = colors->dim() > 0 ? colors->size(-1) : 0, bases = harmonics && colors->dim() > 1 ? colors->size(-2) : 1;
-    STD_TORCH_CHECK(harmonics ? degree <= 4 && last == 3 && bases >= (degree + 1) * (degree + 1)
+    check(harmonics ? degree <= 4 && last == 3 && bases >= (degree + 1) * (degree + 1)
                               : degree == kPlainColors && last >= 1 && last <= kMostPlainColors,
                     "rasterize: colors must be [..., N, K, 3] with K >= (degree + 1)^2, or [..., N, 1 to 3] without a degree");
     scene.degree = int32_t(degree);
     scene.color_row = int32_t(last * bases);
     scene.channels = int32_t(last);
     scene.colors_per_camera = colors->numel() != rows * scene.color_row;
-    STD_TORCH_CHECK(!scene.colors_per_camera || colors->numel() == images * scene.gaussians * scene.color_row,
+    check(!scene.colors_per_camera || colors->numel() == images * scene.gaussians * scene.color_row,
                     "rasterize: there must be colours for every Gaussian, or for every camera and Gaussian");
   }
 };
 
-}  // namespace rasterization
+}  // namespace gsplat::rasterization

@@ -2,20 +2,15 @@
 // where programs look at the gradient of means2d.
 #include <tuple>
 
-#include "rasterization_scene.h"
+#include "scene_inputs.h"
 
-namespace rasterization {
+namespace gsplat::rasterization {
 namespace {
 
 Sizes sizes_of(const Tensor& t) {
   Sizes sizes(size_t(t.dim()));
   for (size_t i = 0; i < sizes.size(); ++i) sizes[i] = t.size(int64_t(i));
   return sizes;
-}
-
-OptionalTensor optional_ints(const CudaCall& call, const OptionalTensor& t, const char* name) {
-  if (!t.has_value()) return std::nullopt;
-  return call.ints(*t, name);
 }
 
 std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(
@@ -27,19 +22,19 @@ std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(
   const PictureSize size(image_dims, width, height);
   for (const Tensor* t : {&isect_offsets, &splat_ids, &sorted, &splat_starts, &last}) call.ints(*t, "the lists");
   const Tensor conics = call.floats(conics_in, "conics"), alphas = call.floats(alphas_in, "alphas");
-  const OptionalTensor row_of = optional_ints(call, row_of_in, "row_of"),
-                       backgrounds = optional_floats(call, backgrounds_in, "backgrounds"),
-                       expected = optional_floats(call, expected_in, "expected"),
-                       v_image = optional_floats(call, v_image_in, "v_image"),
-                       v_alphas = optional_floats(call, v_alphas_in, "v_alphas");
+  const OptionalTensor row_of = call.ints(row_of_in, "row_of"),
+                       backgrounds = call.floats(backgrounds_in, "backgrounds"),
+                       expected = call.floats(expected_in, "expected"),
+                       v_image = call.floats(v_image_in, "v_image"),
+                       v_alphas = call.floats(v_alphas_in, "v_alphas");
   Scene scene = size.scene(records.size(0) / size.images);
   scene.channels = int32_t(channels);
   scene.depth = depth_mode != kNoDepth;
   scene.expected = depth_mode == kExpectedDepth;
-  scene.backgrounds = optional_data(backgrounds);
+  scene.backgrounds = data(backgrounds);
   const int64_t splats = size.images * scene.gaussians, pixels = size.images * width * height, length = sorted.numel();
   const int64_t rows_of_splats = conics.numel() / 3;
-  STD_TORCH_CHECK(records.is_contiguous() && records.numel() == splats * kSplatFloats && splat_starts.numel() == splats + 1 &&
+  check(records.is_contiguous() && records.numel() == splats * kSplatFloats && splat_starts.numel() == splats + 1 &&
                       isect_offsets.numel() == size.images * scene.tiles() && splat_ids.numel() == length &&
                       (row_of ? row_of->numel() == splats : rows_of_splats == splats) && alphas.numel() == pixels &&
                       last.numel() == pixels && (!v_alphas || v_alphas->numel() == pixels) &&
@@ -60,13 +55,13 @@ std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(
   lists.length = length;
   lists.tiles = size.images * scene.tiles();
   const Tensor rows = memory.floats({length, kSplatFloats});
-  const PictureGradient from = {optional_data(v_image), optional_data(v_alphas), data(alphas),
+  const PictureGradient from = {data(v_image), data(v_alphas), data(alphas),
                                 scene.expected ? data(*expected) : nullptr, int_data(last)};
   instance_gradients(scene, float_data(records), lists, from, absolute, float_data(rows), call.stream);
   const SplatSums out = {data(conics), row_of ? int_data(*row_of) : nullptr, float_data(v_splats), float_data(v_means2d),
                          absolute ? float_data(v_absolute) : nullptr};
   splat_gradients(scene, lists.splat_starts, float_data(rows), out, call.stream);
-  check_cuda(cudaGetLastError(), "rasterize_splats_backward");
+  call.finish("rasterize_splats_backward");
   return {v_splats, v_means2d, v_absolute};
 }
 
@@ -74,7 +69,7 @@ std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(
 std::vector<Tensor> rasterize_inputs_backward(Tensor means, OptionalTensor covars, OptionalTensor quats, OptionalTensor scales,
                                               Tensor opacities, OptionalTensor colors, Tensor viewmats, Tensor intrinsics,
                                               OptionalTensor centers, Tensor radii_in, OptionalTensor row_of_in,
-                                              std::vector<std::optional<Tensor>> gradients, std::vector<int64_t> image_dims,
+                                              std::vector<OptionalTensor> gradients, std::vector<int64_t> image_dims,
                                               int64_t width, int64_t height, int64_t camera_model, int64_t degree,
                                               int64_t depth_mode, bool antialiased, double eps2d, std::vector<bool> needs) {
   const CudaCall call(means);
@@ -84,22 +79,22 @@ std::vector<Tensor> rasterize_inputs_backward(Tensor means, OptionalTensor covar
   Scene& scene = inputs.scene;
   scene.depth = depth_mode != kNoDepth;
   enum { kMeans, kCovars, kQuats, kScales, kOpacities, kColors, kViewmats, kCenters, kInputs };
-  STD_TORCH_CHECK(needs.size() == kInputs && gradients.size() == 5, "rasterize_inputs_backward: ", kInputs,
+  check(needs.size() == kInputs && gradients.size() == 5, "rasterize_inputs_backward: ", kInputs,
                   " needs and 5 gradients are expected");
   const Tensor radii = call.ints(radii_in, "radii");
-  const OptionalTensor row_of = optional_ints(call, row_of_in, "row_of");
+  const OptionalTensor row_of = call.ints(row_of_in, "row_of");
   const int64_t splats = size.images * scene.gaussians;
-  STD_TORCH_CHECK(radii.numel() == 2 * splats && (!row_of || row_of->numel() == splats),
+  check(radii.numel() == 2 * splats && (!row_of || row_of->numel() == splats),
                   "rasterize_inputs_backward: radii must be [images, N, 2] and row_of [images, N]");
   OptionalTensor v[5];
   constexpr int kColumns[5] = {kSplatFloats, 2, 1, 3, 1};
   for (int i = 0; i < 5; ++i) {
-    v[i] = optional_floats(call, gradients[size_t(i)], "a gradient");
-    STD_TORCH_CHECK(!v[i] || (row_of && i > 0) || v[i]->numel() == splats * kColumns[i],
+    v[i] = call.floats(gradients[size_t(i)], "a gradient");
+    check(!v[i] || (row_of && i > 0) || v[i]->numel() == splats * kColumns[i],
                     "rasterize_inputs_backward: the sizes of the gradients do not fit the inputs");
   }
-  const ProjectedGradients from = {int_data(radii), row_of ? int_data(*row_of) : nullptr, optional_data(v[0]),
-                                   optional_data(v[1]), optional_data(v[2]), optional_data(v[3]), optional_data(v[4])};
+  const ProjectedGradients from = {int_data(radii), row_of ? int_data(*row_of) : nullptr, data(v[0]),
+                                   data(v[1]), data(v[2]), data(v[3]), data(v[4])};
   const Allocator memory(means);
   const OptionalTensor given[kInputs] = {means, covars, quats, scales, opacities, colors, viewmats, inputs.centers};
   std::vector<Tensor> out;
@@ -117,15 +112,15 @@ std::vector<Tensor> rasterize_inputs_backward(Tensor means, OptionalTensor covar
                              float_data(out[kScales]),    float_data(out[kOpacities]), float_data(out[kColors]),
                              float_data(sums),            float_data(out[kViewmats]), float_data(out[kCenters])};
   input_gradients(scene, from, to, call.stream);
-  check_cuda(cudaGetLastError(), "rasterize_inputs_backward");
+  call.finish("rasterize_inputs_backward");
   if (inputs.centers && views) out[kCenters] = torch::stable::view(out[kCenters], sizes_of(*inputs.centers));
   return out;
 }
 
 }  // namespace
-}  // namespace rasterization
+}  // namespace gsplat::rasterization
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
-  m.impl("rasterize_splats_backward", TORCH_BOX(&rasterization::rasterize_splats_backward));
-  m.impl("rasterize_inputs_backward", TORCH_BOX(&rasterization::rasterize_inputs_backward));
+  m.impl("rasterize_splats_backward", GSPLAT_BOX(&gsplat::rasterization::rasterize_splats_backward));
+  m.impl("rasterize_inputs_backward", GSPLAT_BOX(&gsplat::rasterization::rasterize_inputs_backward));
 }

@@ -14,7 +14,7 @@
 #include "../projection/projection.h"
 #include "cuda_scratch.h"
 
-namespace rasterization {
+namespace gsplat::rasterization {
 
 constexpr int kPlainColors = -1;     // in place of a degree: colours are taken as they are
 constexpr int kSplatFloats = 12;     // of a splat's record, and of its gradient
@@ -22,7 +22,7 @@ constexpr int kMostPlainColors = 3;  // the record's fourth channel is the depth
 constexpr int kViewSums = 15;        // gradient of a camera: rotation by rows, translation, centre
 
 struct Scene {
-  ProjectionInput projection;  // of the first batch and camera
+  projection::ProjectionInput projection;  // of the first batch and camera
   const float* colors;         // [batches or images, N, color_row]; null: not rendered
   const float* centers;        // [images, 3], or null: of the view matrices
   const float* backgrounds;    // [images, channels without depth], or null: black
@@ -127,4 +127,4 @@ struct InputGradients {
 };
 void input_gradients(const Scene& scene, const ProjectedGradients& from, const InputGradients& to, cudaStream_t stream);
 
-}  // namespace rasterization
+}  // namespace gsplat::rasterization

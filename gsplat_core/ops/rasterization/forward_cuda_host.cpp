@@ -1,7 +1,7 @@
 // `rasterization()` in one call: what gsplat's chain of projection, tiles and compositing returns, from the Gaussians.
-#include "rasterization_scene.h"
+#include "scene_inputs.h"
 
-namespace rasterization {
+namespace gsplat::rasterization {
 namespace {
 
 constexpr int64_t kFewTiles = 4096;  // for so many a counter may have 128 bytes of its own
@@ -120,7 +120,7 @@ struct Pass {
     // The host waits here, once, for the lengths: what is returned is exactly as long.
     check_cuda(cudaStreamSynchronize(call.stream), "projecting the Gaussians");
     lists.length = words[kStatusNeeded];
-    STD_TORCH_CHECK(lists.length < kMostInts, "the splats touch more than 2^31 - 2 tiles in all; render fewer images at a time");
+    check(lists.length < kMostInts, "the splats touch more than 2^31 - 2 tiles in all; render fewer images at a time");
 
     Arena of_lists;
     const size_t keys = of_lists.place<uint64_t>(lists.length), instances = of_lists.place<int32_t>(lists.length);
@@ -181,7 +181,7 @@ struct Pass {
       stride *= sizes[i];
     }
     AtenTensorHandle handle = nullptr;
-    STD_TORCH_CHECK(aoti_torch__reinterpret_tensor(offsets.get(), int64_t(sizes.size()), sizes.data(), strides.data(), 0,
+    check(aoti_torch__reinterpret_tensor(offsets.get(), int64_t(sizes.size()), sizes.data(), strides.data(), 0,
                                                    &handle) == 0,
                     "torch could not make a view");
     return Tensor(handle);
@@ -212,17 +212,17 @@ std::vector<Tensor> rasterize(Tensor means, OptionalTensor covars, OptionalTenso
   scene.projection.radius_clip = float(radius_clip);
   scene.depth = depth_mode != kNoDepth;
   scene.expected = depth_mode == kExpectedDepth;
-  STD_TORCH_CHECK(scene.image_channels() > 0, "rasterize: there is neither a colour nor a depth to render");
-  const OptionalTensor behind = optional_floats(call, backgrounds, "backgrounds");
-  STD_TORCH_CHECK(!behind || behind->numel() == size.images * scene.channels, "rasterize: backgrounds must be [..., C, D]");
-  scene.backgrounds = optional_data(behind);
+  check(scene.image_channels() > 0, "rasterize: there is neither a colour nor a depth to render");
+  const OptionalTensor behind = call.floats(backgrounds, "backgrounds");
+  check(!behind || behind->numel() == size.images * scene.channels, "rasterize: backgrounds must be [..., C, D]");
+  scene.backgrounds = data(behind);
   Pass pass(call, means, scene, image_dims, packed, training);
   pass.run();
-  check_cuda(cudaGetLastError(), "rasterize");
+  call.finish("rasterize");
   return pass.outputs();
 }
 
 }  // namespace
-}  // namespace rasterization
+}  // namespace gsplat::rasterization
 
-STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) { m.impl("rasterize", TORCH_BOX(&rasterization::rasterize)); }
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) { m.impl("rasterize", GSPLAT_BOX(&gsplat::rasterization::rasterize)); }
