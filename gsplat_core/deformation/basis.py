@@ -20,14 +20,14 @@ from torch import Tensor
 
 from gsplat_core.deformation.basis_adam import BasisRates, Moments
 from gsplat_core.deformation.field import DeformationField, checked_window, count_of
+from gsplat_core.deformation.field_slots import BasisSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
 from gsplat_core.ops.basis_field.plain_torch import BUMP_REACH
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import BASIS_CHANNELS as CHANNELS
-from gsplat_core.scene.layout import BASIS_GROUPS, width_of
+from gsplat_core.scene.layout import BASIS_CHANNELS, BASIS_GROUPS, width_of
 
 COLUMNS_AHEAD = 1
 """Columns that the window keeps ahead of the newest frame online."""
@@ -64,7 +64,7 @@ class BasisField(DeformationField):
         self._origin_s = start - self._spacing_s
         self.centers = torch.nn.Parameter(torch.arange(bumps, dtype=torch.float32).repeat(count, 1))
         self.log_widths = torch.nn.Parameter(torch.zeros(count, bumps))
-        self.weights = torch.nn.Parameter(torch.zeros(count, bumps, CHANNELS))
+        self.weights = torch.nn.Parameter(torch.zeros(count, bumps, BASIS_CHANNELS))
         self._moments: Moments | None = None
 
     @classmethod
@@ -222,10 +222,24 @@ class BasisField(DeformationField):
             new = [
                 columns.repeat(count, 1),
                 self.log_widths.new_zeros(count, self.bumps),
-                self.weights.new_zeros(count, self.bumps, CHANNELS),
+                self.weights.new_zeros(count, self.bumps, BASIS_CHANNELS),
             ]
         self._set_parameters(*(torch.cat([p.data, n]) for p, n in zip(self._parameters_in_order(), new, strict=True)))
         self._change_moments(lambda t: torch.cat([t, t.new_zeros(count, *t.shape[1:])]))
+
+    def slot(self, rows: int) -> BasisSlot:
+        """See `DeformationField.slot`; it has capacity for more bumps too."""
+        return BasisSlot(self, rows)
+
+    def adopt_layout(self, other: BasisField) -> None:
+        """Take over window, origin and spacing of the columns of `other`."""
+        self._time_window_s, self._origin_s, self._spacing_s = other._time_window_s, other._origin_s, other._spacing_s
+
+    def cropped(self, count: int, bumps: int) -> BasisField:
+        """A detached copy of the first `count` Gaussians and `bumps` columns."""
+        copied = self.detached_copy()
+        copied._set_parameters(*(p.data[:count, :bumps] for p in self._parameters_in_order()))
+        return copied
 
     def config(self) -> dict[str, Any]:
         """Kind, window and the layout of the columns."""
@@ -233,7 +247,7 @@ class BasisField(DeformationField):
             "kind": self.kind,
             "time_window_s": list(self._time_window_s),
             "bumps": self.bumps,
-            "channels": CHANNELS,
+            "channels": BASIS_CHANNELS,
             "origin_s": self._origin_s,
             "spacing_s": self._spacing_s,
         }
@@ -260,7 +274,7 @@ class BasisField(DeformationField):
         centers, log_widths, weights = (p.data for p in self._parameters_in_order())
         columns = torch.arange(self.bumps, self.bumps + added, dtype=centers.dtype, device=centers.device)
         columns = columns.repeat(self.count, 1)
-        new_weights = weights.new_zeros(self.count, added, CHANNELS)
+        new_weights = weights.new_zeros(self.count, added, BASIS_CHANNELS)
         if held is not None:
             new_weights += held[:, None] / BUMPS_PER_SPACING
         self._set_parameters(

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.basis import CHANNELS, COLUMNS_AHEAD, BasisField
+from gsplat_core.deformation.basis import COLUMNS_AHEAD, BasisField
 from gsplat_core.deformation.basis_adam import BasisRates
 from gsplat_core.deformation.kind import FieldKind, NewField
 from gsplat_core.deformation.rates import FieldRates
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.layout import BASIS_CHANNELS
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 
@@ -100,7 +101,7 @@ KIND = FieldKind(
     new=new_basis_field,
     config={
         "bumps": IntegerIn(4, 1 << 20),
-        "channels": IntegerIn(CHANNELS, CHANNELS),
+        "channels": IntegerIn(BASIS_CHANNELS, BASIS_CHANNELS),
         "origin_s": NumberIn(-2e10, 2e10),
         "spacing_s": NumberIn(1e-6, 1e6),
     },

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self, cast
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation.field_slots import FieldSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.value_ranges import ListOf, NumberIn
@@ -105,6 +106,13 @@ class DeformationField(torch.nn.Module):
         """A copy for publishing: own memory, no gradients, no state of training."""
         copied = copy.deepcopy(self, {id(state): None for state in self._training_state()})
         return copied.requires_grad_(False)
+
+    def slot(self, rows: int) -> FieldSlot | None:
+        """A copy for `rows` Gaussians that newer states of this field can be written over, at the same addresses.
+
+        None: this kind of field has no such copy, and every snapshot of it gets memory of its own.
+        """
+        return None
 
     def check_state(self) -> None:
         """InvalidInput when loaded tensors, finite and of the right shapes, still make no field."""

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gsplat_core.deformation import regularisers
 from gsplat_core.deformation.field import DeformationField, checked_window
+from gsplat_core.deformation.field_slots import WholeFieldSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane import hexplane as compiled
 from gsplat_core.ops.hexplane import plain_torch
@@ -225,6 +226,10 @@ class HexPlaneField(DeformationField):
         """Weights and biases of the trunk and the head, layer by layer, outside of autograd."""
         weights, biases = self._network()
         return [weight.data for weight in weights], [bias.data for bias in biases]
+
+    def slot(self, rows: int) -> WholeFieldSlot:
+        """See `DeformationField.slot`; the field has no tensors per Gaussian."""
+        return WholeFieldSlot(self)
 
     def config(self) -> dict[str, Any]:
         """Kind, window and architecture; the box is stored with the tensors."""

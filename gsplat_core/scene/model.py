@@ -19,6 +19,12 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 
 
+def clamp_time(time_s: float, window_s: tuple[float, float]) -> float:
+    """`time_s` brought into the window; not a number stays so, for the field to refuse."""
+    start, end = window_s
+    return min(max(time_s, start), end) if time_s == time_s else time_s
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """One immutable version of a reconstruction; may be read by several threads.
@@ -74,12 +80,29 @@ class Model:
         field = None if self.field is None else self.field.detached_copy().to(device)
         return dataclasses.replace(self, gaussians=self.gaussians.to(device), field=field)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return self.gaussians.device
+
+    @property
+    def gaussian_count(self) -> int:
+        """How many Gaussians there are."""
+        return self.gaussians.count
+
+    def as_model(self) -> Model:
+        """Itself; a `Snapshot` gives a copy."""
+        return self
+
+    def clamp_time(self, time_s: float) -> float:
+        """`time_s` brought into the time window."""
+        return clamp_time(time_s, self.time_window_s)
+
     def at(self, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`, clamped to the window. The last answer is remembered, so asking again is free."""
         if self.field is None:
             return self.gaussians
-        start, end = self.time_window_s
-        time_s = min(max(time_s, start), end) if time_s == time_s else time_s  # NaN: the field refuses it
+        time_s = self.clamp_time(time_s)
         last = self._last
         if last is not None and last[0] == time_s:
             return last[1]

@@ -17,6 +17,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.training.budget import Budget, Ending, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth import gaussians_for_uncovered_tissue
@@ -75,6 +76,7 @@ class Reconstructor:
         self._step_s: float | None = None
         """How long a step took lately, where budgets are timed."""
         self._version = 0
+        self._slots = SnapshotSlots(self.device)
         self._usual_surprise = math.inf
         self._first_time_s = 0.0
         self._last_time_s = 0.0
@@ -216,6 +218,23 @@ class Reconstructor:
             version=self._version,
             gaussians=gaussians,
             field=field,
+            camera=self.camera,
+            time_window_s=(self._first_time_s, self._last_time_s),
+            training_digest=self._recording_digest,
+        )
+
+    def publish(self) -> Model | Snapshot:
+        """The model as it is now, for showing it, with the next version number. As `snapshot`, but on a GPU it is copied into a slot.
+
+        Nothing is allocated then and the host does not wait; see `gsplat_core.scene.snapshots`.
+        """
+        if self._step is None or self.device.type != "cuda" or not SnapshotSlots.can_hold(self._step.field):
+            return self.snapshot()
+        self._version += 1
+        return self._slots.publish(
+            self._step.gaussians,
+            self._step.field,
+            version=self._version,
             camera=self.camera,
             time_window_s=(self._first_time_s, self._last_time_s),
             training_digest=self._recording_digest,

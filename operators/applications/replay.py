@@ -129,7 +129,7 @@ class ReplayApplication(Application):
 
     def room_to_finish(self) -> int:
         """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
-        model = self.reconstruct.model
+        model = self.reconstruct.newest
         return self._reserve_bytes + (0 if model is None else 4 * model.parameter_count)
 
     def _new_reconstructor(self) -> Reconstructor:
