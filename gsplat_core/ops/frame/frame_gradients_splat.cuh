@@ -8,6 +8,7 @@
 namespace {
 
 using namespace GSPLAT_ISA;
+using namespace GSPLAT_ISA::spherical_harmonics;
 
 // The sum of a Gaussian's rows.
 struct SplatRow {
