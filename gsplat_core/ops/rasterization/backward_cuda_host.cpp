@@ -1,5 +1,5 @@
-// The gradient of `rasterize`, in two calls: from the picture to the splats, and from the splats to the inputs. Between the two is
-// where programs look at the gradient of means2d.
+// The gradient of `rasterize`, in two calls: from the picture to the splats, and from the splats to the inputs. Between the two
+// is where programs look at the gradient of means2d.
 #include <tuple>
 
 #include "scene_inputs.h"
@@ -13,19 +13,19 @@ Sizes sizes_of(const Tensor& t) {
   return sizes;
 }
 
-std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(
-    Tensor records, Tensor conics_in, Tensor isect_offsets, Tensor splat_ids, Tensor sorted, Tensor splat_starts,
-    OptionalTensor row_of_in, OptionalTensor backgrounds_in, Tensor alphas_in, OptionalTensor expected_in, Tensor last,
-    OptionalTensor v_image_in, OptionalTensor v_alphas_in, std::vector<int64_t> image_dims, int64_t width, int64_t height,
-    int64_t channels, int64_t depth_mode, bool absolute) {
+std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(Tensor records, Tensor conics_in, Tensor isect_offsets,
+                                                             Tensor splat_ids, Tensor sorted, Tensor splat_starts,
+                                                             OptionalTensor row_of_in, OptionalTensor backgrounds_in,
+                                                             Tensor alphas_in, OptionalTensor expected_in, Tensor last,
+                                                             OptionalTensor v_image_in, OptionalTensor v_alphas_in,
+                                                             std::vector<int64_t> image_dims, int64_t width, int64_t height,
+                                                             int64_t channels, int64_t depth_mode, bool absolute) {
   const CudaCall call(records);
   const PictureSize size(image_dims, width, height);
   for (const Tensor* t : {&isect_offsets, &splat_ids, &sorted, &splat_starts, &last}) call.ints(*t, "the lists");
   const Tensor conics = call.floats(conics_in, "conics"), alphas = call.floats(alphas_in, "alphas");
-  const OptionalTensor row_of = call.ints(row_of_in, "row_of"),
-                       backgrounds = call.floats(backgrounds_in, "backgrounds"),
-                       expected = call.floats(expected_in, "expected"),
-                       v_image = call.floats(v_image_in, "v_image"),
+  const OptionalTensor row_of = call.ints(row_of_in, "row_of"), backgrounds = call.floats(backgrounds_in, "backgrounds"),
+                       expected = call.floats(expected_in, "expected"), v_image = call.floats(v_image_in, "v_image"),
                        v_alphas = call.floats(v_alphas_in, "v_alphas");
   Scene scene = size.scene(records.size(0) / size.images);
   scene.channels = int32_t(channels);
@@ -35,13 +35,13 @@ std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(
   const int64_t splats = size.images * scene.gaussians, pixels = size.images * width * height, length = sorted.numel();
   const int64_t rows_of_splats = conics.numel() / 3;
   check(records.is_contiguous() && records.numel() == splats * kSplatFloats && splat_starts.numel() == splats + 1 &&
-                      isect_offsets.numel() == size.images * scene.tiles() && splat_ids.numel() == length &&
-                      (row_of ? row_of->numel() == splats : rows_of_splats == splats) && alphas.numel() == pixels &&
-                      last.numel() == pixels && (!v_alphas || v_alphas->numel() == pixels) &&
-                      (!v_image || v_image->numel() == pixels * scene.image_channels()) &&
-                      (!scene.expected || (expected && expected->numel() == pixels)) &&
-                      (!backgrounds || backgrounds->numel() == size.images * channels),
-                  "rasterize_splats_backward: the sizes of the inputs do not fit together");
+            isect_offsets.numel() == size.images * scene.tiles() && splat_ids.numel() == length &&
+            (row_of ? row_of->numel() == splats : rows_of_splats == splats) && alphas.numel() == pixels &&
+            last.numel() == pixels && (!v_alphas || v_alphas->numel() == pixels) &&
+            (!v_image || v_image->numel() == pixels * scene.image_channels()) &&
+            (!scene.expected || (expected && expected->numel() == pixels)) &&
+            (!backgrounds || backgrounds->numel() == size.images * channels),
+        "rasterize_splats_backward: the sizes of the inputs do not fit together");
   const Allocator memory(records);
   Sizes of_rows = sizes_of(conics);
   of_rows.back() = 2;
@@ -55,8 +55,8 @@ std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(
   lists.length = length;
   lists.tiles = size.images * scene.tiles();
   const Tensor rows = memory.floats({length, kSplatFloats});
-  const PictureGradient from = {data(v_image), data(v_alphas), data(alphas),
-                                scene.expected ? data(*expected) : nullptr, int_data(last)};
+  const PictureGradient from = {data(v_image), data(v_alphas), data(alphas), scene.expected ? data(*expected) : nullptr,
+                                int_data(last)};
   instance_gradients(scene, float_data(records), lists, from, absolute, float_data(rows), call.stream);
   const SplatSums out = {data(conics), row_of ? int_data(*row_of) : nullptr, float_data(v_splats), float_data(v_means2d),
                          absolute ? float_data(v_absolute) : nullptr};
@@ -79,22 +79,22 @@ std::vector<Tensor> rasterize_inputs_backward(Tensor means, OptionalTensor covar
   Scene& scene = inputs.scene;
   scene.depth = depth_mode != kNoDepth;
   enum { kMeans, kCovars, kQuats, kScales, kOpacities, kColors, kViewmats, kCenters, kInputs };
-  check(needs.size() == kInputs && gradients.size() == 5, "rasterize_inputs_backward: ", kInputs,
-                  " needs and 5 gradients are expected");
+  check(needs.size() == kInputs && gradients.size() == 5, "rasterize_inputs_backward: ", int(kInputs),
+        " needs and 5 gradients are expected");
   const Tensor radii = call.ints(radii_in, "radii");
   const OptionalTensor row_of = call.ints(row_of_in, "row_of");
   const int64_t splats = size.images * scene.gaussians;
   check(radii.numel() == 2 * splats && (!row_of || row_of->numel() == splats),
-                  "rasterize_inputs_backward: radii must be [images, N, 2] and row_of [images, N]");
+        "rasterize_inputs_backward: radii must be [images, N, 2] and row_of [images, N]");
   OptionalTensor v[5];
   constexpr int kColumns[5] = {kSplatFloats, 2, 1, 3, 1};
   for (int i = 0; i < 5; ++i) {
     v[i] = call.floats(gradients[size_t(i)], "a gradient");
     check(!v[i] || (row_of && i > 0) || v[i]->numel() == splats * kColumns[i],
-                    "rasterize_inputs_backward: the sizes of the gradients do not fit the inputs");
+          "rasterize_inputs_backward: the sizes of the gradients do not fit the inputs");
   }
-  const ProjectedGradients from = {int_data(radii), row_of ? int_data(*row_of) : nullptr, data(v[0]),
-                                   data(v[1]), data(v[2]), data(v[3]), data(v[4])};
+  const ProjectedGradients from = {
+      int_data(radii), row_of ? int_data(*row_of) : nullptr, data(v[0]), data(v[1]), data(v[2]), data(v[3]), data(v[4])};
   const Allocator memory(means);
   const OptionalTensor given[kInputs] = {means, covars, quats, scales, opacities, colors, viewmats, inputs.centers};
   std::vector<Tensor> out;
@@ -108,9 +108,9 @@ std::vector<Tensor> rasterize_inputs_backward(Tensor means, OptionalTensor covar
                "rasterize_inputs_backward");
   }
   const Tensor sums = memory.floats({views ? size.images * scene.blocks() + 1 : 0, kViewSums});
-  const InputGradients to = {float_data(out[kMeans]),     float_data(out[kCovars]),   float_data(out[kQuats]),
-                             float_data(out[kScales]),    float_data(out[kOpacities]), float_data(out[kColors]),
-                             float_data(sums),            float_data(out[kViewmats]), float_data(out[kCenters])};
+  const InputGradients to = {float_data(out[kMeans]),  float_data(out[kCovars]),    float_data(out[kQuats]),
+                             float_data(out[kScales]), float_data(out[kOpacities]), float_data(out[kColors]),
+                             float_data(sums),         float_data(out[kViewmats]),  float_data(out[kCenters])};
   input_gradients(scene, from, to, call.stream);
   call.finish("rasterize_inputs_backward");
   if (inputs.centers && views) out[kCenters] = torch::stable::view(out[kCenters], sizes_of(*inputs.centers));

@@ -38,7 +38,8 @@ __device__ inline void write_pixel(const Scene& scene, const Pixels& out, int64_
   if (scene.depth) to[scene.channels] = sum[3];
 }
 
-__global__ void __launch_bounds__(kBlockThreads, 8) blend_tiles(Scene scene, Splats splats, Lists lists, int tile_bits, Pixels out) {
+__global__ void __launch_bounds__(kBlockThreads, 8)
+    blend_tiles(Scene scene, Splats splats, Lists lists, int tile_bits, Pixels out) {
   wait_for_kernel_in_front();
   __shared__ BlendRoom<Stage> room;
   const int tiles = int(scene.tiles()), image = int(blockIdx.x) / tiles, tile = int(blockIdx.x) % tiles;
@@ -51,8 +52,8 @@ __global__ void __launch_bounds__(kBlockThreads, 8) blend_tiles(Scene scene, Spl
     const int32_t splat = lists.instance_splats[instance];
     if (lists.sorted != nullptr) lists.sorted[begin + i] = int32_t(instance);
     lists.flatten_ids[begin + i] = int32_t(first_splat + splat);
-    lists.isect_ids[begin + i] = int64_t(image) << (32 + tile_bits) | int64_t(tile) << 32 |
-                                 int64_t(__float_as_uint(splats.depths[first_splat + splat]));
+    lists.isect_ids[begin + i] =
+        int64_t(image) << (32 + tile_bits) | int64_t(tile) << 32 | int64_t(__float_as_uint(splats.depths[first_splat + splat]));
   }
   const int left = tile % scene.tile_width * kFrameTile, top = tile / scene.tile_width * kFrameTile;
   const Window w(begin, end, left, top, min(left + kFrameTile, scene.width), min(top + kFrameTile, scene.height));

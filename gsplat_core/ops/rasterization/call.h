@@ -25,8 +25,8 @@ class Allocator {
     }
     AtenTensorHandle handle = nullptr;
     check(aoti_torch_empty_strided(int64_t(sizes.size()), sizes.data(), strides.data(), int32_t(type),
-                                             aoti_torch_device_type_cuda(), device_, &handle) == 0,
-                    "torch could not allocate device memory");
+                                   aoti_torch_device_type_cuda(), device_, &handle) == 0,
+          "torch could not allocate device memory");
     return Tensor(handle);
   }
   Tensor floats(const Sizes& sizes) const { return empty(sizes); }

@@ -78,10 +78,15 @@ struct Pass {
   Tensor batch_ids, camera_ids, gaussian_ids, row_of, dense_radii, splat_ids;
 
   Pass(const CudaCall& call_, const Tensor& on, const Scene& scene_, const Sizes& image_dims_, bool packed_, bool training_)
-      : call(call_), memory(on), scene(scene_), image_dims(image_dims_), packed(packed_), training(training_),
+      : call(call_),
+        memory(on),
+        scene(scene_),
+        image_dims(image_dims_),
+        packed(packed_),
+        training(training_),
         none(memory.floats({0})) {
-    for (Tensor* t : {&opacities, &expected, &last, &sorted, &batch_ids, &camera_ids, &gaussian_ids, &row_of, &dense_radii,
-                      &splat_ids})
+    for (Tensor* t :
+         {&opacities, &expected, &last, &sorted, &batch_ids, &camera_ids, &gaussian_ids, &row_of, &dense_radii, &splat_ids})
       *t = none;
   }
 
@@ -102,8 +107,8 @@ struct Pass {
     if (own_opacities) opacities = memory.floats(of_images({n}));
     records = memory.floats({scene.images() * n, kSplatFloats});
     const ListScratch scratch(memory, scene, packed, call.stream);
-    const Splats splats = {float_data(means2d),  float_data(depths), float_data(conics),          float_data(opacities),
-                           int_data(radii), int_data(tiles_per_gauss), float_data(records)};
+    const Splats splats = {float_data(means2d), float_data(depths),        float_data(conics), float_data(opacities),
+                           int_data(radii),     int_data(tiles_per_gauss), float_data(records)};
     project(scene, splats, scratch.frame, call.stream);
 
     offsets = memory.ints({scene.images() * scene.tiles() + 1});
@@ -164,7 +169,9 @@ struct Pass {
     radii = memory.ints({rows, 2});
     tiles_per_gauss = memory.ints({rows});
     flatten_ids = memory.ints({lists.length});
-    const PackedSplats out = {long_data(batch_ids), long_data(camera_ids), long_data(gaussian_ids),
+    const PackedSplats out = {long_data(batch_ids),
+                              long_data(camera_ids),
+                              long_data(gaussian_ids),
                               {float_data(means2d), float_data(depths), float_data(conics), float_data(opacities),
                                int_data(radii), int_data(tiles_per_gauss), nullptr},
                               int_data(row_of)};
@@ -181,15 +188,14 @@ struct Pass {
       stride *= sizes[i];
     }
     AtenTensorHandle handle = nullptr;
-    check(aoti_torch__reinterpret_tensor(offsets.get(), int64_t(sizes.size()), sizes.data(), strides.data(), 0,
-                                                   &handle) == 0,
-                    "torch could not make a view");
+    check(aoti_torch__reinterpret_tensor(offsets.get(), int64_t(sizes.size()), sizes.data(), strides.data(), 0, &handle) == 0,
+          "torch could not make a view");
     return Tensor(handle);
   }
 
   std::vector<Tensor> outputs() const {
-    std::vector<Tensor> all = {image, alphas, means2d, depths, conics, opacities, radii, tiles_per_gauss, isect_offsets(),
-                               flatten_ids, isect_ids};
+    std::vector<Tensor> all = {image, alphas,          means2d,         depths,      conics,   opacities,
+                               radii, tiles_per_gauss, isect_offsets(), flatten_ids, isect_ids};
     if (packed) all.insert(all.end(), {batch_ids, camera_ids, gaussian_ids});
     if (training) all.insert(all.end(), {records, splat_starts, sorted, last, expected});
     if (training && packed) all.insert(all.end(), {row_of, dense_radii, splat_ids});

@@ -99,7 +99,8 @@ __device__ inline void start_copy(void* to, const void* from) {
 }
 
 // The coefficients of 32 Gaussians that a degree uses, in shared memory. A lane's row is an odd number of float4s from the next:
-// then eight lanes that read the same float4 of theirs meet in no bank. Rows in global memory may be longer than the degree needs.
+// then eight lanes that read the same float4 of theirs meet in no bank. Rows in global memory may be longer than the degree
+// needs.
 template <int degree>
 struct Coefficients {
   static constexpr int kUsed = 3 * kBasesOf<degree>, kQuads = (kUsed + 3) / 4, kStride = 4 * (kQuads | 1);

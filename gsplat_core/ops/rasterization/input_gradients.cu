@@ -182,7 +182,9 @@ struct WarpColors<kPlainColors> {
 // A block is of one batch: a thread has one Gaussian and goes through the cameras in their order. Of one camera (kOne) the
 // colours' gradient is written before the geometry's is computed, which needs fewer registers.
 template <int degree, bool kViews, bool kOne>
-__global__ void __launch_bounds__(kFrameThreads, kViews ? 1 : degree < 4 ? 4 : 2)
+__global__ void __launch_bounds__(kFrameThreads, kViews       ? 1
+                                                 : degree < 4 ? 4
+                                                              : 2)
     gradients_of_inputs(Scene scene, ProjectedGradients from, InputGradients to) {
   __shared__ float center[3];
   __shared__ WarpColors<degree> warps[kWarps];
@@ -286,7 +288,8 @@ void input_gradients(const Scene& scene, const ProjectedGradients& from, const I
       kernel<<<unsigned(blocks), kFrameThreads, 0, stream>>>(scene, from, to);
     });
   if (views && scene.images() > 0)
-    sum_over_blocks<<<unsigned(scene.images()), 32 * kViewSums, 0, stream>>>(to.view_sums, scene.blocks(), to.viewmats, to.centers);
+    sum_over_blocks<<<unsigned(scene.images()), 32 * kViewSums, 0, stream>>>(to.view_sums, scene.blocks(), to.viewmats,
+                                                                             to.centers);
 }
 
 }  // namespace gsplat::rasterization

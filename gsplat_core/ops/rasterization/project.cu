@@ -1,6 +1,6 @@
 // Projection, colours and tile counts of all splats, and the packed form of what projection returns.
-#include "../frame/frame_footprint.cuh"
 #include "../frame/frame_emit.cuh"
+#include "../frame/frame_footprint.cuh"
 #include "../frame/frame_launch.cuh"
 #include "gaussians.cuh"
 
@@ -25,7 +25,8 @@ template <>
 struct WarpColors<kPlainColors> {};
 
 template <int degree>
-__global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 7 : 4) project_splats(Scene scene, Splats out, FrameScratch scratch) {
+__global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 7 : 4)
+    project_splats(Scene scene, Splats out, FrameScratch scratch) {
   let_kernel_behind_come();
   __shared__ float camera[25], center[3];
   __shared__ WarpColors<degree> warps[kFrameThreads / 32];
@@ -91,9 +92,7 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 7 : 4) project_spl
     box.ellipse = ellipse_of_record(r.xyab, r.c, r.l);
     footprint = footprint_of(box);
   }
-  const auto count = [&](int tile, int) {
-    atomicAdd(scratch.slots + (image * scene.tiles() + tile) * scratch.slot_stride, 1u);
-  };
+  const auto count = [&](int tile, int) { atomicAdd(scratch.slots + (image * scene.tiles() + tile) * scratch.slot_stride, 1u); };
   for_small_tiles(footprint, scene.tile_width, count);
   uint32_t tiles = uint32_t(footprint.small_count());
   __syncwarp();  // the records of large footprints are written

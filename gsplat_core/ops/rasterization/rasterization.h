@@ -23,9 +23,9 @@ constexpr int kViewSums = 15;        // gradient of a camera: rotation by rows, 
 
 struct Scene {
   projection::ProjectionInput projection;  // of the first batch and camera
-  const float* colors;         // [batches or images, N, color_row]; null: not rendered
-  const float* centers;        // [images, 3], or null: of the view matrices
-  const float* backgrounds;    // [images, channels without depth], or null: black
+  const float* colors;                     // [batches or images, N, color_row]; null: not rendered
+  const float* centers;                    // [images, 3], or null: of the view matrices
+  const float* backgrounds;                // [images, channels without depth], or null: black
   int64_t gaussians;
   int32_t batches, cameras;
   int32_t degree;     // of the harmonics, or kPlainColors
@@ -37,7 +37,7 @@ struct Scene {
   int32_t width, height, tile_width, tile_height;
 
   constexpr int64_t images() const { return int64_t(batches) * cameras; }
-  constexpr int64_t tiles() const { return int64_t(tile_width) * tile_height; }  // of one image
+  constexpr int64_t tiles() const { return int64_t(tile_width) * tile_height; }      // of one image
   constexpr int64_t blocks() const { return blocks_for(gaussians, kFrameThreads); }  // of Gaussians, of one image
   constexpr int32_t image_channels() const { return channels + (depth ? 1 : 0); }
 };
@@ -66,14 +66,15 @@ struct Lists {
 };
 
 struct Pixels {
-  float* image;    // [images, H, W, image_channels]
-  float* alphas;   // [images, H, W]
-  float* depths;   // [images, H, W]: expected depth, for the gradient; or null
-  int32_t* last;   // [images, H, W]: position of the last instance blended, or -1; null where no gradient is wanted
+  float* image;   // [images, H, W, image_channels]
+  float* alphas;  // [images, H, W]
+  float* depths;  // [images, H, W]: expected depth, for the gradient; or null
+  int32_t* last;  // [images, H, W]: position of the last instance blended, or -1; null where no gradient is wanted
 };
 
 void project(const Scene& scene, const Splats& out, const FrameScratch& scratch, cudaStream_t stream);
-// Offsets and starts of the lists; status[kStatusNeeded] becomes their length. `scratch.sums` has one sum for each block of each image.
+// Offsets and starts of the lists; status[kStatusNeeded] becomes their length. `scratch.sums` has one sum for each block of each
+// image.
 void scan(const Scene& scene, const Lists& lists, int32_t* status, const FrameScratch& scratch, cudaStream_t stream);
 void fill(const Scene& scene, const Splats& splats, const Lists& lists, const FrameScratch& scratch, cudaStream_t stream);
 void blend(const Scene& scene, const Splats& splats, const Lists& lists, const Pixels& out, cudaStream_t stream);
@@ -81,8 +82,8 @@ void blend(const Scene& scene, const Splats& splats, const Lists& lists, const P
 // One row per visible splat, in the order of image and Gaussian: what gsplat calls packed.
 struct PackedSplats {
   int64_t *batch_ids, *camera_ids, *gaussian_ids;
-  Splats rows;           // without records
-  int32_t* row_of;       // [images, N]: the row of a splat, or -1
+  Splats rows;      // without records
+  int32_t* row_of;  // [images, N]: the row of a splat, or -1
 };
 // `visible` [images * blocks of Gaussians + 1] gets how many rows there are in front of each block; their number is the last.
 void count_visible(const Scene& scene, const Splats& splats, uint32_t* counts, cudaStream_t stream);
@@ -107,17 +108,18 @@ struct SplatSums {
 };
 void instance_gradients(const Scene& scene, const float* records, const Lists& lists, const PictureGradient& from, bool absolute,
                         float* rows, cudaStream_t stream);
-void splat_gradients(const Scene& scene, const int32_t* splat_starts, const float* rows, const SplatSums& out, cudaStream_t stream);
+void splat_gradients(const Scene& scene, const int32_t* splat_starts, const float* rows, const SplatSums& out,
+                     cudaStream_t stream);
 
 // From the splats' gradients to the inputs'. Null: none came, or none is wanted.
 struct ProjectedGradients {
-  const int32_t* radii;     // [images, N, 2]
-  const int32_t* row_of;    // [images, N], or null: row i is splat i
-  const float* v_splats;    // [images, N, kSplatFloats]
-  const float* v_means2d;   // [rows, 2]
-  const float* v_depths;    // [rows]
-  const float* v_conics;    // [rows, 3]
-  const float* v_opacities; // [rows], where antialiased
+  const int32_t* radii;      // [images, N, 2]
+  const int32_t* row_of;     // [images, N], or null: row i is splat i
+  const float* v_splats;     // [images, N, kSplatFloats]
+  const float* v_means2d;    // [rows, 2]
+  const float* v_depths;     // [rows]
+  const float* v_conics;     // [rows, 3]
+  const float* v_opacities;  // [rows], where antialiased
 };
 struct InputGradients {
   float *means, *covars, *quats, *scales, *opacities, *colors;

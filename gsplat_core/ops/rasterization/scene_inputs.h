@@ -19,7 +19,7 @@ struct PictureSize {
     for (const int64_t size : image_dims) images *= size;
     check(images > 0, "rasterize: there must be at least one camera");
     check(width > 0 && height > 0 && width <= kMostPixels && height <= kMostPixels, "rasterize: images must have 1 to ",
-                    kMostPixels, " pixels on a side, got ", width, " x ", height);
+          kMostPixels, " pixels on a side, got ", width, " x ", height);
     check(images * tile_width() * tile_height() < kMostInts / 32, "rasterize: too many tiles in all images");
   }
   int64_t tile_width() const { return (width + kFrameTile - 1) / kFrameTile; }
@@ -28,7 +28,7 @@ struct PictureSize {
   // What it says about a scene; all else is left empty.
   Scene scene(int64_t gaussians) const {
     check(gaussians * images <= kMostInts - 1, "rasterize takes at most 2^31 - 2 Gaussians times cameras, got ",
-                    gaussians * images);
+          gaussians * images);
     Scene s = {};
     s.gaussians = gaussians;
     s.cameras = int32_t(cameras);
@@ -63,19 +63,30 @@ struct SceneInputs {
         scene(size.scene(means_in.dim() >= 2 ? means_in.size(-2) : 0)) {
     const int64_t images = size.images, rows = images / size.cameras * scene.gaussians;
     const auto fits = [](const OptionalTensor& t, int64_t numbers) { return !t.has_value() || t->numel() == numbers; };
-    check(covars.has_value() != (quats.has_value() && scales.has_value()),
-                    "rasterize takes covars, or quats and scales");
+    check(covars.has_value() != (quats.has_value() && scales.has_value()), "rasterize takes covars, or quats and scales");
     check(means.numel() == 3 * rows && opacities.numel() == rows && fits(covars, 6 * rows) && fits(quats, 4 * rows) &&
-                        fits(scales, 3 * rows) && viewmats.numel() == 16 * images && intrinsics.numel() == 9 * images &&
-                        fits(centers, 3 * images),
-                    "rasterize: the sizes of the inputs do not fit together");
+              fits(scales, 3 * rows) && viewmats.numel() == 16 * images && intrinsics.numel() == 9 * images &&
+              fits(centers, 3 * images),
+          "rasterize: the sizes of the inputs do not fit together");
     check(camera_model >= 0 && camera_model <= 2, "rasterize: no camera model ", camera_model);
     scene.antialiased = antialiased;
     scene.degree = kPlainColors;
     if (colors) set_colors(degree, images, rows);
     projection::ProjectionInput& in = scene.projection;
-    in = {data(means), data(covars), data(quats), data(scales), data(opacities), data(viewmats),
-          data(intrinsics), float(size.width), float(size.height), float(eps2d), 0, 0, 0, projection::CameraModel(camera_model)};
+    in = {data(means),
+          data(covars),
+          data(quats),
+          data(scales),
+          data(opacities),
+          data(viewmats),
+          data(intrinsics),
+          float(size.width),
+          float(size.height),
+          float(eps2d),
+          0,
+          0,
+          0,
+          projection::CameraModel(camera_model)};
     scene.colors = data(colors);
     scene.centers = data(centers);
   }
@@ -85,14 +96,14 @@ struct SceneInputs {
     const bool harmonics = degree >= 0;
     const int64_t last = colors->dim() > 0 ? colors->size(-1) : 0, bases = harmonics && colors->dim() > 1 ? colors->size(-2) : 1;
     check(harmonics ? degree <= 4 && last == 3 && bases >= (degree + 1) * (degree + 1)
-                              : degree == kPlainColors && last >= 1 && last <= kMostPlainColors,
-                    "rasterize: colors must be [..., N, K, 3] with K >= (degree + 1)^2, or [..., N, 1 to 3] without a degree");
+                    : degree == kPlainColors && last >= 1 && last <= kMostPlainColors,
+          "rasterize: colors must be [..., N, K, 3] with K >= (degree + 1)^2, or [..., N, 1 to 3] without a degree");
     scene.degree = int32_t(degree);
     scene.color_row = int32_t(last * bases);
     scene.channels = int32_t(last);
     scene.colors_per_camera = colors->numel() != rows * scene.color_row;
     check(!scene.colors_per_camera || colors->numel() == images * scene.gaussians * scene.color_row,
-                    "rasterize: there must be colours for every Gaussian, or for every camera and Gaussian");
+          "rasterize: there must be colours for every Gaussian, or for every camera and Gaussian");
   }
 };
 

@@ -31,8 +31,7 @@ __device__ inline Pixel start_pixel(const Scene& scene, const PictureGradient& f
       if (alpha >= 1e-10f) v_left = fmaf(v_color[3], from.depths[pixel], v_left);
     }
     if (scene.backgrounds != nullptr)
-      for (int d = 0; d < scene.channels; ++d)
-        v_left = fmaf(v_color[d], scene.backgrounds[image * scene.channels + d], v_left);
+      for (int d = 0; d < scene.channels; ++d) v_left = fmaf(v_color[d], scene.backgrounds[image * scene.channels + d], v_left);
   }
   return {left, left * v_left, from.last[pixel]};
 }
@@ -64,7 +63,8 @@ __global__ void __launch_bounds__(kBlockThreads, 5)
   __shared__ BackwardStage<kChannels, kAbsolute> stage;
   const int tiles = int(scene.tiles()), image = int(blockIdx.x) / tiles, tile = int(blockIdx.x) % tiles;
   const int left = tile % scene.tile_width * kFrameTile, top = tile / scene.tile_width * kFrameTile;
-  const Window w(lists.begin(blockIdx.x), lists.begin(blockIdx.x + 1), left, top, min(left + kFrameTile, scene.width), min(top + kFrameTile, scene.height));
+  const Window w(lists.begin(blockIdx.x), lists.begin(blockIdx.x + 1), left, top, min(left + kFrameTile, scene.width),
+                 min(top + kFrameTile, scene.height));
   Pixel pixels[kPixelsEach];
   float v_color[kPixelsEach][kChannels] = {};
   for (int p = 0; p < kPixelsEach; ++p) {
@@ -93,7 +93,8 @@ __device__ inline float difference_of_products(float a, float b, float c, float 
 
 // Four lanes per splat, each with a float4 of the row. A splat with very many rows is left to the whole warp, in an order that
 // depends on their number alone.
-__global__ void __launch_bounds__(kThreads) sums_of_splats(int64_t splats, const int32_t* starts, const float4* rows, SplatSums out) {
+__global__ void __launch_bounds__(kThreads)
+    sums_of_splats(int64_t splats, const int32_t* starts, const float4* rows, SplatSums out) {
   constexpr int kMany = 64;
   const int64_t splat = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / 4;
   const int lane = threadIdx.x & 31, q = min(lane % 4, kRowFloat4s - 1);  // the fourth lane repeats the third
@@ -136,10 +137,12 @@ void instance_gradients(const Scene& scene, const float* records, const Lists& l
                                                         reinterpret_cast<float4*>(rows));
 }
 
-void splat_gradients(const Scene& scene, const int32_t* splat_starts, const float* rows, const SplatSums& out, cudaStream_t stream) {
+void splat_gradients(const Scene& scene, const int32_t* splat_starts, const float* rows, const SplatSums& out,
+                     cudaStream_t stream) {
   const int64_t splats = scene.images() * scene.gaussians;
   if (splats > 0)
-    sums_of_splats<<<blocks_for(4 * splats), kThreads, 0, stream>>>(splats, splat_starts, reinterpret_cast<const float4*>(rows), out);
+    sums_of_splats<<<blocks_for(4 * splats), kThreads, 0, stream>>>(splats, splat_starts, reinterpret_cast<const float4*>(rows),
+                                                                    out);
 }
 
 }  // namespace gsplat::rasterization
