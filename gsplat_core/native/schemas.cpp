@@ -71,22 +71,14 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
       "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 
-  // The whole of `rasterization()` (CUDA only): gsplat_core/ops/rasterization/rasterization.py names what the ops return.
+  // The whole of `rasterization()`, CUDA only: gsplat_core/ops/rasterization/rasterization.py names what is in the lists.
+  m.def("rasterize(Tensor?[] inputs, int[] image_dims, int[] options, float[] ranges, bool training) -> Tensor[]");
   m.def(
-      "rasterize(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor opacities, Tensor? colors, "
-      "Tensor viewmats, Tensor Ks, Tensor? centers, Tensor? backgrounds, int[] image_dims, int width, int height, "
-      "int camera_model, int degree, int depth_mode, bool antialiased, bool packed, bool training, float eps2d, "
-      "float near_plane, float far_plane, float radius_clip) -> Tensor[]");
+      "rasterize_splats_backward(Tensor?[] saved, Tensor? v_image, Tensor? v_alphas, int[] image_dims, int[] options, "
+      "float[] ranges) -> (Tensor v_records, Tensor v_means2d, Tensor v_absolute)");
   m.def(
-      "rasterize_splats_backward(Tensor records, Tensor conics, Tensor isect_offsets, Tensor splat_ids, Tensor sorted, "
-      "Tensor splat_starts, Tensor? row_of, Tensor? backgrounds, Tensor alphas, Tensor? expected, Tensor last, "
-      "Tensor? v_image, Tensor? v_alphas, int[] image_dims, int width, int height, int channels, int depth_mode, "
-      "bool absolute) -> (Tensor v_splats, Tensor v_means2d, Tensor v_absolute)");
-  m.def(
-      "rasterize_inputs_backward(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor opacities, "
-      "Tensor? colors, Tensor viewmats, Tensor Ks, Tensor? centers, Tensor radii, Tensor? row_of, Tensor?[] gradients, "
-      "int[] image_dims, int width, int height, int camera_model, int degree, int depth_mode, bool antialiased, float eps2d, "
-      "bool[] needs) -> Tensor[]");
+      "rasterize_inputs_backward(Tensor?[] inputs, Tensor radii, Tensor? row_of, Tensor?[] gradients, int[] image_dims, "
+      "int[] options, float[] ranges, bool[] needs) -> Tensor[]");
 
   // One frame from raw Gaussians (CUDA only): image [H, W, 4] with depth, and what its gradient needs.
   m.def(

@@ -15,6 +15,8 @@ from gsplat_core.ops.rasterization.rasterization import (
     NO_DEPTH,
     PLAIN_COLORS,
     Inputs,
+    Options,
+    Ranges,
     Rasterized,
     View,
     rasterize,
@@ -97,23 +99,18 @@ def _rasterize(arguments: Arguments, settings: RenderSettings) -> Rasterized:
     harmonics = settings.has_colors and settings.sh_degree is not None
     if harmonics and differentiable and viewmats.requires_grad:
         centers = camera_centers(viewmats)
-    view = View(
-        image_dims=tuple(viewmats.shape[:-2]),
+    options = Options(
         width=settings.width,
         height=settings.height,
         camera_model=CAMERA_MODELS.index(settings.camera_model),
         degree=settings.sh_degree if harmonics and settings.sh_degree is not None else PLAIN_COLORS,
-        channels=0 if not settings.has_colors else colors.shape[-1],
+        channels=colors.shape[-1] if settings.has_colors else 0,
         depth_mode=_DEPTH_MODES[settings.render_mode],
         antialiased=settings.rasterize_mode == "antialiased",
         packed=settings.packed,
         absgrad=settings.absgrad,
-        eps2d=settings.eps2d,
-        near_plane=settings.near_plane,
-        far_plane=settings.far_plane,
-        radius_clip=settings.radius_clip,
     )
-    inputs = Inputs(
-        means, triangles, quats, scales, opacities, colors if settings.has_colors else None, viewmats, Ks, centers
-    )
-    return rasterize(inputs, backgrounds, view, differentiable)
+    ranges = Ranges(settings.eps2d, settings.near_plane, settings.far_plane, settings.radius_clip)
+    shown = colors if settings.has_colors else None
+    inputs = Inputs(means, triangles, quats, scales, opacities, shown, viewmats, Ks, centers, backgrounds)
+    return rasterize(inputs, View(tuple(viewmats.shape[:-2]), options, ranges), differentiable)

@@ -13,26 +13,30 @@ Sizes sizes_of(const Tensor& t) {
   return sizes;
 }
 
-std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(Tensor records, Tensor conics_in, Tensor isect_offsets,
-                                                             Tensor splat_ids, Tensor sorted, Tensor splat_starts,
-                                                             OptionalTensor row_of_in, OptionalTensor backgrounds_in,
-                                                             Tensor alphas_in, OptionalTensor expected_in, Tensor last,
-                                                             OptionalTensor v_image_in, OptionalTensor v_alphas_in,
-                                                             std::vector<int64_t> image_dims, int64_t width, int64_t height,
-                                                             int64_t channels, int64_t depth_mode, bool absolute) {
+// What the forward pass left for the gradient: places in the list. `Saved` in rasterization.py has them in the same order.
+enum SavedTensor { kRecords, kConics, kOffsets, kSplatIds, kSorted, kStarts, kRowOf, kBehind, kAlphas, kExpected, kLast, kSaved };
+
+// The gradients of the splats' records and means2d, and the sums of |dL/dmeans2d|, which are empty if not asked for.
+std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(OptionalTensors saved, OptionalTensor v_image_in,
+                                                             OptionalTensor v_alphas_in, std::vector<int64_t> image_dims,
+                                                             std::vector<int64_t> options, std::vector<double> ranges) {
+  check(saved.size() == kSaved && saved[kRecords].has_value(), "rasterize_splats_backward takes ", int(kSaved), " tensors");
+  const Tensor records = *saved[kRecords];
   const CudaCall call(records);
-  const PictureSize size(image_dims, width, height);
-  for (const Tensor* t : {&isect_offsets, &splat_ids, &sorted, &splat_starts, &last}) call.ints(*t, "the lists");
-  const Tensor conics = call.floats(conics_in, "conics"), alphas = call.floats(alphas_in, "alphas");
-  const OptionalTensor row_of = call.ints(row_of_in, "row_of"), backgrounds = call.floats(backgrounds_in, "backgrounds"),
-                       expected = call.floats(expected_in, "expected"), v_image = call.floats(v_image_in, "v_image"),
+  const Request size(image_dims, options, ranges);
+  for (const SavedTensor i : {kConics, kOffsets, kSplatIds, kSorted, kStarts, kAlphas, kLast})
+    check(saved[i].has_value(), "rasterize_splats_backward: tensor ", int(i), " is missing");
+  const Tensor conics = call.floats(*saved[kConics], "conics"), alphas = call.floats(*saved[kAlphas], "alphas");
+  const Tensor isect_offsets = call.ints(*saved[kOffsets], "isect_offsets"),
+               splat_ids = call.ints(*saved[kSplatIds], "splat_ids"), sorted = call.ints(*saved[kSorted], "sorted"),
+               splat_starts = call.ints(*saved[kStarts], "splat_starts"), last = call.ints(*saved[kLast], "last");
+  const OptionalTensor row_of = call.ints(saved[kRowOf], "row_of"), backgrounds = call.floats(saved[kBehind], "backgrounds"),
+                       expected = call.floats(saved[kExpected], "expected"), v_image = call.floats(v_image_in, "v_image"),
                        v_alphas = call.floats(v_alphas_in, "v_alphas");
   Scene scene = size.scene(records.size(0) / size.images);
-  scene.channels = int32_t(channels);
-  scene.depth = depth_mode != kNoDepth;
-  scene.expected = depth_mode == kExpectedDepth;
   scene.backgrounds = data(backgrounds);
-  const int64_t splats = size.images * scene.gaussians, pixels = size.images * width * height, length = sorted.numel();
+  const bool absolute = options[kAbsolute] != 0;
+  const int64_t splats = size.images * scene.gaussians, pixels = size.pixels(), length = sorted.numel();
   const int64_t rows_of_splats = conics.numel() / 3;
   check(records.is_contiguous() && records.numel() == splats * kSplatFloats && splat_starts.numel() == splats + 1 &&
             isect_offsets.numel() == size.images * scene.tiles() && splat_ids.numel() == length &&
@@ -40,7 +44,7 @@ std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(Tensor records, Ten
             last.numel() == pixels && (!v_alphas || v_alphas->numel() == pixels) &&
             (!v_image || v_image->numel() == pixels * scene.image_channels()) &&
             (!scene.expected || (expected && expected->numel() == pixels)) &&
-            (!backgrounds || backgrounds->numel() == size.images * channels),
+            (!backgrounds || backgrounds->numel() == size.images * scene.channels),
         "rasterize_splats_backward: the sizes of the inputs do not fit together");
   const Allocator memory(records);
   Sizes of_rows = sizes_of(conics);
@@ -65,20 +69,14 @@ std::tuple<Tensor, Tensor, Tensor> rasterize_splats_backward(Tensor records, Ten
   return {v_splats, v_means2d, v_absolute};
 }
 
-// The inputs' gradients in their order; those that `needs` does not ask for are empty.
-std::vector<Tensor> rasterize_inputs_backward(Tensor means, OptionalTensor covars, OptionalTensor quats, OptionalTensor scales,
-                                              Tensor opacities, OptionalTensor colors, Tensor viewmats, Tensor intrinsics,
-                                              OptionalTensor centers, Tensor radii_in, OptionalTensor row_of_in,
-                                              std::vector<OptionalTensor> gradients, std::vector<int64_t> image_dims,
-                                              int64_t width, int64_t height, int64_t camera_model, int64_t degree,
-                                              int64_t depth_mode, bool antialiased, double eps2d, std::vector<bool> needs) {
-  const CudaCall call(means);
-  const PictureSize size(image_dims, width, height);
-  SceneInputs inputs(call, size, means, covars, quats, scales, opacities, colors, viewmats, intrinsics, centers, camera_model,
-                     degree, antialiased, eps2d);
-  Scene& scene = inputs.scene;
-  scene.depth = depth_mode != kNoDepth;
-  enum { kMeans, kCovars, kQuats, kScales, kOpacities, kColors, kViewmats, kCenters, kInputs };
+// The gradients of the inputs in their order; those that `needs` does not ask for are empty.
+std::vector<Tensor> rasterize_inputs_backward(OptionalTensors given, Tensor radii_in, OptionalTensor row_of_in,
+                                              OptionalTensors gradients, std::vector<int64_t> image_dims,
+                                              std::vector<int64_t> options, std::vector<double> ranges, std::vector<bool> needs) {
+  const CudaCall call(radii_in);
+  const Request size(image_dims, options, ranges);
+  const SceneInputs inputs(call, size, given);
+  const Scene& scene = inputs.scene;
   check(needs.size() == kInputs && gradients.size() == 5, "rasterize_inputs_backward: ", int(kInputs),
         " needs and 5 gradients are expected");
   const Tensor radii = call.ints(radii_in, "radii");
@@ -95,25 +93,25 @@ std::vector<Tensor> rasterize_inputs_backward(Tensor means, OptionalTensor covar
   }
   const ProjectedGradients from = {
       int_data(radii), row_of ? int_data(*row_of) : nullptr, data(v[0]), data(v[1]), data(v[2]), data(v[3]), data(v[4])};
-  const Allocator memory(means);
-  const OptionalTensor given[kInputs] = {means, covars, quats, scales, opacities, colors, viewmats, inputs.centers};
+  const Allocator memory(radii);
+  const auto gradient_of = [&](Input i, bool wanted) {
+    return memory.floats(wanted && inputs.tensors[i] ? sizes_of(*inputs.tensors[i]) : Sizes{0});
+  };
   std::vector<Tensor> out;
-  for (int i = 0; i < kInputs; ++i)
-    out.push_back(memory.floats(needs[size_t(i)] && given[i].has_value() ? sizes_of(*given[i]) : Sizes{0}));
   const bool views = needs[kViewmats] || needs[kCenters];
-  if (views) {
-    out[kViewmats] = memory.floats(sizes_of(viewmats));
-    out[kCenters] = memory.floats({size.images, 3});
+  for (int i = 0; i < kInputs; ++i) {
+    const bool has_none = i == kIntrinsics || i == kBackgrounds;
+    out.push_back(gradient_of(Input(i), !has_none && (needs[size_t(i)] || (views && (i == kViewmats || i == kCenters)))));
+  }
+  if (views)
     check_cuda(cudaMemsetAsync(float_data(out[kViewmats]), 0, size_t(out[kViewmats].numel()) * sizeof(float), call.stream),
                "rasterize_inputs_backward");
-  }
   const Tensor sums = memory.floats({views ? size.images * scene.blocks() + 1 : 0, kViewSums});
   const InputGradients to = {float_data(out[kMeans]),  float_data(out[kCovars]),    float_data(out[kQuats]),
                              float_data(out[kScales]), float_data(out[kOpacities]), float_data(out[kColors]),
                              float_data(sums),         float_data(out[kViewmats]),  float_data(out[kCenters])};
   input_gradients(scene, from, to, call.stream);
   call.finish("rasterize_inputs_backward");
-  if (inputs.centers && views) out[kCenters] = torch::stable::view(out[kCenters], sizes_of(*inputs.centers));
   return out;
 }
 

@@ -203,26 +203,14 @@ struct Pass {
   }
 };
 
-std::vector<Tensor> rasterize(Tensor means, OptionalTensor covars, OptionalTensor quats, OptionalTensor scales, Tensor opacities,
-                              OptionalTensor colors, Tensor viewmats, Tensor intrinsics, OptionalTensor centers,
-                              OptionalTensor backgrounds, std::vector<int64_t> image_dims, int64_t width, int64_t height,
-                              int64_t camera_model, int64_t degree, int64_t depth_mode, bool antialiased, bool packed,
-                              bool training, double eps2d, double near_plane, double far_plane, double radius_clip) {
+std::vector<Tensor> rasterize(OptionalTensors inputs, std::vector<int64_t> image_dims, std::vector<int64_t> options,
+                              std::vector<double> ranges, bool training) {
+  check(!inputs.empty() && inputs[kMeans].has_value(), "rasterize needs means");
+  const Tensor& means = *inputs[kMeans];
   const CudaCall call(means);
-  const PictureSize size(image_dims, width, height);
-  SceneInputs inputs(call, size, means, covars, quats, scales, opacities, colors, viewmats, intrinsics, centers, camera_model,
-                     degree, antialiased, eps2d);
-  Scene& scene = inputs.scene;
-  scene.projection.near_plane = float(near_plane);
-  scene.projection.far_plane = float(far_plane);
-  scene.projection.radius_clip = float(radius_clip);
-  scene.depth = depth_mode != kNoDepth;
-  scene.expected = depth_mode == kExpectedDepth;
-  check(scene.image_channels() > 0, "rasterize: there is neither a colour nor a depth to render");
-  const OptionalTensor behind = call.floats(backgrounds, "backgrounds");
-  check(!behind || behind->numel() == size.images * scene.channels, "rasterize: backgrounds must be [..., C, D]");
-  scene.backgrounds = data(behind);
-  Pass pass(call, means, scene, image_dims, packed, training);
+  const Request request(image_dims, options, ranges);
+  const SceneInputs scene(call, request, inputs);
+  Pass pass(call, means, scene.scene, image_dims, options[kPacked] != 0, training);
   pass.run();
   call.finish("rasterize");
   return pass.outputs();

@@ -269,7 +269,7 @@ __global__ void sum_over_blocks(const float* sums, int64_t blocks, float* viewma
   if (lane > 0) return;
   if (i < 12) {
     viewmats[image * 16 + (i < 9 ? i / 3 * 4 + i % 3 : (i - 9) * 4 + 3)] = float(total);
-  } else {
+  } else if (centers != nullptr) {
     centers[image * 3 + i - 12] = float(total);
   }
 }

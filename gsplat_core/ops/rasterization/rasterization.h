@@ -125,7 +125,7 @@ struct InputGradients {
   float *means, *covars, *quats, *scales, *opacities, *colors;
   float* view_sums;  // scratch: [images, blocks of Gaussians, kViewSums]
   float* viewmats;   // [images, 4, 4], zero before
-  float* centers;    // [images, 3]
+  float* centers;    // [images, 3]; null where they were computed from the matrices
 };
 void input_gradients(const Scene& scene, const ProjectedGradients& from, const InputGradients& to, cudaStream_t stream);
 

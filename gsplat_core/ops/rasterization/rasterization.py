@@ -28,11 +28,9 @@ _SPLATS_BACKWARD = torch.ops.gsplat_core.rasterize_splats_backward.default
 _INPUTS_BACKWARD = torch.ops.gsplat_core.rasterize_inputs_backward.default
 
 
-class View(NamedTuple):
-    """What is not a tensor."""
+class Options(NamedTuple):
+    """The op's list of integers."""
 
-    image_dims: tuple[int, ...]
-    """Batch dimensions and number of cameras."""
     width: int
     height: int
     camera_model: int
@@ -42,13 +40,28 @@ class View(NamedTuple):
     channels: int
     """Colours in the picture, 0 to 3."""
     depth_mode: int
-    antialiased: bool
-    packed: bool
-    absgrad: bool
+    antialiased: int
+    """1 or 0, like the next two."""
+    packed: int
+    absgrad: int
+
+
+class Ranges(NamedTuple):
+    """The op's list of numbers: blur in pixels², planes in the scene's unit, smallest radius in pixels."""
+
     eps2d: float
     near_plane: float
     far_plane: float
     radius_clip: float
+
+
+class View(NamedTuple):
+    """What is to be rendered, but for the tensors."""
+
+    image_dims: tuple[int, ...]
+    """Batch dimensions and number of cameras."""
+    options: Options
+    ranges: Ranges
 
 
 class Inputs(NamedTuple):
@@ -66,6 +79,31 @@ class Inputs(NamedTuple):
     Ks: Tensor
     centers: Tensor | None
     """[..., C, 3]: the cameras' centres, where their gradient is wanted; else they are computed from the matrices."""
+    backgrounds: Tensor | None
+    """[..., C, channels]."""
+
+
+class Saved(NamedTuple):
+    """What the forward pass leaves for the gradient of the picture."""
+
+    records: Tensor
+    """[images * N, 12]: the splats as the kernels keep them."""
+    conics: Tensor
+    isect_offsets: Tensor
+    splat_ids: Tensor
+    """int32 [M]: the tiles' lists; a splat is image * N + Gaussian."""
+    sorted: Tensor
+    """int32 [M]: for every entry of the lists which pair of splat and tile it is, counted in the order of the splats."""
+    splat_starts: Tensor
+    """int32 [images * N + 1]: where the pairs of each splat start."""
+    row_of: Tensor | None
+    """int32 [images * N]: the packed row of a splat or -1; None unless packed."""
+    backgrounds: Tensor | None
+    alphas: Tensor
+    expected: Tensor
+    """[..., C, H, W]: expected depth, where it is in the picture."""
+    last: Tensor
+    """int32 [..., C, H, W]: the last entry of the lists that a pixel blended, or -1."""
 
 
 class Rasterized(NamedTuple):
@@ -96,63 +134,52 @@ class _Call:
         self.view = view
         self.outputs: list[Tensor] = []
 
+    def left_for_gradients(self) -> list[Tensor]:
+        """records, splat_starts, sorted, last and expected; packed also row_of, the radii of all splats and splat_ids."""
+        return self.outputs[14 if self.view.options.packed else 11 :]
 
-def rasterize(inputs: Inputs, backgrounds: Tensor | None, view: View, differentiable: bool) -> Rasterized:
-    """Render; the caller has checked shapes, types and devices. `backgrounds`: [..., C, channels].
+
+def rasterize(inputs: Inputs, view: View, differentiable: bool) -> Rasterized:
+    """Render; the caller has checked shapes, types and devices.
 
     The host waits once, for the length of the tiles' lists. The same inputs give the same bits, forward and backward.
     """
     if not differentiable:
-        return _named(_run(inputs, backgrounds, view, False), view)
+        return _named(_FORWARD(inputs, *view, False), view)
     call = _Call(view)
-    means2d, depths, conics, opacities, records = _Project.apply(call, backgrounds, *inputs)
-    image, alphas = _Blend.apply(call, means2d, records, backgrounds)
+    means2d, depths, conics, opacities, records = _Project.apply(call, *inputs)
+    image, alphas = _Blend.apply(call, means2d, records, inputs.backgrounds)
     out = _named(call.outputs, view)
     return out._replace(image=image, alphas=alphas, means2d=means2d, depths=depths, conics=conics, opacities=opacities)
 
 
-def _run(inputs: tuple[Any, ...], backgrounds: Tensor | None, view: View, training: bool) -> list[Tensor]:
-    return _FORWARD(
-        *inputs, backgrounds, view.image_dims, view.width, view.height, view.camera_model, view.degree, view.depth_mode,
-        view.antialiased, view.packed, training, view.eps2d, view.near_plane, view.far_plane, view.radius_clip,
-    )  # fmt: skip
-
-
 def _named(outputs: list[Tensor], view: View) -> Rasterized:
-    return Rasterized(*outputs[: 14 if view.packed else 11])
+    return Rasterized(*outputs[: 14 if view.options.packed else 11])
 
 
 class _Project(Function):
     @staticmethod
-    def forward(ctx: Any, call: _Call, backgrounds: Tensor | None, *inputs: Any) -> tuple[Tensor, ...]:
-        view = call.view
-        call.outputs = out = _run(inputs, backgrounds, view, True)
-        ctx.view = view
+    def forward(ctx: Any, call: _Call, *inputs: Any) -> tuple[Tensor, ...]:
+        call.outputs = out = _FORWARD(inputs, *call.view, True)
+        ctx.view = call.view
         ctx.set_materialize_grads(False)
-        # records, splat_starts, sorted, last, expected, and packed: row_of, dense radii, splat_ids
-        own = out[14:] if view.packed else out[11:]
-        row_of, radii = (own[5], own[6]) if view.packed else (None, out[6])
+        own = call.left_for_gradients()
+        row_of, radii = (own[5], own[6]) if call.view.options.packed else (None, out[6])
         ctx.save_for_backward(*inputs, radii, row_of)
         return out[2], out[3], out[4], out[5], own[0]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
-        v_means2d, v_depths, v_conics, v_opacities, v_splats = v
-        view: View = ctx.view
-        needs = ctx.needs_input_grad
+        v_means2d, v_depths, v_conics, v_opacities, v_records = v
         *inputs, radii, row_of = ctx.saved_tensors
-        wanted = [*needs[2:8], needs[8], needs[10]]
-        if not view.channels:
-            wanted[5] = False
+        wanted = list(ctx.needs_input_grad[1:])
+        wanted[-1] = False  # the backgrounds' is the other node's
         if v_opacities is not None and not v_opacities.numel():
             v_opacities = None
-        out = _INPUTS_BACKWARD(
-            *inputs, radii, row_of, [v_splats, v_means2d, v_depths, v_conics, v_opacities], view.image_dims, view.width,
-            view.height, view.camera_model, view.degree, view.depth_mode, view.antialiased, view.eps2d, wanted,
-        )  # fmt: skip
-        g = [gradient if want else None for gradient, want in zip(out, wanted, strict=True)]
-        return None, None, *g[:7], None, g[7]
+        gradients = [v_records, v_means2d, v_depths, v_conics, v_opacities]
+        out = _INPUTS_BACKWARD(inputs, radii, row_of, gradients, *ctx.view, wanted)
+        return None, *(gradient if want else None for gradient, want in zip(out, wanted, strict=True))
 
 
 class _Blend(Function):
@@ -160,33 +187,29 @@ class _Blend(Function):
     def forward(
         ctx: Any, call: _Call, means2d: Tensor, records: Tensor, backgrounds: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        view, out = call.view, call.outputs
-        image, alphas = out[0], out[1]
-        own = out[14:] if view.packed else out[11:]
-        row_of, splat_ids = (own[5], own[7]) if view.packed else (None, out[9])
-        ctx.view = view
+        out, own, options = call.outputs, call.left_for_gradients(), call.view.options
+        ctx.view = call.view
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(
-            records, out[4], out[8], splat_ids, own[2], own[1], row_of, backgrounds, alphas, own[4], own[3],
-            means2d if view.absgrad else None,
+        row_of, splat_ids = (own[5], own[7]) if options.packed else (None, out[9])
+        saved = Saved(
+            records, conics=out[4], isect_offsets=out[8], splat_ids=splat_ids, sorted=own[2], splat_starts=own[1],
+            row_of=row_of, backgrounds=backgrounds, alphas=out[1], expected=own[4], last=own[3],
         )  # fmt: skip
-        return image, alphas
+        ctx.save_for_backward(*saved, means2d if options.absgrad else None)
+        return out[0], out[1]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None) -> tuple[Tensor | None, ...]:
-        view: View = ctx.view
-        *saved, means2d = ctx.saved_tensors
+        *tensors, means2d = ctx.saved_tensors
+        saved = Saved(*tensors)
         _, needs_means2d, needs_records, needs_backgrounds = ctx.needs_input_grad
         v_means2d = v_records = v_backgrounds = None
         if needs_backgrounds and v_image is not None:
-            alphas = saved[8]
-            v_backgrounds = (v_image[..., : view.channels] * (1 - alphas)).sum((-3, -2))
+            colors = v_image[..., : ctx.view.options.channels]
+            v_backgrounds = (colors * (1 - saved.alphas)).sum((-3, -2))
         if needs_means2d or needs_records:
-            v_records, v_means2d, absolute = _SPLATS_BACKWARD(
-                *saved, v_image, v_alphas, view.image_dims, view.width, view.height, view.channels, view.depth_mode,
-                view.absgrad,
-            )  # fmt: skip
+            v_records, v_means2d, absolute = _SPLATS_BACKWARD(saved, v_image, v_alphas, *ctx.view)
             if means2d is not None:
                 means2d.absgrad = absolute
         return None, v_means2d, v_records, v_backgrounds
@@ -194,59 +217,53 @@ class _Blend(Function):
 
 @torch.library.register_fake("gsplat_core::rasterize")
 def _fake(
-    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, opacities: Tensor,
-    colors: Tensor | None, viewmats: Tensor, Ks: Tensor, centers: Tensor | None, backgrounds: Tensor | None,
-    image_dims: list[int], width: int, height: int, camera_model: int, degree: int, depth_mode: int, antialiased: bool,
-    packed: bool, training: bool, eps2d: float, near_plane: float, far_plane: float, radius_clip: float,
-) -> list[Tensor]:  # fmt: skip
+    inputs: list[Tensor | None], image_dims: list[int], options: list[int], ranges: list[float], training: bool
+) -> list[Tensor]:
+    means, option = inputs[0], Options(*options)
+    assert means is not None
     n, size = means.shape[-2], torch.library.get_ctx().new_dynamic_size
     images, length = torch.Size(image_dims).numel(), size()
-    channels = 0 if colors is None else int(colors.shape[-1])
     floats = lambda *shape: means.new_empty(shape)
     ints = lambda *shape: means.new_empty(shape, dtype=torch.int32)
     longs = lambda *shape: means.new_empty(shape, dtype=torch.int64)
-    rows = (size(),) if packed else (*image_dims, n)
-    tiles = (-(-height // TILE_SIZE), -(-width // TILE_SIZE))
+    pixels = (*image_dims, option.height, option.width)
+    rows = (size(),) if option.packed else (*image_dims, n)
+    own_opacities = option.packed or option.antialiased
+    tiles = (-(-option.height // TILE_SIZE), -(-option.width // TILE_SIZE))
     out = [
-        floats(*image_dims, height, width, channels + (depth_mode != NO_DEPTH)), floats(*image_dims, height, width, 1),
-        floats(*rows, 2), floats(*rows), floats(*rows, 3), floats(*rows) if packed or antialiased else floats(0),
-        ints(*rows, 2), ints(*rows), ints(*image_dims, *tiles), ints(length), longs(length),
+        floats(*pixels, option.channels + (option.depth_mode != NO_DEPTH)), floats(*pixels, 1), floats(*rows, 2),
+        floats(*rows), floats(*rows, 3), floats(*rows) if own_opacities else floats(0), ints(*rows, 2), ints(*rows),
+        ints(*image_dims, *tiles), ints(length), longs(length),
     ]  # fmt: skip
-    if packed:
+    if option.packed:
         out += [longs(*rows) for _ in range(3)]
     if training:
-        expected = floats(*image_dims, height, width) if depth_mode == EXPECTED_DEPTH else floats(0)
-        out += [floats(images * n, 12), ints(images * n + 1), ints(length), ints(*image_dims, height, width), expected]
-    if training and packed:
+        expected = floats(*pixels) if option.depth_mode == EXPECTED_DEPTH else floats(0)
+        out += [floats(images * n, 12), ints(images * n + 1), ints(length), ints(*pixels), expected]
+    if training and option.packed:
         out += [ints(images * n), ints(*image_dims, n, 2), ints(length)]
     return out
 
 
 @torch.library.register_fake("gsplat_core::rasterize_splats_backward")
 def _fake_splats_backward(
-    records: Tensor, conics: Tensor, isect_offsets: Tensor, splat_ids: Tensor, sorted: Tensor, splat_starts: Tensor,
-    row_of: Tensor | None, backgrounds: Tensor | None, alphas: Tensor, expected: Tensor | None, last: Tensor,
-    v_image: Tensor | None, v_alphas: Tensor | None, image_dims: list[int], width: int, height: int, channels: int,
-    depth_mode: int, absolute: bool,
-) -> tuple[Tensor, ...]:  # fmt: skip
+    saved: list[Tensor | None], v_image: Tensor | None, v_alphas: Tensor | None, image_dims: list[int],
+    options: list[int], ranges: list[float],
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    records, conics = saved[:2]
+    assert records is not None and conics is not None
     rows = (*conics.shape[:-1], 2)
-    return records.new_empty(records.shape), conics.new_empty(rows), conics.new_empty(rows if absolute else (0,))
+    absolute = rows if Options(*options).absgrad else (0,)
+    return records.new_empty(records.shape), conics.new_empty(rows), conics.new_empty(absolute)
 
 
 @torch.library.register_fake("gsplat_core::rasterize_inputs_backward")
 def _fake_inputs_backward(
-    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, opacities: Tensor,
-    colors: Tensor | None, viewmats: Tensor, Ks: Tensor, centers: Tensor | None, radii: Tensor, row_of: Tensor | None,
-    gradients: list[Tensor | None], image_dims: list[int], width: int, height: int, camera_model: int, degree: int,
-    depth_mode: int, antialiased: bool, eps2d: float, needs: list[bool],
+    inputs: list[Tensor | None], radii: Tensor, row_of: Tensor | None, gradients: list[Tensor | None],
+    image_dims: list[int], options: list[int], ranges: list[float], needs: list[bool],
 ) -> list[Tensor]:  # fmt: skip
-    inputs = (means, covars, quats, scales, opacities, colors, viewmats, centers)
-    wanted = list(needs)
-    if wanted[6] or wanted[7]:
-        wanted[6] = True
-    out = [means.new_empty(t.shape if w and t is not None else (0,)) for t, w in zip(inputs, wanted, strict=True)]
-    if wanted[6] and centers is None:
-        out[7] = means.new_empty((torch.Size(image_dims).numel(), 3))
-    elif wanted[6] and centers is not None:
-        out[7] = centers.new_empty(centers.shape)
-    return out
+    wanted = dict(zip(Inputs._fields, needs, strict=True))
+    views = wanted["viewmats"] or wanted["centers"]
+    wanted |= {"viewmats": views, "centers": views, "Ks": False, "backgrounds": False}
+    empty = lambda t, want: radii.new_empty(t.shape if want and t is not None else (0,), dtype=torch.float32)
+    return [empty(t, want) for t, want in zip(inputs, wanted.values(), strict=True)]

@@ -1,4 +1,4 @@
-// The inputs of the op, checked, and what the kernels are told about them.
+// What the ops are given, checked, and what the kernels are told about it.
 #pragma once
 
 #include "call.h"
@@ -9,101 +9,117 @@ namespace gsplat::rasterization {
 constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
 enum DepthMode : int64_t { kNoDepth = 0, kDepthSum = 1, kExpectedDepth = 2 };
 
-// The size of the pictures: `image_dims` are the batch dimensions and the number of cameras.
-struct PictureSize {
-  int64_t images = 1, cameras, width, height;
+// Places in the lists that the ops take. `Inputs` and `View` in rasterization.py have them in the same order.
+enum Input { kMeans, kCovars, kQuats, kScales, kOpacities, kColors, kViewmats, kIntrinsics, kCenters, kBackgrounds, kInputs };
+enum Option { kWidth, kHeight, kCameraModel, kDegree, kChannels, kDepthMode, kAntialiased, kPacked, kAbsolute, kOptions };
+enum Range { kEps2d, kNearPlane, kFarPlane, kRadiusClip, kRanges };
 
-  PictureSize(const Sizes& image_dims, int64_t width_, int64_t height_)
-      : cameras(image_dims.empty() ? 0 : image_dims.back()), width(width_), height(height_) {
+using OptionalTensors = std::vector<OptionalTensor>;
+
+// What is to be rendered, but for the tensors. `image_dims` are the batch dimensions and the number of cameras.
+struct Request {
+  const Sizes image_dims;
+  const std::vector<int64_t> options;
+  const std::vector<double> ranges;
+  int64_t images = 1, cameras;
+
+  Request(const Sizes& image_dims_, const std::vector<int64_t>& options_, const std::vector<double>& ranges_)
+      : image_dims(image_dims_), options(options_), ranges(ranges_), cameras(image_dims_.empty() ? 0 : image_dims_.back()) {
+    check(options.size() == kOptions && ranges.size() == kRanges, "rasterize takes ", int(kOptions), " options and ",
+          int(kRanges), " ranges, got ", options.size(), " and ", ranges.size());
     constexpr int64_t kMostPixels = int64_t(kMostTilesAcross) * kFrameTile;
     for (const int64_t size : image_dims) images *= size;
-    check(images > 0, "rasterize: there must be at least one camera");
+    check(images > 0 && !image_dims.empty(), "rasterize: there must be at least one camera");
+    const int64_t width = options[kWidth], height = options[kHeight], channels = options[kChannels];
     check(width > 0 && height > 0 && width <= kMostPixels && height <= kMostPixels, "rasterize: images must have 1 to ",
           kMostPixels, " pixels on a side, got ", width, " x ", height);
     check(images * tile_width() * tile_height() < kMostInts / 32, "rasterize: too many tiles in all images");
+    check(options[kCameraModel] >= 0 && options[kCameraModel] <= 2, "rasterize: no camera model ", options[kCameraModel]);
+    check(options[kDepthMode] >= kNoDepth && options[kDepthMode] <= kExpectedDepth, "rasterize: no depth mode ",
+          options[kDepthMode]);
+    check(channels >= 0 && channels <= kMostPlainColors && (channels > 0 || options[kDepthMode] != kNoDepth),
+          "rasterize: a picture has 0 to 3 colours, and without any the depth; got ", channels);
   }
-  int64_t tile_width() const { return (width + kFrameTile - 1) / kFrameTile; }
-  int64_t tile_height() const { return (height + kFrameTile - 1) / kFrameTile; }
 
-  // What it says about a scene; all else is left empty.
+  int64_t tile_width() const { return (options[kWidth] + kFrameTile - 1) / kFrameTile; }
+  int64_t tile_height() const { return (options[kHeight] + kFrameTile - 1) / kFrameTile; }
+  int64_t pixels() const { return images * options[kWidth] * options[kHeight]; }
+
+  // All of the scene but the pointers.
   Scene scene(int64_t gaussians) const {
-    check(gaussians * images <= kMostInts - 1, "rasterize takes at most 2^31 - 2 Gaussians times cameras, got ",
-          gaussians * images);
+    check(gaussians * images < kMostInts, "rasterize takes at most 2^31 - 2 Gaussians times cameras, got ", gaussians * images);
     Scene s = {};
     s.gaussians = gaussians;
     s.cameras = int32_t(cameras);
     s.batches = int32_t(images / cameras);
-    s.width = int32_t(width);
-    s.height = int32_t(height);
+    s.width = int32_t(options[kWidth]);
+    s.height = int32_t(options[kHeight]);
     s.tile_width = int32_t(tile_width());
     s.tile_height = int32_t(tile_height());
+    s.degree = kPlainColors;
+    s.channels = int32_t(options[kChannels]);
+    s.depth = options[kDepthMode] != kNoDepth;
+    s.expected = options[kDepthMode] == kExpectedDepth;
+    s.antialiased = options[kAntialiased] != 0;
+    projection::ProjectionInput& in = s.projection;
+    in.width = float(s.width);
+    in.height = float(s.height);
+    in.eps2d = float(ranges[kEps2d]);
+    in.near_plane = float(ranges[kNearPlane]);
+    in.far_plane = float(ranges[kFarPlane]);
+    in.radius_clip = float(ranges[kRadiusClip]);
+    in.model = projection::CameraModel(options[kCameraModel]);
     return s;
   }
 };
 
-// Gaussians and cameras.
+// Gaussians, cameras and backgrounds: the checked tensors, which own the memory that `scene` points to.
 struct SceneInputs {
-  Tensor means, opacities, viewmats, intrinsics;
-  OptionalTensor covars, quats, scales, colors, centers;
+  OptionalTensors tensors;
   Scene scene;
 
-  SceneInputs(const CudaCall& call, const PictureSize& size, const Tensor& means_in, const OptionalTensor& covars_in,
-              const OptionalTensor& quats_in, const OptionalTensor& scales_in, const Tensor& opacities_in,
-              const OptionalTensor& colors_in, const Tensor& viewmats_in, const Tensor& intrinsics_in,
-              const OptionalTensor& centers_in, int64_t camera_model, int64_t degree, bool antialiased, double eps2d)
-      : means(call.floats(means_in, "means")),
-        opacities(call.floats(opacities_in, "opacities")),
-        viewmats(call.floats(viewmats_in, "viewmats")),
-        intrinsics(call.floats(intrinsics_in, "Ks")),
-        covars(call.floats(covars_in, "covars")),
-        quats(call.floats(quats_in, "quats")),
-        scales(call.floats(scales_in, "scales")),
-        colors(call.floats(colors_in, "colors")),
-        centers(call.floats(centers_in, "centers")),
-        scene(size.scene(means_in.dim() >= 2 ? means_in.size(-2) : 0)) {
-    const int64_t images = size.images, rows = images / size.cameras * scene.gaussians;
-    const auto fits = [](const OptionalTensor& t, int64_t numbers) { return !t.has_value() || t->numel() == numbers; };
-    check(covars.has_value() != (quats.has_value() && scales.has_value()), "rasterize takes covars, or quats and scales");
-    check(means.numel() == 3 * rows && opacities.numel() == rows && fits(covars, 6 * rows) && fits(quats, 4 * rows) &&
-              fits(scales, 3 * rows) && viewmats.numel() == 16 * images && intrinsics.numel() == 9 * images &&
-              fits(centers, 3 * images),
-          "rasterize: the sizes of the inputs do not fit together");
-    check(camera_model >= 0 && camera_model <= 2, "rasterize: no camera model ", camera_model);
-    scene.antialiased = antialiased;
-    scene.degree = kPlainColors;
-    if (colors) set_colors(degree, images, rows);
+  SceneInputs(const CudaCall& call, const Request& request, const OptionalTensors& given) : tensors(kInputs) {
+    constexpr const char* kNames[kInputs] = {"means",  "covars",   "quats", "scales",  "opacities",
+                                             "colors", "viewmats", "Ks",    "centers", "backgrounds"};
+    check(given.size() == kInputs, "rasterize takes ", int(kInputs), " tensors, got ", given.size());
+    for (size_t i = 0; i < kInputs; ++i) tensors[i] = call.floats(given[i], kNames[i]);
+    for (const Input i : {kMeans, kOpacities, kViewmats, kIntrinsics})
+      check(tensors[i].has_value(), "rasterize needs ", kNames[i]);
+    check(tensors[kCovars].has_value() != (tensors[kQuats].has_value() && tensors[kScales].has_value()),
+          "rasterize takes covars, or quats and scales");
+    scene = request.scene(tensors[kMeans]->dim() >= 2 ? tensors[kMeans]->size(-2) : 0);
+    const int64_t images = request.images, rows = images / request.cameras * scene.gaussians;
+    const auto fits = [&](Input i, int64_t numbers) {
+      check(!tensors[i] || tensors[i]->numel() == numbers, "rasterize: ", kNames[i], " must have ", numbers, " numbers for ",
+            scene.gaussians, " Gaussians and ", images, " images, got ", tensors[i] ? tensors[i]->numel() : 0);
+    };
+    fits(kMeans, 3 * rows), fits(kCovars, 6 * rows), fits(kQuats, 4 * rows), fits(kScales, 3 * rows), fits(kOpacities, rows);
+    fits(kViewmats, 16 * images), fits(kIntrinsics, 9 * images), fits(kCenters, 3 * images);
+    fits(kBackgrounds, images * scene.channels);
     projection::ProjectionInput& in = scene.projection;
-    in = {data(means),
-          data(covars),
-          data(quats),
-          data(scales),
-          data(opacities),
-          data(viewmats),
-          data(intrinsics),
-          float(size.width),
-          float(size.height),
-          float(eps2d),
-          0,
-          0,
-          0,
-          projection::CameraModel(camera_model)};
-    scene.colors = data(colors);
-    scene.centers = data(centers);
+    in.means = data(tensors[kMeans]), in.covars = data(tensors[kCovars]), in.quats = data(tensors[kQuats]);
+    in.scales = data(tensors[kScales]), in.opacities = data(tensors[kOpacities]);
+    in.viewmat = data(tensors[kViewmats]), in.intrinsics = data(tensors[kIntrinsics]);
+    scene.centers = data(tensors[kCenters]);
+    scene.backgrounds = data(tensors[kBackgrounds]);
+    check(tensors[kColors].has_value() == (scene.channels > 0), "rasterize needs colors, and no more than the picture has");
+    if (tensors[kColors]) set_colors(request.options[kDegree], images, rows);
   }
 
  private:
   void set_colors(int64_t degree, int64_t images, int64_t rows) {
+    const Tensor& colors = *tensors[kColors];
     const bool harmonics = degree >= 0;
-    const int64_t last = colors->dim() > 0 ? colors->size(-1) : 0, bases = harmonics && colors->dim() > 1 ? colors->size(-2) : 1;
-    check(harmonics ? degree <= 4 && last == 3 && bases >= (degree + 1) * (degree + 1)
-                    : degree == kPlainColors && last >= 1 && last <= kMostPlainColors,
-          "rasterize: colors must be [..., N, K, 3] with K >= (degree + 1)^2, or [..., N, 1 to 3] without a degree");
+    const int64_t last = colors.dim() > 0 ? colors.size(-1) : 0, bases = harmonics && colors.dim() > 1 ? colors.size(-2) : 1;
+    check(last == scene.channels &&
+              (harmonics ? degree <= 4 && last == 3 && bases >= (degree + 1) * (degree + 1) : degree == kPlainColors),
+          "rasterize: colors must be [..., N, K, 3] with K >= (degree + 1)^2, or [..., N, channels] without a degree");
     scene.degree = int32_t(degree);
     scene.color_row = int32_t(last * bases);
-    scene.channels = int32_t(last);
-    scene.colors_per_camera = colors->numel() != rows * scene.color_row;
-    check(!scene.colors_per_camera || colors->numel() == images * scene.gaussians * scene.color_row,
+    scene.colors_per_camera = colors.numel() != rows * scene.color_row;
+    check(!scene.colors_per_camera || colors.numel() == images * scene.gaussians * scene.color_row,
           "rasterize: there must be colours for every Gaussian, or for every camera and Gaussian");
+    scene.colors = data(colors);
   }
 };
 
