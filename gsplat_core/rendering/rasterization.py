@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -21,14 +22,15 @@ from gsplat_core.transfers import HostCopy
 
 __all__ = ["RenderOutput", "rasterization", "render"]
 
-rasterization = Operations(
+step_by_step = Operations(
     fully_fused_projection=fully_fused_projection,
     spherical_harmonics=spherical_harmonics,
     bin_splats=bin_splats,
     rasterize_to_pixels=rasterize_to_pixels,
     zero_gradients_stay_zero=True,
-    in_one_call=rasterize_in_one_call,
-).rasterization
+)
+"""The chain of compiled operations, on any device they run on."""
+rasterization = replace(step_by_step, in_one_call=rasterize_in_one_call).rasterization
 
 
 INSTANCES_PER_GAUSSIAN = 8
