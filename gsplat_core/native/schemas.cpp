@@ -71,6 +71,15 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
       "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 
+  // The whole of `rasterization()`, CUDA only: gsplat_core/ops/rasterization/rasterization.py names what is in the lists.
+  m.def("rasterize(Tensor?[] inputs, int[] image_dims, int[] options, float[] ranges, bool training) -> Tensor[]");
+  m.def(
+      "rasterize_splats_backward(Tensor?[] saved, Tensor? v_image, Tensor? v_alphas, int[] image_dims, int[] options, "
+      "float[] ranges) -> (Tensor v_records, Tensor v_means2d, Tensor v_absolute)");
+  m.def(
+      "rasterize_inputs_backward(Tensor?[] inputs, Tensor radii, Tensor? row_of, Tensor?[] gradients, int[] image_dims, "
+      "int[] options, float[] ranges, bool[] needs) -> Tensor[]");
+
   // One frame from raw Gaussians (CUDA only): image [H, W, 4] with depth, and what its gradient needs. gaussians: means, quats,
   // log_scales, logit_opacities, sh. mode: 0 tile lists in one buffer, 1 the same for training, 2 a segment per tile.
   m.def(
