@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -12,22 +13,24 @@ from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
 from gsplat_core.ops.frame.frame import STATUS_NEEDED, STATUS_OVERFLOW, View, render_frame
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
-from gsplat_core.ops.tiles.tiles import bin_splats, isect_tiles
+from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.rendering.pipeline import Operations
+from gsplat_core.rendering.single_call import rasterize_in_one_call
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.transfers import HostCopy
 
 __all__ = ["RenderOutput", "rasterization", "render"]
 
-rasterization = Operations(
+step_by_step = Operations(
     fully_fused_projection=fully_fused_projection,
     spherical_harmonics=spherical_harmonics,
-    isect_tiles=isect_tiles,
     bin_splats=bin_splats,
     rasterize_to_pixels=rasterize_to_pixels,
-    passes_no_zeros_on=True,
-).rasterization
+    zero_gradients_stay_zero=True,
+)
+"""The chain of compiled operations, on any device they run on."""
+rasterization = replace(step_by_step, in_one_call=rasterize_in_one_call).rasterization
 
 
 INSTANCES_PER_GAUSSIAN = 8

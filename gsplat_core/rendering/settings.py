@@ -1,9 +1,11 @@
-"""The options of `rasterization` that are no tensors, and which of gsplat's are refused."""
+"""The arguments of `rasterization`: its tensors, its options, and which of gsplat's are refused."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
+
+from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE
@@ -17,6 +19,20 @@ EPS2D = 0.3
 """Default blur, pixels² added to the diagonal of a splat's covariance."""
 TILE_SIZE = 16
 """Default side of a tile in pixels."""
+
+
+class Arguments(NamedTuple):
+    """The tensors that `rasterization` was given, unchecked."""
+
+    means: Tensor
+    quats: Tensor | None
+    scales: Tensor | None
+    opacities: Tensor
+    colors: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    backgrounds: Tensor | None
+    covars: Tensor | None
 
 
 @dataclass(frozen=True)
@@ -53,6 +69,11 @@ class RenderSettings:
     def has_colors(self) -> bool:
         """Whether colours are among the channels."""
         return self.render_mode.startswith("RGB")
+
+    @property
+    def tile_grid(self) -> tuple[int, int]:
+        """Tiles across and down."""
+        return -(-self.width // self.tile_size), -(-self.height // self.tile_size)
 
     @property
     def has_depth(self) -> bool:
