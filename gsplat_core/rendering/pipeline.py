@@ -129,7 +129,19 @@ class Operations(StepOperations):
         rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
         if rendered is not None:
             return _named_as_in_gsplat(rendered, arguments, settings)
-        return _step_by_step(self, arguments, settings)
+        image, splats = _step_by_step(self, arguments, settings)
+        ids = splats.rows[:3] if isinstance(splats.rows, PackedProjection) else (None, None, None)
+        keys = isect_ids_of(splats.flatten_ids, splats.isect_offsets, splats.rows.depths, math.prod(settings.tile_grid))
+        meta = _meta(splats, splats.rows, ids, splats.opacities, keys, settings, viewmats.shape[:-2])
+        return image, splats.alphas, meta
+
+    def pictures(self, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor]:
+        """The colours and alphas of `rasterization`, without what it computes for `meta` alone."""
+        rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
+        if rendered is not None:
+            return rendered.image, rendered.alphas
+        image, splats = _step_by_step(self, arguments, settings)
+        return image, splats.alphas
 
 
 def _named_as_in_gsplat(out: Rasterized, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor, Meta]:
@@ -142,7 +154,8 @@ def _named_as_in_gsplat(out: Rasterized, arguments: Arguments, settings: RenderS
     return out.image, out.alphas, meta
 
 
-def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor, Meta]:
+def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, RenderedSplats]:
+    """Colours and depth [..., C, H, W, X], and what was computed on the way."""
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars = arguments
     batch_dims, n_gaussians = _check_shapes(means, opacities, colors, viewmats, backgrounds, settings)
     if covars is not None:
@@ -159,11 +172,7 @@ def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSet
     if settings.render_mode.endswith("ED"):
         expected = image[..., -1:] / splats.alphas.clamp(min=1e-10)
         image = torch.cat([image[..., :-1], expected], -1) if settings.has_colors else expected
-    ids: tuple[Tensor | None, ...] = (None, None, None)
-    if isinstance(splats.rows, PackedProjection):
-        ids = splats.rows[:3]
-    keys = isect_ids_of(splats.flatten_ids, splats.isect_offsets, splats.rows.depths, math.prod(settings.tile_grid))
-    return image, splats.alphas, _meta(splats, splats.rows, ids, splats.opacities, keys, settings, viewmats.shape[:-2])
+    return image, splats
 
 
 def _meta(
