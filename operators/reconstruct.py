@@ -74,6 +74,6 @@ class ReconstructOp(Operator):
         # A held-out frame changes no parameter, but the model's time window now reaches it.
         self.newest = self._reconstructor.publish()
         op_output.emit(
-            Reconstruction(frame, self.newest, trained=train, steps=report.steps, loss=report.loss),
+            Reconstruction(frame, self.newest, trained=train, steps=report.steps, arriving_loss=report.arriving_loss),
             "reconstruction",
         )

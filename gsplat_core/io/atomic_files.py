@@ -47,7 +47,10 @@ class PartialFile:
         _unfinished.add(self.path)
 
     def finish(self) -> None:
-        """Force the file to the disk and give it its name; when that fails it is removed and the OSError passed on."""
+        """Force the file to the disk and give it its name; when that fails it is removed and the OSError passed on. Once it has its name, or was
+        discarded, nothing happens."""
+        if self.path not in _unfinished:
+            return
         try:
             self.file.flush()
             os.fsync(self.file.fileno())
@@ -63,7 +66,9 @@ class PartialFile:
         _unfinished.discard(self.path)
 
     def discard(self) -> None:
-        """Remove what was written."""
+        """Remove what was written, unless it has its name already."""
+        if self.path not in _unfinished:
+            return
         with contextlib.suppress(OSError):  # buffered bytes of a full disk: they are given up anyway
             self.file.close()
         self.path.unlink(missing_ok=True)

@@ -16,20 +16,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from gsplat_core.errors import InvalidInput
+from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import Recording, is_heldout, open_recording
+from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
+from operators.applications.delivery import Report, delivered
 from operators.applications.device import check_device, scheduler_for
 from operators.applications.execution import Execution
+from operators.applications.limits import check_picture, check_scale, check_seed, check_steps
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.result import RunOutcome
 from operators.deform import DeformOp
 from operators.graph import Application, Engine
 from operators.ingest import SourceOp
 from operators.metrics import MetricsOp, ScoredFrame
-from operators.output_folder import check_output_folder, claim_output_folder
 from operators.rasterize import RasterizeOp
 from operators.reconstruct import ReconstructOp
 from operators.sinks.display import CallbackSinkOp, VideoSinkOp
@@ -52,6 +54,8 @@ class ReplaySettings:
     device: str = "cpu"
     engine: Engine = "embedded"
     field: str = "auto"
+    renderer: str = "alpha"
+    """A name in `gsplat_core.rendering.registry.RENDERERS`."""
     seed: int = 0
     steps_per_frame: int | None = None
     """Optimiser steps per frame; None is the reconstructor's default."""
@@ -62,12 +66,16 @@ class ReplaySettings:
 
     def __post_init__(self) -> None:
         if self.engine not in get_args(Engine):
-            raise InvalidInput(f"engine is {self.engine!r}; choose {' or '.join(get_args(Engine))}")
-        if self.seed < 0:
-            raise InvalidInput(f"seed is {self.seed}; it must not be negative")
+            raise InvalidSetting(f"engine is {self.engine!r}; choose {' or '.join(get_args(Engine))}")
+        check_seed(self.seed)
+        check_scale(self.scale)
+        if self.steps_per_frame is not None:
+            check_steps("steps_per_frame", self.steps_per_frame)
+        if self.max_frames is not None and self.max_frames < 1:
+            raise InvalidSetting(f"max_frames must be at least 1, got {self.max_frames}")
 
     def reconstructor_config(self, pixels: int | None = None) -> ReconstructorConfig:
-        """The reconstructor's settings for frames of so many pixels. Raises InvalidInput."""
+        """The reconstructor's settings for frames of so many pixels. Raises InvalidSetting."""
         config = ReconstructorConfig(field=self.field)
         if pixels is not None:
             # More Gaussians than a quarter of the pixels have nothing to show.
@@ -113,7 +121,7 @@ class ReplayApplication(Application):
             self, name="reconstruct", make_reconstructor=self._make_reconstructor, held_out=self._held_out
         )
         self.deform = DeformOp(self, name="deform")
-        self.rasterize = RasterizeOp(self, name="rasterize")
+        self.rasterize = RasterizeOp(self, name="rasterize", renderer=self.settings.renderer)
         self.video = VideoSinkOp(self, name="video", path=self.video_path, fps=self.recording.fps, reserve=reserve)
         self.metrics = MetricsOp(self, name="metrics")
         self.keyframes = KeyframesOp(self, name="keyframes", count=KEYFRAMES)
@@ -160,38 +168,43 @@ def replay(
     settings: ReplaySettings,
     progress: ProgressCallback | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
+    report: Report | None = None,
 ) -> RunOutcome:
     """Run a replay and write `reconstruction.mp4` and `model/` into the output folder.
 
-    When `stop_requested` answers True the frames on their way are finished and everything is written; the outcome says so.
+    When `stop_requested` answers True the frames on their way are finished and everything is written; the outcome says so. `report` writes
+    what it makes of the outcome beside them (see `delivered`).
 
     Raises:
-        RecordingError, InvalidInput, DeviceMissing, OutputFolderInUse, StorageFull: before anything was written.
+        RecordingError, InvalidSetting, DeviceMissing, OutputError: before anything was written.
         RunFailed: the run ended early; what it had reached is saved, and the error carries the outcome.
     """
-    recording, notes = prepare(settings, "replay")
-    app = ReplayApplication(
-        recording, settings, video=settings.out / "reconstruction.mp4", progress=progress, stop_requested=stop_requested
-    )
-    return Execution(app, notes, stop_requested).execute()
+
+    def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
+        recording = prepare(inside, notes)
+        app = ReplayApplication(
+            recording, inside, video=inside.out / "reconstruction.mp4", progress=progress, stop_requested=stop_requested
+        )
+        return Execution(app, notes, stop_requested).execute()
+
+    return delivered(settings, "replay", run, report)
 
 
-def prepare(settings: ReplaySettings, made_by: str) -> tuple[Recording, list[str]]:
-    """Check everything that can be checked before the first frame, then claim the output folder; the recording and its notes.
+def prepare(settings: ReplaySettings, notes: list[str]) -> Recording:
+    """Check everything that can be checked before the first frame; returns the recording, and adds what is to be said about it to `notes`.
 
     Raises as `replay` does before anything is written.
     """
     check_device(settings.device)
-    settings.reconstructor_config()
-    check_output_folder(settings.out)
+    check_renderer(settings.renderer, settings.device)
+    config = settings.reconstructor_config()
     recording = open_recording(settings.recording, scale=settings.scale, max_frames=settings.max_frames)
-    notes = list(recording.notes)
+    check_picture(recording.camera, settings.scale)
+    notes.extend(recording.notes)
     if "depth" not in recording.fields:
         notes.append(
-            f"the recording has no depth: the scene starts on a plane {settings.reconstructor_config().default_depth_mm:g} mm away, and its"
+            f"the recording has no depth: the scene starts on a plane {config.default_depth_mm:g} mm away, and its"
             " depth has no measured scale"
         )
-    if claim_output_folder(settings.out, made_by):
-        notes.append("the output folder held an earlier run; this one replaces its files")
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
-    return recording, notes
+    return recording

@@ -143,12 +143,13 @@ def render(
     fps: Annotated[float, typer.Option(help="Frames per second of the model's time.")] = 30.0,
     scale: ScaleOption = 1.0,
     device: DeviceOption = "cpu",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a video that is there already.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Render a model over its time window to a video or to images."""
     from services.cli.render import render_command
 
-    return render_command(model, out, fps, scale, device, as_json=json)
+    return render_command(model, out, fps, scale, device, overwrite=overwrite, as_json=json)
 
 
 @app.command()

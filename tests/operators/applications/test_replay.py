@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsplat_core.errors import InvalidInput, RecordingMissing
+from gsplat_core.errors import InvalidSetting, RecordingMissing
 from gsplat_core.io.bundle import load_bundle
 from operators.applications import replay as replay_module
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.result import RunOutcome
-from operators.errors import DeviceMissing, OutputFolderInUse, RunFailed, StorageFull
+from operators.errors import DeviceMissing, OutputError, RunFailed, StorageFull
 from operators.graph import MultiThreadScheduler
 
 
@@ -111,14 +111,16 @@ def test_what_is_wrong_is_said_before_anything_is_written(tiny, tmp_path, monkey
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     out = tmp_path / "out"
     for error, settings in (
-        (RecordingMissing, ReplaySettings(tmp_path / "nowhere", out)),
-        (DeviceMissing, ReplaySettings(tiny, out, device="cuda")),
-        (InvalidInput, ReplaySettings(tiny, out, steps_per_frame=0)),
-        (InvalidInput, ReplaySettings(tiny, out, max_frames=0)),
-        (OutputFolderInUse, ReplaySettings(tiny, tiny)),
+        (RecordingMissing, {"recording": tmp_path / "nowhere"}),
+        (DeviceMissing, {"device": "cuda"}),
+        (InvalidSetting, {"steps_per_frame": 0}),
+        (InvalidSetting, {"max_frames": 0}),
+        (InvalidSetting, {"scale": 1e9}),
+        (InvalidSetting, {"seed": 2**64}),
+        (OutputError, {"out": tiny}),
     ):
         with pytest.raises(error):
-            replay(settings)
+            replay(ReplaySettings(**({"recording": tiny, "out": out} | settings)))
     assert not out.exists()
 
 
