@@ -92,7 +92,7 @@ class HexPlaneTraining:
             time: as for `deltas`.
             rates: float32 [2], of the planes and of the network.
             step: int64 [1], counts from 1.
-            status: int32 [4] of the frame; where status[2] is not 0 its lists were cut, and nothing but `v_raw` is changed.
+            status: int32 [4] of the frame; where status[2] is not 0 its splats did not fit the tile lists, and nothing but `v_raw` is changed.
         """
         gradient = self.gradient(v_raw)
         betas, epsilon = self._betas, self._epsilon
