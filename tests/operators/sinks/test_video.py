@@ -1,4 +1,4 @@
-"""Sinks: a video that is playable or not there, lossless images, a function."""
+"""The video of a run: playable or not there."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from operators.errors import OutputError, StorageFull
-from operators.sinks.display import CallbackSinkOp, ImageFolderSinkOp, VideoSinkOp
+from operators.outcome import OutcomeBuilder
+from operators.sinks.video import DisplayResult, VideoSinkOp
 from operators.storage import StorageReserve
 
 
@@ -87,21 +88,13 @@ def test_a_frame_of_another_size_is_refused(tmp_path, rendered, frame, compute):
     operator.stop()
 
 
-def test_images_are_lossless_and_numbered_by_frame(tmp_path, rendered, compute):
-    operator = ImageFolderSinkOp(None, folder=tmp_path / "images")
+def test_what_it_contributes(tmp_path, rendered, compute):
+    operator, outcome = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0), OutcomeBuilder()
+    operator.contribute(outcome)
+    assert outcome.find(DisplayResult) == DisplayResult(0) and outcome.outputs == {}
     operator.start()
-    shown = rendered(12)
-    compute(operator, rendered=shown)
-    read = cv2.imread(str(tmp_path / "images" / "000012.png"))[..., ::-1]
-    np.testing.assert_array_equal(read, shown.image)
-    assert [p.name for p in (tmp_path / "images").iterdir()] == ["000012.png"]
-
-
-def test_a_callback_gets_each_message(rendered, compute):
-    seen = []
-    operator = CallbackSinkOp(None, callback=seen.append)
-    operator.start()
-    messages = [rendered(k) for k in range(3)]
-    for message in messages:
-        compute(operator, message=message)
-    assert seen == messages and operator.displayed == 3
+    compute(operator, rendered=rendered(0))
+    operator.stop()
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    assert outcome.find(DisplayResult) == DisplayResult(1) and outcome.outputs == {"video": tmp_path / "out.mp4"}
