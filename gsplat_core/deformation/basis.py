@@ -19,13 +19,12 @@ import torch
 from torch import Tensor
 
 from gsplat_core.deformation.basis_adam import BasisRates, Moments
-from gsplat_core.deformation.field import DeformationField, checked_window, count_of
+from gsplat_core.deformation.field import DeformationField, checked_window, count_of, ops_for
 from gsplat_core.deformation.field_slots import BasisSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
 from gsplat_core.ops.basis_field.plain_torch import BUMP_REACH
-from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import BASIS_CHANNELS, BASIS_GROUPS, width_of
 
@@ -46,7 +45,7 @@ class BasisField(DeformationField):
     """
 
     kind = "basis"
-    has_frame_deltas = True
+    slot_type = BasisSlot
 
     def __init__(
         self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26, spacing_s: float | None = None
@@ -141,17 +140,14 @@ class BasisField(DeformationField):
         """
         moments = self._moments_in_use()
         self._ops.basis_field_backward_adam_(
-            gradient,
-            tau,
-            *(p.data for p in self._parameters_in_order()),
-            moments.first,
-            moments.second,
-            moments.steps,
-            rates,
-            beta1,
-            beta2,
-            epsilon,
-        )
+            gradient, tau, *(p.data for p in self._parameters_in_order()), moments.first, moments.second, moments.steps,
+            rates, beta1, beta2, epsilon,
+        )  # fmt: skip
+
+    @property
+    def has_frame_deltas(self) -> bool:
+        """Always."""
+        return True
 
     def frame_time(self, time_s: float) -> float:
         """What `frame_deltas` takes for a time: its `tau`."""
@@ -227,20 +223,6 @@ class BasisField(DeformationField):
         self._set_parameters(*(torch.cat([p.data, n]) for p, n in zip(self._parameters_in_order(), new, strict=True)))
         self._change_moments(lambda t: torch.cat([t, t.new_zeros(count, *t.shape[1:])]))
 
-    def slot(self, rows: int) -> BasisSlot:
-        """See `DeformationField.slot`; it has capacity for more bumps too."""
-        return BasisSlot(self, rows)
-
-    def adopt_layout(self, other: BasisField) -> None:
-        """Take over window, origin and spacing of the columns of `other`."""
-        self._time_window_s, self._origin_s, self._spacing_s = other._time_window_s, other._origin_s, other._spacing_s
-
-    def cropped(self, count: int, bumps: int) -> BasisField:
-        """A detached copy of the first `count` Gaussians and `bumps` columns."""
-        copied = self.detached_copy()
-        copied._set_parameters(*(p.data[:count, :bumps] for p in self._parameters_in_order()))
-        return copied
-
     def config(self) -> dict[str, Any]:
         """Kind, window and the layout of the columns."""
         return {
@@ -286,10 +268,7 @@ class BasisField(DeformationField):
 
     @property
     def _ops(self) -> ModuleType:
-        """The compiled ops where they exist, plain torch for other dtypes and devices."""
-        device = self.weights.device.type
-        has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
-        return compiled if has_kernels and self.weights.dtype == torch.float32 else plain_torch
+        return ops_for(self.weights, compiled, plain_torch)
 
     def _moments_in_use(self) -> Moments:
         if self._moments is None:

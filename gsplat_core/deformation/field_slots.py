@@ -38,7 +38,7 @@ class FieldSlot(Protocol):
 class WholeFieldSlot:
     """For a field without tensors per Gaussian: its tensors never change their shapes."""
 
-    def __init__(self, source: DeformationField) -> None:
+    def __init__(self, source: DeformationField, rows: int) -> None:
         self.field = source.detached_copy()
 
     def overwrite(self, source: DeformationField) -> bool:
@@ -84,9 +84,13 @@ class BasisSlot:
             if columns > bumps:
                 to[:, bumps:columns].fill_(inert)
         self._used = count, bumps
-        self.field.adopt_layout(source)
+        for name in ("_time_window_s", "_origin_s", "_spacing_s"):
+            setattr(self.field, name, getattr(source, name))
         return True
 
     def exact_copy(self) -> DeformationField:
         """A field of as many Gaussians and bumps as are in use."""
-        return self.field.cropped(*self._used)
+        count, bumps = self._used
+        copied = self.field.detached_copy()
+        copied._set_parameters(*(p.data[:count, :bumps] for p in copied._parameters_in_order()))
+        return copied

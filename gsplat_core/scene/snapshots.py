@@ -40,6 +40,8 @@ class SnapshotSlot:
         self._gaussians: Gaussians | None = None
         self._field: FieldSlot | None = None
         self._count = 0
+        self._in_use: list[Tensor] = []
+        """The first `_count` rows of every tensor."""
         self._holder: weakref.ref[Snapshot] | None = None
         self._order = _DeviceOrder(device)
 
@@ -74,18 +76,20 @@ class SnapshotSlot:
             return False
         if field is not None and self._field is not None and not self._field.overwrite(field):
             return False
-        count, mine, theirs = gaussians.count, self._gaussians.tensors(), gaussians.tensors()
-        for name, tensor in mine.items():
-            tensor[:count].copy_(theirs[name])
+        count = gaussians.count
         if self._count > count:
             self._gaussians.logit_opacities[count : self._count].fill_(-math.inf)
-        self._count = count
+        if self._count != count or not self._in_use:
+            self._in_use = [tensor[:count] for tensor in self._gaussians.tensors().values()]
+            self._count = count
+        for to, tensor in zip(self._in_use, gaussians.tensors().values(), strict=True):
+            to.copy_(tensor)
         return True
 
     def _replace(self, gaussians: Gaussians, field: DeformationField | None) -> None:
         rows = math.ceil(max(gaussians.count * ROW_HEADROOM, 1) / ROW_STEP) * ROW_STEP
         self._gaussians = _inert_gaussians(gaussians, rows)
-        self._count = 0
+        self._count, self._in_use = 0, []
         self._field = None if field is None else field.slot(rows)
         self.layout += 1
         written = self._overwrite(gaussians, field)
@@ -177,7 +181,7 @@ class SnapshotSlots:
     @staticmethod
     def can_hold(field: DeformationField | None) -> bool:
         """Whether snapshots of this kind of field can lie in slots."""
-        return field is None or type(field).slot is not DeformationField.slot
+        return field is None or field.slot_type is not None
 
     def publish(
         self,
@@ -197,9 +201,9 @@ class SnapshotSlots:
             raise InvalidInput(f"a {type(field).__name__} cannot lie in a slot; publish it as a Model")
         slot = self._free_slot()
         slot.write(gaussians, field)
-        tensors: list[Tensor] = [*gaussians.tensors().values()]
+        tensors = [*gaussians.tensors().values()]
         if field is not None:
-            tensors += field.state_dict(keep_vars=True).values()
+            tensors += [*field.parameters(), *field.buffers()]
         snapshot = Snapshot(
             slot,
             version=version,

@@ -27,7 +27,7 @@ from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.delivery import Report, delivered
 from operators.applications.device import check_device, scheduler_for
 from operators.applications.finishing import measures_baselines, saves_model
-from operators.applications.limits import check_picture, check_scale, check_seed, check_steps
+from operators.applications.limits import check_max_frames, check_picture, check_scale, check_seed, check_steps
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.result import RunOutcome, RunSettings
 from operators.applications.session import Session
@@ -80,8 +80,7 @@ class ReplaySettings:
         check_scale(self.scale)
         if self.steps_per_frame is not None:
             check_steps("steps_per_frame", self.steps_per_frame)
-        if self.max_frames is not None and self.max_frames < 1:
-            raise InvalidSetting(f"max_frames must be at least 1, got {self.max_frames}")
+        check_max_frames(self.max_frames)
         for name in self.sinks:
             SINKS.check(name)
 

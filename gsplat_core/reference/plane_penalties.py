@@ -1,4 +1,4 @@
-"""Penalties on feature planes [V, U, C], as in K-Planes (Fridovich-Keil et al. 2023, section 3.4).
+"""Penalties on feature planes [V, U, C], as in K-Planes (Fridovich-Keil et al. 2023, section 3.4): the oracle of `hexplane_planes_adam_`.
 
 A plane too small to differ along an axis has a penalty of 0 there, with zero gradient.
 """
