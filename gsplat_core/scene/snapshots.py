@@ -57,6 +57,12 @@ class SnapshotSlot:
         return None if self._field is None else self._field.field
 
     @property
+    def parameter_count(self) -> int:
+        """Numbers in all tensors of what was written last, without the spare capacity."""
+        own = sum(tensor[:1].numel() for tensor in self.gaussians.tensors().values()) * self._count
+        return own + (0 if self._field is None else self._field.parameter_count)
+
+    @property
     def is_free(self) -> bool:
         """Whether nobody holds the snapshot that lies here."""
         return self._holder is None or self._holder() is None
@@ -110,7 +116,6 @@ class Snapshot:
         camera: Camera,
         time_window_s: tuple[float, float],
         training_digest: str | None = None,
-        parameter_count: int,
     ) -> None:
         self.version = version
         """Counts up with every snapshot, from 1."""
@@ -119,7 +124,7 @@ class Snapshot:
         self.time_window_s = time_window_s
         """First and last time that the model has seen; other times show the nearest of these."""
         self.training_digest = training_digest
-        self.parameter_count = parameter_count
+        self.parameter_count = slot.parameter_count
         """Numbers in all tensors, without the slot's spare capacity."""
         self.slot = slot
         self.gaussian_count = slot._count
@@ -201,16 +206,12 @@ class SnapshotSlots:
             raise InvalidInput(f"a {type(field).__name__} cannot lie in a slot; publish it as a Model")
         slot = self._free_slot()
         slot.write(gaussians, field)
-        tensors = [*gaussians.tensors().values()]
-        if field is not None:
-            tensors += [*field.parameters(), *field.buffers()]
         snapshot = Snapshot(
             slot,
             version=version,
             camera=camera,
             time_window_s=time_window_s,
             training_digest=training_digest,
-            parameter_count=sum(tensor.numel() for tensor in tensors),
         )
         slot._holder = weakref.ref(snapshot)
         return snapshot
