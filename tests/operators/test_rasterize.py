@@ -21,7 +21,9 @@ def test_a_scene_made_from_a_frame_looks_like_it(frame, model, camera, compute):
     covered = shown.alpha > 0.5
     assert covered.mean() > 0.5
     np.testing.assert_allclose(shown.depth[covered], 50, atol=0.5)
-    assert np.abs(shown.image.astype(int) - frame().image)[covered].mean() < 60
+    error = np.abs(shown.image.astype(int) - frame().image)[covered].mean()
+    # 60 Gaussians for 384 pixels: 10 grey levels. The picture moved by two pixels scores 19, swapped channels 40, its mean colour 42.
+    assert error < 14
 
 
 def test_displayed_clips_and_rounds_to_nearest():
