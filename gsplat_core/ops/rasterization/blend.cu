@@ -1,11 +1,13 @@
 // The lists of the tiles, and the picture.
 #include "../compositing/blend_forward.cuh"
-#include "../frame/frame_launch.cuh"
-#include "../frame/frame_tile_sort.cuh"
+#include "../frame/tile_sort.cuh"
+#include "dependent_launch.cuh"
 #include "rasterization.h"
 
 namespace gsplat::rasterization {
 namespace {
+
+using namespace frame;
 
 using Splat = Record<4>;
 using Stage = ForwardStage<4>;
@@ -14,7 +16,7 @@ using Stage = ForwardStage<4>;
 struct TileSplats {
   const Splat* records;  // of the image
   const int32_t* instance_splats;
-  SortedNumbers sorted;
+  SortedIds sorted;
   int begin;
 
   __device__ Splat operator()(int position) const { return records[instance_splats[sorted[position - begin]]]; }
@@ -40,11 +42,11 @@ __device__ inline void write_pixel(const Scene& scene, const Pixels& out, int64_
 
 __global__ void __launch_bounds__(kBlockThreads, 8)
     blend_tiles(Scene scene, Splats splats, Lists lists, int tile_bits, Pixels out) {
-  wait_for_kernel_in_front();
-  __shared__ BlendRoom<Stage> room;
+  wait_for_preceding_kernel();
+  __shared__ BlendShared<Stage> shared;
   const int tiles = int(scene.tiles()), image = int(blockIdx.x) / tiles, tile = int(blockIdx.x) % tiles;
   const int begin = lists.begin(blockIdx.x), end = lists.begin(blockIdx.x + 1);
-  const SortedNumbers sorted = sort_tile(lists.keys + begin, end - begin, room);
+  const SortedIds sorted = sort_tile(lists.keys + begin, end - begin, shared);
   const int64_t first_splat = image * scene.gaussians;
   const Splat* const records = reinterpret_cast<const Splat*>(splats.records) + first_splat;
   for (int i = threadIdx.x; i < end - begin; i += kBlockThreads) {
@@ -55,10 +57,10 @@ __global__ void __launch_bounds__(kBlockThreads, 8)
     lists.isect_ids[begin + i] =
         int64_t(image) << (32 + tile_bits) | int64_t(tile) << 32 | int64_t(__float_as_uint(splats.depths[first_splat + splat]));
   }
-  const int left = tile % scene.tile_width * kFrameTile, top = tile / scene.tile_width * kFrameTile;
-  const Window w(begin, end, left, top, min(left + kFrameTile, scene.width), min(top + kFrameTile, scene.height));
+  const int left = tile % scene.tile_width * frame::kTile, top = tile / scene.tile_width * frame::kTile;
+  const Window w(begin, end, left, top, min(left + frame::kTile, scene.width), min(top + frame::kTile, scene.height));
   const TileSplats of_tile = {records, lists.instance_splats, sorted, begin};
-  BlendedPixels<4> pixels = blend_forward<4, false, true>(w, of_tile, room.stage);
+  BlendedPixels<4> pixels = blend_forward<4, false, true>(w, of_tile, shared.stage);
   for (int p = 0; p < kPixelsEach; ++p) {
     if (!w.inside[p]) continue;
     const int64_t pixel = (int64_t(image) * scene.height + w.y[p]) * scene.width + w.x;
@@ -67,44 +69,44 @@ __global__ void __launch_bounds__(kBlockThreads, 8)
 }
 
 // The frame path's view of the lists of one image, or of all.
-FrameScene frame_of(const Scene& scene, int64_t count, int64_t tile_rows) {
-  FrameScene frame = {};
-  frame.count = count;
-  frame.width = scene.width;
-  frame.height = scene.height;
-  frame.tile_width = scene.tile_width;
-  frame.tile_height = int32_t(tile_rows);
-  return frame;
+frame::Scene frame_of(const Scene& scene, int64_t count, int64_t tile_rows) {
+  frame::Scene of_frame = {};
+  of_frame.count = count;
+  of_frame.width = scene.width;
+  of_frame.height = scene.height;
+  of_frame.tile_width = scene.tile_width;
+  of_frame.tile_height = int32_t(tile_rows);
+  return of_frame;
 }
 
 }  // namespace
 
-void scan(const Scene& scene, const Lists& lists, int32_t* status, const FrameScratch& scratch, cudaStream_t stream) {
-  FrameLists frame = {};
-  frame.tile_offsets = lists.tile_offsets;
-  frame.status = status;
-  frame.capacity = (int64_t(1) << 31) - 1;
+void scan(const Scene& scene, const Lists& lists, int32_t* status, const frame::Scratch& scratch, cudaStream_t stream) {
+  frame::Lists frame_lists = {};
+  frame_lists.tile_offsets = lists.tile_offsets;
+  frame_lists.status = status;
+  frame_lists.capacity = (int64_t(1) << 31) - 1;
   // All images' tiles below one another, and as many Gaussians as there are threads: a block is of one image.
-  scan_frame(frame_of(scene, scene.images() * scene.blocks() * kFrameThreads, scene.images() * scene.tile_height), frame, scratch,
-             stream);
+  frame::scan(frame_of(scene, scene.images() * scene.blocks() * frame::kGaussianThreads, scene.images() * scene.tile_height),
+              frame_lists, scratch, stream);
 }
 
-void fill(const Scene& scene, const Splats& splats, const Lists& lists, const FrameScratch& scratch, cudaStream_t stream) {
+void fill(const Scene& scene, const Splats& splats, const Lists& lists, const frame::Scratch& scratch, cudaStream_t stream) {
   for (int64_t image = 0; image < scene.images(); ++image) {
     const int64_t first = image * scene.gaussians;
-    FrameLists frame = {};
-    frame.records = splats.records + first * kSplatFloats;
-    frame.tile_offsets = lists.tile_offsets;
-    frame.keys = lists.keys;
-    frame.splat_starts = lists.splat_starts + first;
-    frame.instance_splats = lists.instance_splats;
-    frame.capacity = lists.length;
-    FrameScratch of_image = scratch;
+    frame::Lists frame_lists = {};
+    frame_lists.records = splats.records + first * kSplatFloats;
+    frame_lists.tile_offsets = lists.tile_offsets;
+    frame_lists.keys = lists.keys;
+    frame_lists.splat_starts = lists.splat_starts + first;
+    frame_lists.instance_splats = lists.instance_splats;
+    frame_lists.capacity = lists.length;
+    frame::Scratch of_image = scratch;
     of_image.footprints += first;
     of_image.depths += first;
-    of_image.slots += image * scene.tiles() * scratch.slot_stride;
-    of_image.starts += image * scene.blocks();
-    fill_frame(frame_of(scene, scene.gaussians, scene.tile_height), frame, of_image, stream);
+    of_image.counters += image * scene.tiles() * scratch.counter_stride;
+    of_image.block_starts += image * scene.blocks();
+    frame::fill(frame_of(scene, scene.gaussians, scene.tile_height), frame_lists, of_image, stream);
   }
 }
 
@@ -113,7 +115,7 @@ void blend(const Scene& scene, const Splats& splats, const Lists& lists, const P
   if (tiles == 0) return;
   // As many bits as gsplat gives the tile: floor(log2(tiles)) + 1.
   const int tile_bits = 64 - __builtin_clzll(uint64_t(scene.tiles()));
-  launch_behind(blend_tiles, unsigned(tiles), kBlockThreads, stream, 0, scene, splats, lists, tile_bits, out);
+  launch_dependent(blend_tiles, unsigned(tiles), kBlockThreads, stream, 0, scene, splats, lists, tile_bits, out);
 }
 
 }  // namespace gsplat::rasterization

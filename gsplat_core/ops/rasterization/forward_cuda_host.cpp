@@ -9,8 +9,8 @@ constexpr int64_t kFewTiles = 4096;  // for so many a counter may have 128 bytes
 // Scratch memory that is needed until the length of the lists is known.
 struct ListScratch {
   Arena arena;
-  FrameScratch frame;
-  int32_t* status;           // [2, kStatusWords]: of the lists, and of the packed rows
+  frame::Scratch lists;
+  int32_t* status;           // [2, frame::kStatusSize]: of the lists, and of the packed rows
   uint32_t* visible_counts;  // [images * blocks], packed
   int32_t* visible_starts;   // [images * blocks + 1], packed
   uint64_t* visible_states;
@@ -19,9 +19,9 @@ struct ListScratch {
     const int64_t tiles = scene.images() * scene.tiles(), blocks = scene.images() * scene.blocks();
     const int64_t splats = scene.images() * scene.gaussians;
     const int32_t stride = tiles <= kFewTiles ? 32 : 8;
-    const int64_t states = scan_states(tiles, blocks), visible = packed ? scan_states(blocks, 0) : 0;
+    const int64_t states = frame::scan_state_count(tiles, blocks), visible = packed ? frame::scan_state_count(blocks, 0) : 0;
     const size_t zeros = arena.place<uint64_t>(states + visible + tiles * stride / 2);
-    const size_t zeros_end = arena.place<int32_t>(2 * kStatusWords), status_at = zeros_end;
+    const size_t zeros_end = arena.place<int32_t>(2 * frame::kStatusSize), status_at = zeros_end;
     const size_t footprints = arena.place<uint2>(splats), depths = arena.place<uint32_t>(splats);
     const size_t sums = arena.place<uint32_t>(blocks), starts = arena.place<uint32_t>(blocks);
     const size_t counts = arena.place<uint32_t>(packed ? blocks : 0), of_visible = arena.place<int32_t>(packed ? blocks + 1 : 0);
@@ -31,37 +31,37 @@ struct ListScratch {
     visible_starts = arena.at<int32_t>(of_visible);
     uint64_t* const first = arena.at<uint64_t>(zeros);
     visible_states = first + states;
-    frame = {.footprints = arena.at<uint2>(footprints),
+    lists = {.footprints = arena.at<uint2>(footprints),
              .depths = arena.at<uint32_t>(depths),
-             .slots = reinterpret_cast<uint32_t*>(visible_states + visible),
-             .states = first,
-             .sums = arena.at<uint32_t>(sums),
-             .starts = arena.at<uint32_t>(starts),
-             .slot_stride = stride};
+             .counters = reinterpret_cast<uint32_t*>(visible_states + visible),
+             .scan_states = first,
+             .block_counts = arena.at<uint32_t>(sums),
+             .block_starts = arena.at<uint32_t>(starts),
+             .counter_stride = stride};
     check_cuda(cudaMemsetAsync(first, 0, zeros_end - zeros, stream), "clearing the counts");
   }
 };
 
-// Counts the visible splats; their number becomes status[kStatusWords + kStatusNeeded].
+// Counts the visible splats; their number becomes status[frame::kStatusSize + frame::kStatusNeeded].
 void scan_visible(const Scene& scene, const Splats& splats, const ListScratch& scratch, cudaStream_t stream) {
   const int64_t blocks = scene.images() * scene.blocks();
   if (blocks == 0) {
-    check_cuda(cudaMemsetAsync(scratch.status + kStatusWords, 0, sizeof(int32_t), stream), "counting no splats");
+    check_cuda(cudaMemsetAsync(scratch.status + frame::kStatusSize, 0, sizeof(int32_t), stream), "counting no splats");
     return;
   }
   count_visible(scene, splats, scratch.visible_counts, stream);
-  FrameScene counters = {};
+  frame::Scene counters = {};
   counters.tile_width = int32_t(blocks);
   counters.tile_height = 1;
-  FrameLists lists = {};
+  frame::Lists lists = {};
   lists.tile_offsets = scratch.visible_starts;
-  lists.status = scratch.status + kStatusWords;
+  lists.status = scratch.status + frame::kStatusSize;
   lists.capacity = kMostInts;
-  FrameScratch of_counters = {};
-  of_counters.slots = scratch.visible_counts;
-  of_counters.states = scratch.visible_states;
-  of_counters.slot_stride = 1;
-  scan_frame(counters, lists, of_counters, stream);
+  frame::Scratch of_counters = {};
+  of_counters.counters = scratch.visible_counts;
+  of_counters.scan_states = scratch.visible_states;
+  of_counters.counter_stride = 1;
+  frame::scan(counters, lists, of_counters, stream);
 }
 
 // One forward pass: every tensor that it returns, in the order of `outputs`.
@@ -109,7 +109,7 @@ struct Pass {
     const ListScratch scratch(memory, scene, packed, call.stream);
     const Splats splats = {float_data(means2d), float_data(depths),        float_data(conics), float_data(opacities),
                            int_data(radii),     int_data(tiles_per_gauss), float_data(records)};
-    project(scene, splats, scratch.frame, call.stream);
+    project(scene, splats, scratch.lists, call.stream);
 
     offsets = memory.ints({scene.images() * scene.tiles() + 1});
     splat_starts = memory.ints({scene.images() * n + 1});
@@ -117,14 +117,14 @@ struct Pass {
     lists.tile_offsets = int_data(offsets);
     lists.splat_starts = int_data(splat_starts);
     lists.tiles = scene.images() * scene.tiles();
-    scan(scene, lists, scratch.status, scratch.frame, call.stream);
+    scan(scene, lists, scratch.status, scratch.lists, call.stream);
     if (packed) scan_visible(scene, splats, scratch, call.stream);
     PinnedWords& words = PinnedWords::of_thread();
-    words.read(scratch.status, 2 * kStatusWords, call.stream);
+    words.read(scratch.status, 2 * frame::kStatusSize, call.stream);
     const Pixels pixels = make_pixels();  // while the device is at work
     // The host waits here, once, for the lengths: what is returned is exactly as long.
     check_cuda(cudaStreamSynchronize(call.stream), "projecting the Gaussians");
-    lists.length = words[kStatusNeeded];
+    lists.length = words[frame::kStatusNeeded];
     check(lists.length < kMostInts, "the splats touch more than 2^31 - 2 tiles in all; render fewer images at a time");
 
     Arena of_lists;
@@ -140,9 +140,9 @@ struct Pass {
       sorted = memory.ints({lists.length});
       lists.sorted = int_data(sorted);
     }
-    fill(scene, splats, lists, scratch.frame, call.stream);
+    fill(scene, splats, lists, scratch.lists, call.stream);
     blend(scene, splats, lists, pixels, call.stream);
-    if (packed) pack_rows(splats, scratch, words[kStatusWords + kStatusNeeded], lists);
+    if (packed) pack_rows(splats, scratch, words[frame::kStatusSize + frame::kStatusNeeded], lists);
   }
 
   Pixels make_pixels() {

@@ -4,7 +4,7 @@
 namespace gsplat::rasterization {
 namespace {
 
-constexpr int kWarps = kFrameThreads / 32;
+constexpr int kWarps = frame::kGaussianThreads / 32;
 constexpr int kMoments = 6;
 
 // a b - c d without the loss of digits where they are nearly the same (Kahan; Jeannerod et al. 2013).
@@ -182,14 +182,14 @@ struct WarpColors<kPlainColors> {
 // A block is of one batch: a thread has one Gaussian and goes through the cameras in their order. Of one camera (kOne) the
 // colours' gradient is written before the geometry's is computed, which needs fewer registers.
 template <int degree, bool kViews, bool kOne>
-__global__ void __launch_bounds__(kFrameThreads, kViews       ? 1
-                                                 : degree < 4 ? 4
-                                                              : 2)
+__global__ void __launch_bounds__(frame::kGaussianThreads, kViews       ? 1
+                                                           : degree < 4 ? 4
+                                                                        : 2)
     gradients_of_inputs(Scene scene, ProjectedGradients from, InputGradients to) {
   __shared__ float center[3];
   __shared__ WarpColors<degree> warps[kWarps];
   const int64_t blocks = scene.blocks(), batch = blockIdx.x / blocks, block = blockIdx.x % blocks;
-  const int64_t n = block * kFrameThreads + threadIdx.x, N = scene.gaussians;
+  const int64_t n = block * frame::kGaussianThreads + threadIdx.x, N = scene.gaussians;
   const int lane = threadIdx.x % 32;
   const int64_t first = n - lane;
   const int count = int(N - first < 0 ? 0 : N - first < 32 ? N - first : 32);
@@ -285,7 +285,7 @@ void input_gradients(const Scene& scene, const ProjectedGradients& from, const I
       const auto kernel = views                ? gradients_of_inputs<kDegree, true, false>
                           : scene.cameras == 1 ? gradients_of_inputs<kDegree, false, true>
                                                : gradients_of_inputs<kDegree, false, false>;
-      kernel<<<unsigned(blocks), kFrameThreads, 0, stream>>>(scene, from, to);
+      kernel<<<unsigned(blocks), frame::kGaussianThreads, 0, stream>>>(scene, from, to);
     });
   if (views && scene.images() > 0)
     sum_over_blocks<<<unsigned(scene.images()), 32 * kViewSums, 0, stream>>>(to.view_sums, scene.blocks(), to.viewmats,

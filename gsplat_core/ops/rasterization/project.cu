@@ -1,11 +1,12 @@
 // Projection, colours and tile counts of all splats, and the packed form of what projection returns.
-#include "../frame/frame_emit.cuh"
-#include "../frame/frame_footprint.cuh"
-#include "../frame/frame_launch.cuh"
+#include "../frame/instances.cuh"
+#include "dependent_launch.cuh"
 #include "gaussians.cuh"
 
 namespace gsplat::rasterization {
 namespace {
+
+using namespace frame;
 
 __device__ inline Projected project_one(const ProjectionInput& in, const float* mean, const Geometry& geometry, float opacity,
                                         bool antialiased) {
@@ -25,13 +26,13 @@ template <>
 struct WarpColors<kPlainColors> {};
 
 template <int degree>
-__global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 7 : 4)
-    project_splats(Scene scene, Splats out, FrameScratch scratch) {
-  let_kernel_behind_come();
+__global__ void __launch_bounds__(frame::kGaussianThreads, degree < 4 ? 7 : 4)
+    project_splats(Scene scene, Splats out, frame::Scratch scratch) {
+  allow_dependent_launch();
   __shared__ float camera[25], center[3];
-  __shared__ WarpColors<degree> warps[kFrameThreads / 32];
+  __shared__ WarpColors<degree> warps[frame::kGaussianThreads / 32];
   const int64_t blocks = scene.blocks(), image = blockIdx.x / blocks, batch = image / scene.cameras;
-  const int64_t n = blockIdx.x % blocks * kFrameThreads + threadIdx.x, at = image * scene.gaussians + n;
+  const int64_t n = blockIdx.x % blocks * frame::kGaussianThreads + threadIdx.x, at = image * scene.gaussians + n;
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
   ProjectionInput in = seen_by(scene, batch, image);
   if (threadIdx.x < 25) camera[threadIdx.x] = threadIdx.x < 16 ? in.viewmat[threadIdx.x] : in.intrinsics[threadIdx.x - 16];
@@ -88,22 +89,24 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 7 : 4)
     for (int j = 0; j < 3; ++j) r.colors[j] = color[j];
     r.colors[3] = p.depth;
     reinterpret_cast<Record<4>*>(out.records)[at] = r;
-    TileBox box = box_around(p.u, p.v, p.radius_x, p.radius_y, kFrameTile, scene.tile_width, scene.tile_height);
+    TileBox box = box_around(p.u, p.v, p.radius_x, p.radius_y, frame::kTile, scene.tile_width, scene.tile_height);
     box.ellipse = ellipse_of_record(r.xyab, r.c, r.l);
     footprint = footprint_of(box);
   }
-  const auto count = [&](int tile, int) { atomicAdd(scratch.slots + (image * scene.tiles() + tile) * scratch.slot_stride, 1u); };
-  for_small_tiles(footprint, scene.tile_width, count);
+  const auto count = [&](int tile, int) {
+    atomicAdd(scratch.counters + (image * scene.tiles() + tile) * scratch.counter_stride, 1u);
+  };
+  for_each_small_tile(footprint, scene.tile_width, count);
   uint32_t tiles = uint32_t(footprint.small_count());
   __syncwarp();  // the records of large footprints are written
-  for_large_owners(footprint, [&](int owner) {
+  for_each_large(footprint, [&](int owner) {
     const Record<4>* const records = reinterpret_cast<const Record<4>*>(out.records) + image * scene.gaussians;
-    const int of_large = for_large_tiles(footprint, records, n, owner, scene.tile_width, count);
+    const int of_large = for_each_large_tile(footprint, records, n, owner, scene.tile_width, count);
     if (lane == owner) tiles = uint32_t(of_large);
   });
   __shared__ uint32_t of_warps[32];
   const uint32_t sum = sum_over_block(tiles, of_warps).all;
-  if (threadIdx.x == 0) scratch.sums[blockIdx.x] = sum;
+  if (threadIdx.x == 0) scratch.block_counts[blockIdx.x] = sum;
   if (n >= scene.gaussians) return;
   scratch.footprints[at] = make_uint2(footprint.x, footprint.y);
   scratch.depths[at] = __float_as_uint(p.depth);
@@ -116,17 +119,19 @@ __global__ void __launch_bounds__(kFrameThreads, degree < 4 ? 7 : 4)
   out.tiles_per_gauss[at] = int32_t(tiles);
 }
 
-__global__ void __launch_bounds__(kFrameThreads) count_visible_splats(Scene scene, const int32_t* radii, uint32_t* counts) {
-  const int64_t blocks = scene.blocks(), n = blockIdx.x % blocks * kFrameThreads + threadIdx.x;
+__global__ void __launch_bounds__(frame::kGaussianThreads)
+    count_visible_splats(Scene scene, const int32_t* radii, uint32_t* counts) {
+  const int64_t blocks = scene.blocks(), n = blockIdx.x % blocks * frame::kGaussianThreads + threadIdx.x;
   const bool visible = n < scene.gaussians && radii[2 * (blockIdx.x / blocks * scene.gaussians + n)] > 0;
   const int count = __syncthreads_count(visible);
   if (threadIdx.x == 0) counts[blockIdx.x] = uint32_t(count);
 }
 
-__global__ void __launch_bounds__(kFrameThreads)
+__global__ void __launch_bounds__(frame::kGaussianThreads)
     pack_splats(Scene scene, Splats splats, const int32_t* block_starts, PackedSplats out) {
   __shared__ uint32_t of_warps[32];
-  const int64_t blocks = scene.blocks(), image = blockIdx.x / blocks, n = blockIdx.x % blocks * kFrameThreads + threadIdx.x;
+  const int64_t blocks = scene.blocks(), image = blockIdx.x / blocks,
+                n = blockIdx.x % blocks * frame::kGaussianThreads + threadIdx.x;
   const int64_t at = image * scene.gaussians + n;
   const bool visible = n < scene.gaussians && splats.radii[2 * at] > 0;
   const int64_t row = block_starts[blockIdx.x] + int64_t(sum_over_block(visible, of_warps).before);
@@ -152,22 +157,22 @@ __global__ void renumber_splats(int64_t length, const int32_t* row_of, const int
 
 }  // namespace
 
-void project(const Scene& scene, const Splats& out, const FrameScratch& scratch, cudaStream_t stream) {
+void project(const Scene& scene, const Splats& out, const frame::Scratch& scratch, cudaStream_t stream) {
   const int64_t blocks = scene.images() * scene.blocks();
   if (blocks == 0) return;
   with_degree(scene.degree, [&](auto degree) {
-    project_splats<decltype(degree)::value><<<unsigned(blocks), kFrameThreads, 0, stream>>>(scene, out, scratch);
+    project_splats<decltype(degree)::value><<<unsigned(blocks), frame::kGaussianThreads, 0, stream>>>(scene, out, scratch);
   });
 }
 
 void count_visible(const Scene& scene, const Splats& splats, uint32_t* counts, cudaStream_t stream) {
   const int64_t blocks = scene.images() * scene.blocks();
-  if (blocks > 0) count_visible_splats<<<unsigned(blocks), kFrameThreads, 0, stream>>>(scene, splats.radii, counts);
+  if (blocks > 0) count_visible_splats<<<unsigned(blocks), frame::kGaussianThreads, 0, stream>>>(scene, splats.radii, counts);
 }
 
 void pack(const Scene& scene, const Splats& splats, const int32_t* block_starts, const PackedSplats& out, cudaStream_t stream) {
   const int64_t blocks = scene.images() * scene.blocks();
-  if (blocks > 0) pack_splats<<<unsigned(blocks), kFrameThreads, 0, stream>>>(scene, splats, block_starts, out);
+  if (blocks > 0) pack_splats<<<unsigned(blocks), frame::kGaussianThreads, 0, stream>>>(scene, splats, block_starts, out);
 }
 
 void renumber(int64_t length, const int32_t* row_of, const int32_t* from, int32_t* to, cudaStream_t stream) {

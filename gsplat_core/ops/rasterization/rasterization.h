@@ -10,7 +10,7 @@
 
 #include <cuda_runtime.h>
 
-#include "../frame/frame_cuda.h"
+#include "../frame/frame.h"
 #include "../projection/projection.h"
 #include "cuda_scratch.h"
 
@@ -37,8 +37,8 @@ struct Scene {
   int32_t width, height, tile_width, tile_height;
 
   constexpr int64_t images() const { return int64_t(batches) * cameras; }
-  constexpr int64_t tiles() const { return int64_t(tile_width) * tile_height; }      // of one image
-  constexpr int64_t blocks() const { return blocks_for(gaussians, kFrameThreads); }  // of Gaussians, of one image
+  constexpr int64_t tiles() const { return int64_t(tile_width) * tile_height; }                // of one image
+  constexpr int64_t blocks() const { return blocks_for(gaussians, frame::kGaussianThreads); }  // of Gaussians, of one image
   constexpr int32_t image_channels() const { return channels + (depth ? 1 : 0); }
 };
 
@@ -72,11 +72,11 @@ struct Pixels {
   int32_t* last;  // [images, H, W]: position of the last instance blended, or -1; null where no gradient is wanted
 };
 
-void project(const Scene& scene, const Splats& out, const FrameScratch& scratch, cudaStream_t stream);
-// Offsets and starts of the lists; status[kStatusNeeded] becomes their length. `scratch.sums` has one sum for each block of each
-// image.
-void scan(const Scene& scene, const Lists& lists, int32_t* status, const FrameScratch& scratch, cudaStream_t stream);
-void fill(const Scene& scene, const Splats& splats, const Lists& lists, const FrameScratch& scratch, cudaStream_t stream);
+void project(const Scene& scene, const Splats& out, const frame::Scratch& scratch, cudaStream_t stream);
+// Offsets and starts of the lists; status[frame::kStatusNeeded] becomes their length. `scratch.block_counts` has one sum for each
+// block of each image.
+void scan(const Scene& scene, const Lists& lists, int32_t* status, const frame::Scratch& scratch, cudaStream_t stream);
+void fill(const Scene& scene, const Splats& splats, const Lists& lists, const frame::Scratch& scratch, cudaStream_t stream);
 void blend(const Scene& scene, const Splats& splats, const Lists& lists, const Pixels& out, cudaStream_t stream);
 
 // One row per visible splat, in the order of image and Gaussian: what gsplat calls packed.

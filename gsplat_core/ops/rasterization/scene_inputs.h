@@ -27,7 +27,7 @@ struct Request {
       : image_dims(image_dims_), options(options_), ranges(ranges_), cameras(image_dims_.empty() ? 0 : image_dims_.back()) {
     check(options.size() == kOptions && ranges.size() == kRanges, "rasterize takes ", int(kOptions), " options and ",
           int(kRanges), " ranges, got ", options.size(), " and ", ranges.size());
-    constexpr int64_t kMostPixels = int64_t(kMostTilesAcross) * kFrameTile;
+    constexpr int64_t kMostPixels = int64_t(frame::kMaxTilesAcross) * frame::kTile;
     for (const int64_t size : image_dims) images *= size;
     check(images > 0 && !image_dims.empty(), "rasterize: there must be at least one camera");
     const int64_t width = options[kWidth], height = options[kHeight], channels = options[kChannels];
@@ -41,8 +41,8 @@ struct Request {
           "rasterize: a picture has 0 to 3 colours, and without any the depth; got ", channels);
   }
 
-  int64_t tile_width() const { return (options[kWidth] + kFrameTile - 1) / kFrameTile; }
-  int64_t tile_height() const { return (options[kHeight] + kFrameTile - 1) / kFrameTile; }
+  int64_t tile_width() const { return (options[kWidth] + frame::kTile - 1) / frame::kTile; }
+  int64_t tile_height() const { return (options[kHeight] + frame::kTile - 1) / frame::kTile; }
   int64_t pixels() const { return images * options[kWidth] * options[kHeight]; }
 
   // All of the scene but the pointers.

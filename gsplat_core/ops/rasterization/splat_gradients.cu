@@ -62,9 +62,9 @@ __global__ void __launch_bounds__(kBlockThreads, 5)
     gradients_of_instances(Scene scene, const Record<kChannels>* records, Lists lists, PictureGradient from, float4* rows) {
   __shared__ BackwardStage<kChannels, kAbsolute> stage;
   const int tiles = int(scene.tiles()), image = int(blockIdx.x) / tiles, tile = int(blockIdx.x) % tiles;
-  const int left = tile % scene.tile_width * kFrameTile, top = tile / scene.tile_width * kFrameTile;
-  const Window w(lists.begin(blockIdx.x), lists.begin(blockIdx.x + 1), left, top, min(left + kFrameTile, scene.width),
-                 min(top + kFrameTile, scene.height));
+  const int left = tile % scene.tile_width * frame::kTile, top = tile / scene.tile_width * frame::kTile;
+  const Window w(lists.begin(blockIdx.x), lists.begin(blockIdx.x + 1), left, top, min(left + frame::kTile, scene.width),
+                 min(top + frame::kTile, scene.height));
   Pixel pixels[kPixelsEach];
   float v_color[kPixelsEach][kChannels] = {};
   for (int p = 0; p < kPixelsEach; ++p) {
