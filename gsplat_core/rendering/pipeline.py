@@ -78,7 +78,10 @@ class Operations(StepOperations):
         rolling_shutter: Any = None,
         viewmats_rs: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Meta]:
-        """Render 3D Gaussians (Kerbl et al. 2023) with gsplat 1.5.3's arguments and results.
+        """Render 3D Gaussians (Kerbl et al. 2023) with gsplat 1.5.3's arguments, in its order, and its results.
+
+        Constants are those of gsplat 1.6, here and in all operations: alpha is at most 0.99, and the compensation for
+        antialiasing at least 0.005. gsplat 1.5.3 has 0.999 and 0; that is not offered.
 
         Shapes; `...` are any batch dimensions, the same everywhere:
             means [..., N, 3]; quats [..., N, 4] wxyz, of any length but zero; scales [..., N, 3]; opacities [..., N];
@@ -102,8 +105,11 @@ class Operations(StepOperations):
             covars: [..., N, 3, 3] in place of quats and scales.
             channel_chunk, segmented: accepted and without effect; neither changes the result.
 
+        On CUDA one native call per pass renders tiles of 16 px and spherical harmonics or up to 3 plain colours; the rest goes
+        through the chain of operations. Either way the host waits once, for the length of the tiles' lists.
+
         Returns:
-            render_colors [..., C, H, W, X], render_alphas [..., C, H, W, 1] and `meta` with batch_ids, camera_ids and
+            render_colors [..., C, H, W, X], render_alphas [..., C, H, W, 1] and `meta`, a dict with batch_ids, camera_ids and
             gaussian_ids (None unless packed), radii, means2d (call retain_grad() on it to see its gradient), depths,
             conics, opacities, tile_width, tile_height, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets, width,
             height, tile_size, n_batches and n_cameras.
