@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -21,6 +23,22 @@ def test_gradient_of_the_background(make_scene, mode):
         result, _ = run(function, scene, inputs(scene) | {"backgrounds": background}, render_mode=mode)
         found.append(result)
     assert_same(*found)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4, None])
+@pytest.mark.parametrize("bases", [16, 25])
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_of_the_gaussians_alone(make_scene, degree, bases, cameras):
+    degree = min(degree, math.isqrt(bases) - 1) if degree is not None else None
+    scene = make_scene(150, cameras=cameras, degree=4)
+    leaves = inputs(scene, colors=scene.sh[:, :bases] if degree is not None else scene.sh[:, 0])
+    leaves["viewmats"].requires_grad_(False)
+    options = {"sh_degree": degree, "packed": False, "render_mode": "RGB+ED"}
+    seen, _ = run(rasterization, scene, leaves, **options)
+    assert "viewmats" not in seen
+    assert_same(seen, run(step_by_step.rasterization, scene, leaves, **options)[0])
+    if degree is not None and (degree + 1) ** 2 < bases:
+        assert not seen["colors"][:, (degree + 1) ** 2 :].any()
 
 
 @pytest.mark.parametrize("wanted", [("means",), ("colors",), ("quats", "opacities"), ("viewmats",), ("scales",)])
