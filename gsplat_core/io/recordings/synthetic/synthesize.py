@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings.calibration import DEFAULT_FOCAL_FACTOR
-from gsplat_core.io.recordings.layouts import RECORDING_FORMAT, RECORDING_VERSION
+from gsplat_core.io.recordings.sidecars import RECORDING_FORMAT, RECORDING_VERSION
 from gsplat_core.io.recordings.synthetic.renderer import Eye, render_eye
 from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM, Tissue
 from gsplat_core.io.recordings.synthetic.tool import CYCLE_S, ToolMotion

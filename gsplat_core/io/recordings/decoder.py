@@ -1,0 +1,109 @@
+"""Decoding packet by packet, with everything that the decoder lets on about damage.
+
+One thread, so that results repeat and each complaint of the decoder belongs to the packet it was given. Where there is a choice of
+decoders, the one that checks most: FFmpeg's own decoder for VP9 hides nearly all damage, libvpx reports nearly all of it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from typing import cast
+
+import av
+import numpy as np
+from av.video.reformatter import Interpolation
+from numpy.typing import NDArray
+
+from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.io.recordings.packet_checks import packet_check
+
+_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9", "av1": "libdav1d"}
+_OPTIONS = {
+    # Every check that the decoders have; what they find is reported, and they go on with the next picture.
+    "err_detect": "crccheck+bitstream+buffer+careful+compliant+aggressive",
+    "max_pixels": str(MAX_PIXELS),
+}
+_STRICT = {"libdav1d": {"strict": "1"}}
+_QUARTER_TURNS = {90: 1, 180: 2, -180: 2, -90: 3, 270: 3}
+
+
+@contextmanager
+def captured_log() -> Iterator[list[tuple[int, str, str]]]:
+    """FFmpeg's error messages (level, who, text) of this thread, kept off the terminal."""
+    if av.logging.get_level() != av.logging.ERROR:
+        logger = logging.getLogger("libav")
+        logger.addHandler(logging.NullHandler())
+        logger.propagate = False
+        av.logging.set_level(av.logging.ERROR)
+    av.logging.set_skip_repeated(False)  # the same complaint about two packets counts twice
+    with av.logging.Capture() as messages:
+        yield messages
+
+
+class PictureDecoder:
+    """Decodes one stream, and says which packets are damaged."""
+
+    def __init__(self, stream: av.VideoStream) -> None:
+        known = stream.codec_context
+        name = known.codec.canonical_name
+        self.doubts: dict[int, str] = {}
+        """What spoke against a packet, by its number; whoever has dealt with a packet takes its entry out."""
+        self._check = packet_check(name, known.extradata)
+        if name in _DECODERS:
+            self._context = cast(av.VideoCodecContext, av.CodecContext.create(_DECODERS[name], "r"))
+            self._context.width, self._context.height = known.width, known.height
+            self._context.colorspace, self._context.color_range = known.colorspace, known.color_range
+            if known.extradata:
+                self._context.extradata = known.extradata
+        else:
+            self._context = known
+        self._context.thread_type = "NONE"
+        self._context.thread_count = 1
+        self._context.options = _OPTIONS | _STRICT.get(self._context.name, {})
+        flags = av.codec.context.Flags
+        # A damaged picture is handed out too: something must be shown in its place.
+        self._context.flags |= flags.copy_opaque | flags.output_corrupt
+
+    def decode(self, packet: av.Packet | None, number: int) -> list[tuple[int, av.VideoFrame]]:
+        """The frames that come out when a packet goes in, each with the number of its own packet; None at the end, for those that
+        are still inside."""
+        if packet is not None:
+            packet.opaque = number
+            if packet.is_corrupt:
+                self._doubt(number, "its packet is not complete")
+            elif self._check is not None and (wrong := self._check(bytes(packet))):
+                self._doubt(number, wrong)
+        with captured_log() as messages:
+            try:
+                frames = self._context.decode(packet)
+            except av.FFmpegError as error:
+                self._doubt(number, messages[0][2] if messages else error.strerror or str(error))
+                frames = []
+        if messages:
+            self._doubt(number, messages[0][2])
+        numbered = [(frame.opaque, frame) for frame in frames if isinstance(frame.opaque, int)]
+        for own, frame in numbered:
+            if frame.is_corrupt:
+                self._doubt(own, "the decoder marked it as damaged")
+        return numbered
+
+    def _doubt(self, number: int, what: str) -> None:
+        text = " ".join(what.split())
+        self.doubts.setdefault(number, text if text.isprintable() else ascii(text))
+
+
+def picture(frame: av.VideoFrame, rotation: int) -> NDArray[np.uint8]:
+    """RGB uint8 [H, W, 3]: the bytes that OpenCV gives for the same frame, turned upright."""
+    image = frame.to_ndarray(format="bgr24", interpolation=Interpolation.BICUBIC)[..., ::-1]
+    if turns := _QUARTER_TURNS.get(rotation, 0):
+        image = np.rot90(image, turns)
+    return np.ascontiguousarray(image)
+
+
+def frame_rate(stream: av.VideoStream) -> float:
+    """Frames per second as the container tells it; 0 where it does not."""
+    rate = stream.guessed_rate or stream.average_rate or Fraction(0)
+    return float(rate)
