@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from gsplat_core.io.recordings import Recording
-from gsplat_core.scene.frames import Frame
+from gsplat_core.io.recordings.decoded import DamagedFrames
+from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.graph import Operator, OperatorSpec
+
+log = logging.getLogger(__name__)
 
 
 class SourceOp(Operator):
@@ -32,6 +36,8 @@ class SourceOp(Operator):
         self.recording = recording
         self.stop_requested = stop_requested
         self.emitted = 0
+        self.damaged = DamagedFrames()
+        """Those of the emitted frames that are damaged."""
         self._frames: Iterator[Frame] = iter(())
         super().__init__(fragment, *args, **kwargs)
 
@@ -41,18 +47,28 @@ class SourceOp(Operator):
     def start(self) -> None:
         self._frames = iter(self.recording)
         self.emitted = 0
+        self.damaged = DamagedFrames()
 
     def stop(self) -> None:
         # A generator holds the video open until it is closed.
         close = getattr(self._frames, "close", None)
         if close is not None:
             close()
+        for note in self.notes:
+            log.warning("%s", note)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of the results must know about the frames."""
+        return (self.damaged.sentence(self.emitted),) if self.damaged.count else ()
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         frame = None if self.stop_requested() else next(self._frames, None)
         if frame is None:
             self.stop_execution()
             return
+        if frame.status is FrameStatus.DAMAGED:
+            self.damaged.add(frame.seq)
         self.metadata["seq"] = frame.seq
         self.metadata["pts_ns"] = frame.pts_ns
         op_output.emit(frame, "frame")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings.split import is_heldout
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.training.metrics import mean_of_scored, psnr_tissue_db
 
 
@@ -67,7 +67,7 @@ def measure_baselines(recording: Iterable[Frame]) -> Baselines:
             if is_heldout(index):
                 heldout_previous.append(value)
                 pending = frame, before
-        if not is_heldout(index):
+        if not is_heldout(index) and frame.status is not FrameStatus.DAMAGED:
             train_mean.add(frame.image)
         before = frame
     mean_image = train_mean.image()

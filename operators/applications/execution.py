@@ -148,7 +148,7 @@ class Execution:
             worst_seq=app.keyframes.worst_seq,
             model=self.fitted or app.reconstruct.model,
             frames_sha256=metrics.frames_sha256,
-            notes=(*self.notes, *app.tool_mask.notes),
+            notes=(*self.notes, *app.source.notes, *app.tool_mask.notes),
             outputs=self.outputs,
             peak_memory_bytes=peak_memory_bytes(),
         )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings import Recording, is_heldout
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.training.reconstructor import ObserveReport, Reconstructor
 from operators.applications.device import seeded
@@ -79,6 +79,10 @@ def reconstruct(
     return Execution(app, notes, stop_requested, command="reconstruct", fitted=model, start=start).execute()
 
 
+def _trains(frame: Frame) -> bool:
+    return not is_heldout(frame.seq) and frame.status is not FrameStatus.DAMAGED
+
+
 def _fit(
     learning: Reconstructor,
     recording: Recording,
@@ -99,5 +103,5 @@ def _fit(
             raise _StopFitting
 
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
-        learning.fit((frame for frame in recording if not is_heldout(frame.seq)), steps, after_step)
+        learning.fit((frame for frame in recording if _trains(frame)), steps, after_step)
     return done

@@ -27,6 +27,9 @@ _OPTIONS = {
     "max_pixels": str(MAX_PIXELS),
 }
 _STRICT = {"libdav1d": {"strict": "1"}}
+_WITHOUT_DELAY = frozenset({"vp8", "vp9", "av1", "mjpeg", "ffv1", "png", "huffyuv", "prores", "dnxhd"})
+"""A packet's picture comes out as the packet goes in."""
+NO_PICTURE = "the decoder gave no picture for it"
 _QUARTER_TURNS = {90: 1, 180: 2, -180: 2, -90: 3, 270: 3}
 
 
@@ -52,6 +55,7 @@ class PictureDecoder:
         self.doubts: dict[int, str] = {}
         """What spoke against a packet, by its number; whoever has dealt with a packet takes its entry out."""
         self._check = packet_check(name, known.extradata)
+        self._at_once = name in _WITHOUT_DELAY
         if name in _DECODERS:
             self._context = cast(av.VideoCodecContext, av.CodecContext.create(_DECODERS[name], "r"))
             self._context.width, self._context.height = known.width, known.height
@@ -67,9 +71,9 @@ class PictureDecoder:
         # A damaged picture is handed out too: something must be shown in its place.
         self._context.flags |= flags.copy_opaque | flags.output_corrupt
 
-    def decode(self, packet: av.Packet | None, number: int) -> list[tuple[int, av.VideoFrame]]:
+    def decode(self, packet: av.Packet | None, number: int, shown: bool) -> list[tuple[int, av.VideoFrame]]:
         """The frames that come out when a packet goes in, each with the number of its own packet; None at the end, for those that
-        are still inside."""
+        are still inside. `shown`: the packet has a picture to show."""
         if packet is not None:
             packet.opaque = number
             if packet.is_corrupt:
@@ -85,6 +89,8 @@ class PictureDecoder:
         if messages:
             self._doubt(number, messages[0][2])
         numbered = [(frame.opaque, frame) for frame in frames if isinstance(frame.opaque, int)]
+        if packet is not None and self._at_once and shown and number not in (own for own, _ in numbered):
+            self._doubt(number, NO_PICTURE)
         for own, frame in numbered:
             if frame.is_corrupt:
                 self._doubt(own, "the decoder marked it as damaged")

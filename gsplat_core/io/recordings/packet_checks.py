@@ -15,6 +15,9 @@ _H265_PICTURES = frozenset(range(32))
 # Inside a unit an encoder puts 3 after two zeros, so that none of these can occur (H.264 7.4.1, H.265 7.4.2.1).
 _FORBIDDEN = (b"\0\0\0", b"\0\0\1", b"\0\0\2")
 
+_HOLE_BYTES = 64
+"""So many zeros one after the other are a hole: arithmetic coding makes them of nothing but a large picture without any change."""
+
 PacketCheck = Callable[[bytes], str | None]
 """What is wrong with a packet's bytes; None for nothing."""
 
@@ -28,7 +31,13 @@ def packet_check(codec: str, extradata: bytes | None) -> PacketCheck | None:
             return lambda data: _check_units(data, width, pictures, kind)
     if codec == "mjpeg":
         return jpeg_damage
+    if codec in ("vp8", "vp9", "av1"):
+        return _check_hole
     return None
+
+
+def _check_hole(data: bytes) -> str | None:
+    return f"it holds a run of {_HOLE_BYTES} or more zeros" if bytes(_HOLE_BYTES) in data else None
 
 
 def is_shown(codec: str, data: bytes) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings.contents import Contents
-from gsplat_core.io.recordings.decoded import DamagedFrames
+from gsplat_core.io.recordings.decoded import DEPENDS, DamagedFrames
 from gsplat_core.io.recordings.findings import Findings, ValidationReport
 from gsplat_core.io.recordings.frame_files import resize_area, resize_nearest
 from gsplat_core.io.recordings.image_files import MAX_PIXELS
@@ -21,7 +21,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 MAX_REPORTED_PROBLEMS = 100
-_DAMAGE_ADVICE = "It is shown, but neither trained on nor scored; copy the file again from its source"
+_DAMAGE_ADVICE = "Damaged frames are shown, but neither trained on nor scored; copy the file again from its source"
 MIN_SCALED_SIDE_PX = 8
 """Shortest side that `scale` may lead to."""
 
@@ -147,7 +147,7 @@ def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
     contents = inspect(Path(path), findings)
     if contents is None:
         return ValidationReport({"path": str(path)}, findings.problems, findings.warnings)
-    decoded = intact = 0
+    decoded = intact = causes = 0
     tissue = 0.0
     damaged = DamagedFrames()
     for frame in contents.frames(findings):
@@ -159,13 +159,15 @@ def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
         decoded += 1
         if frame.status is FrameStatus.DAMAGED:
             damaged.add(frame.seq)
-            if damaged.count <= MAX_REPORTED_PROBLEMS:
+            causes += not str(frame.damage).startswith(DEPENDS)
+            if causes <= MAX_REPORTED_PROBLEMS and not str(frame.damage).startswith(DEPENDS):
                 findings.warn(f"{contents.root}, frame {frame.seq}", f"it is damaged: {frame.damage}", _DAMAGE_ADVICE)
         else:
             intact += 1
             tissue += 1.0 if frame.mask is None else float(frame.mask.mean())
-    if damaged.count > MAX_REPORTED_PROBLEMS:
-        findings.warn(contents.root, f"{damaged.count} frames are damaged ({damaged.numbers()})", _DAMAGE_ADVICE)
+    if damaged.count:
+        what = f"{damaged.count} frames are damaged, or may depend on damaged ones: {damaged.numbers()}"
+        findings.warn(contents.root, what, _DAMAGE_ADVICE)
     images, calibration = contents.images, contents.calibration
     facts: dict[str, object] = {
         "path": str(path),

@@ -9,8 +9,8 @@ from pathlib import Path
 import av
 
 from gsplat_core.io.recordings.containers import Container, UnusableContainer, recognise
-from gsplat_core.io.recordings.decoded import Picture
-from gsplat_core.io.recordings.decoder import PictureDecoder, captured_log, frame_rate, picture
+from gsplat_core.io.recordings.decoded import DEPENDS, Picture
+from gsplat_core.io.recordings.decoder import NO_PICTURE, PictureDecoder, captured_log, frame_rate, picture
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.image_files import MAX_PIXELS
 from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
@@ -20,7 +20,6 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
 _REENCODE = "Copy the file again from its source, or re-encode it (ffmpeg -i IN -c:v libx264 OUT.mp4)"
 _MOST_LATE = 64
 """Packets: no decoder holds a frame longer."""
-_NO_PICTURE = "the decoder gave no picture for it"
 
 
 class VideoFrames:
@@ -46,7 +45,7 @@ class VideoFrames:
             if self._index.ordered and position < due:
                 continue  # given twice, or after its time
             while self._index.ordered and due < position and last is not None:
-                yield Picture(last.image, _NO_PICTURE)
+                yield Picture(last.image, NO_PICTURE)
                 due += 1
             image, damage = decoded.image, decoded.damage
             if image.shape != (self.height_px, self.width_px, 3):
@@ -78,7 +77,7 @@ class VideoFrames:
         if first is not None:
             self.height_px, self.width_px = first.image.shape[:2]
             if self._index.ordered and position > 0:
-                return Picture(first.image, _NO_PICTURE)
+                return Picture(first.image, NO_PICTURE)
         return first
 
     def _decoded(self) -> Generator[tuple[int, Picture], None, None]:
@@ -87,7 +86,8 @@ class VideoFrames:
             decoder = PictureDecoder(stream)
             spread = DamageSpread(self._index)
             for number, packet in _numbered(container, stream):
-                frames = decoder.decode(packet, number)
+                shown = number < len(self._index.positions) and self._index.positions[number] >= 0
+                frames = decoder.decode(packet, number, shown)
                 spread.follow(decoder.doubts, number)
                 for own, frame in frames:
                     position = self._index.positions[own]
@@ -127,9 +127,9 @@ class DamageSpread:
             self._cause = self._cause or f"frame {position}: {own}"
             self._damage[number] = own
         elif self._cause is not None:
-            self._damage.setdefault(number, f"it may depend on a damaged frame ({self._cause})")
+            self._damage.setdefault(number, f"{DEPENDS} ({self._cause})")
         elif 0 <= position < self._before_position:
-            self._damage.setdefault(number, "it may depend on a damaged frame before the key frame that follows it")
+            self._damage.setdefault(number, f"{DEPENDS} before the key frame that follows it")
 
     def damage(self, number: int) -> str | None:
         """What is known against the picture of a packet; asked once."""
