@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-
 DEPENDS = "it may depend on a damaged frame"
 """How the damage of a picture begins that was decoded without error, from pictures with errors."""
 
