@@ -23,7 +23,7 @@ import gsplat_core
 from gsplat_core.ops.frame.frame import STATUS_MOST, STATUS_NEEDED, Frame, render_frame
 from gsplat_core.ops.frame.frame_gradients import RATES, render_frame_backward, render_frame_backward_adam_
 from gsplat_core.rendering.frame_renderer import FrameRenderer
-from gsplat_core.rendering.tile_capacity import ListRoom, capacity_for
+from gsplat_core.rendering.tile_capacity import TileListCapacity, capacity_for
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 
@@ -41,7 +41,7 @@ they are stored, as the peer's are; a training step of ours, whose Adam is in th
 
 
 class FramePath:
-    """The frame path on one scene, with as much room as its owner (`FrameRenderer`) would keep for it."""
+    """The frame path on one scene, with the list capacity that `FrameRenderer` would choose for it."""
 
     def __init__(self, scene: Scene, target: Tensor) -> None:
         self._gaussians = scene.raw()
@@ -50,7 +50,7 @@ class FramePath:
         self._capacity = 1 << 16
         status = self._training().status.tolist()
         self.instances, self.most_in_a_tile = status[STATUS_NEEDED], status[STATUS_MOST]
-        self._room = ListRoom.for_frame(self.instances, self.most_in_a_tile)
+        self._lists = TileListCapacity.for_frame(self.instances, self.most_in_a_tile)
         self._capacity = capacity_for(self.instances)
 
     def forward(self) -> Frame:
@@ -85,8 +85,8 @@ class FramePath:
 
     def _render(self, sh: Tensor) -> Frame:
         return render_frame(
-            *self._gaussians[:4], sh, None, *self._camera, None, *self._size, self._room.capacity,
-            per_tile=self._room.per_tile,
+            *self._gaussians[:4], sh, None, *self._camera, None, *self._size, self._lists.capacity,
+            per_tile=self._lists.per_tile,
         )  # fmt: skip
 
     def _training(self) -> Frame:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.gaussians import MAX_SH_DEGREE
 
 
 def require_shape(name: str, tensor: Tensor, shape: tuple[int, ...], meaning: str) -> None:
@@ -60,3 +61,37 @@ def require_kernels(op: str, name: str, tensor: Tensor) -> None:
         f"{op}: {name} is on {tensor.device}, and this build has kernels for the CPU {why}; move it with .cpu(), or use"
         " gsplat_core.reference, which runs on any device"
     )
+
+
+def check_covariance_arguments(quats: Tensor, scales: Tensor) -> None:
+    """Raise InvalidInput unless quats are [..., 4] and scales [..., 3], of one dtype and device."""
+    leading = require_trailing("quats", quats, (4,), "[..., 4] (wxyz)")
+    require_shape("scales", scales, (*leading, 3), "[..., 3]")
+    require_same_kind(quats=quats, scales=scales)
+
+
+def check_spherical_harmonics_arguments(
+    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None
+) -> None:
+    """Raise InvalidInput unless dirs are [..., 3], coeffs [..., K, 3] with K >= (degree + 1)² and masks bool [...].
+
+    The leading dimensions of coeffs and masks must broadcast to those of dirs.
+    """
+    leading = require_trailing("dirs", dirs, (3,), "[..., 3]")
+    if not 0 <= degrees_to_use <= MAX_SH_DEGREE:
+        raise InvalidInput(f"degrees_to_use must be 0 to {MAX_SH_DEGREE}, got {degrees_to_use}")
+    bases = (degrees_to_use + 1) ** 2
+    if coeffs.dim() < 2 or coeffs.shape[-1] != 3 or coeffs.shape[-2] < bases:
+        raise InvalidInput(
+            f"coeffs must be [..., K, 3] with K >= {bases} for degree {degrees_to_use}, got {list(coeffs.shape)}"
+        )
+    require_same_kind(dirs=dirs, coeffs=coeffs)
+    if masks is not None and masks.dtype != torch.bool:
+        raise InvalidInput(f"masks must be bool, got {masks.dtype}")
+    for name, shape in (("coeffs", coeffs.shape[:-2]), ("masks", () if masks is None else masks.shape)):
+        pairs = zip(reversed(shape), reversed(leading), strict=False)
+        if len(shape) > len(leading) or any(have not in (1, want) for have, want in pairs):
+            raise InvalidInput(
+                f"{name} must have the leading dimensions of dirs, {list(leading)}, or broadcast to them;"
+                f" got {list(shape)}"
+            )

@@ -1,4 +1,4 @@
-"""The model at a moment: deforms the Gaussians of the newest snapshot to a frame's time."""
+"""The model at a moment: finds the time and the camera of a frame, and deforms the model to it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from operators.messages import DeformedScene, Reconstruction
 
 
 class DeformOp(Operator):
-    """Deforms the snapshot to its frame's time and finds the camera that saw the frame.
+    """Deforms the model to its frame's time and finds the camera that saw the frame.
+
+    On a GPU the deformation is part of the renderer's captured graph, and nothing is computed here.
 
     Inputs:
         reconstruction: `Reconstruction`.
@@ -28,6 +30,7 @@ class DeformOp(Operator):
         message: Reconstruction = op_input.receive("reconstruction")
         frame, model = message.frame, message.model
         camera = model.camera if frame.pose is None else model.camera.with_pose(frame.pose)
-        with torch.inference_mode():
-            gaussians = model.at(frame.time_s)
-        op_output.emit(DeformedScene(frame, gaussians, camera, model.version, message.trained), "scene")
+        if model.device.type == "cpu":
+            with torch.inference_mode():
+                model.at(frame.time_s)  # a model remembers its last state, so the renderer finds it there
+        op_output.emit(DeformedScene(frame, model, camera, message.trained), "scene")

@@ -12,6 +12,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
 
 
 @dataclass(frozen=True)
@@ -19,8 +20,8 @@ class Reconstruction:
     """A frame and the model as it stands right after that frame's own training steps."""
 
     frame: Frame
-    model: Model
-    """Immutable; later steps publish later versions and never change this one."""
+    model: Model | Snapshot
+    """Later steps publish later versions and do not change this one, a snapshot in a slot for as long as somebody holds it."""
     trained: bool
     """False for a held-out frame: it is shown and scored, and no step has seen it."""
     steps: int = 0
@@ -39,12 +40,15 @@ class Reconstruction:
 
 @dataclass(frozen=True)
 class DeformedScene:
-    """The Gaussians at a frame's time, and the camera that saw the frame."""
+    """A model at a frame's time, and the camera that saw the frame.
+
+    A renderer that deforms by itself, as the captured one on a GPU does, takes model and time; any other reader takes `gaussians`.
+    """
 
     frame: Frame
-    gaussians: Gaussians
+    model: Model | Snapshot
+    """Held for as long as this message is: a snapshot's slot is not overwritten meanwhile."""
     camera: Camera
-    model_version: int
     trained: bool
 
     def __post_init__(self) -> None:
@@ -53,6 +57,16 @@ class DeformedScene:
                 f"frame {self.frame.seq} is {self.frame.width_px}x{self.frame.height_px} px, its camera "
                 f"{self.camera.width_px}x{self.camera.height_px}; scale the camera with Camera.scaled"
             )
+
+    @property
+    def time_s(self) -> float:
+        """The time that the scene is deformed to."""
+        return self.frame.time_s
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The Gaussians at that time; computed when asked for, and by a `Model` only once."""
+        return self.model.at(self.time_s)
 
 
 @dataclass(frozen=True)

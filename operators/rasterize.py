@@ -1,14 +1,18 @@
-"""From Gaussians to a picture at the frame's camera."""
+"""From a model at a moment to a picture at the frame's camera."""
 
 from __future__ import annotations
 
-from typing import Any
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.rendering.rasterization import render
+from gsplat_core.rendering.registry import RENDERERS, new_renderer
+from gsplat_core.rendering.renderer import Renderer
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.transfers import HostCopy
 from operators.graph import Operator, OperatorSpec
 from operators.messages import DeformedScene, RenderedFrame
@@ -25,33 +29,71 @@ def _displayed(image: torch.Tensor) -> HostCopy:
 
 
 class RasterizeOp(Operator):
-    """Renders colour, depth and opacity.
+    """Renders colour, depth and opacity with the renderer of a name.
+
+    On a GPU the frame is queued on a stream of its own, which goes before the training that is queued for later frames. This operator's
+    thread waits until the picture has arrived in page-locked memory; the other threads go on meanwhile.
 
     Inputs:
         scene: `DeformedScene`.
 
     Outputs:
-        rendered: `RenderedFrame`.
+        rendered: `RenderedFrame`, complete.
+
+    Params:
+        renderer: a name in `gsplat_core.rendering.registry.RENDERERS`.
     """
+
+    renderer: str
+
+    def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
+        self._made: Renderer | None = None
+        self._made_for: tuple[int, int, str, torch.device] | None = None
+        self._stream: torch.cuda.Stream | None = None
+        super().__init__(fragment, *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:
         spec.input("scene", type=DeformedScene)
         spec.output("rendered", type=RenderedFrame)
+        spec.param("renderer", "alpha")
+
+    def stop(self) -> None:
+        # It holds the last model and, on a GPU, memory.
+        self._made = self._made_for = self._stream = None
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         scene: DeformedScene = op_input.receive("scene")
-        with torch.inference_mode():
-            output = render(scene.gaussians, scene.camera)
+        with torch.inference_mode(), self._own_stream(scene.model):
+            renderer = self._renderer_for(scene)
+            reads_snapshots = RENDERERS[self.renderer].capabilities.reads_snapshots
+            renderer.prepare(scene.model if reads_snapshots else scene.model.as_model())
+            output = renderer.render(scene.camera, scene.time_s).result()
             # All three are queued before the first is waited for.
             image, depth, alpha = _displayed(output.image), HostCopy(output.depth), HostCopy(output.alpha)
-        op_output.emit(
-            RenderedFrame(
+            rendered = RenderedFrame(
                 frame=scene.frame,
                 image=image.numpy(),
                 depth=depth.numpy(),
                 alpha=alpha.numpy(),
-                model_version=scene.model_version,
+                model_version=scene.model.version,
                 trained=scene.trained,
-            ),
-            "rendered",
-        )
+            )
+        op_output.emit(rendered, "rendered")
+
+    def _renderer_for(self, scene: DeformedScene) -> Renderer:
+        camera = scene.camera
+        wanted = camera.width_px, camera.height_px, camera.model, scene.model.device
+        if self._made is None or self._made_for != wanted:
+            self._made = new_renderer(self.renderer, camera, scene.model.device)
+            self._made_for = wanted
+        return self._made
+
+    def _own_stream(self, model: Model | Snapshot) -> AbstractContextManager[Any]:
+        if model.device.type != "cuda":
+            return nullcontext()
+        if self._stream is None:
+            self._stream = torch.cuda.Stream(model.device, priority=-1)
+        if isinstance(model, Model):
+            # Nothing says when its copy was complete; a snapshot orders that by itself.
+            self._stream.wait_stream(torch.cuda.current_stream(model.device))
+        return cast(AbstractContextManager[Any], torch.cuda.stream(self._stream))

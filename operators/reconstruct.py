@@ -7,6 +7,7 @@ from typing import Any
 
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.graph import Operator, OperatorSpec
 from operators.messages import Reconstruction
@@ -24,7 +25,7 @@ class ReconstructOp(Operator):
         frame: `Frame`.
 
     Outputs:
-        reconstruction: `Reconstruction` with an immutable snapshot.
+        reconstruction: `Reconstruction` with the model as it is then: an immutable `Model`, or on a GPU a `Snapshot`.
 
     Params:
         make_reconstructor: called in `start()`; what it returns is owned by this operator alone.
@@ -41,10 +42,15 @@ class ReconstructOp(Operator):
     ) -> None:
         self.make_reconstructor = make_reconstructor
         self.held_out = held_out
-        self.model: Model | None = None
-        """The newest published snapshot."""
+        self.newest: Model | Snapshot | None = None
+        """What was published last."""
         self._reconstructor: Reconstructor | None = None
         super().__init__(fragment, *args, **kwargs)
+
+    @property
+    def model(self) -> Model | None:
+        """What was published last, as a model in memory of its own; on a GPU it is copied when it is asked for."""
+        return None if self.newest is None else self.newest.as_model()
 
     def setup(self, spec: OperatorSpec) -> None:
         spec.input("frame", type=Frame)
@@ -52,21 +58,22 @@ class ReconstructOp(Operator):
 
     def start(self) -> None:
         self._reconstructor = self.make_reconstructor()
-        self.model = None
+        self.newest = None
 
     def stop(self) -> None:
-        # The optimiser's state goes; the last snapshot stays for whoever saves it.
+        # The optimiser's state and the slots go; the last model stays for whoever saves it.
+        self.newest = self.model
         self._reconstructor = None
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         assert self._reconstructor is not None
         frame = op_input.receive("frame")
         # Without a first frame there is no model that a held-out one could be shown with.
-        train = self.model is None or not (frame.status is FrameStatus.DAMAGED or self.held_out(frame))
+        train = self.newest is None or not (frame.status is FrameStatus.DAMAGED or self.held_out(frame))
         report = self._reconstructor.observe(frame, train=train)
         # A held-out frame changes no parameter, but the model's time window now reaches it.
-        self.model = self._reconstructor.snapshot()
+        self.newest = self._reconstructor.publish()
         op_output.emit(
-            Reconstruction(frame, self.model, trained=train, steps=report.steps, loss=report.loss),
+            Reconstruction(frame, self.newest, trained=train, steps=report.steps, loss=report.loss),
             "reconstruction",
         )

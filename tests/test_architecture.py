@@ -17,14 +17,23 @@ MAY_IMPORT = {
 }
 
 
-def imported_packages(path: Path) -> set[str]:
+REFERENCE = "gsplat_core.reference"
+UNUSED_LOSSES = ROOT / "gsplat_core/training/losses.py"  # no run uses it
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Every module that a file may import, also inside of functions: `from a import b` counts as a and as a.b."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            found |= {alias.name.split(".")[0] for alias in node.names}
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            found.add(node.module.split(".")[0])
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
     return found
+
+
+def imported_packages(path: Path) -> set[str]:
+    return {name.split(".")[0] for name in imported_modules(path)}
 
 
 @pytest.mark.parametrize("package", MAY_IMPORT)
@@ -35,6 +44,31 @@ def test_arrows_point_one_way(package):
     for path in files:
         wrong = imported_packages(path) & (forbidden - MAY_IMPORT[package])
         assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
+
+
+def imports_reference(path: Path) -> bool:
+    return any(name == REFERENCE or name.startswith(f"{REFERENCE}.") for name in imported_modules(path))
+
+
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_the_reference_is_imported_by_tests_only(package):
+    reference = ROOT / REFERENCE.replace(".", "/")
+    files = [path for path in (ROOT / package).rglob("*.py") if reference not in path.parents and path != UNUSED_LOSSES]
+    assert [str(path.relative_to(ROOT)) for path in files if imports_reference(path)] == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import gsplat_core.reference",
+        "from gsplat_core import reference",
+        "from gsplat_core.reference.frame import x",
+        "def f():\n    from gsplat_core.reference import deformation",
+    ],
+)
+def test_every_way_to_import_the_reference_is_seen(tmp_path, line):
+    (tmp_path / "module.py").write_text(line)
+    assert imports_reference(tmp_path / "module.py")
 
 
 PROGRAM = """

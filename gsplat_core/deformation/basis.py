@@ -11,50 +11,28 @@ starts with centre b and width 1.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation.basis_adam import BasisRates, Moments
 from gsplat_core.deformation.field import DeformationField, checked_window, count_of
+from gsplat_core.deformation.field_slots import BasisSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
+from gsplat_core.ops.basis_field import plain_torch
+from gsplat_core.ops.basis_field.plain_torch import BUMP_REACH
 from gsplat_core.ops.native import CUDA_MISSING
-from gsplat_core.reference import deformation as reference
-from gsplat_core.reference.deformation import BUMP_REACH, CHANNEL_GROUPS
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.layout import BASIS_CHANNELS, BASIS_GROUPS, width_of
 
-CHANNELS = sum(CHANNEL_GROUPS)
+COLUMNS_AHEAD = 1
+"""Columns that the window keeps ahead of the newest frame online."""
 BUMPS_PER_SPACING = math.sqrt(math.pi)
 """What a row of equal bumps of width 1, one per spacing, adds up to at any time (within 0.02 %)."""
-
-
-@dataclass(frozen=True)
-class BasisRates:
-    """Learning rates of `BasisField.adam_step`, in the units of the parameters (mm, quaternion, log, SH; bump spacings)."""
-
-    position: float = 1e-2
-    rotation: float = 1e-3
-    log_scale: float = 5e-3
-    colour: float = 5e-3
-    centers: float = 1e-3
-    widths: float = 1e-3
-
-
-@dataclass
-class _Moments:
-    """Adam's state of the bumps: first and second moments of (centers, log_widths, weights) and updates per bump."""
-
-    first: list[Tensor]
-    second: list[Tensor]
-    steps: Tensor
-
-    def map(self, change: Callable[[Tensor], Tensor]) -> _Moments:
-        """The same change of rows or columns applied to every tensor."""
-        return _Moments([change(t) for t in self.first], [change(t) for t in self.second], change(self.steps))
 
 
 class BasisField(DeformationField):
@@ -68,6 +46,7 @@ class BasisField(DeformationField):
     """
 
     kind = "basis"
+    has_frame_deltas = True
 
     def __init__(
         self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26, spacing_s: float | None = None
@@ -85,8 +64,12 @@ class BasisField(DeformationField):
         self._origin_s = start - self._spacing_s
         self.centers = torch.nn.Parameter(torch.arange(bumps, dtype=torch.float32).repeat(count, 1))
         self.log_widths = torch.nn.Parameter(torch.zeros(count, bumps))
-        self.weights = torch.nn.Parameter(torch.zeros(count, bumps, CHANNELS))
-        self._moments: _Moments | None = None
+        self.weights = torch.nn.Parameter(torch.zeros(count, bumps, BASIS_CHANNELS))
+        self._moments: Moments | None = None
+
+    @classmethod
+    def for_gaussians(cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any) -> BasisField:
+        return cls(gaussians.count, time_window_s, **architecture)
 
     @property
     def count(self) -> int:
@@ -118,7 +101,7 @@ class BasisField(DeformationField):
                 f"the field holds bumps for {deltas.shape[0]} Gaussians, got {gaussians.count}; keep them in step with"
                 " select and append"
             )
-        position, rotation, log_scale, colour = torch.split(deltas, list(CHANNEL_GROUPS), dim=1)
+        position, rotation, log_scale, colour = torch.split(deltas, [width_of(group) for group in BASIS_GROUPS], dim=1)
         sh = gaussians.sh
         base = sh[:, :1] + colour[:, None]
         return Gaussians(
@@ -133,22 +116,14 @@ class BasisField(DeformationField):
         """The Gaussians at `time_s`; outside the window the state of its nearest end."""
         return self.displaced(gaussians, self.deltas(time_s))
 
-    def adam_step(
-        self,
-        time_s: float,
-        gradient: Tensor,
-        rates: BasisRates,
-        beta1: float = 0.9,
-        beta2: float = 0.999,
-        epsilon: float = 1e-8,
-    ) -> None:
+    def adam_step(self, time_s: float, gradient: Tensor, rates: BasisRates) -> None:
         """Lazy Adam of the bumps active at `time_s`, given dL/d(deltas) `gradient` [N, 13]; the others are left alone.
 
         The moments live in the field, follow `select`, `append` and `extend`, and are not part of a bundle. On CUDA the host does
         not wait.
         """
         each = (rates.position, rates.rotation, rates.log_scale, rates.colour, rates.centers, rates.widths)
-        self.adam_step_at(self.tau(time_s), gradient, each, beta1, beta2, epsilon)
+        self.adam_step_at(self.tau(time_s), gradient, each)
 
     def adam_step_at(
         self,
@@ -205,16 +180,6 @@ class BasisField(DeformationField):
         moments = self._moments_in_use()
         return *(p.data for p in self._parameters_in_order()), *moments.first, *moments.second, moments.steps
 
-    def cached(self, gaussians: Gaussians) -> Callable[[float], Gaussians]:
-        """Nothing of this field is the same at all times, so the function is `forward` without a graph."""
-        gaussians = gaussians.detach()
-
-        def at(time_s: float) -> Gaussians:
-            with torch.no_grad():
-                return self.forward(gaussians, time_s)
-
-        return at
-
     def extend(self, time_window_s: tuple[float, float], *, hold_at_s: float | None = None) -> None:
         """Move the window on: new bumps at the head, and bumps that ended before the new start dropped.
 
@@ -257,10 +222,24 @@ class BasisField(DeformationField):
             new = [
                 columns.repeat(count, 1),
                 self.log_widths.new_zeros(count, self.bumps),
-                self.weights.new_zeros(count, self.bumps, CHANNELS),
+                self.weights.new_zeros(count, self.bumps, BASIS_CHANNELS),
             ]
         self._set_parameters(*(torch.cat([p.data, n]) for p, n in zip(self._parameters_in_order(), new, strict=True)))
         self._change_moments(lambda t: torch.cat([t, t.new_zeros(count, *t.shape[1:])]))
+
+    def slot(self, rows: int) -> BasisSlot:
+        """See `DeformationField.slot`; it has capacity for more bumps too."""
+        return BasisSlot(self, rows)
+
+    def adopt_layout(self, other: BasisField) -> None:
+        """Take over window, origin and spacing of the columns of `other`."""
+        self._time_window_s, self._origin_s, self._spacing_s = other._time_window_s, other._origin_s, other._spacing_s
+
+    def cropped(self, count: int, bumps: int) -> BasisField:
+        """A detached copy of the first `count` Gaussians and `bumps` columns."""
+        copied = self.detached_copy()
+        copied._set_parameters(*(p.data[:count, :bumps] for p in self._parameters_in_order()))
+        return copied
 
     def config(self) -> dict[str, Any]:
         """Kind, window and the layout of the columns."""
@@ -268,22 +247,25 @@ class BasisField(DeformationField):
             "kind": self.kind,
             "time_window_s": list(self._time_window_s),
             "bumps": self.bumps,
-            "channels": CHANNELS,
+            "channels": BASIS_CHANNELS,
             "origin_s": self._origin_s,
             "spacing_s": self._spacing_s,
         }
 
     @classmethod
-    def from_config(cls, config: dict[str, Any], count: int) -> BasisField:
-        """An untrained field of the architecture that `config` describes."""
+    def from_config(cls, config: Mapping[str, Any], gaussians: Gaussians) -> BasisField:
+        """An untrained field with the columns that `config` describes."""
         start, end = config["time_window_s"]
-        if config["channels"] != CHANNELS:
-            raise InvalidInput(f"a basis field has {CHANNELS} channels, the config says {config['channels']}")
-        field = cls(count, (start, end), bumps=config["bumps"])
+        field = cls(gaussians.count, (start, end), bumps=config["bumps"])
         field._origin_s, field._spacing_s = float(config["origin_s"]), float(config["spacing_s"])
-        if not (math.isfinite(field._origin_s) and math.isfinite(field._spacing_s) and field._spacing_s > 0):
-            raise InvalidInput(f"spacing_s must be positive and origin_s finite, got {config}")
         return field
+
+    def cover(self, time_s: float, newest_s: float) -> None:
+        """Keep `COLUMNS_AHEAD` columns ahead of `time_s`, and one beyond; new ones continue the deformation at `newest_s`."""
+        start, end = self._time_window_s
+        ahead_s = COLUMNS_AHEAD * self._spacing_s
+        if time_s + ahead_s > end:
+            self.extend((start, time_s + ahead_s + self._spacing_s), hold_at_s=newest_s)
 
     def _training_state(self) -> Sequence[object]:
         return (self._moments,)
@@ -292,7 +274,7 @@ class BasisField(DeformationField):
         centers, log_widths, weights = (p.data for p in self._parameters_in_order())
         columns = torch.arange(self.bumps, self.bumps + added, dtype=centers.dtype, device=centers.device)
         columns = columns.repeat(self.count, 1)
-        new_weights = weights.new_zeros(self.count, added, CHANNELS)
+        new_weights = weights.new_zeros(self.count, added, BASIS_CHANNELS)
         if held is not None:
             new_weights += held[:, None] / BUMPS_PER_SPACING
         self._set_parameters(
@@ -307,16 +289,11 @@ class BasisField(DeformationField):
         """The compiled ops where they exist, plain torch for other dtypes and devices."""
         device = self.weights.device.type
         has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
-        return compiled if has_kernels and self.weights.dtype == torch.float32 else reference
+        return compiled if has_kernels and self.weights.dtype == torch.float32 else plain_torch
 
-    def _moments_in_use(self) -> _Moments:
+    def _moments_in_use(self) -> Moments:
         if self._moments is None:
-            parameters = [p.data for p in self._parameters_in_order()]
-            self._moments = _Moments(
-                [torch.zeros_like(p) for p in parameters],
-                [torch.zeros_like(p) for p in parameters],
-                torch.zeros_like(parameters[0], dtype=torch.int32),
-            )
+            self._moments = Moments.zeros([p.data for p in self._parameters_in_order()])
         return self._moments
 
     def _parameters_in_order(self) -> tuple[Tensor, Tensor, Tensor]:

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Self
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, Self, cast
 
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation.field_slots import FieldSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.value_ranges import ListOf, NumberIn
+
+WINDOW_S = ListOf(NumberIn(-1e10, 1e10), 2, 2)
+"""Range of the ends of a field's time window, in seconds: times since 1970 are in it."""
 
 
 class DeformationField(torch.nn.Module):
@@ -19,14 +24,40 @@ class DeformationField(torch.nn.Module):
 
     A field knows the window of time that it covers. Times outside the window are clamped to it: the field holds the state of
     the nearest end. An untrained field is the identity.
+
+    A field has to have `kind` and a differentiable `forward`. What it learns are its parameters, float32. One that is made otherwise than by
+    `cls(time_window_s)` overrides `for_gaussians` and `config`; one with state for each Gaussian `count`, `select` and `append`; one whose
+    parameters mean times relative to the window `extend`.
     """
 
     kind: ClassVar[str] = ""
-    """The name of the architecture in a bundle's manifest."""
+    """The name in the registry, in reports and in a bundle's manifest."""
+    has_frame_deltas: ClassVar[bool] = False
+    """Whether `frame_time` and `frame_deltas` are there, so that a CUDA graph can hold the field."""
 
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__()
         self._time_window_s = checked_window(time_window_s)
+
+    @classmethod
+    def for_gaussians(cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any) -> Self:
+        """An untrained field for these Gaussians; `architecture` is what `config` has besides kind and window."""
+        return cls(time_window_s, **architecture)
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any], gaussians: Gaussians) -> Self:
+        """An untrained field of the checked values of `config`, whose tensors are then loaded.
+
+        Called for the "meta" device when a bundle is read: it may look at shapes, not at values.
+        """
+        start, end = config["time_window_s"]
+        architecture = {name: value for name, value in config.items() if name not in ("kind", "time_window_s")}
+        return cls.for_gaussians(gaussians, (start, end), **architecture)
+
+    @property
+    def count(self) -> int | None:
+        """How many Gaussians the field has state for; None when it moves any number of them."""
+        return None
 
     @property
     def time_window_s(self) -> tuple[float, float]:
@@ -45,30 +76,43 @@ class DeformationField(torch.nn.Module):
         raise NotImplementedError
 
     def cached(self, gaussians: Gaussians) -> Callable[[float], Gaussians]:
-        """A function time_s -> Gaussians for inference, with everything that does not depend on time computed once.
+        """A function time_s -> Gaussians for inference: no autograd graph, and what does not depend on time is computed once.
 
-        It does not follow later changes of the field or the Gaussians, and builds no autograd graph.
+        The field and the Gaussians must not change while it is in use.
         """
-        raise NotImplementedError
+        gaussians = gaussians.detach()
+
+        def at(time_s: float) -> Gaussians:
+            with torch.no_grad():
+                return cast(Gaussians, self(gaussians, time_s))
+
+        return at
 
     def frame_time(self, time_s: float) -> float:
         """`time_s` as `frame_deltas` counts it."""
-        raise NotImplementedError(f"a {self.kind} field has no fused frame path")
+        raise InvalidInput(f"a {self.kind} field cannot be captured in a CUDA graph (has_frame_deltas); use cached")
 
     def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:
         """From a time ([1] on the field's device, see `frame_time`) to what the field adds then: [N, 16], the columns of
         `gsplat_core.ops.frame`. No autograd graph and no wait, so a CUDA graph can hold it. With `dtype` torch.float16 a field may
         compute in half precision where that is faster; the result is float32."""
-        raise NotImplementedError(f"a {self.kind} field has no fused frame path")
+        raise InvalidInput(f"a {self.kind} field cannot be captured in a CUDA graph (has_frame_deltas); use cached")
 
     def config(self) -> dict[str, Any]:
-        """All that `field_from_config` needs to rebuild the architecture, as JSON-able values."""
-        raise NotImplementedError
+        """All that `field_from_config` needs to rebuild the field without its tensors, as values of JSON."""
+        return {"kind": self.kind, "time_window_s": list(self._time_window_s)}
 
     def detached_copy(self) -> Self:
         """A copy for publishing: own memory, no gradients, no state of training."""
         copied = copy.deepcopy(self, {id(state): None for state in self._training_state()})
         return copied.requires_grad_(False)
+
+    def slot(self, rows: int) -> FieldSlot | None:
+        """A copy for `rows` Gaussians that newer states of this field can be written over, at the same addresses.
+
+        None: this kind of field has no such copy, and every snapshot of it gets memory of its own.
+        """
+        return None
 
     def check_state(self) -> None:
         """InvalidInput when loaded tensors, finite and of the right shapes, still make no field."""
@@ -79,15 +123,22 @@ class DeformationField(torch.nn.Module):
 
     def extend(self, time_window_s: tuple[float, float]) -> None:
         """Cover a window that reaches further ahead; what was learned keeps its place in time."""
-        raise NotImplementedError
+        self._time_window_s = checked_window(time_window_s)
+
+    def cover(self, time_s: float, newest_s: float) -> None:
+        """Extend the window so that it has `time_s` in it, online, where the end is not known.
+
+        Here it becomes twice as long as it has to be, so that it is extended seldom. `newest_s` is the time of the newest frame so far.
+        """
+        start, end = self._time_window_s
+        if time_s > end:
+            self.extend((start, start + 2 * (time_s - start)))
 
     def select(self, index: Tensor) -> None:
-        """Keep the per-Gaussian state of the Gaussians in `index` (int64 positions or a bool mask), in that order."""
-        raise NotImplementedError
+        """Keep the state of the Gaussians in `index` (int64 positions or a bool mask), in that order. Here there is none."""
 
     def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
-        """Add per-Gaussian state for new Gaussians at the end: still, or copied from `parents` (int64 [count])."""
-        raise NotImplementedError
+        """Add state for new Gaussians at the end: still, or copied from `parents` (int64 [count]). Here there is none."""
 
 
 def checked_window(time_window_s: tuple[float, float]) -> tuple[float, float]:

@@ -17,16 +17,15 @@ from torch import Tensor
 
 from gsplat_core.deformation import regularisers
 from gsplat_core.deformation.field import DeformationField, checked_window
+from gsplat_core.deformation.field_slots import WholeFieldSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane import hexplane as compiled
+from gsplat_core.ops.hexplane import plain_torch
 from gsplat_core.ops.hexplane.deltas import hexplane_deltas, takes_layers
+from gsplat_core.ops.hexplane.plain_torch import PLANE_AXES
 from gsplat_core.ops.native import CUDA_MISSING
-from gsplat_core.reference import deformation as reference
-from gsplat_core.reference.deformation import HEAD_COLUMNS, PLANE_AXES
 from gsplat_core.scene.gaussians import Gaussians
-
-HEAD_CHANNELS = (3, 3, 4, 1)
-"""Outputs of the head: position, log-scale, rotation (wxyz), opacity logit."""
+from gsplat_core.scene.layout import HEAD_COLUMNS, HEAD_GROUPS, width_of
 
 PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")
 SPACE_PLANES, TIME_PLANES = PLANE_NAMES[:3], PLANE_NAMES[3:]
@@ -68,6 +67,7 @@ class HexPlaneField(DeformationField):
     """
 
     kind = "hexplane"
+    has_frame_deltas = True
 
     def __init__(
         self,
@@ -94,11 +94,17 @@ class HexPlaneField(DeformationField):
         self.planes = torch.nn.ModuleList(self._new_planes(level) for level in self.levels)
         sizes = [channels * len(self.levels)] + [width] * depth
         self.trunk = torch.nn.ModuleList(torch.nn.Linear(a, b) for a, b in pairwise(sizes))
-        self.head = torch.nn.Linear(width, sum(HEAD_CHANNELS))
+        self.head = torch.nn.Linear(width, len(HEAD_COLUMNS))
         torch.nn.init.zeros_(self.head.weight)
         torch.nn.init.zeros_(self.head.bias)
         if not gaussians.means.is_meta:
             self.to(self.box.device)
+
+    @classmethod
+    def for_gaussians(
+        cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any
+    ) -> HexPlaneField:
+        return cls(gaussians, time_window_s, **architecture)
 
     def coordinates(self, means: Tensor, time_s: float) -> Tensor:
         """[N, 4] in [-1, 1]: the one place where space and time are normalised. Outside the box or window: clamped."""
@@ -119,7 +125,7 @@ class HexPlaneField(DeformationField):
         """The Gaussians at `time_s`; outside the window the state of its nearest end."""
         coordinates = self.coordinates(gaussians.means, time_s)
         # With a graph, torch's own layers: they keep what their gradients need.
-        ops = reference if torch.is_grad_enabled() else self._ops
+        ops = plain_torch if torch.is_grad_enabled() else self._ops
         return self._displaced(
             gaussians, ops.hexplane_decode(self._features(coordinates), coordinates, [], *self._network())
         )
@@ -176,7 +182,7 @@ class HexPlaneField(DeformationField):
                 weights, biases = self.network_tensors()
                 if fits:
                     return hexplane_deltas(spaces, coordinates, time, planes, weights, biases, order)
-                return reference.hexplane_deltas(
+                return plain_torch.hexplane_deltas(
                     spaces, coordinates, time, planes, weights, biases, order, self._ops.hexplane_decode
                 )
 
@@ -221,11 +227,9 @@ class HexPlaneField(DeformationField):
         weights, biases = self._network()
         return [weight.data for weight in weights], [bias.data for bias in biases]
 
-    def select(self, index: Tensor) -> None:
-        """The field holds no state per Gaussian; nothing to do."""
-
-    def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
-        """The field holds no state per Gaussian; nothing to do."""
+    def slot(self, rows: int) -> WholeFieldSlot:
+        """See `DeformationField.slot`; the field has no tensors per Gaussian."""
+        return WholeFieldSlot(self)
 
     def config(self) -> dict[str, Any]:
         """Kind, window and architecture; the box is stored with the tensors."""
@@ -238,13 +242,6 @@ class HexPlaneField(DeformationField):
             "width": self.width,
             "depth": self.depth,
         }
-
-    @classmethod
-    def from_config(cls, config: dict[str, Any], gaussians: Gaussians) -> HexPlaneField:
-        """An untrained field of the architecture that `config` describes."""
-        start, end = config["time_window_s"]
-        names = ("channels", "resolution", "levels", "width", "depth")
-        return cls(gaussians, (start, end), **{name: config[name] for name in names})
 
     def check_state(self) -> None:
         """InvalidInput when the box is not one: its lower corner must be below its upper one."""
@@ -266,7 +263,7 @@ class HexPlaneField(DeformationField):
         """The compiled ops where they exist, plain torch for other dtypes and devices."""
         device = self.box.device.type
         has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
-        return compiled if has_kernels and self.box.dtype == torch.float32 else reference
+        return compiled if has_kernels and self.box.dtype == torch.float32 else plain_torch
 
     def _named(self, names: Sequence[str]) -> list[Tensor]:
         return [plane for level in self._levels(names) for plane in level]
@@ -294,7 +291,7 @@ class HexPlaneField(DeformationField):
         return [layer.weight for layer in layers], [layer.bias for layer in layers]
 
     def _displaced(self, gaussians: Gaussians, deltas: Tensor) -> Gaussians:
-        position, log_scale, rotation, opacity = torch.split(deltas, list(HEAD_CHANNELS), dim=1)
+        position, log_scale, rotation, opacity = torch.split(deltas, [width_of(group) for group in HEAD_GROUPS], dim=1)
         return Gaussians(
             means=gaussians.means + position,
             quats=gaussians.quats + rotation,

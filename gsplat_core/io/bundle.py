@@ -11,6 +11,7 @@ tensors before manifest. Should the machine stop between the two renames, the ne
 from __future__ import annotations
 
 import hashlib
+import os
 import struct
 from pathlib import Path
 
@@ -19,22 +20,24 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation.field import DeformationField
 from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
 from gsplat_core.io.atomic_files import replace_durably, write_durably
 from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, Manifest, manifest_bytes, parse_manifest
+from gsplat_core.io.model_files import check_memory, open_model_file
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 
 TENSORS, NEXT_TENSORS = "model.safetensors", "model.next.safetensors"
 MANIFEST, NEXT_MANIFEST = "manifest.json", "manifest.next.json"
-MAX_HEADER_BYTES = 25_000_000
+MAX_HEADER_BYTES = 1 << 20
 
 
 def save_bundle(model: Model, folder: str | Path) -> None:
     """Write `model` into `folder` (made when missing), replacing the bundle there in one step.
 
-    Raises BundleCorrupt when a tensor holds NaN or infinity, BundleError when the files cannot be written (a full disk, a
-    missing right); the bundle that was there before is then still whole.
+    Raises BundleCorrupt when a tensor holds NaN or infinity, BundleError when the model is beyond the ranges of `docs/bundle.md` or the
+    files cannot be written (a full disk, a missing right); the bundle that was there before is then still whole.
     """
     folder = Path(folder)
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.tensors().items()}
@@ -44,10 +47,17 @@ def save_bundle(model: Model, folder: str | Path) -> None:
     _check_finite(tensors, f"the model was not saved to {folder}")
     payload = safetensors.torch.save(tensors)
     digest = hashlib.sha256(payload).hexdigest()
+    manifest = manifest_bytes(model, len(payload), digest)
+    try:
+        parse_manifest(manifest, MANIFEST)  # what could not be read again is not written
+    except BundleCorrupt as error:
+        raise BundleError(
+            f"the model was not saved to {folder}, because it could not be read again: {error}"
+        ) from error
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_durably(folder / NEXT_TENSORS, [payload])
-        write_durably(folder / NEXT_MANIFEST, [manifest_bytes(model, len(payload), digest)])
+        write_durably(folder / NEXT_MANIFEST, [manifest])
         replace_durably(folder / NEXT_TENSORS, folder / TENSORS)
         replace_durably(folder / NEXT_MANIFEST, folder / MANIFEST)
     except OSError as error:
@@ -60,37 +70,36 @@ def save_bundle(model: Model, folder: str | Path) -> None:
 def load_bundle(folder: str | Path) -> Model:
     """Read a model and check all of it.
 
-    Raises UnknownFormatVersion (a later format), BundleCorrupt (digest, truncation, wrong tensors, NaN or infinity) or
-    BundleError (not there, not readable); each names the file and what to do.
+    Raises UnknownFormatVersion (a later format), BundleCorrupt (a value out of its range, digest, truncation, wrong tensors, NaN or
+    infinity) or BundleError (not there, not readable, not a plain file, more than fits into memory); each names the file and what to do.
     """
     folder = Path(folder)
+    path = folder / TENSORS
     try:
-        with open(folder / TENSORS, "rb") as file:
-            size = file.seek(0, 2)
-            file.seek(0)
+        with open_model_file(path, folder) as file:
+            size = os.fstat(file.fileno()).st_size
             manifest = _manifest_for(folder, size)
-            _check_header(folder / TENSORS, file.read(8), size)
+            _check_size(path, _expected_tensors(path, manifest), file.read(8), size)
+            check_memory(path, 2 * size)  # the file's bytes, and the tensors made from them
             file.seek(0)
             payload = file.read(size)
-    except FileNotFoundError as error:
-        raise BundleError(f"{error.filename} is missing; a bundle is a folder with {TENSORS} and {MANIFEST}") from error
     except OSError as error:
-        raise BundleError(f"cannot read the model in {folder}: {error.strerror or error}") from error
+        raise BundleError(f"cannot read the model in {folder}: {error.strerror or error}; copy it again") from error
     digest = hashlib.sha256(payload).hexdigest()
     if digest != manifest.tensors_sha256:
         manifest = _interrupted_save(folder, size, digest) or _raise_digest(folder, digest, manifest)
-    return _model(folder / TENSORS, payload, manifest)
+    return _model(path, payload, manifest)
 
 
 def _manifest_for(folder: Path, size: int) -> Manifest:
     """The manifest, or the next one when only that fits the tensors (see the module's text)."""
     if not (folder / MANIFEST).exists() and (folder / NEXT_MANIFEST).exists():
-        return _read_manifest(folder / NEXT_MANIFEST)
-    manifest = _read_manifest(folder / MANIFEST)
+        return _read_manifest(folder, NEXT_MANIFEST)
+    manifest = _read_manifest(folder, MANIFEST)
     if manifest.tensors_bytes == size:
         return manifest
     if (folder / NEXT_MANIFEST).exists():
-        following = _read_manifest(folder / NEXT_MANIFEST)
+        following = _read_manifest(folder, NEXT_MANIFEST)
         if following.tensors_bytes == size:
             return following
     raise BundleCorrupt(
@@ -101,7 +110,7 @@ def _manifest_for(folder: Path, size: int) -> Manifest:
 def _interrupted_save(folder: Path, size: int, digest: str) -> Manifest | None:
     if not (folder / NEXT_MANIFEST).exists():
         return None
-    following = _read_manifest(folder / NEXT_MANIFEST)
+    following = _read_manifest(folder, NEXT_MANIFEST)
     return following if (following.tensors_bytes, following.tensors_sha256) == (size, digest) else None
 
 
@@ -112,37 +121,42 @@ def _raise_digest(folder: Path, digest: str, manifest: Manifest) -> Manifest:
     )
 
 
-def _read_manifest(path: Path) -> Manifest:
-    with open(path, "rb") as file:
+def _read_manifest(folder: Path, name: str) -> Manifest:
+    path = folder / name
+    with open_model_file(path, folder) as file:
         text = file.read(MAX_MANIFEST_BYTES + 1)
     if len(text) > MAX_MANIFEST_BYTES:
         raise BundleCorrupt(f"{path} is larger than {MAX_MANIFEST_BYTES} bytes; it is not a manifest")
     return parse_manifest(text, str(path))
 
 
-def _check_header(path: Path, start: bytes, size: int) -> None:
-    """safetensors: eight bytes of header length, the header as JSON, the data."""
-    if len(start) < 8:
-        raise BundleCorrupt(f"{path} has only {size} bytes; copy the bundle again")
-    (header,) = struct.unpack("<Q", start)
-    if header > min(size - 8, MAX_HEADER_BYTES):
-        raise BundleCorrupt(
-            f"{path} states a header of {header} bytes; the file has {size}, and at most {MAX_HEADER_BYTES} are allowed"
-        )
-
-
-def _model(path: Path, payload: bytes, manifest: Manifest) -> Model:
+def _skeleton(path: Path, manifest: Manifest) -> tuple[Gaussians, DeformationField | None]:
     try:
-        gaussians, field = manifest.skeleton()
-    except InvalidInput as error:
-        raise BundleCorrupt(f"the manifest of {path} describes no valid model: {error}") from error
+        return manifest.skeleton()
+    except (InvalidInput, RuntimeError) as error:  # torch: more elements than it can count
+        reason = str(error).splitlines()[0]
+        raise BundleCorrupt(f"the manifest of {path} describes no valid model: {reason}") from error
+
+
+def _expected_tensors(path: Path, manifest: Manifest) -> dict[str, Tensor]:
+    """The tensors that a manifest describes, on the meta device."""
+    gaussians, field = _skeleton(path, manifest)
     expected = {f"gaussians.{name}": tensor for name, tensor in gaussians.tensors().items()}
     if field is not None:
         expected |= {f"field.{name}": tensor for name, tensor in field.state_dict().items()}
-    _check_size(path, expected, len(payload))
+    parameters = sum(tensor.numel() for tensor in expected.values())
+    if manifest.parameters not in (None, parameters):
+        raise BundleCorrupt(f"the manifest of {path} says {manifest.parameters} parameters, and describes {parameters}")
+    return expected
+
+
+def _model(path: Path, payload: bytes, manifest: Manifest) -> Model:
+    gaussians, field = _skeleton(path, manifest)
+    expected = _expected_tensors(path, manifest)
+    _check_size(path, expected, payload[:8], len(payload))
     try:
         tensors = safetensors.torch.load(payload)
-    except (safetensors.SafetensorError, ValueError, KeyError) as error:
+    except (safetensors.SafetensorError, ValueError, KeyError, AssertionError, RuntimeError) as error:
         raise BundleCorrupt(f"{path} is not a safetensors file ({error}); copy the bundle again") from error
     _check_tensors(path, tensors, expected)
     _check_finite(tensors, f"{path} cannot be used")
@@ -159,11 +173,23 @@ def _model(path: Path, payload: bytes, manifest: Manifest) -> Model:
     return Model(manifest.version, loaded, field, manifest.camera, manifest.time_window_s, manifest.training_digest)
 
 
-def _check_size(path: Path, expected: dict[str, Tensor], size: int) -> None:
-    """Before anything is parsed: the file can hold the tensors that the manifest describes, and little more."""
+def _check_size(path: Path, expected: dict[str, Tensor], start: bytes, size: int) -> None:
+    """Before anything is read: the file is as long as the tensors that the manifest describes, and a header of allowed length.
+
+    A safetensors file is eight bytes with the header's length, the header as JSON, and the tensors without gaps.
+    """
+    if len(start) < 8:
+        raise BundleCorrupt(f"{path} has only {size} bytes; copy the bundle again")
+    (header,) = struct.unpack("<Q", start)
+    if header > min(size - 8, MAX_HEADER_BYTES):
+        raise BundleCorrupt(
+            f"{path} states a header of {header} bytes; the file has {size}, and at most {MAX_HEADER_BYTES} are allowed"
+        )
     needed = 4 * sum(tensor.numel() for tensor in expected.values())
-    if not needed + 8 <= size <= needed + 8 + MAX_HEADER_BYTES:
-        raise BundleCorrupt(f"{path} has {size} bytes, but the manifest describes {needed} bytes of tensors")
+    if size != 8 + header + needed:
+        raise BundleCorrupt(
+            f"{path} holds {size - 8 - header} bytes of tensors, but the manifest describes {needed}; copy the bundle again"
+        )
 
 
 def _check_tensors(path: Path, tensors: dict[str, Tensor], expected: dict[str, Tensor]) -> None:

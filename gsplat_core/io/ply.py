@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.errors import InvalidInput
+from gsplat_core.errors import BundleCorrupt
 from gsplat_core.io.atomic_files import replace_durably, write_durably
+from gsplat_core.io.model_files import check_memory, open_model_file
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 
 MAX_HEADER_BYTES = 1 << 16
@@ -57,29 +58,32 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
 def load_ply(path: str | Path) -> Gaussians:
     """Read Gaussians of any SH degree up to 4; properties that are not used are skipped.
 
-    Raises InvalidInput, naming the file and the fault, when it is not such a file, is cut short or holds NaN or infinity.
+    Raises BundleCorrupt, naming the file and the fault, when it is not such a file, is cut short or holds NaN or infinity; BundleError when
+    it is missing, is no plain file, or does not fit into memory.
     """
     path = Path(path)
-    with open(path, "rb") as file:
+    with open_model_file(path) as file:
         layout, count = _read_header(file, path)
-        start, size = file.tell(), file.seek(0, 2)
-        if size - start < count * layout.itemsize:
-            raise InvalidInput(
-                f"{path}: {count} Gaussians take {count * layout.itemsize} bytes, only {size - start} follow the header;"
-                " the file was cut short"
+        needed, left = count * layout.itemsize, os.fstat(file.fileno()).st_size - file.tell()
+        if left < needed:
+            raise BundleCorrupt(
+                f"{path}: {count} Gaussians take {needed} bytes, only {left} follow the header; the file was cut short"
             )
-        file.seek(start)
-        rows = np.frombuffer(file.read(count * layout.itemsize), dtype=layout)
+        check_memory(path, 4 * needed)  # rows, columns, and the tensors made from them
+        content = file.read(needed)
+    if len(content) < needed:
+        raise BundleCorrupt(f"{path} became shorter while it was read; copy it again")
+    rows = np.frombuffer(content, dtype=layout)
     names = set(layout.names or ())
     rest_count = sum(name.startswith("f_rest_") for name in names)
     rest = [f"f_rest_{i}" for i in range(rest_count)]
     missing = [n for n in (*POSITION, *COLOUR, *rest, "opacity", *SCALE, *ROTATION) if n not in names]
     if missing:
-        raise InvalidInput(
+        raise BundleCorrupt(
             f"{path}: no property {', '.join(missing[:5])}; it is not a file of Gaussians in the INRIA layout"
         )
     if rest_count not in REST_COUNTS:
-        raise InvalidInput(
+        raise BundleCorrupt(
             f"{path}: {rest_count} f_rest properties; SH degrees 0 to {MAX_SH_DEGREE} have {REST_COUNTS}"
         )
     higher = _columns(rows, rest, path).reshape(count, 3, rest_count // 3).transpose(0, 2, 1)
@@ -94,10 +98,11 @@ def load_ply(path: str | Path) -> Gaussians:
 def _columns(rows: NDArray[np.void], names: tuple[str, ...] | list[str], path: Path) -> NDArray[np.float32]:
     columns = np.empty((len(rows), len(names)), dtype=np.float32)
     for i, name in enumerate(names):
-        columns[:, i] = rows[name]
+        with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is refused below
+            columns[:, i] = rows[name]
         bad = int(np.count_nonzero(~np.isfinite(columns[:, i])))
         if bad:
-            raise InvalidInput(f"{path}: property {name} holds {bad} of {len(rows)} values that are NaN or infinite")
+            raise BundleCorrupt(f"{path}: property {name} holds {bad} of {len(rows)} values that are NaN or infinite")
     return columns
 
 
@@ -105,7 +110,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[np.dtype[np.void], int]:
     """The layout of one vertex and how many there are; the file is left at the first one."""
     lines = _header_lines(file, path)
     if lines[:2] != ["ply", "format binary_little_endian 1.0"]:
-        raise InvalidInput(
+        raise BundleCorrupt(
             f"{path}: expected 'ply' and 'format binary_little_endian 1.0', got {[line[:80] for line in lines[:2]]}"
         )
     count: int | None = None
@@ -121,10 +126,10 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[np.dtype[np.void], int]:
             case ["property", kind, name] if count is not None and kind in SCALAR_TYPES:
                 properties.append((name, SCALAR_TYPES[kind]))
             case _:
-                raise InvalidInput(f"{path}: unexpected line in the header: {line[:80]!r}; vertices must come first")
+                raise BundleCorrupt(f"{path}: unexpected line in the header: {line[:80]!r}; vertices must come first")
     names = [name for name, _ in properties]
     if count is None or not properties or len(set(names)) != len(names):
-        raise InvalidInput(f"{path}: the header has no vertices, no properties or a property twice: {names[:80]}")
+        raise BundleCorrupt(f"{path}: the header has no vertices, no properties or a property twice: {names[:80]}")
     return np.dtype(properties), count
 
 
@@ -135,11 +140,11 @@ def _header_lines(file: BinaryIO, path: Path) -> list[str]:
         line = file.readline(MAX_HEADER_BYTES - read + 1)
         read += len(line)
         if not line.endswith(b"\n") or read > MAX_HEADER_BYTES:
-            raise InvalidInput(
+            raise BundleCorrupt(
                 f"{path}: no 'end_header' in the first {min(read, MAX_HEADER_BYTES)} bytes; it is not a ply file"
             )
         try:
             lines.append(line.decode("ascii").strip())
         except UnicodeDecodeError as error:
-            raise InvalidInput(f"{path}: the header holds bytes that are not ASCII: {line[:40]!r}") from error
+            raise BundleCorrupt(f"{path}: the header holds bytes that are not ASCII: {line[:40]!r}") from error
     return lines[:-1]

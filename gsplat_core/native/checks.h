@@ -1,7 +1,8 @@
 // Errors of the core: one sentence with what was expected and what came, thrown as std::runtime_error.
 //
-// torch_abi.h hands the sentence to torch, and Python gets a RuntimeError. It is put together without iostreams: in a library that
-// was linked with a static libstdc++ they are a second, uninitialised copy, and formatting a number with them crashes the process.
+// torch_abi.h hands the sentence to torch, and Python gets a RuntimeError. It is put together without iostreams: in a library
+// that was linked with a static libstdc++ they are a second, uninitialised copy, and formatting a number with them crashes the
+// process.
 #pragma once
 
 #include <cstdio>

@@ -6,12 +6,44 @@ enum class Isa { baseline = 0, avx2 = 1, avx512 = 2 };
 // The widest set that this processor has, or the one that INTRASPLAT_ISA names (baseline, avx2, avx512) when it has it.
 Isa active_isa();
 
-// A kernel header declares its functions once with this macro, and `pick` returns the table of the active set:
+// An op's kernels for the CPU are functions in the table of each set. The op's header declares it once, outside of any namespace:
 //
-//   struct AdamKernels { void (*step)(...); };
-//   GSPLAT_DECLARE_KERNELS(AdamKernels, adam_kernels)
+//   namespace gsplat::adam { struct Kernels { int64_t (*step)(...); }; }
+//   GSPLAT_KERNELS(adam, Kernels)
 //
-// The kernel file defines `const AdamKernels GSPLAT_ISA::adam_kernels`.
+// The kernel file <op>_cpu.cpp is compiled once for each set with GSPLAT_ISA as its name, and defines
+// `const gsplat::adam::Kernels kernels` in the namespace GSPLAT_ISA::adam. Host files call gsplat::adam::kernels(): the active
+// set's.
+#define GSPLAT_DECLARE_KERNELS_OF(isa, op, Type) \
+  namespace isa::op {                            \
+  extern const gsplat::op::Type kernels;         \
+  }
+
+#if defined(GSPLAT_X86)
+#define GSPLAT_KERNELS(op, Type)                      \
+  GSPLAT_DECLARE_KERNELS_OF(baseline, op, Type)       \
+  GSPLAT_DECLARE_KERNELS_OF(avx2, op, Type)           \
+  GSPLAT_DECLARE_KERNELS_OF(avx512, op, Type)         \
+  namespace gsplat::op {                              \
+  inline const Type& kernels() {                      \
+    switch (active_isa()) {                           \
+      case Isa::avx512: return ::avx512::op::kernels; \
+      case Isa::avx2: return ::avx2::op::kernels;     \
+      default: return ::baseline::op::kernels;        \
+    }                                                 \
+  }                                                   \
+  }
+#elif defined(GSPLAT_ISA)
+#define GSPLAT_KERNELS(op, Type) GSPLAT_DECLARE_KERNELS_OF(GSPLAT_ISA, op, Type)
+#else
+#define GSPLAT_KERNELS(op, Type)                                   \
+  GSPLAT_DECLARE_KERNELS_OF(baseline, op, Type)                    \
+  namespace gsplat::op {                                           \
+  inline const Type& kernels() { return ::baseline::op::kernels; } \
+  }
+#endif
+
+// As GSPLAT_KERNELS, for tables with a name of their own outside of any op's namespace.
 #define GSPLAT_DECLARE_TABLE(isa, Type, name) \
   namespace isa {                             \
   extern const Type name;                     \

@@ -1,39 +1,60 @@
-// Checks and typed access shared by the op files: what was expected, what came, in one sentence.
+// Checks of tensors and typed access to them, shared by the host files of the ops.
 #pragma once
 
 #include <initializer_list>
+#include <optional>
 
 #include "torch_abi.h"
 
 using gsplat::check;
 using torch::stable::Tensor;
+using OptionalTensor = std::optional<Tensor>;
 using ScalarType = torch::headeronly::ScalarType;
 
-// A float32 CPU tensor, made contiguous; the wrappers in Python have checked shapes and broadcast already.
-inline Tensor floats(const Tensor& t, const char* name) {
-  check(t.is_cpu(), name, " must be on the CPU for this implementation");
-  check(t.scalar_type() == ScalarType::Float, name, " must be float32");
-  return t.is_contiguous() ? t : torch::stable::contiguous(t);
-}
-
-inline Tensor ints(const Tensor& t, const char* name) {
-  check(t.is_cpu(), name, " must be on the CPU for this implementation");
-  check(t.scalar_type() == ScalarType::Int, name, " must be int32");
-  return t.is_contiguous() ? t : torch::stable::contiguous(t);
-}
-
-inline Tensor empty_floats(std::initializer_list<int64_t> sizes) {
-  return torch::stable::empty(torch::headeronly::IntHeaderOnlyArrayRef(sizes.begin(), sizes.size()), ScalarType::Float);
-}
-
-inline Tensor zero_floats(std::initializer_list<int64_t> sizes) {
-  Tensor t = empty_floats(sizes);
-  return torch::stable::zero_(t);
-}
-
-inline Tensor empty_ints(std::initializer_list<int64_t> sizes) {
-  return torch::stable::empty(torch::headeronly::IntHeaderOnlyArrayRef(sizes.begin(), sizes.size()), ScalarType::Int);
-}
-
 inline const float* data(const Tensor& t) { return t.const_data_ptr<float>(); }
+inline const float* data(const OptionalTensor& t) { return t.has_value() ? data(*t) : nullptr; }
 inline float* mutable_data(const Tensor& t) { return t.mutable_data_ptr<float>(); }
+
+inline const char* name_of(ScalarType type) {
+  switch (type) {
+    case ScalarType::Float: return "float32";
+    case ScalarType::Double: return "float64";
+    case ScalarType::Half: return "float16";
+    case ScalarType::Byte: return "uint8";
+    case ScalarType::Int: return "int32";
+    case ScalarType::Long: return "int64";
+    case ScalarType::Bool: return "bool";
+    default: return "another type";
+  }
+}
+
+// What a call of an op takes, on either device. `Call` has take(tensor, type, name): the tensor, contiguous, checked to be of
+// this type and on the device of the call.
+template <class Call>
+class CallArguments {
+ public:
+  Tensor floats(const Tensor& t, const char* name) const { return self().take(t, ScalarType::Float, name); }
+  Tensor ints(const Tensor& t, const char* name) const { return self().take(t, ScalarType::Int, name); }
+  OptionalTensor floats(const OptionalTensor& t, const char* name) const { return take_optional(t, ScalarType::Float, name); }
+  OptionalTensor ints(const OptionalTensor& t, const char* name) const { return take_optional(t, ScalarType::Int, name); }
+  OptionalTensor take_optional(const OptionalTensor& t, ScalarType type, const char* name) const {
+    if (!t.has_value()) return std::nullopt;
+    return self().take(*t, type, name);
+  }
+
+  // For a tensor that the op updates: it cannot be copied to be contiguous.
+  void in_place(const Tensor& t, ScalarType type, const char* name) const {
+    check(t.is_contiguous(), name, " is updated in place and must be contiguous");
+    self().take(t, type, name);
+  }
+  void in_place(const Tensor& t, const char* name) const { in_place(t, ScalarType::Float, name); }
+
+ protected:
+  static Tensor contiguous(const Tensor& t, ScalarType type, const char* name) {
+    check(t.scalar_type() == type, name, " must be ", name_of(type), ", got ", name_of(t.scalar_type()));
+    return t.is_contiguous() ? t : torch::stable::contiguous(t);
+  }
+
+ private:
+  const Call& self() const { return static_cast<const Call&>(*this); }
+};

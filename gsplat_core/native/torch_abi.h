@@ -9,14 +9,7 @@
 
 #include <dlfcn.h>
 
-#include <ostream>
-
-#if defined(__GLIBCXX__) && !defined(_GLIBCXX_IOSTREAM)
-#define _GLIBCXX_IOSTREAM 1  // libstdc++'s include guard; what torch uses of <iostream> is declared here, and discarded unused
-namespace std {
-extern ostream cerr;
-}
-#endif
+#include "without_iostreams.h"
 
 #if __has_include(<torch/csrc/stable/macros.h>)
 #include <torch/csrc/stable/macros.h>

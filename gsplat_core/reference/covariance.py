@@ -5,17 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_same_kind, require_shape, require_trailing
+from gsplat_core.argument_checks import check_covariance_arguments
 
 TRIU_ROWS = (0, 0, 0, 1, 1, 2)
 TRIU_COLUMNS = (0, 1, 2, 1, 2, 2)
-
-
-def check_covariance_arguments(quats: Tensor, scales: Tensor) -> None:
-    """Raise InvalidInput unless quats are [..., 4] and scales [..., 3], of one dtype and device."""
-    leading = require_trailing("quats", quats, (4,), "[..., 4] (wxyz)")
-    require_shape("scales", scales, (*leading, 3), "[..., 3]")
-    require_same_kind(quats=quats, scales=scales)
 
 
 def quat_to_rotmat(quats: Tensor) -> Tensor:

@@ -11,9 +11,7 @@ from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.rendering.settings import EPS2D, FAR_PLANE, NEAR_PLANE, RenderMode
-
-RAW_COLUMNS = 16
-"""Columns of a Gaussian's row of deltas: position 3, rotation 4 (wxyz), log-scale 3, colour 3, opacity logit, 2 unused."""
+from gsplat_core.scene.layout import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION
 
 
 def render_frame(
@@ -39,7 +37,7 @@ def render_frame(
     Args:
         means [N, 3], quats [N, 4] (wxyz, any length but zero), log_scales [N, 3], logit_opacities [N], sh [N, B, 3] with B a
             square: raw parameters.
-        deltas: [N, 16], added to them (see `RAW_COLUMNS`; the colour's to the first coefficient), or None.
+        deltas: [N, 16], added to them in the layout of `scene.layout`, or None.
         viewmat: [4, 4] world to camera. K: [3, 3] in pixels. background: [3], black where None.
         expected_depth: the fourth channel is the weighted mean of z over the splats and not the weighted sum.
 
@@ -63,7 +61,9 @@ def render_frame(
         raw = raw + deltas[:, : raw.shape[1]]
     # Picked before any arithmetic: a NaN behind a mask would still be a NaN in the gradient.
     usable = (raw.isfinite().all(1) & sh.isfinite().flatten(1).all(1)).nonzero()[:, 0]
-    mean, quat, log_scale, dc, logit = raw[usable].split([3, 4, 3, 3, 1], 1)
+    mean, quat, log_scale, dc, logit = (
+        raw[usable][:, group] for group in (POSITION, ROTATION, LOG_SCALE, COLOUR, OPACITY)
+    )
     mode: RenderMode = "RGB+ED" if expected_depth else "RGB+D"
     image, alphas, _ = rasterization(
         mean, quat, log_scale.exp(), torch.sigmoid(logit[:, 0]), torch.cat([dc[:, None], sh[usable, 1:]], 1),

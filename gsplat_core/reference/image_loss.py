@@ -5,26 +5,12 @@ A term over nothing (no tissue, no valid depth) is 0 with zero gradient, never N
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.image_loss.result import ImageLoss
 from gsplat_core.reference.ssim import ssim_map
-
-
-class ImageLoss(NamedTuple):
-    """A loss with its gradients, ready to be fed to the renderer's backward op."""
-
-    loss: Tensor
-    """Scalar; differentiable in image and depth."""
-    terms: Tensor
-    """[3]: L1, 1 - SSIM (0 when its weight is 0) and inverse-depth L1, each before its weight. Not differentiable."""
-    grad_image: Tensor
-    """dL/dimage [H, W, C]. Not differentiable."""
-    grad_depth: Tensor | None
-    """dL/ddepth [H, W]; None without depth. Not differentiable."""
 
 
 def _mean_where(values: Tensor, keep: Tensor) -> Tensor:

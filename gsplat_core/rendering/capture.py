@@ -1,7 +1,8 @@
-"""A sequence of launches, recorded once as a CUDA graph and replayed without the host's work."""
+"""A sequence of kernel launches, captured once as a CUDA graph and replayed as one launch."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
@@ -9,28 +10,34 @@ import torch
 
 Result = TypeVar("Result")
 
+_CAPTURING = threading.Lock()
+"""Held while a graph is captured: threads may launch and allocate meanwhile, but two captures never overlap."""
+
 
 class GraphMemory:
-    """Memory that the recordings of one owner hand on: a new one takes what the one before it, no longer in use, has left."""
+    """A memory pool for the captured graphs of one owner.
+
+    When a graph is captured to replace another one that is no longer used, it takes over the same memory.
+    """
 
     def __init__(self, device: torch.device) -> None:
-        # torch gives a pool up with the last graph in it; this one stays.
-        self._anchor = torch.cuda.CUDAGraph()
-        _record(self._anchor, lambda: torch.zeros(1, device=device), device, None)
+        # torch frees a pool together with the last graph in it; this empty one keeps it.
+        self._keeper = torch.cuda.CUDAGraph()
+        _capture(self._keeper, lambda: torch.zeros(1, device=device), device, None)
 
     @property
     def pool(self) -> Any:
-        """What torch knows the memory by."""
-        return self._anchor.pool()
+        """torch's handle of the pool."""
+        return self._keeper.pool()
 
 
 class CapturedSequence(Generic[Result]):
-    """`sequence()` as one launch.
+    """The launches of `sequence()` as one CUDA graph.
 
-    What it allocates keeps its place from one replay to the next, so `results` are the same tensors every time, overwritten by every
-    replay. Anything that changes between replays must be read from device memory that the sequence refers to already.
+    What the sequence allocates stays at the same addresses, so `results` are the same tensors every time, overwritten by every replay.
+    Whatever changes between replays must be read from device memory that the sequence refers to.
 
-    A recording may not load kernels: the sequence must have run before, or `warm_up` runs it once for real.
+    Kernels cannot be loaded during a capture: the sequence must have run before, or `warm_up` runs it once, with all its effects.
     """
 
     def __init__(
@@ -39,28 +46,29 @@ class CapturedSequence(Generic[Result]):
         if warm_up:
             sequence()
         self._graph = torch.cuda.CUDAGraph()
-        self.results = _record(self._graph, sequence, device, memory.pool)
+        self.results = _capture(self._graph, sequence, device, memory.pool)
 
     def replay(self) -> Result:
-        """Launch the whole sequence on the current stream; returns at once."""
+        """Launch the graph on the current stream; returns at once."""
         self._graph.replay()
         return self.results
 
 
-def _record(
+def _capture(
     graph: torch.cuda.CUDAGraph,
     sequence: Callable[[], Result],
     device: torch.device,
     pool: Any,
 ) -> Result:
     # Not `torch.cuda.graph`, which collects garbage first: that takes longer than many frames.
-    current, side = torch.cuda.current_stream(device), torch.cuda.Stream(device)
-    side.wait_stream(current)
-    with torch.cuda.stream(side):
-        graph.capture_begin(pool=pool, capture_error_mode="thread_local")  # other threads may go on allocating
-        try:
-            results = sequence()
-        finally:
-            graph.capture_end()
-    current.wait_stream(side)
+    with _CAPTURING:
+        current, side = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+        side.wait_stream(current)
+        with torch.cuda.stream(side):
+            graph.capture_begin(pool=pool, capture_error_mode="thread_local")  # other threads may go on allocating
+            try:
+                results = sequence()
+            finally:
+                graph.capture_end()
+        current.wait_stream(side)
     return results

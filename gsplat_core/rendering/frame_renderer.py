@@ -1,31 +1,29 @@
-"""Whole frames on an NVIDIA GPU without a wait of the host: deform, project, sort and blend as one CUDA graph."""
+"""Whole frames on an NVIDIA GPU as one CUDA graph, without a wait of the host: deform, project, list by tile, sort and blend."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_shape
 from gsplat_core.deformation import DeformationField
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.frame.frame import Frame, render_frame
 from gsplat_core.ops.scalars.scalars import store_scalars_
 from gsplat_core.rendering.capture import CapturedSequence, GraphMemory
 from gsplat_core.rendering.rasterization import RenderOutput
-from gsplat_core.rendering.tile_capacity import ListRoom, StatusOnHost
+from gsplat_core.rendering.renderer import Precision, check_background, check_camera
+from gsplat_core.rendering.tile_capacity import FrameStatusCopy, TileListCapacity
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 
-Precision = Literal["fp32", "fp16"]
-
 
 class FrameControls:
-    """What changes from frame to frame, in one piece of device memory: pose, intrinsics, the field's time, and learning rates where
-    the frame is trained on."""
+    """The inputs that change from frame to frame, in one piece of device memory that a captured graph reads: pose, intrinsics, the field's
+    time, and for a training step its learning rates."""
 
     def __init__(self, device: torch.device, rates: int = 0) -> None:
         self._values = torch.zeros(26 + rates, device=device)
@@ -35,20 +33,20 @@ class FrameControls:
         self.rates = self._values[26:]
 
     def set(self, camera: Camera, time: float, rates: Sequence[float] = ()) -> None:
-        """One launch, with the values in its arguments: nothing is copied from memory that could change meanwhile."""
+        """Queue the new values: one launch that carries them as arguments, so that no host memory must stay unchanged."""
         values = [*camera.world_to_camera.ravel().tolist(), *camera.K.ravel().tolist(), time, *rates]
         store_scalars_(self._values, values)
 
 
 @dataclass(frozen=True)
-class PendingFrame:
-    """A frame that was launched. `result` gives its picture, rendered again with more room if the lists were too short."""
+class LaunchedFrame:
+    """A frame that was launched. `result` gives its picture; where its tile lists overflowed, it is rendered again with longer ones."""
 
     _renderer: FrameRenderer
     _number: int
 
     def result(self) -> RenderOutput:
-        """Waits for the frame. The tensors are the renderer's own and hold until its next `render`.
+        """Waits for the frame. The tensors are the renderer's own and are overwritten by its next `render`.
 
         Raises InvalidInput when another frame was rendered since.
         """
@@ -56,14 +54,14 @@ class PendingFrame:
 
 
 class FrameRenderer:
-    """Renders one set of Gaussians again and again: new camera, new time, changed parameters, same number.
+    """Renders one set of Gaussians again and again: new camera, new time, changed parameters, same number of Gaussians.
 
-    `render` queues a frame and returns at once; nothing in it waits for the device. The lists of splats per tile have a fixed size; a
-    frame that does not fit is noticed on the device and rendered again with more room by `PendingFrame.result`, so no splat is ever left
-    out of a finished picture.
+    `render` queues a frame and returns at once; the host never waits for the device. The tile lists have a fixed capacity. A frame that
+    exceeds it says so in its status, and `LaunchedFrame.result` renders it again with more, so that no finished picture lacks a splat.
 
-    The Gaussians' tensors and the field's parameters are used where they are: changed in place, they change the next frame. Not so in half
-    precision, which keeps what it rounds: the harmonics and what a field computes ahead.
+    The tensors of the Gaussians and of the field are read where they are: changed in place, they change the next frame. Exceptions are the
+    values that are computed once, when the renderer is made: harmonics in half precision and what a HexPlane field computes ahead.
+    With `recompute` they are computed in every frame.
     """
 
     def __init__(
@@ -74,6 +72,7 @@ class FrameRenderer:
         *,
         background: Tensor | None = None,
         precision: Precision = "fp32",
+        recompute: bool = False,
     ) -> None:
         """`camera` gives size and camera model of every frame, and the pose of those rendered without one.
 
@@ -89,80 +88,79 @@ class FrameRenderer:
                 f"FrameRenderer needs float32 Gaussians on a CUDA device, got {gaussians.dtype} on {gaussians.device};"
                 " gsplat_core.render takes those of the CPU"
             )
-        if background is not None:
-            require_shape("background", background, (3,), "[3]")
+        check_background(background)
         self.gaussians = gaussians.detach()
         self.field = field
+        self.capacity = TileListCapacity.initial(gaussians.count, camera.width_px, camera.height_px)
+        """Of the tile lists; may be replaced between frames."""
         self._camera = camera
         self._background = background
-        kept = torch.float32 if precision == "fp32" else torch.float16
-        self._sh = self.gaussians.sh.to(kept)
-        self._deltas: Callable[[Tensor], Tensor] | None = (
-            None if field is None else field.frame_deltas(self.gaussians, kept)
-        )
+        self._dtype = torch.float32 if precision == "fp32" else torch.float16
+        self._recompute = recompute
+        self._sh = self.gaussians.sh.to(self._dtype)
+        self._deltas = self._field_deltas()
         self._controls = FrameControls(gaussians.device)
-        self._status = StatusOnHost()
+        self._status = FrameStatusCopy()
         self._memory = GraphMemory(gaussians.device)
         self._number = 0
         self._asked: tuple[Camera, float] | None = None
-        self._room = ListRoom.at_first(gaussians.count, camera.width_px, camera.height_px)
         self._captured: CapturedSequence[Frame] | None = None
+        self._captured_capacity = self.capacity
 
-    @property
-    def room(self) -> ListRoom:
-        """What there is room for now."""
-        return self._room
-
-    def render(self, camera: Camera | None = None, time_s: float = 0.0) -> PendingFrame:
+    def render(self, camera: Camera | None = None, time_s: float = 0.0) -> LaunchedFrame:
         """Queue the picture of `camera` at `time_s` on the current stream."""
         camera = camera or self._camera
-        wanted = (self._camera.width_px, self._camera.height_px, self._camera.model)
-        if (camera.width_px, camera.height_px, camera.model) != wanted:
-            raise InvalidInput(
-                f"this renderer makes {wanted[0]}x{wanted[1]} {wanted[2]} pictures, the camera is"
-                f" {camera.width_px}x{camera.height_px} {camera.model}; make another FrameRenderer for it"
-            )
+        check_camera(self._camera, camera)
         self._number += 1
         self._asked = camera, 0.0 if self.field is None else self.field.frame_time(time_s)
         self._launch()
-        return PendingFrame(self, self._number)
+        return LaunchedFrame(self, self._number)
+
+    def _field_deltas(self) -> Callable[[Tensor], Tensor] | None:
+        return None if self.field is None else self.field.frame_deltas(self.gaussians, self._dtype)
 
     def _launch(self) -> None:
         assert self._asked is not None
         self._controls.set(*self._asked)
-        if self._captured is None:
+        if self._captured is None or self._captured_capacity != self.capacity:
+            self._captured = None  # its memory serves the next capture
             self._captured = CapturedSequence(self._sequence, self.gaussians.device, self._memory, warm_up=True)
+            self._captured_capacity = self.capacity
         self._captured.replay()
-        self._status.mark(self.gaussians.device)
+        self._status.launched(self.gaussians.device)
 
     def _sequence(self) -> Frame:
-        deltas = None if self._deltas is None else self._deltas(self._controls.time)
+        sh, field_deltas = self._sh, self._deltas
+        if self._recompute:
+            sh, field_deltas = self.gaussians.sh.to(self._dtype), self._field_deltas()
+        deltas = None if field_deltas is None else field_deltas(self._controls.time)
         scene = self.gaussians
         frame = render_frame(
             scene.means,
             scene.quats,
             scene.log_scales,
             scene.logit_opacities,
-            self._sh,
+            sh,
             deltas,
             self._controls.viewmat,
             self._controls.intrinsics,
             self._background,
             self._camera.width_px,
             self._camera.height_px,
-            self._room.capacity,
+            self.capacity.capacity,
             camera_model=self._camera.model,
-            per_tile=self._room.per_tile,
+            per_tile=self.capacity.per_tile,
         )
-        self._status.fetch(frame.status)
+        self._status.queue(frame.status)
         return frame
 
     def _finish(self, number: int) -> RenderOutput:
         if number != self._number:
-            raise InvalidInput("this frame's memory was used for a later one; take result() before the next render()")
-        while (needs := self._status.wait()).cut:
-            self._room = ListRoom.for_frame(needs.in_all, needs.in_a_tile)
-            self._captured = None
+            raise InvalidInput(
+                "a later frame was rendered into this frame's memory; take result() before the next render()"
+            )
+        while (needs := self._status.wait()).overflowed:
+            self.capacity = TileListCapacity.for_frame(needs.instances, needs.most_in_tile)
             self._launch()
         assert self._captured is not None
         frame = self._captured.results

@@ -1,4 +1,7 @@
-"""Room for the lists of splats that every tile of a frame has, and how a frame tells that it needs more."""
+"""How long the tile lists of a frame may be, and how the host learns that a frame needed longer ones.
+
+An instance is a pair of a splat and a tile that it touches; a tile's list holds the instances that it blends.
+"""
 
 from __future__ import annotations
 
@@ -12,57 +15,57 @@ from torch import Tensor
 from gsplat_core.ops.frame.frame import MOST_IN_TILE, STATUS_CUT, STATUS_MOST, STATUS_NEEDED, TILE_SIZE
 
 CAPACITY_STEP = 1 << 16
-"""Lists in one room grow by multiples of this many instances (a splat in a tile)."""
+"""The capacity of one buffer for all lists is a multiple of this many instances."""
 TILE_STEP = 32
-"""A tile's own room grows by multiples of this many."""
+"""The capacity of each tile's own buffer is a multiple of this many instances."""
 HEADROOM = 1.25
-"""Room kept beyond what a frame needed, so that a scene that moves seldom outgrows its lists."""
+"""Capacity relative to what a frame needed, so that a scene that moves seldom outgrows it."""
 
 
 def capacity_for(needed: int) -> int:
-    """How many instances to make room for where `needed` were seen."""
+    """The capacity to allocate for all lists together after a frame that needed `needed` instances."""
     return max(1, math.ceil(needed * HEADROOM / CAPACITY_STEP)) * CAPACITY_STEP
 
 
 @dataclass(frozen=True)
-class ListRoom:
-    """`capacity` and `per_tile` as `render_frame` takes them."""
+class TileListCapacity:
+    """`capacity` and `per_tile` as `render_frame` takes them: one buffer for all lists, or one of that size for each tile."""
 
     capacity: int
     per_tile: bool
 
     @staticmethod
-    def for_frame(needed: int, most: int) -> ListRoom:
-        """For a frame with `needed` instances, `most` of them in one tile.
+    def for_frame(needed: int, most_in_tile: int) -> TileListCapacity:
+        """For a frame with `needed` instances, at most `most_in_tile` of them in one tile.
 
-        Rooms of their own are faster. They take up to 32 bytes a pixel; where a tile has more than fits then, all lists share one.
+        Separate buffers are faster and take up to 32 bytes a pixel. Where a tile has more instances than that allows, one buffer serves all.
         """
-        of_tile = max(1, math.ceil(most * HEADROOM / TILE_STEP)) * TILE_STEP
+        of_tile = max(1, math.ceil(most_in_tile * HEADROOM / TILE_STEP)) * TILE_STEP
         if of_tile <= MOST_IN_TILE:
-            return ListRoom(of_tile, per_tile=True)
-        return ListRoom(capacity_for(needed), per_tile=False)
+            return TileListCapacity(of_tile, per_tile=True)
+        return TileListCapacity(capacity_for(needed), per_tile=False)
 
     @staticmethod
-    def at_first(gaussians: int, width_px: int, height_px: int) -> ListRoom:
-        """Before any frame: for four tiles a Gaussian, and tiles with twice the mean."""
+    def initial(gaussians: int, width_px: int, height_px: int) -> TileListCapacity:
+        """Before any frame was seen: for four tiles a Gaussian, and tiles with twice the mean."""
         tiles = math.ceil(width_px / TILE_SIZE) * math.ceil(height_px / TILE_SIZE)
-        return ListRoom.for_frame(4 * gaussians, math.ceil(8 * gaussians / tiles))
+        return TileListCapacity.for_frame(4 * gaussians, math.ceil(8 * gaussians / tiles))
 
 
 class FrameNeeds(NamedTuple):
-    """What the last frame needed, in instances."""
+    """What rendered frames needed, in instances, and whether their lists overflowed."""
 
-    in_all: int
-    in_a_tile: int
-    """The most in one tile."""
-    cut: int
-    """How many frames had to leave some out for want of room."""
+    instances: int
+    """Of all tiles of a frame."""
+    most_in_tile: int
+    overflowed: int
+    """How many frames left instances out because their lists were full."""
 
 
-class StatusOnHost:
-    """What the last frame needed, copied to the host behind its launches and read when it has arrived.
+class FrameStatusCopy:
+    """The status of the last frame on its way to the host.
 
-    The copy may be part of a CUDA graph: `fetch` in it, `mark` behind each of its launches, then `wait`.
+    Queue the copy with `queue` (also inside a CUDA graph), call `launched` after the launch that contains it, then `wait`.
     """
 
     def __init__(self) -> None:
@@ -70,19 +73,19 @@ class StatusOnHost:
         self._values = torch.zeros(4, dtype=torch.int32, pin_memory=True)
 
     def __del__(self) -> None:
-        # torch does not know of copies in graphs: it would give the memory to somebody else while one is still on its way there.
+        # torch does not know that a graph writes here: it would give the memory away while a copy is still in flight.
         self._arrived.synchronize()
 
-    def fetch(self, status: Tensor) -> None:
-        """Queue the copy of `status` behind what was launched."""
+    def queue(self, status: Tensor) -> None:
+        """Queue the copy of a frame's `status` on the current stream."""
         self._values.copy_(status, non_blocking=True)
 
-    def mark(self, device: torch.device) -> None:
-        """What is queued on the current stream of `device` until now is what `wait` waits for."""
+    def launched(self, device: torch.device) -> None:
+        """`wait` shall wait for everything that is queued on the current stream of `device` by now."""
         self._arrived.record(torch.cuda.current_stream(device))
 
     def wait(self) -> FrameNeeds:
-        """What the copy in front of the last mark has brought; waits for it."""
+        """Wait until the copy has arrived, and return it."""
         self._arrived.synchronize()
         values = self._values.tolist()
         return FrameNeeds(values[STATUS_NEEDED], values[STATUS_MOST], values[STATUS_CUT])

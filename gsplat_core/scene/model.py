@@ -12,12 +12,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation import BasisField, DeformationField
-from gsplat_core.deformation.field import checked_window
+from gsplat_core.deformation.field import DeformationField, checked_window
 from gsplat_core.errors import InvalidInput
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
+
+
+def clamp_time(time_s: float, window_s: tuple[float, float]) -> float:
+    """`time_s` brought into the window; not a number stays so, for the field to refuse."""
+    start, end = window_s
+    return min(max(time_s, start), end) if time_s == time_s else time_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +58,7 @@ class Model:
             raise InvalidInput(
                 f"a model is published with detached copies, but {', '.join(learning)} require gradients"
             )
-        if isinstance(self.field, BasisField) and self.field.count != self.gaussians.count:
+        if self.field is not None and self.field.count not in (None, self.gaussians.count):
             raise InvalidInput(f"the field deforms {self.field.count} Gaussians, the model has {self.gaussians.count}")
 
     def tensors(self) -> dict[str, Tensor]:
@@ -75,12 +80,29 @@ class Model:
         field = None if self.field is None else self.field.detached_copy().to(device)
         return dataclasses.replace(self, gaussians=self.gaussians.to(device), field=field)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        return self.gaussians.device
+
+    @property
+    def gaussian_count(self) -> int:
+        """How many Gaussians there are."""
+        return self.gaussians.count
+
+    def as_model(self) -> Model:
+        """Itself; a `Snapshot` gives a copy."""
+        return self
+
+    def clamp_time(self, time_s: float) -> float:
+        """`time_s` brought into the time window."""
+        return clamp_time(time_s, self.time_window_s)
+
     def at(self, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`, clamped to the window. The last answer is remembered, so asking again is free."""
         if self.field is None:
             return self.gaussians
-        start, end = self.time_window_s
-        time_s = min(max(time_s, start), end) if time_s == time_s else time_s  # NaN: the field refuses it
+        time_s = self.clamp_time(time_s)
         last = self._last
         if last is not None and last[0] == time_s:
             return last[1]

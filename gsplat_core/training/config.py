@@ -5,42 +5,37 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal
 
-from gsplat_core.errors import InvalidInput
-
-FieldChoice = Literal["auto", "basis", "hexplane"]
+from gsplat_core.deformation.rates import FieldRates, check_rates
+from gsplat_core.deformation.registry import FIELDS
+from gsplat_core.errors import InvalidSetting
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's rates. Those of positions are in pixels of the training image: they are multiplied by depth / focal length."""
+    """Adam's rates. Those of positions are in pixels of the training image: they are multiplied by depth / focal length.
+
+    Raises InvalidSetting when a rate is not in 0..10.
+    """
 
     means_px: float = 0.03
     quats: float = 2e-3
     log_scales: float = 5e-3
     logit_opacities: float = 2e-2
     sh: float = 5e-3
-    basis_means_px: float = 0.1
-    basis_quats: float = 5e-3
-    basis_log_scales: float = 5e-3
-    basis_sh: float = 1e-2
-    basis_timing: float = 1e-3
-    hexplane_planes: float = 2e-2
-    hexplane_network: float = 5e-3
+    field: FieldRates | None = None
+    """Rates of the deformation field, of the type that its kind has (`FIELDS[name].rates`); None: the kind's defaults."""
 
     def __post_init__(self) -> None:
-        for name, rate in vars(self).items():
-            if not 0 <= rate < 10:
-                raise InvalidInput(f"learning rate {name} is {rate}; it must be between 0 and 10")
+        check_rates({name: rate for name, rate in vars(self).items() if name != "field"})
 
 
 @dataclass(frozen=True)
 class ReconstructorConfig:
-    """What a `Reconstructor` learns and how much work it does."""
+    """What a `Reconstructor` learns and how much work it does. Raises InvalidSetting for a value out of its range."""
 
-    field: FieldChoice = "auto"
-    """Deformation field; `auto` takes basis functions, the better one in `benchmarks/RESULTS.md`."""
+    field: str = "auto"
+    """Deformation field: a name in `gsplat_core.deformation.FIELDS`. `auto` is the better one in `benchmarks/RESULTS.md`."""
     gaussians: int = 30_000
     """Gaussians that the first frame starts with; frames that uncover new tissue add to them."""
     max_gaussians: int = 60_000
@@ -60,7 +55,7 @@ class ReconstructorConfig:
     jump_extra: int = 4
     """Extra steps for a jump, in multiples of the frame's own."""
     bump_spacing_s: float = 0.2
-    """Time between the basis functions of the basis field."""
+    """The shortest time within which motion changes its course: the time between the basis functions of the basis field."""
     ssim_weight: float = 0.0
     """Weight of 1 - SSIM beside L1, 0..1."""
     depth_weight: float = 0.02
@@ -70,28 +65,33 @@ class ReconstructorConfig:
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:
-        if self.field not in ("auto", "basis", "hexplane"):
-            raise InvalidInput(f"field is {self.field!r}; choose auto, basis or hexplane")
+        kind = FIELDS[self.field]
+        if self.rates.field is not None and not isinstance(self.rates.field, type(kind.rates)):
+            raise InvalidSetting(
+                f"rates.field is {type(self.rates.field).__name__}; a {kind.name} field has {type(kind.rates).__name__}"
+            )
         for name in ("gaussians", "max_gaussians", "steps_per_frame", "first_frame_steps", "window_frames"):
             if getattr(self, name) < 1:
-                raise InvalidInput(f"{name} is {getattr(self, name)}; it must be at least 1")
+                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 1")
         if not 0 <= self.sh_degree <= 4:
-            raise InvalidInput(f"sh_degree is {self.sh_degree}; it must be 0 to 4")
+            raise InvalidSetting(f"sh_degree is {self.sh_degree}; it must be 0 to 4")
         if self.max_gaussians < self.gaussians:
-            raise InvalidInput(
+            raise InvalidSetting(
                 f"max_gaussians is {self.max_gaussians}, below the {self.gaussians} gaussians to start with"
             )
-        for name in ("bump_spacing_s", "default_depth_mm"):
+        if self.jump_extra < 0:
+            raise InvalidSetting(f"jump_extra is {self.jump_extra}; it must be at least 0")
+        for name in ("bump_spacing_s", "default_depth_mm", "jump_ratio"):
             if not 0 < getattr(self, name) < math.inf:
-                raise InvalidInput(f"{name} is {getattr(self, name)}; it must be positive")
+                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be positive")
         if not 0 <= self.ssim_weight <= 1:
-            raise InvalidInput(f"ssim_weight is {self.ssim_weight}; it must be between 0 and 1")
+            raise InvalidSetting(f"ssim_weight is {self.ssim_weight}; it must be between 0 and 1")
         if not 0 <= self.depth_weight < math.inf:
-            raise InvalidInput(f"depth_weight is {self.depth_weight}; it must be at least 0")
+            raise InvalidSetting(f"depth_weight is {self.depth_weight}; it must be at least 0")
         if not 0 < self.newest_share <= 1:
-            raise InvalidInput(f"newest_share is {self.newest_share}; it must be in (0, 1]")
+            raise InvalidSetting(f"newest_share is {self.newest_share}; it must be in (0, 1]")
 
     @property
-    def chosen_field(self) -> Literal["basis", "hexplane"]:
-        """The field that `auto` stands for."""
-        return "basis" if self.field == "auto" else self.field
+    def chosen_field(self) -> str:
+        """The field's own name: for `auto`, of the field that it stands for."""
+        return FIELDS[self.field].name

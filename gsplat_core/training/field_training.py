@@ -1,63 +1,51 @@
-"""How a deformation field takes part in a fused training step: its deltas before the frame, its update after."""
+"""Training a deformation field of any kind through autograd."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
-from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
-from gsplat_core.ops.hexplane.deltas import takes_layers
+from gsplat_core.deformation.field import DeformationField
+from gsplat_core.deformation.rates import FieldRates
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.hexplane_training import HexPlaneTraining
+from gsplat_core.training.optimiser import FusedAdam
 
 
-class FieldTraining(Protocol):
-    """A field as the step sees it; nothing of it waits for the device."""
+class AutogradTraining:
+    """Takes the gradient at the deformed Gaussians back through `field.forward`, to the field's parameters and the canonical Gaussians.
 
-    rates: int
-    """How many learning rates it takes."""
-    reads_positions: bool
-    """Whether what it adds depends on the canonical positions, which then get a gradient through it too."""
+    Works for every field, on every device. Parameters may be replaced by larger ones when Gaussians join: moments of rows that were there
+    are kept.
+    """
 
-    def tensors(self) -> Sequence[Tensor]:
-        """Everything on the device that a step changes. The same sequence again says that nothing of it was replaced."""
-
-    def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor | None:
-        """What the field adds at the time that the device scalar holds: [N, 16], the frame path's layout; None: nothing."""
-
-    def update(self, gradient: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor) -> None:
-        """One optimiser step for dL/d(deltas) `gradient` [N, 16]; none where the frame's `status` says that splats were left out.
-
-        A field that reads positions adds what goes back to them to the first three columns of `gradient`.
-        """
-
-
-class BasisTraining:
-    """Lazy Adam over the bumps that are active at a step's time."""
-
-    rates = 6
-    reads_positions = False
-
-    def __init__(self, field: BasisField) -> None:
+    def __init__(self, field: DeformationField, rates: FieldRates) -> None:
         self._field = field
+        parameters = dict(field.named_parameters())
+        self._rate_names = {name: rates.rate_of(name) for name in parameters}
+        self._adam = FusedAdam(parameters, rows=False)
+        self._canonical: Gaussians | None = None
+        self._deformed: Gaussians | None = None
 
-    def tensors(self) -> Sequence[Tensor]:
-        return self._field.training_tensors()
+    def deform(self, gaussians: Gaussians, time_s: float) -> Gaussians:
+        """The Gaussians at `time_s`; the graph from the canonical ones to them is kept for `update`."""
+        self._canonical = gaussians.detach().requires_grad_()
+        with torch.enable_grad():
+            self._deformed = self._field(self._canonical, time_s)
+        assert self._deformed is not None
+        return self._deformed.detach()
 
-    def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor:
-        return self._field.frame_deltas(gaussians)(time)
-
-    def update(self, gradient: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor) -> None:
-        # A frame that was cut has a gradient of zero, and bumps of Gaussians without gradient are left alone.
-        self._field.adam_step_at(time, gradient, rates)
-
-
-def training_of(field: DeformationField) -> FieldTraining | None:
-    """What trains this field on a GPU without autograd; None where nothing does."""
-    if isinstance(field, BasisField):
-        return BasisTraining(field)
-    if isinstance(field, HexPlaneField) and takes_layers(field.channels, len(field.levels), field.width, field.depth):
-        return HexPlaneTraining(field)
-    return None
+    def update(self, gradients: Mapping[str, Tensor], rates: Mapping[str, float]) -> Mapping[str, Tensor | None]:
+        """One step of Adam over the field's parameters; returns the gradients of the canonical Gaussians."""
+        assert self._canonical is not None and self._deformed is not None
+        pairs = [(tensor, gradients[name]) for name, tensor in self._deformed.tensors().items() if tensor.requires_grad]
+        torch.autograd.backward([tensor for tensor, _ in pairs], [gradient for _, gradient in pairs])
+        parameters = dict(self._field.named_parameters())
+        self._adam.follow(parameters)
+        self._adam.step(parameters, learning_rates={name: rates[rate] for name, rate in self._rate_names.items()})
+        for parameter in parameters.values():
+            parameter.grad = None
+        own = {name: tensor.grad for name, tensor in self._canonical.tensors().items()}
+        self._canonical = self._deformed = None
+        return own

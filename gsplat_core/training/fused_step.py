@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation.kind import CapturedTraining
 from gsplat_core.ops.adam.adam import adam_step_at_
 from gsplat_core.ops.frame.frame import render_frame
 from gsplat_core.ops.frame.frame_count import count_frame_
@@ -14,10 +15,9 @@ from gsplat_core.ops.frame.frame_gradients import render_frame_backward_adam_
 from gsplat_core.ops.image_loss.frame_loss import frame_loss
 from gsplat_core.rendering.capture import CapturedSequence, GraphMemory
 from gsplat_core.rendering.frame_renderer import FrameControls
-from gsplat_core.rendering.tile_capacity import StatusOnHost, capacity_for
+from gsplat_core.rendering.tile_capacity import FrameStatusCopy, capacity_for
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.field_training import FieldTraining
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
 from gsplat_core.training.photometric import LossWeights
@@ -37,7 +37,7 @@ class FusedStep:
     """
 
     def __init__(
-        self, gaussians: Gaussians, field: FieldTraining, adam: FusedAdam, weights: LossWeights, camera: Camera
+        self, gaussians: Gaussians, field: CapturedTraining, adam: FusedAdam, weights: LossWeights, camera: Camera
     ) -> None:
         device = gaussians.device
         self._gaussians, self._field, self._adam = gaussians, field, adam
@@ -58,7 +58,7 @@ class FusedStep:
         self._most = torch.zeros(4, dtype=torch.int32, device=device)
         """The frames' status since the last `settle`: the largest of each value, but the sum of those that were cut."""
         self._unread: tuple[Tensor, Tensor] | None = None
-        self._status = StatusOnHost()
+        self._status = FrameStatusCopy()
         self._memory = GraphMemory(device)
         self._capacity = capacity_for(4 * gaussians.count)
         self._captured: CapturedSequence[Tensor] | None = None
@@ -108,15 +108,15 @@ class FusedStep:
 
         There is room for them now: take them again.
         """
-        self._status.fetch(self._most)
-        self._status.mark(self._most.device)
+        self._status.queue(self._most)
+        self._status.launched(self._most.device)
         needs = self._status.wait()
         self._most.zero_()
-        if needs.cut:
-            self._adam.steps -= needs.cut
-            self._capacity = capacity_for(needs.in_all)
+        if needs.overflowed:
+            self._adam.steps -= needs.overflowed
+            self._capacity = capacity_for(needs.instances)
             self._captured = None
-        return needs.cut
+        return needs.overflowed
 
     def _places(self) -> tuple[int, ...]:
         moments = (*self._adam.first_moments.values(), *self._adam.second_moments.values())

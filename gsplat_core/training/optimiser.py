@@ -142,6 +142,21 @@ class FusedAdam:
             for name, moment in moments.items():
                 moments[name] = torch.cat([moment, moment.new_zeros((count, *moment.shape[1:]))])
 
+    def follow(self, parameters: Mapping[str, Tensor]) -> None:
+        """Make the moments fit tensors that were replaced by others of another shape.
+
+        Where dimension 0 alone grew, the new rows' moments start at zero; for any other shape all of them do.
+        """
+        for moments in (self.first_moments, self.second_moments):
+            for name, moment in moments.items():
+                parameter = parameters[name]
+                if parameter.shape == moment.shape:
+                    continue
+                fresh = _zeros(parameter)
+                if moment.shape[1:] == parameter.shape[1:] and moment.shape[0] < parameter.shape[0]:
+                    fresh[: moment.shape[0]] = moment
+                moments[name] = fresh
+
     def reset(self, name: str, index: Tensor | None = None) -> None:
         """Forget the moments of one tensor, or of some of its rows: after its values were set by hand (opacity reset, relocation)."""
         for moments in (self.first_moments, self.second_moments):

@@ -11,12 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
+from gsplat_core.deformation.kind import NewField
+from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
+from gsplat_core.training.budget import Budget, Ending, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth import gaussians_for_uncovered_tissue
 from gsplat_core.training.initialisation import gaussians_from_frame
@@ -24,10 +26,10 @@ from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
-EXTEND_AHEAD_BUMPS = 1
-"""Window that the online basis field keeps ahead of the newest frame, in bumps; beyond it lies one more column."""
 USUAL_DECAY = 0.1
 """How fast the usual loss of a new frame follows the newest ones."""
+STEP_TIME_DECAY = 0.3
+"""How fast the usual time of a step follows the newest frames', where budgets are timed."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,8 @@ class ObserveReport:
     loss: float | None
     """Loss of the last step, None when the frame was not trained on."""
     gaussians: int
+    ending: Ending = "steps"
+    """Why training on the frame ended."""
 
 
 class Reconstructor:
@@ -68,7 +72,11 @@ class Reconstructor:
         self._recording_digest = recording_digest
         self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
         self._step: TrainingStep | None = None
+        self._in_flight = StepsInFlight(self.device)
+        self._step_s: float | None = None
+        """How long a step took lately, where budgets are timed."""
         self._version = 0
+        self._slots = SnapshotSlots(self.device)
         self._usual_surprise = math.inf
         self._first_time_s = 0.0
         self._last_time_s = 0.0
@@ -78,14 +86,22 @@ class Reconstructor:
         """How many Gaussians the model has now."""
         return 0 if self._step is None else self._step.gaussians.count
 
-    def observe(self, frame: Frame, *, steps: int | None = None, train: bool = True) -> ObserveReport:
+    def observe(
+        self, frame: Frame, *, budget: Budget | None = None, steps: int | None = None, train: bool = True
+    ) -> ObserveReport:
         """Take the next frame in order and train on it; with `train=False` only move on to its time.
 
-        `steps` overrides the configured number for this frame. Raises InvalidInput when the first frame is not to be trained on (there is
-        nothing to show yet), when time runs backwards, or when the frame does not fit the camera.
+        Args:
+            budget: the work that the frame may take; None: the configured number of steps.
+            steps: short for `budget=Budget.of_steps(steps)`.
+
+        Raises InvalidInput when the first frame is not to be trained on (there is nothing to show yet), when time runs backwards, or when
+        the frame does not fit the camera.
         """
-        if steps is not None and steps < 0:
-            raise InvalidInput(f"steps is {steps}; it must be at least 0")
+        if steps is not None:
+            if budget is not None:
+                raise InvalidInput("budget and steps are both given; steps is short for Budget.of_steps(steps)")
+            budget = Budget.of_steps(steps)
         observation = Observation.of(frame, self.camera, self.device)
         first = self._step is None
         if first:
@@ -98,33 +114,62 @@ class Reconstructor:
                 " frames must come in order"
             )
         assert self._step is not None
-        self._cover_time(observation.time_s)
+        self._step.field.cover(observation.time_s, self._last_time_s)
         self._last_time_s = observation.time_s
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
         self._window.add(observation)
         if not first:
             self._grow(frame, observation)
-        count = steps if steps is not None else self.config.first_frame_steps if first else self.config.steps_per_frame
-        if count == 0:
-            return ObserveReport(frame.seq, 0, None, self.gaussians)
-        loss = self._step(observation)
-        arriving = HostCopy(loss)
-        schedule = self._window.schedule(count - 1)
-        for chosen in schedule:
-            loss = self._step(chosen)
-        # Asked for only now: whether the frame is a jump decides about extra steps after its own.
-        surprise = arriving.item()
+        if budget is None:
+            budget = Budget.of_steps(self.config.first_frame_steps if first else self.config.steps_per_frame)
+        return self._train_on(observation, budget, first)
+
+    def _train_on(self, observation: Observation, budget: Budget, first: bool) -> ObserveReport:
+        """Spend a budget on the newest frame and the window. A jump gets more steps, or with a deadline all that are left."""
+        assert self._step is not None
+        spending = Spending(budget, self._step_s)
+        plan: list[Observation] = [observation]
+        arriving: HostCopy | None = None
+        jump = False
+        while spending.allows_step():
+            if not plan:
+                if budget.is_timed and not jump:
+                    jump = self._is_jump(arriving, first)
+                count = spending.planned()
+                plan = [observation] * count if jump else self._window.schedule(count)[::-1]
+            loss = self._step(plan.pop())
+            arriving = arriving or HostCopy(loss)
+            spending.step_made(self._in_flight.queued() if budget.is_timed else 0)
+        if arriving is None:
+            return ObserveReport(observation.seq, 0, None, self.gaussians, spending.ending)
         extra = 0
-        if not first and surprise > self.config.jump_ratio * self._usual_surprise:
-            extra = count * self.config.jump_extra
+        # Asked for only now, so that a GPU need not be waited for before its queue is filled.
+        if not budget.is_timed and self._is_jump(arriving, first):
+            extra = spending.made * self.config.jump_extra
         for _ in range(extra):
             loss = self._step(observation)
         self._step.settle(observation)
+        if budget.is_timed:
+            self._learn_step_time(spending)
         if not first:
-            known = self._usual_surprise if self._usual_surprise < math.inf else surprise
-            self._usual_surprise = known + USUAL_DECAY * (min(surprise, self.config.jump_ratio * known) - known)
-        return ObserveReport(frame.seq, 1 + len(schedule) + extra, HostCopy(loss).item(), self.gaussians)
+            self._learn_surprise(arriving.item())
+        return ObserveReport(
+            observation.seq, spending.made + extra, HostCopy(loss).item(), self.gaussians, spending.ending
+        )
+
+    def _is_jump(self, arriving: HostCopy | None, first: bool) -> bool:
+        """Whether the loss with which a frame arrived shows a cut or a pull. Waits for it."""
+        return not first and arriving is not None and arriving.item() > self.config.jump_ratio * self._usual_surprise
+
+    def _learn_surprise(self, surprise: float) -> None:
+        known = self._usual_surprise if self._usual_surprise < math.inf else surprise
+        self._usual_surprise = known + USUAL_DECAY * (min(surprise, self.config.jump_ratio * known) - known)
+
+    def _learn_step_time(self, spending: Spending) -> None:
+        spending.all_finished()
+        known = spending.step_s if self._step_s is None else self._step_s
+        self._step_s = known + STEP_TIME_DECAY * (spending.step_s - known)
 
     def fit(
         self, frames: Iterable[Frame], steps: int, progress: Callable[[int, Tensor], None] | None = None
@@ -178,6 +223,23 @@ class Reconstructor:
             training_digest=self._recording_digest,
         )
 
+    def publish(self) -> Model | Snapshot:
+        """The model as it is now, for showing it, with the next version number. As `snapshot`, but on a GPU it is copied into a slot.
+
+        Nothing is allocated then and the host does not wait; see `gsplat_core.scene.snapshots`.
+        """
+        if self._step is None or self.device.type != "cuda" or not SnapshotSlots.can_hold(self._step.field):
+            return self.snapshot()
+        self._version += 1
+        return self._slots.publish(
+            self._step.gaussians,
+            self._step.field,
+            version=self._version,
+            camera=self.camera,
+            time_window_s=(self._first_time_s, self._last_time_s),
+            training_digest=self._recording_digest,
+        )
+
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
         gaussians = gaussians_from_frame(
             frame,
@@ -189,32 +251,11 @@ class Reconstructor:
         ).to(self.device)
         self._first_time_s = observation.time_s
         self.camera = observation.camera
-        field = self._new_field(gaussians, end_s).to(self.device)
+        wanted = NewField(gaussians, observation.time_s, end_s, self.config.bump_spacing_s)
+        with torch.random.fork_rng(devices=[]):  # planes and layers start random
+            torch.manual_seed(self._seed)
+            field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config, self.camera)
-
-    def _new_field(self, gaussians: Gaussians, end_s: float | None) -> DeformationField:
-        start = self._first_time_s
-        spacing = self.config.bump_spacing_s
-        if self.config.chosen_field == "hexplane":
-            with torch.random.fork_rng(devices=[]):  # planes and layers start random
-                torch.manual_seed(self._seed)
-                return HexPlaneField(gaussians, (start, start + spacing if end_s is None else end_s))
-        ahead = EXTEND_AHEAD_BUMPS * spacing
-        span = ahead if end_s is None else max(end_s - start, spacing)
-        bumps = max(4, round(span / spacing) + 3)
-        return BasisField(gaussians.count, (start, start + span), bumps=bumps)
-
-    def _cover_time(self, time_s: float) -> None:
-        """Move the field's window on, so that the frame's time is inside."""
-        assert self._step is not None
-        field = self._step.field
-        start, end = field.time_window_s
-        if isinstance(field, BasisField):
-            ahead = EXTEND_AHEAD_BUMPS * field.spacing_s
-            if time_s + ahead > end:
-                field.extend((start, time_s + ahead + field.spacing_s), hold_at_s=self._last_time_s)
-        elif time_s > end:
-            field.extend((start, start + 2 * (time_s - start)))
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
         """Add Gaussians where the frame shows tissue that the model does not cover."""

@@ -33,7 +33,7 @@ class FittedModel:
         """Learn nothing."""
         return ObserveReport(frame.seq, 0, None, self.model.gaussians.count)
 
-    def snapshot(self) -> Model:
+    def publish(self) -> Model:
         """The finished model."""
         return self.model
 

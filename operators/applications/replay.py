@@ -19,7 +19,7 @@ from typing import Any, get_args
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings import Recording, is_heldout, open_recording
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.config import FieldChoice, ReconstructorConfig
+from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, scheduler_for
 from operators.applications.execution import Execution
@@ -51,7 +51,7 @@ class ReplaySettings:
     out: Path
     device: str = "cpu"
     engine: Engine = "embedded"
-    field: FieldChoice = "auto"
+    field: str = "auto"
     seed: int = 0
     steps_per_frame: int | None = None
     """Optimiser steps per frame; None is the reconstructor's default."""
@@ -129,7 +129,7 @@ class ReplayApplication(Application):
 
     def room_to_finish(self) -> int:
         """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
-        model = self.reconstruct.model
+        model = self.reconstruct.newest
         return self._reserve_bytes + (0 if model is None else 4 * model.parameter_count)
 
     def _new_reconstructor(self) -> Reconstructor:

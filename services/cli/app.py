@@ -98,7 +98,7 @@ def replay(
         out=out,
         device=device,
         engine=engine,  # type: ignore[arg-type]
-        field=field,  # type: ignore[arg-type]
+        field=field,
         seed=seed,
         steps_per_frame=steps_per_frame,
         max_frames=max_frames,
@@ -128,7 +128,7 @@ def reconstruct(
         recording=recording,
         out=out,
         device=device,
-        field=field,  # type: ignore[arg-type]
+        field=field,
         seed=seed,
         max_frames=max_frames,
         scale=scale,

@@ -20,7 +20,7 @@ def test_the_gaussians_are_those_of_the_frames_time(frame, model, camera, comput
             parameter.requires_grad_(False)
     moving = Model(3, still.gaussians, field, camera, (0.0, 1.0))
     (scene,) = compute(DeformOp(None), reconstruction=Reconstruction(frame(5), moving, trained=True))
-    assert scene.model_version == 3 and scene.trained
+    assert scene.model.version == 3 and scene.trained
     torch.testing.assert_close(scene.gaussians.means, moving.at(0.2).means)
     assert not torch.allclose(scene.gaussians.means, still.gaussians.means)
     assert scene.camera == camera

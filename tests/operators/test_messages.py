@@ -21,7 +21,7 @@ def test_steps_are_not_negative(frame, model):
 
 def test_a_scene_is_seen_by_a_camera_of_the_frames_size(frame, model, camera):
     with pytest.raises(InvalidInput, match=r"frame 0 is 24x16 px, its camera 48x32; scale the camera"):
-        DeformedScene(frame(), model().gaussians, camera.scaled(2), 1, True)
+        DeformedScene(frame(), model(), camera.scaled(2), True)
 
 
 @pytest.mark.parametrize(

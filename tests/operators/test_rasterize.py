@@ -10,7 +10,7 @@ from operators.rasterize import RasterizeOp, displayed
 
 
 def test_a_scene_made_from_a_frame_looks_like_it(frame, model, camera, compute):
-    scene = DeformedScene(frame(), model().gaussians, camera, 4, True)
+    scene = DeformedScene(frame(), model(4), camera, True)
     (shown,) = compute(RasterizeOp(None), scene=scene)
     assert shown.image.dtype == np.uint8 and shown.image.shape == frame().image.shape
     assert shown.model_version == 4 and shown.trained

@@ -19,9 +19,9 @@ class FakeReconstructor:
         self.calls.append(("observe", frame.seq, train))
         return SimpleNamespace(seq=frame.seq, steps=7 if train else 0, loss=0.5 if train else None, gaussians=60)
 
-    def snapshot(self):
+    def publish(self):
         self.version += 1
-        self.calls.append(("snapshot", self.version))
+        self.calls.append(("publish", self.version))
         return self.make_model(self.version)
 
 
@@ -30,7 +30,7 @@ def test_each_frame_is_trained_on_before_its_snapshot(frame, model, compute):
     operator = ReconstructOp(None, make_reconstructor=lambda: fake)
     operator.start()
     messages = [compute(operator, frame=frame(k))[0] for k in range(2)]
-    assert fake.calls == [("observe", 0, True), ("snapshot", 1), ("observe", 1, True), ("snapshot", 2)]
+    assert fake.calls == [("observe", 0, True), ("publish", 1), ("observe", 1, True), ("publish", 2)]
     assert [(m.frame.seq, m.model.version, m.steps, m.loss, m.trained) for m in messages] == [
         (0, 1, 7, 0.5, True),
         (1, 2, 7, 0.5, True),

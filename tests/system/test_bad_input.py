@@ -232,7 +232,7 @@ def test_a_gpu_that_is_not_there(tiny, tmp_path, refused, monkeypatch):
         (("--max-frames", "0"), "max_frames must be at least 1, got 0"),
         (("--steps-per-frame", "0"), "steps_per_frame is 0"),
         (("--seed", "-1"), "seed is -1"),
-        (("--field", "fourier"), "field is 'fourier'"),
+        (("--field", "fourier"), "unknown deformation field 'fourier'"),
         (("--engine", "steam"), "engine is 'steam'"),
         (("--device", "tpu"), "device 'tpu' is not known"),
     ],

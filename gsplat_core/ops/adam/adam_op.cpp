@@ -1,7 +1,7 @@
 #include <atomic>
 
 #include "adam_options.h"
-#include "tensor_checks.h"
+#include "cpu_call.h"
 
 static int64_t active_isa_op() { return int64_t(active_isa()); }
 

@@ -4,14 +4,18 @@
 #include <cstdint>
 
 #include "isa.h"
+#include "raw_layout.h"
 
-constexpr int64_t kBasisChannels = 13;
-constexpr int64_t kBasisPadded = 16;  // columns of deltas and gradients in the frame path's layout; the last three are not ours
-constexpr float kBasisReach = 4.0f;   // widths; a bump further away is left out (BUMP_REACH of the reference)
+constexpr int64_t kBasisChannels = kRawBasisChannels;
+constexpr int64_t kBasisPadded =
+    kRawColumns;                     // columns of deltas and gradients as whole raw rows; the field has no part in the last
+constexpr float kBasisReach = 4.0f;  // widths; a bump further away is left out (BUMP_REACH in Python)
 
 // Learning rates in their order: position, rotation, log-scale, colour; centres, widths.
 constexpr int kBasisRates = 6, kBasisCenterRate = 4, kBasisWidthRate = 5;
-constexpr int basis_rate_of(int64_t channel) { return channel < 3 ? 0 : channel < 7 ? 1 : channel < 10 ? 2 : 3; }
+constexpr int basis_rate_of(int64_t channel) {
+  return channel < kRawRotation ? 0 : channel < kRawLogScale ? 1 : channel < kRawColor ? 2 : 3;
+}
 
 // One field at one time: centres and log-widths [N, B], weights [N, B, 13].
 struct BasisBumps {
@@ -28,8 +32,8 @@ struct BasisAdam {
   int32_t* steps;
   int64_t bumps;
   float tau;
-  int64_t row;              // columns of the gradient
-  float channel_rates[16];  // by channel; the last three are unused
+  int64_t row;                       // columns of the gradient
+  float channel_rates[kRawColumns];  // by channel; the last three are unused
   float center_rate, width_rate, beta1, beta2, epsilon;
   // Bias corrections after k updates, k < table_size: 1 / (1 - beta1^k) and 1 / sqrt(1 - beta2^k); later ones are the last.
   const float *inverse_bias1, *inverse_root_bias2;

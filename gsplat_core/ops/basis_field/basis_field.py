@@ -18,11 +18,9 @@ from gsplat_core.argument_checks import require_float32
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.scalars.scalars import store_scalars_
-from gsplat_core.reference.deformation import CHANNEL_GROUPS
+from gsplat_core.scene.layout import BASIS_CHANNELS as CHANNELS
+from gsplat_core.scene.layout import RAW_COLUMNS
 
-CHANNELS = sum(CHANNEL_GROUPS)
-PADDED_CHANNELS = 16
-"""Columns of deltas and gradients in the frame path's layout: our 13, and three that are not ours."""
 RATES = 6
 """Learning rates: position, rotation, log-scale, colour, centres, widths."""
 
@@ -115,7 +113,7 @@ def _check(centers: Tensor, log_widths: Tensor, weights: Tensor) -> None:
 
 
 def _check_gradient(gradient: Tensor, centers: Tensor) -> None:
-    shapes = [(centers.shape[0], columns) for columns in (CHANNELS, PADDED_CHANNELS)]
+    shapes = [(centers.shape[0], columns) for columns in (CHANNELS, RAW_COLUMNS)]
     if gradient.shape not in shapes or gradient.dtype != torch.float32:
         raise InvalidInput(
             f"gradient must be float32 {list(shapes[0])} or {list(shapes[1])}, got {gradient.dtype} {list(gradient.shape)}"
@@ -125,7 +123,7 @@ def _check_gradient(gradient: Tensor, centers: Tensor) -> None:
 
 @torch.library.register_fake("gsplat_core::basis_field")
 def _(centers: Tensor, log_widths: Tensor, weights: Tensor, tau: Tensor, padded: bool = False) -> Tensor:
-    return centers.new_empty(centers.shape[0], PADDED_CHANNELS if padded else CHANNELS)
+    return centers.new_empty(centers.shape[0], RAW_COLUMNS if padded else CHANNELS)
 
 
 @torch.library.register_fake("gsplat_core::basis_field_backward")

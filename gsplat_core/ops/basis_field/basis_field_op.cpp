@@ -6,6 +6,7 @@
 
 #include "basis_field.h"
 #include "basis_field_checks.h"
+#include "cpu_call.h"
 
 static constexpr int64_t kGrain = 1024;
 

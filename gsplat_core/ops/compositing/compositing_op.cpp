@@ -5,7 +5,7 @@
 
 #include "compositing.h"
 #include "counting_sort.h"
-#include "tensor_checks.h"
+#include "cpu_call.h"
 
 namespace {
 

@@ -1,10 +1,9 @@
 // The rows of the instances, summed by splat in the order of the lists, and turned into gradients.
 #pragma once
 
-#include <cub/device/device_radix_sort.cuh>
-
 #include "blend_backward.cuh"
 #include "composite_windows.cuh"
+#include "cub_device.cuh"
 
 namespace {
 

@@ -1,10 +1,11 @@
-#include "covariance_cuda.h"
+#include "covariance.h"
 #include "covariance_math.h"
 #include "cuda_scratch.h"
 
-using namespace GSPLAT_ISA;
-
+namespace gsplat::covariance {
 namespace {
+
+using namespace GSPLAT_ISA::covariance;
 
 __global__ void __launch_bounds__(kThreads) forward(const float* __restrict__ quats, const float* __restrict__ scales,
                                                     float* __restrict__ out, bool inverse, bool triu, int64_t count) {
@@ -69,3 +70,5 @@ void covariance_backward(const float* quats, const float* scales, const float* v
   if (count == 0) return;
   backward<<<blocks_for(count), kThreads, 0, stream>>>(quats, scales, v_covars, v_precis, triu, v_quats, v_scales, count);
 }
+
+}  // namespace gsplat::covariance

@@ -3,7 +3,7 @@
 #include "rows.h"
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::covariance {
 
 static void forward(const float* quats, const float* scales, float* out, bool inverse, bool triu, int64_t begin, int64_t end) {
   for (int64_t first = begin; first < end; first += kLanes) {
@@ -62,6 +62,6 @@ static void backward(const float* quats, const float* scales, const float* v_cov
   }
 }
 
-extern const CovarianceKernels covariance_kernels = {forward, backward};
+extern const gsplat::covariance::Kernels kernels = {forward, backward};
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::covariance

@@ -3,7 +3,7 @@
 
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::covariance {
 
 struct Matrix3 {
   vfloat m[3][3];
@@ -73,4 +73,4 @@ GSPLAT_INLINE void rotation_backward(const UnitQuat& q, const Matrix3& v, vfloat
   v_q[3] = (z - along * q.z) * q.inverse_norm;
 }
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::covariance

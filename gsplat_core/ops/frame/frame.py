@@ -18,6 +18,7 @@ from gsplat_core.ops.frame import frame_autograd  # noqa: F401  registers the gr
 from gsplat_core.rendering.settings import EPS2D, FAR_PLANE, NEAR_PLANE
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE
+from gsplat_core.scene.layout import RAW_COLUMNS
 
 TILE_SIZE = 16
 """Side of the frame path's tiles in pixels; other sizes are for the plain ops."""
@@ -77,8 +78,7 @@ def render_frame(
     Args:
         means [N, 3], quats [N, 4] (wxyz, any length but zero), log_scales [N, 3], logit_opacities [N], sh [N, B, 3] with
             B = (degree + 1)², up to degree 4.
-        deltas: [N, 16], added to the raw parameters: position 3, rotation 4, log-scale 3, colour 3 (to the first coefficient),
-            opacity logit 1, 2 unused. Or None.
+        deltas: [N, 16], added to the raw parameters in the layout of `gsplat_core.scene.layout`. Or None.
         viewmat: [4, 4] world to camera, OpenCV axes. K: [3, 3] in pixels, without skew. background: [3], black where None.
         width, height: pixels.
         capacity: for how many instances (a splat in a tile) there is room, in all tiles together or, with `per_tile`, in each.
@@ -110,7 +110,7 @@ def render_frame(
             f"sh must be [N, B, 3] with N = {n} and B = (degree + 1)², degree 0 to {MAX_SH_DEGREE}; got {list(sh.shape)}"
         )
     if deltas is not None:
-        require_shape("deltas", deltas, (n, 16), "[N, 16]")
+        require_shape("deltas", deltas, (n, RAW_COLUMNS), "[N, 16]")
     require_shape("viewmat", viewmat, (4, 4), "[4, 4]")
     require_shape("K", K, (3, 3), "[3, 3]")
     if background is not None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.ops.frame.frame_gradients import DC
+from gsplat_core.scene.layout import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION
 
 TENSORS = 9
 """Inputs of the op that are tensors: five of the Gaussians, deltas, viewmat, K, background."""
@@ -38,7 +38,8 @@ def _backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: Any
         ctx.width, ctx.height, ctx.eps2d, ctx.camera_model, True,
     )  # fmt: skip
     # Copies: autograd may add to what it was given, and these would share their memory.
-    columns = raw[:, :3], raw[:, 3:7], raw[:, 7:10], raw[:, 13], raw[:, None, DC] if inputs[4].shape[1] == 1 else sh
+    sh_gradient = raw[:, None, COLOUR] if inputs[4].shape[1] == 1 else sh
+    columns = raw[:, POSITION], raw[:, ROTATION], raw[:, LOG_SCALE], raw[:, OPACITY.start], sh_gradient
     own = [column.clone() if needed else None for column, needed in zip(columns, ctx.needs_input_grad, strict=False)]
     return (*own, raw if ctx.needs_input_grad[5] else None, *[None] * 12)
 

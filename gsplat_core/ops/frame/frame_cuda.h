@@ -10,10 +10,10 @@
 #include <cuda_runtime.h>
 
 #include "cuda_scratch.h"
+#include "raw_layout.h"
 
 constexpr int kFrameTile = 16;      // pixels on a side
 constexpr int kFrameThreads = 128;  // of a block that does one Gaussian per thread
-constexpr int kRawColumns = 16;     // position 3, rotation 4, log-scale 3, colour 3, opacity logit 1, 2 unused
 constexpr int kRowQuads = 3;        // float4s of an instance's gradient row: 6 moments, 4 channels, 2 unused
 constexpr int kStatusNeeded = 0;    // instances that the frame needs
 constexpr int kStatusMost = 1;      // most instances in one tile

@@ -7,6 +7,8 @@
 
 namespace {
 
+using namespace gsplat::tiles;
+
 // A splat whose box has at most 32 tiles has a bit for each, row by row. Of a larger one the box is kept, and the warp finds its
 // tiles together, in every kernel anew, from the record. Nothing touched: both words are 0.
 //   small: x = width - 1 (5 bits from 26) | top (13 bits from 13) | left (13 bits), y = the bits

@@ -6,6 +6,8 @@
 
 namespace {
 
+using namespace GSPLAT_ISA::projection;
+
 // The camera in shared memory: its matrices are in device memory, so that a captured graph sees new ones.
 struct FrameCamera {
   float viewmat[16], intrinsics[9], center[3];
@@ -50,17 +52,17 @@ __device__ inline RawGaussian load_gaussian(const FrameScene& in, int64_t n) {
   RawGaussian g;
   const float4 quat = load_four(in.quats + 4 * n, in.aligned);
   const float4 zero = make_float4(0, 0, 0, 0);
-  float4 d[4] = {zero, zero, zero, zero};
+  float4 d[kRawColumns / 4] = {zero, zero, zero, zero};
   if (in.deltas != nullptr)
-    for (int k = 0; k < 4; ++k) d[k] = load_four(in.deltas + kRawColumns * n + 4 * k, in.aligned);
-  const float delta[14] = {d[0].x, d[0].y, d[0].z, d[0].w, d[1].x, d[1].y, d[1].z,
-                           d[1].w, d[2].x, d[2].y, d[2].z, d[2].w, d[3].x, d[3].y};
+    for (int k = 0; k < kRawColumns / 4; ++k) d[k] = load_four(in.deltas + kRawColumns * n + 4 * k, in.aligned);
+  const float delta[kRawUsed] = {d[0].x, d[0].y, d[0].z, d[0].w, d[1].x, d[1].y, d[1].z,
+                                 d[1].w, d[2].x, d[2].y, d[2].z, d[2].w, d[3].x, d[3].y};
   const float q[4] = {quat.x, quat.y, quat.z, quat.w};
-  for (int k = 0; k < 3; ++k) g.mean[k] = in.means[3 * n + k] + delta[k];
-  for (int k = 0; k < 4; ++k) g.quat[k] = q[k] + delta[3 + k];
-  for (int k = 0; k < 3; ++k) g.log_scale[k] = in.log_scales[3 * n + k] + delta[7 + k];
-  for (int k = 0; k < 3; ++k) g.color[k] = delta[10 + k];
-  g.logit = in.logit_opacities[n] + delta[13];
+  for (int k = 0; k < 3; ++k) g.mean[k] = in.means[3 * n + k] + delta[kRawPosition + k];
+  for (int k = 0; k < 4; ++k) g.quat[k] = q[k] + delta[kRawRotation + k];
+  for (int k = 0; k < 3; ++k) g.log_scale[k] = in.log_scales[3 * n + k] + delta[kRawLogScale + k];
+  for (int k = 0; k < 3; ++k) g.color[k] = delta[kRawColor + k];
+  g.logit = in.logit_opacities[n] + delta[kRawOpacity];
   // 0 x is 0 for a finite x and NaN for any other.
   float sum = 0 * g.logit;
   for (int k = 0; k < 3; ++k) sum += 0 * g.mean[k] + 0 * g.log_scale[k] + 0 * g.color[k];
@@ -71,9 +73,9 @@ __device__ inline RawGaussian load_gaussian(const FrameScene& in, int64_t n) {
 
 __device__ inline float opacity_of(const RawGaussian& g) { return 1.0f / (1.0f + expf(-g.logit)); }
 
-__device__ inline GSPLAT_ISA::Geometry geometry_of(const RawGaussian& g) {
+__device__ inline Geometry geometry_of(const RawGaussian& g) {
   const float scales[3] = {expf(g.log_scale[0]), expf(g.log_scale[1]), expf(g.log_scale[2])};
-  return GSPLAT_ISA::geometry_of(g.quat, scales);
+  return GSPLAT_ISA::projection::geometry_of(g.quat, scales);
 }
 
 // The unit vector from the camera to the Gaussian, and one over their distance.

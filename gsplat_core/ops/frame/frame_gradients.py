@@ -15,26 +15,24 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_float32, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.reference.frame import RAW_COLUMNS
 from gsplat_core.rendering.settings import EPS2D
 from gsplat_core.scene.cameras import CAMERA_MODELS
+from gsplat_core.scene.layout import RAW_COLUMNS
 
 if TYPE_CHECKING:
     from gsplat_core.ops.frame.frame import Frame
 
 RATES = 5
 """Learning rates of the fused Adam: means, quats, log-scales, logit opacities, spherical harmonics."""
-DC = slice(10, 13)
-"""Where the first coefficient of the colour is in a row of raw gradients (see `reference.frame.RAW_COLUMNS`)."""
 
 
 class RawGradients(NamedTuple):
     """Gradients of one frame's raw Gaussians, all zero where the frame's lists were cut (`status[2]`)."""
 
     raw: Tensor
-    """[N, 16] in the layout of the deltas, whose gradient it is too; the last two columns are zero."""
+    """[N, 16] in the layout of `scene.layout`, which is that of the deltas, whose gradient it is too."""
     sh: Tensor
-    """[N, B, 3]; empty for B = 1, where `raw[:, DC]` is all there is."""
+    """[N, B, 3]; empty for B = 1, where `raw[:, COLOUR]` is all there is."""
 
 
 def render_frame_backward(

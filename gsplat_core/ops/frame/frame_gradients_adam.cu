@@ -74,7 +74,9 @@ __device__ inline void update_value(const FrameAdam& adam, int tensor, int64_t a
 // The tensors but the last, and where their columns are in a raw row.
 constexpr int kSmall = kRateCount - 1;
 constexpr int small_columns(int tensor) { return tensor == 1 ? 4 : tensor == 3 ? 1 : 3; }
-constexpr int small_offset(int tensor) { return tensor == 0 ? 0 : tensor == 1 ? 3 : tensor == 2 ? 7 : 13; }
+constexpr int small_offset(int tensor) {
+  return tensor == 0 ? kRawPosition : tensor == 1 ? kRawRotation : tensor == 2 ? kRawLogScale : kRawOpacity;
+}
 template <int kDegree>
 __device__ inline float small_gradient(const WarpGradients<kDegree>& warp, int tensor, int value) {
   const int columns = small_columns(tensor);
@@ -155,10 +157,10 @@ __global__ void __launch_bounds__(kSplatThreads<kDegree>, kDegree < 4 ? 5 : 1)
   warp.raw.get(lane, raw);
   warp.sh.get(lane, sh);
   const bool mine = lane < count;
-  const unsigned poisoned[kRateCount] = {__ballot_sync(kAllLanes, mine && !usable_gradient<3>(raw)),
-                                         __ballot_sync(kAllLanes, mine && !usable_gradient<4>(raw + 3)),
-                                         __ballot_sync(kAllLanes, mine && !usable_gradient<3>(raw + 7)),
-                                         __ballot_sync(kAllLanes, mine && !usable_gradient<1>(raw + 13)),
+  const unsigned poisoned[kRateCount] = {__ballot_sync(kAllLanes, mine && !usable_gradient<3>(raw + kRawPosition)),
+                                         __ballot_sync(kAllLanes, mine && !usable_gradient<4>(raw + kRawRotation)),
+                                         __ballot_sync(kAllLanes, mine && !usable_gradient<3>(raw + kRawLogScale)),
+                                         __ballot_sync(kAllLanes, mine && !usable_gradient<1>(raw + kRawOpacity)),
                                          __ballot_sync(kAllLanes, mine && !usable_gradient<warp.kHarmonics>(sh))};
   __syncwarp();
   if (lists.status[kStatusCut] == 0) {
@@ -176,7 +178,7 @@ __global__ void __launch_bounds__(kSplatThreads<kDegree>, kDegree < 4 ? 5 : 1)
   }
   // A field learns nothing from a Gaussian whose gradient is not usable.
   __syncwarp();
-  if (mine && !usable_gradient<kRawGradients>(raw)) {
+  if (mine && !usable_gradient<kRawUsed>(raw)) {
     const float none[kRawColumns] = {};
     warp.raw.put(lane, none);
   }

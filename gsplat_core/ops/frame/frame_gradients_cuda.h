@@ -3,8 +3,7 @@
 
 #include "frame_cuda.h"
 
-constexpr int kRawGradients = 14;  // of the columns of a raw row, those that are gradients
-constexpr int kRateCount = 5;      // means, quats, log-scales, logit opacities, spherical harmonics
+constexpr int kRateCount = 5;  // means, quats, log-scales, logit opacities, spherical harmonics
 
 // What comes back from the picture, and what it is compared with on the way: the forward pass's transmittance and last splats.
 struct FrameGradients {

@@ -8,6 +8,7 @@
 namespace {
 
 using namespace GSPLAT_ISA;
+using namespace GSPLAT_ISA::spherical_harmonics;
 
 // The sum of a Gaussian's rows.
 struct SplatRow {
@@ -15,7 +16,7 @@ struct SplatRow {
   float colors[4];   // red, green, blue, z
 };
 
-// The gradient of a Gaussian's raw parameters, in the order of kRawColumns.
+// The gradient of a Gaussian's raw parameters.
 struct RawGradient {
   float mean[3], quat[4], log_scales[3], color[3], logit;
 };

@@ -183,8 +183,13 @@ struct WarpGradients {
       harmonics_gradient<kDegree>(camera, gaussian, sum.colors, c, g);
     }
     sh.put(lane, c);
-    raw.put(lane, {g.mean[0], g.mean[1], g.mean[2], g.quat[0], g.quat[1], g.quat[2], g.quat[3], g.log_scales[0], g.log_scales[1],
-                   g.log_scales[2], g.color[0], g.color[1], g.color[2], g.logit, 0, 0});
+    float row[kRawColumns] = {};
+    for (int k = 0; k < 3; ++k) row[kRawPosition + k] = g.mean[k];
+    for (int k = 0; k < 4; ++k) row[kRawRotation + k] = g.quat[k];
+    for (int k = 0; k < 3; ++k) row[kRawLogScale + k] = g.log_scales[k];
+    for (int k = 0; k < 3; ++k) row[kRawColor + k] = g.color[k];
+    row[kRawOpacity] = g.logit;
+    raw.put(lane, row);
   }
 };
 

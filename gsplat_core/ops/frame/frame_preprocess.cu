@@ -6,6 +6,7 @@
 #include "frame_launch.cuh"
 
 using namespace GSPLAT_ISA;
+using namespace GSPLAT_ISA::spherical_harmonics;
 
 namespace {
 

@@ -13,9 +13,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-
-DELTA_COLUMNS = 16
-"""Columns of the frame path's deltas: position 3, rotation 4, log-scale 3, colour 3, opacity logit 1, 2 unused."""
+from gsplat_core.scene.layout import RAW_COLUMNS
 
 
 def hexplane_deltas(
@@ -67,8 +65,8 @@ def takes_layers(channels: int, levels: int, width: int, depth: int, item: int =
     padded = padded_width(width)
     features = channels * levels
     stride = features if features * item % 128 == 64 else features + 64 // item
-    weights = padded * stride + (padded * (depth - 1) + DELTA_COLUMNS) * (padded + 32 // item)
-    size = weights * item + 4 * (depth * padded + DELTA_COLUMNS)
+    weights = padded * stride + (padded * (depth - 1) + RAW_COLUMNS) * (padded + 32 // item)
+    size = weights * item + 4 * (depth * padded + RAW_COLUMNS)
     return channels * item % 64 == 0 and padded > 0 and levels <= 16 and depth <= 9 and size <= 200 * 1024
 
 
@@ -82,4 +80,4 @@ def _(
     weights: list[Tensor],
     biases: list[Tensor],
 ) -> Tensor:
-    return coordinates.new_empty(coordinates.shape[0], DELTA_COLUMNS)
+    return coordinates.new_empty(coordinates.shape[0], RAW_COLUMNS)

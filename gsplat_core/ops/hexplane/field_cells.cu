@@ -1,6 +1,5 @@
-#include <cub/device/device_radix_sort.cuh>
-#include <cub/device/device_scan.cuh>
 
+#include "cub_device.cuh"
 #include "line_position.h"
 #include "node_gradient.cuh"
 #include "training_cuda.h"

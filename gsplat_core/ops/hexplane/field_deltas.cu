@@ -150,7 +150,7 @@ __global__ void __launch_bounds__(32 * warps_of(int(sizeof(T)), kWidth), blocks_
     next_layer(sums, out, next, hidden_stride);
     for (int r = 0; r < 2; ++r) {
       if (rows[r] >= count) continue;
-      float* to = deltas + (in.order != nullptr ? in.order[rows[r]] : rows[r]) * int64_t(kDeltaColumns) + 2 * place.quad;
+      float* to = deltas + (in.order != nullptr ? in.order[rows[r]] : rows[r]) * int64_t(kRawColumns) + 2 * place.quad;
       *reinterpret_cast<float2*>(to) = make_float2(out[0][2 * r], out[0][2 * r + 1]);
       *reinterpret_cast<float2*>(to + 8) = make_float2(out[1][2 * r], out[1][2 * r + 1]);
     }

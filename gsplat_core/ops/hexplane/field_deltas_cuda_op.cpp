@@ -36,7 +36,7 @@ Tensor hexplane_deltas(std::vector<Tensor> spaces, Tensor coordinates, std::opti
   check(channels * item % 64 == 0 && net.fits(item), "hexplane_deltas takes a multiple of ", 64 / item,
         " channels, layers up to 128 wide, and weights that fit into ", kRoomForWeights, " bytes; got ", channels,
         " channels, width ", net.width, ", ", net.layers, " layers; use hexplane_decode");
-  Tensor deltas = call.empty({n, kDeltaColumns});
+  Tensor deltas = call.empty({n, kRawColumns});
   in.lines.values = call.bytes(size_t(size * item));
   void* packed = call.bytes(net.packed_bytes(item));
   prepare_field(times, in, data(now), &net, packed, half, call.stream);

@@ -104,7 +104,7 @@ __global__ void __launch_bounds__(kThreads, 2)
 #pragma unroll
   for (int axis = 0; axis < 3; ++axis) {
     const float sum = team_sum<kTeam>(v_x[axis]);
-    if (lane == axis && active) v_raw[n * kDeltaColumns + axis] += sum * 2.0f / (box[3 + axis] - box[axis]);
+    if (lane == axis && active) v_raw[n * kRawColumns + kRawPosition + axis] += sum * 2.0f / (box[3 + axis] - box[axis]);
   }
 }
 

@@ -1,8 +1,7 @@
 // Gradients of one level's features. A row of gradient per plane and point, then every node of a plane adds the rows around it,
 // in the order of the points within each cell: no atomic additions, and the same bits every time.
-#include <cub/device/device_radix_sort.cuh>
-#include <cub/device/device_scan.cuh>
 
+#include "cub_device.cuh"
 #include "hexplane_cuda.h"
 #include "node_gradient.cuh"
 #include "team_launch.h"

@@ -1,8 +1,8 @@
 #include <algorithm>
 #include <vector>
 
+#include "cpu_call.h"
 #include "hexplane_decode.h"
-#include "tensor_checks.h"
 
 // Weights [outputs, inputs] and bias of one layer, transposed and padded for the kernel.
 static DecodeLayer pack(const Tensor& weight, const Tensor& bias, std::vector<float>& storage) {

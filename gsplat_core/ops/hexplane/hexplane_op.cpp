@@ -3,8 +3,8 @@
 #include <initializer_list>
 #include <tuple>
 
+#include "cpu_call.h"
 #include "hexplane.h"
-#include "tensor_checks.h"
 
 static constexpr int64_t kGrain = 512;
 static constexpr int64_t kChannelChunk = 16;  // channels of one plane that one task adds up: one cache line

@@ -23,7 +23,7 @@ struct BackwardLayout {
   __device__ __host__ int start(int layer) const {
     return layer == 0 ? 0 : width * (first_stride() + (layer - 1) * hidden_stride());
   }
-  __device__ __host__ int floats(int layers) const { return start(layers - 1) + 16 * hidden_stride(); }
+  __device__ __host__ int floats(int layers) const { return start(layers - 1) + kRawColumns * hidden_stride(); }
 };
 
 __global__ void __launch_bounds__(kThreads) pack_weights(FieldNetwork net, float* packed) {
@@ -31,7 +31,7 @@ __global__ void __launch_bounds__(kThreads) pack_weights(FieldNetwork net, float
   const int layer = int(blockIdx.y);
   const bool is_head = layer == net.layers - 1;
   const int columns = layer == 0 ? layout.features : layout.width, inputs = layer == 0 ? net.features : net.width;
-  const int stride = columns + 4, places = is_head ? 16 : layout.width;
+  const int stride = columns + 4, places = is_head ? kRawColumns : layout.width;
   for (int i = int(blockIdx.x) * kThreads + int(threadIdx.x); i < places * stride; i += int(gridDim.x) * kThreads) {
     const int place = i / stride, column = i % stride, row = place / 16 * 16 + place % 4 * 4 + place % 16 / 4;
     const int output = is_head ? head_output(row) : row;
@@ -81,7 +81,7 @@ __device__ __forceinline__ void multiply_columns(Columns (&out)[kOut], const Col
 // Four columns of a row of v_raw; zeros where the row is not finite, and in columns that are not the field's.
 __device__ __forceinline__ float4 head_gradient(const float* v_raw, int64_t row, bool inside, const WarpPlace& place) {
   const int column = 4 * place.quad;
-  const float4 v = inside ? *reinterpret_cast<const float4*>(v_raw + row * kDeltaColumns + column) : float4{};
+  const float4 v = inside ? *reinterpret_cast<const float4*>(v_raw + row * kRawColumns + column) : float4{};
   const unsigned team = 0xfu << (place.group * 4);  // the four lanes of the row
   const bool finite = __all_sync(team, isfinite(v.x) && isfinite(v.y) && isfinite(v.z) && isfinite(v.w));
   const auto own = [&](int i, float x) { return finite && head_output(column + i) >= 0 ? x : 0.0f; };
@@ -109,7 +109,7 @@ __global__ void __launch_bounds__(kThreads, kWidth == 128 ? 1 : 2)
 #pragma unroll
   for (int r = 0; r < 2; ++r) {
     head[r] = head_gradient(v_raw, rows[r], rows[r] < count, place);
-    if (rows[r] < count) *reinterpret_cast<float4*>(v_head + rows[r] * kDeltaColumns + 4 * place.quad) = head[r];
+    if (rows[r] < count) *reinterpret_cast<float4*>(v_head + rows[r] * kRawColumns + 4 * place.quad) = head[r];
   }
   Columns now[kBlocks];
   for (int layer = net.layers - 1; layer >= 1; --layer) {

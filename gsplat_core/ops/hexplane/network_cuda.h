@@ -1,27 +1,17 @@
 // The field's network on CUDA: features of N Gaussians through the trunk (ReLU after each layer) and the head.
 //
-// The head's 11 outputs (position, log-scale, rotation, opacity) are put where the frame path wants them: 16 columns, position 3,
-// rotation 4, log-scale 3, colour 3 (zero), opacity logit 1, 2 zeros. Layers up to 128 wide go through the tensor cores, weights
+// The head's outputs are put into the columns of raw_layout.h, with zeros in the others. Layers up to 128 wide go through the tensor cores, weights
 // in shared memory; `FieldNetwork::fits` says whether they do. All pointers are to device memory.
 #pragma once
 
 #include <cuda_runtime.h>
 
 #include "cuda_scratch.h"
+#include "raw_layout.h"
 
 constexpr int kFieldLevels = 16;
 constexpr int kFieldLayers = 10;   // trunk and head
-constexpr int kDeltaColumns = 16;  // as kRawColumns of the frame path
-constexpr int kHeadOutputs = 11;
 constexpr int kRoomForWeights = 200 * 1024;  // bytes of shared memory that a block may take
-
-// The output of the head that a column of the deltas shows, or -1: the head has log-scales before the rotation.
-__host__ __device__ constexpr int head_output(int column) {
-  if (column < 3) return column;
-  if (column < 7) return column + 3;
-  if (column < 10) return column - 4;
-  return column == 13 ? 10 : -1;
-}
 
 struct FieldNetwork {
   const float* weights[kFieldLayers];  // [outputs, inputs]
@@ -37,8 +27,8 @@ struct FieldNetwork {
   __host__ __device__ int hidden_start(int layer, int item) const {  // in items; layer >= 1, the head is the last
     return padded_width() * (first_stride(item) + (layer - 1) * hidden_stride(item));
   }
-  __host__ __device__ int weight_items(int item) const { return hidden_start(layers - 1, item) + 16 * hidden_stride(item); }
-  __host__ __device__ int bias_floats() const { return (layers - 1) * padded_width() + 16; }
+  __host__ __device__ int weight_items(int item) const { return hidden_start(layers - 1, item) + kRawColumns * hidden_stride(item); }
+  __host__ __device__ int bias_floats() const { return (layers - 1) * padded_width() + kRawColumns; }
   __host__ __device__ size_t packed_bytes(int item) const {
     return size_t(weight_items(item)) * item + size_t(bias_floats()) * 4;
   }

@@ -161,7 +161,7 @@ void network_weight_gradient(const FieldNetwork& net, const float* features, con
   const int width = net.padded_width();
   for (int layer = 0; layer < net.layers; ++layer) {
     const bool head = layer == net.layers - 1;
-    const int inputs = layer == 0 ? net.features : width, outputs = head ? kDeltaColumns : width;
+    const int inputs = layer == 0 ? net.features : width, outputs = head ? kRawColumns : width;
     tiles.inputs[layer] = layer == 0 ? features : hidden + (layer - 1) * count * width;
     tiles.v_outputs[layer] = head ? v_head : v_hidden + layer * count * width;
     tiles.input_count[layer] = inputs, tiles.output_count[layer] = outputs;

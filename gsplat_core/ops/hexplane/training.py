@@ -19,7 +19,8 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.ops.hexplane.deltas import DELTA_COLUMNS, padded_width
+from gsplat_core.ops.hexplane.deltas import padded_width
+from gsplat_core.scene.layout import RAW_COLUMNS
 
 
 class TrainingState(NamedTuple):
@@ -199,7 +200,7 @@ def _(
 ) -> tuple[Tensor, ...]:
     n, width = means.shape[0], weights[0].shape[0]
     return (
-        means.new_empty(n, DELTA_COLUMNS),
+        means.new_empty(n, RAW_COLUMNS),
         means.new_empty(n, 4),
         means.new_empty(_lines_size(planes)),
         means.new_empty(n, weights[0].shape[1]),

@@ -34,7 +34,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_trai
   const int64_t n = m.size(0);
   Field field(call, planes, n);
   const FieldNetwork net = checked_network(call, weights, biases, field);
-  Tensor deltas = call.empty({n, kDeltaColumns}), coordinates = call.empty({n, 4}), lines = call.empty({field.line_size});
+  Tensor deltas = call.empty({n, kRawColumns}), coordinates = call.empty({n, 4}), lines = call.empty({field.line_size});
   Tensor features = call.empty({n, field.features}), hidden = call.empty({net.layers - 1, n, net.padded_width()});
   Tensor order = call.empty({3, 3 * field.planes.levels * n}, ScalarType::Int);
   Tensor starts = call.empty({field.cells.cells + 1}, ScalarType::Int);
@@ -64,8 +64,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tenso
   const Tensor b = call.floats(box, "box"), x = call.floats(coordinates, "coordinates");
   const Tensor o = call.ints(order, "order"), s = call.ints(starts, "starts");
   const int64_t n = x.size(0);
-  check(v_raw.is_contiguous() && v_raw.dim() == 2 && v_raw.size(0) == n && v_raw.size(1) == kDeltaColumns,
-        "v_raw must be contiguous [N, ", kDeltaColumns, "]");
+  check(v_raw.is_contiguous() && v_raw.dim() == 2 && v_raw.size(0) == n && v_raw.size(1) == kRawColumns,
+        "v_raw must be contiguous [N, ", kRawColumns, "]");
   call.floats(v_raw, "v_raw");
   Field field(call, planes, n);
   const FieldNetwork net = checked_network(call, weights, biases, field);
@@ -85,7 +85,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tenso
   const FieldRows r = {mutable_data(rows), mutable_data(rows) + slots * n * field.planes.channels, mutable_data(shares),
                        mutable_data(crowds)};
   float *v_features = call.array<float>(n * field.features), *v_hidden = call.array<float>(h.numel());
-  float* v_head = call.array<float>(n * kDeltaColumns);
+  float* v_head = call.array<float>(n * kRawColumns);
   network_backward(net, data(v_raw), data(h), v_features, v_hidden, v_head, n, call, call.stream);
   CudaBranch branch(call.stream);  // the network and the lines, beside the space planes
   network_weight_gradient(net, data(f), data(h), v_hidden, v_head, mutable_data(network_gradient), n, call, branch.stream);

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
+from gsplat_core.ops.image_loss.result import ImageLoss
 from gsplat_core.ops.ssim.ssim import MAX_CHANNELS
-from gsplat_core.reference.image_loss import ImageLoss
 
 
 def image_loss(

@@ -4,8 +4,8 @@
 #include <vector>
 
 #include "../ssim/ssim.h"
+#include "cpu_call.h"
 #include "image_loss.h"
-#include "tensor_checks.h"
 
 constexpr int64_t kRows = 16;  // rows a thread takes at least
 

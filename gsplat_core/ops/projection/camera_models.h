@@ -1,10 +1,13 @@
 // The three camera models: image point and Jacobian of a camera-space point, and their gradients, one Gaussian per lane.
 #pragma once
 
+#include "constants.h"
 #include "projection.h"
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::projection {
+
+using namespace gsplat::projection;
 
 struct Point3 {
   vfloat x, y, z;
@@ -22,7 +25,8 @@ struct Intrinsics {
 
 GSPLAT_INLINE Intrinsics intrinsics_of(const float* k, float width, float height) {
   const float fx = k[0], fy = k[4], cx = k[2], cy = k[5];
-  const float margin_x = 0.3f * 0.5f * width / fx, margin_y = 0.3f * 0.5f * height / fy;
+  const float margin_x = gsplat::kFieldOfViewMargin * 0.5f * width / fx,
+              margin_y = gsplat::kFieldOfViewMargin * 0.5f * height / fy;
   return {fx,
           fy,
           cx,
@@ -119,4 +123,4 @@ struct Projector<kFisheye> {
   }
 };
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::projection

@@ -1,26 +1,14 @@
 #include "cuda_scratch.h"
-#include "projection_cuda.h"
+#include "projection.h"
 #include "projection_math.h"
 
-using namespace GSPLAT_ISA;
-
+namespace gsplat::projection {
 namespace {
+
+using namespace GSPLAT_ISA::projection;
 
 constexpr int kWarps = kThreads / 32;
 constexpr int kViewSums = 12;  // rotation by rows, then translation
-
-// One camera's share of the inputs.
-__device__ ProjectionInput seen_by(ProjectionInput in, int64_t batch, int64_t image, int64_t gaussians) {
-  const int64_t row = batch * gaussians;
-  in.means += 3 * row;
-  if (in.covars != nullptr) in.covars += 6 * row;
-  if (in.quats != nullptr) in.quats += 4 * row;
-  if (in.scales != nullptr) in.scales += 3 * row;
-  if (in.opacities != nullptr) in.opacities += row;
-  in.viewmat += 16 * image;
-  in.intrinsics += 9 * image;
-  return in;
-}
 
 template <int K>
 __device__ void load(const float* p, int64_t row, float* v) {
@@ -49,7 +37,7 @@ __global__ void __launch_bounds__(kThreads) forward(ProjectionInput all, Project
   const int64_t blocks = (size.gaussians + kThreads - 1) / kThreads, image = blockIdx.x / blocks;
   const int64_t n = (blockIdx.x % blocks) * kThreads + threadIdx.x;
   if (n >= size.gaussians) return;
-  const ProjectionInput in = seen_by(all, image / size.cameras, image, size.gaussians);
+  const ProjectionInput in = of_camera(all, size, image / size.cameras, image % size.cameras);
   const View<model> view(in);
   float mean[3];
   load<3>(in.means, n, mean);
@@ -94,7 +82,7 @@ __global__ void __launch_bounds__(kThreads)
     const int64_t image = batch * size.cameras + camera, at = image * size.gaussians + n;
     BackProjected g = {};
     if (n < size.gaussians && from.radii[2 * at] > 0) {
-      const ProjectionInput in = seen_by(all, batch, image, size.gaussians);
+      const ProjectionInput in = of_camera(all, size, batch, camera);
       const View<model> view(in);
       float mean[3];
       load<3>(in.means, n, mean);
@@ -153,3 +141,5 @@ void project_backward_on_device(const ProjectionInput& in, const ProjectionSize&
   if (to.viewmat != nullptr && images > 0)
     sum_over_blocks<<<unsigned(images), 32 * kViewSums, 0, stream>>>(to.viewmat, per_image, v_viewmats);
 }
+
+}  // namespace gsplat::projection

@@ -1,21 +1,29 @@
-// Projection of 3D Gaussians to screen-space ellipses (EWA splatting, Zwicker et al. 2001), forward and backward.
+// Projection of 3D Gaussians to screen-space ellipses (EWA splatting, Zwicker et al. 2001), forward and backward: what the host
+// code and the kernels of both devices share.
 #pragma once
 
 #include <cstdint>
 
+#include "cuda_stream.h"
 #include "isa.h"
+
+namespace gsplat::projection {
 
 enum CameraModel : int32_t { kPinhole = 0, kOrtho = 1, kFisheye = 2 };
 
-// Gaussians of one scene seen by one camera; rows of floats as torch keeps them.
+struct ProjectionSize {
+  int64_t batches, cameras, gaussians;  // B, C, N
+};
+
+// Gaussians and cameras; rows of floats as torch keeps them. A kernel of the CPU gets one batch and camera, one of CUDA all.
 struct ProjectionInput {
-  const float* means;           // [N, 3]
-  const float* covars;          // [N, 6], or null with the next two given
-  const float* quats;           // [N, 4]
-  const float* scales;          // [N, 3]
-  const float* opacities;       // [N] or null
-  const float* viewmat;         // [4, 4]
-  const float* intrinsics;      // [3, 3]
+  const float* means;           // [B, N, 3]
+  const float* covars;          // [B, N, 6], or null with the next two given
+  const float* quats;           // [B, N, 4]
+  const float* scales;          // [B, N, 3]
+  const float* opacities;       // [B, N] or null
+  const float* viewmat;         // [B, C, 4, 4]
+  const float* intrinsics;      // [B, C, 3, 3]
   float width, height;          // px
   float eps2d;                  // px^2, added to the diagonal of the 2D covariance
   float near_plane, far_plane;  // z
@@ -24,11 +32,11 @@ struct ProjectionInput {
 };
 
 struct ProjectionOutput {
-  int32_t* radii;        // [N, 2]
-  float* means2d;        // [N, 2]
-  float* depths;         // [N]
-  float* conics;         // [N, 3]
-  float* compensations;  // [N] or null
+  int32_t* radii;        // [B, C, N, 2]
+  float* means2d;        // [B, C, N, 2]
+  float* depths;         // [B, C, N]
+  float* conics;         // [B, C, N, 3]
+  float* compensations;  // [B, C, N] or null
 };
 
 // Gradients of the outputs; null where nothing came.
@@ -45,13 +53,38 @@ struct ProjectionInputGradient {
   float* covars;  // or null with the next two given
   float* quats;
   float* scales;
-  float* viewmat;   // 12 sums over the range: rotation by rows, then translation; or null
-  bool accumulate;  // add to means, covars, quats and scales (later cameras) instead of writing them
+  float* viewmat;   // 12 sums for each block of Gaussians: rotation by rows, then translation; or null
+  bool accumulate;  // CPU: add to means, covars, quats and scales (later cameras) instead of writing them
 };
 
-struct ProjectionKernels {
+// The inputs of one camera.
+GSPLAT_HOST_DEVICE ProjectionInput of_camera(ProjectionInput in, const ProjectionSize& size, int64_t batch, int64_t camera) {
+  const int64_t row = batch * size.gaussians, image = batch * size.cameras + camera;
+  in.means += 3 * row;
+  if (in.covars != nullptr) in.covars += 6 * row;
+  if (in.quats != nullptr) in.quats += 4 * row;
+  if (in.scales != nullptr) in.scales += 3 * row;
+  if (in.opacities != nullptr) in.opacities += row;
+  in.viewmat += 16 * image;
+  in.intrinsics += 9 * image;
+  return in;
+}
+
+// CPU: Gaussians `begin` to `end` - 1 of one camera.
+struct Kernels {
   void (*forward)(const ProjectionInput&, const ProjectionOutput&, int64_t begin, int64_t end);
   void (*backward)(const ProjectionInput&, const ProjectionOutputGradient&, const ProjectionInputGradient&, int64_t begin,
                    int64_t end);
 };
-GSPLAT_DECLARE_KERNELS(ProjectionKernels, projection_kernels)
+
+// CUDA: all Gaussians and cameras; every pointer is to device memory.
+void project_on_device(const ProjectionInput& in, const ProjectionSize& size, const ProjectionOutput& out, cudaStream_t stream);
+// `to.viewmat` has memory for 12 sums of each of camera_sums(size) blocks, or is null; the sums are added up in `v_viewmats`
+// [B, C, 4, 4], which must be zero before. Sums are taken in a fixed order, and cameras in theirs.
+void project_backward_on_device(const ProjectionInput& in, const ProjectionSize& size, const ProjectionOutputGradient& from,
+                                const ProjectionInputGradient& to, float* v_viewmats, cudaStream_t stream);
+int64_t camera_sums(const ProjectionSize& size);
+
+}  // namespace gsplat::projection
+
+GSPLAT_KERNELS(projection, Kernels)

@@ -3,7 +3,7 @@
 #include "rows.h"
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::projection {
 
 GSPLAT_INLINE Geometry load_geometry(const ProjectionInput& in, int64_t first, int count) {
   if (in.covars != nullptr) {
@@ -107,6 +107,6 @@ static void backward(const ProjectionInput& in, const ProjectionOutputGradient& 
   }
 }
 
-extern const ProjectionKernels projection_kernels = {forward, backward};
+extern const Kernels kernels = {forward, backward};
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::projection

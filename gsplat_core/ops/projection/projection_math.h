@@ -3,15 +3,15 @@
 
 #include "../covariance/covariance_math.h"
 #include "camera_models.h"
+#include "constants.h"
 #include "projection.h"
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::projection {
 
-constexpr float kAlphaCutoff = 1.0f / 255.0f;
-constexpr float kMaxExtentSigmas = 3.33f;
-constexpr float kMinCompensation = 0.005f;
-constexpr float kMaxRadius = 1e9f;
+using namespace gsplat::projection;
+using namespace covariance;
+
 constexpr float kHuge = 1e30f;  // beyond this a number is taken for infinite: its square is
 
 // False for NaN too.
@@ -92,7 +92,7 @@ GSPLAT_INLINE Ellipse ellipse_of(const View<model>& view, const ImagePoint& imag
 }
 
 GSPLAT_INLINE vfloat compensation_of(const Ellipse& e, vfloat det) {
-  return sqrt(max((e.a0 * e.c0 - e.b * e.b) / det, splat(kMinCompensation * kMinCompensation)));
+  return sqrt(max((e.a0 * e.c0 - e.b * e.b) / det, splat(gsplat::kCompensationFloor * gsplat::kCompensationFloor)));
 }
 
 struct Projected {
@@ -116,17 +116,17 @@ GSPLAT_INLINE Projected project(const ProjectionInput& in, const View<model>& vi
   Projected out = {valid, image.u, image.v, p.z, {c * inverse, -e.b * inverse, a * inverse}, vfloat{}, vfloat{}, vfloat{}};
   valid &= finite(out.conic[0]) & finite(out.conic[1]) & finite(out.conic[2]);
 
-  vfloat extent = splat(kMaxExtentSigmas);
+  vfloat extent = splat(gsplat::kMaxExtentSigmas);
   if (compensate) out.compensation = compensation_of(e, det);
   if (opacity != nullptr) {
     const vfloat effective = compensate ? *opacity * out.compensation : *opacity;
-    valid &= (effective >= kAlphaCutoff) & finite(effective);
+    valid &= (effective >= gsplat::kAlphaCutoff) & finite(effective);
     // 2 ln(o / cutoff) = 2 ln 2 log2(o / cutoff)
-    const vfloat ratio = select(valid, effective * (1.0f / kAlphaCutoff), splat(1.0f));
+    const vfloat ratio = select(valid, effective * (1.0f / gsplat::kAlphaCutoff), splat(1.0f));
     extent = min(extent, sqrt(max(1.38629436f * log2(ratio), vfloat{})));
   }
-  const vfloat rx = min(ceil(extent * sqrt(max(a, vfloat{}))), splat(kMaxRadius));
-  const vfloat ry = min(ceil(extent * sqrt(max(c, vfloat{}))), splat(kMaxRadius));
+  const vfloat rx = min(ceil(extent * sqrt(max(a, vfloat{}))), splat(gsplat::kMaxRadiusPx));
+  const vfloat ry = min(ceil(extent * sqrt(max(c, vfloat{}))), splat(gsplat::kMaxRadiusPx));
   valid &= (rx > in.radius_clip) | (ry > in.radius_clip);
   valid &= (image.u + rx > 0) & (image.u - rx < in.width) & (image.v + ry > 0) & (image.v - ry < in.height);
   out.valid = valid;
@@ -148,7 +148,7 @@ GSPLAT_INLINE void covariance2d_gradient(const Ellipse& e, float eps2d, const vf
   g[2] = -(y * m01 + z * m11);
   if (compensate) {
     const vfloat ratio = (e.a0 * e.c0 - b * b) * inverse;
-    const vint free = ratio > kMinCompensation * kMinCompensation;
+    const vint free = ratio > gsplat::kCompensationFloor * gsplat::kCompensationFloor;
     const vfloat v_ratio = select(free, 0.5f * v_compensation / sqrt(select(free, ratio, splat(1.0f))), vfloat{}) * inverse;
     g[0] += v_ratio * (e.c0 - ratio * c);
     g[1] += v_ratio * b * (ratio - 1);
@@ -223,4 +223,4 @@ GSPLAT_INLINE BackProjected project_backward(const ProjectionInput& in, const Vi
   return project_backward(in, view, mean, geometry, p, image, e, g, v.means2d, v.depth, needs_viewmat);
 }
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::projection

@@ -1,6 +1,6 @@
 #include <vector>
 
-#include "tensor_checks.h"
+#include "cpu_call.h"
 
 static void store_scalars_(Tensor to, std::vector<double> values) {
   floats(to, "store_scalars_'s target");

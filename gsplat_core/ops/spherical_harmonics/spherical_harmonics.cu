@@ -1,12 +1,13 @@
 #include <cuda_pipeline.h>
 
 #include "cuda_scratch.h"
+#include "spherical_harmonics.h"
 #include "spherical_harmonics_bases.h"
-#include "spherical_harmonics_cuda.h"
 
-using namespace GSPLAT_ISA;
-
+namespace gsplat::spherical_harmonics {
 namespace {
+
+using namespace GSPLAT_ISA::spherical_harmonics;
 
 constexpr int kSets = 32;  // of a warp, one per lane
 constexpr int kWarps = 4;
@@ -83,7 +84,7 @@ __global__ void __launch_bounds__(kBlockSets, 4) forward(SphericalHarmonicsInput
 }
 
 // A thread has one set of coefficients and goes through its rows in order: the sum comes out the same every time. A direction
-// whose colour has a gradient of zero passes nothing on, not even what 0 times a coefficient that is not finite would be.
+// whose colour has a gradient of zero adds nothing, not even the NaN that 0 times an infinite coefficient would be.
 template <int degree>
 __global__ void __launch_bounds__(kBlockSets, 4)
     backward(SphericalHarmonicsInput in, int64_t rows, int64_t sets, const float* __restrict__ v_colors,
@@ -160,3 +161,5 @@ void harmonics_backward(const SphericalHarmonicsInput& in, int64_t rows, int64_t
                                                          backward_degree<3>, backward_degree<4>};
   by_degree[in.degree](in, rows, sets, v_colors, v_dirs, v_coeffs, stream);
 }
+
+}  // namespace gsplat::spherical_harmonics

@@ -3,7 +3,10 @@
 
 #include <cstdint>
 
+#include "cuda_stream.h"
 #include "isa.h"
+
+namespace gsplat::spherical_harmonics {
 
 constexpr int kMaxBases = 25;
 
@@ -16,10 +19,20 @@ struct SphericalHarmonicsInput {
   int64_t bases;  // K
 };
 
-struct SphericalHarmonicsKernels {
+// CPU: directions `begin` to `end` - 1 of one row.
+struct Kernels {
   void (*forward)(const SphericalHarmonicsInput&, float* colors, int64_t begin, int64_t end);
   // `v_dirs` [N, 3] may be null; `v_coeffs` [N, K, 3] is added to when `accumulate`, else written whole.
   void (*backward)(const SphericalHarmonicsInput&, const float* v_colors, float* v_dirs, float* v_coeffs, bool accumulate,
                    int64_t begin, int64_t end);
 };
-GSPLAT_DECLARE_KERNELS(SphericalHarmonicsKernels, spherical_harmonics_kernels)
+
+// CUDA: `rows` rows of `sets` directions; the rows share the coefficients of their sets. Every pointer is to device memory.
+void harmonics_forward(const SphericalHarmonicsInput& in, int64_t rows, int64_t sets, float* colors, cudaStream_t stream);
+// `v_dirs` may be null; `v_coeffs` is written whole, summed over the rows in their order.
+void harmonics_backward(const SphericalHarmonicsInput& in, int64_t rows, int64_t sets, const float* v_colors, float* v_dirs,
+                        float* v_coeffs, cudaStream_t stream);
+
+}  // namespace gsplat::spherical_harmonics
+
+GSPLAT_KERNELS(spherical_harmonics, Kernels)

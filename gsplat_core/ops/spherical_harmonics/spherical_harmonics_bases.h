@@ -3,7 +3,7 @@
 
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::spherical_harmonics {
 
 // The basis functions at unit directions, one Gaussian per lane, in the field's order and signs.
 template <int degree>
@@ -98,4 +98,4 @@ GSPLAT_INLINE void bases_backward(vfloat x, vfloat y, vfloat z, const vfloat* v,
   }
 }
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::spherical_harmonics

@@ -3,7 +3,9 @@
 #include "spherical_harmonics.h"
 #include "spherical_harmonics_bases.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::spherical_harmonics {
+
+using namespace gsplat::spherical_harmonics;
 
 typedef float vfloat4 __attribute__((vector_size(16)));
 
@@ -122,6 +124,6 @@ static void backward(const SphericalHarmonicsInput& in, const float* v_colors, f
   }
 }
 
-extern const SphericalHarmonicsKernels spherical_harmonics_kernels = {forward, backward};
+extern const Kernels kernels = {forward, backward};
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::spherical_harmonics

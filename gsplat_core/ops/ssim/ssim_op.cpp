@@ -1,8 +1,8 @@
 #include <cmath>
 #include <vector>
 
+#include "cpu_call.h"
 #include "ssim.h"
-#include "tensor_checks.h"
 
 static void fill_taps(float* taps) {
   double weights[kSsimTaps], total = 0;

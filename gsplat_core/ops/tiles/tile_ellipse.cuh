@@ -1,7 +1,9 @@
 // Which tiles of a row an ellipse touches: the geometry of tiles_cpu.cpp, one splat per thread.
 #pragma once
 
-#include "tiles_cuda.h"
+#include "tiles.h"
+
+namespace gsplat::tiles {
 
 // a dx^2 + 2 b dx dy + c dy^2 = k around (x, y), solved for dx: slope dy +- sqrt(offset - curve dy^2).
 struct TileEllipse {
@@ -35,7 +37,7 @@ __device__ inline TileBox box_around(float x, float y, float rx, float ry, float
   return box;
 }
 
-__device__ inline TileBox tile_box(const DeviceBoxes& in, int64_t i) {
+__device__ inline TileBox tile_box(const SplatBoxes& in, int64_t i) {
   const float x = in.means2d[2 * i], y = in.means2d[2 * i + 1];
   const float rx = float(in.radii[2 * i]), ry = float(in.radii[2 * i + 1]);
   const TileBox none = {};
@@ -86,3 +88,5 @@ __device__ inline void for_tile_rows(const TileBox& box, float size, const Visit
     if (run.first < run.end) visit(row, run.first, run.end);
   }
 }
+
+}  // namespace gsplat::tiles

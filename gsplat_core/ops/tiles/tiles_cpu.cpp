@@ -6,7 +6,10 @@
 #include "simd.h"
 #include "tiles.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::tiles {
+
+using namespace gsplat::tiles;
+
 namespace {
 
 // Of one splat per lane: a dx^2 + 2 b dx dy + c dy^2 = k around (x, y), solved for dx: slope dy +- sqrt(offset - curve dy^2).
@@ -213,6 +216,6 @@ void emit_one(const SplatBoxes& in, const TileSpan& span, int64_t splat, int64_t
 
 }  // namespace
 
-extern const TilesKernels tiles_kernels = {spans, count, emit, emit_one};
+extern const Kernels kernels = {spans, count, emit, emit_one};
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::tiles

@@ -10,14 +10,15 @@ from torch import Tensor
 
 from gsplat_core import fully_fused_projection, spherical_harmonics
 from gsplat_core.ops.frame.frame import Frame, render_frame
-from gsplat_core.ops.frame.frame_gradients import DC, RawGradients, render_frame_backward
+from gsplat_core.ops.frame.frame_gradients import RawGradients, render_frame_backward
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.reference.frame import render_frame as reference_frame
 from gsplat_core.rendering.settings import FAR_PLANE, NEAR_PLANE
+from gsplat_core.scene.layout import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh")
 TILE = 16
-COLUMNS = {"means": slice(0, 3), "quats": slice(3, 7), "log_scales": slice(7, 10), "logit_opacities": 13}
+COLUMNS = {"means": POSITION, "quats": ROTATION, "log_scales": LOG_SCALE, "logit_opacities": OPACITY.start}
 
 
 @dataclass(frozen=True)
@@ -212,5 +213,5 @@ def backward(
 
 def by_name(gradients: RawGradients, bases: int) -> dict[str, Tensor]:
     named = {name: gradients.raw[:, columns] for name, columns in COLUMNS.items()}
-    named["sh"] = gradients.sh if bases > 1 else gradients.raw[:, None, DC]
+    named["sh"] = gradients.sh if bases > 1 else gradients.raw[:, None, COLOUR]
     return {name: value.cpu().double() for name, value in named.items()}

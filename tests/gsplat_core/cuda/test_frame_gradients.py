@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.frame.frame_gradients import DC, RawGradients, render_frame_backward
+from gsplat_core.ops.frame.frame_gradients import RawGradients, render_frame_backward
+from gsplat_core.scene.layout import COLOUR
 from tests.gsplat_core.cuda.frame_scenes import (
     NAMES,
     FrameScene,
@@ -48,7 +49,7 @@ def check(scene: FrameScene, with_alphas: bool = True) -> RawGradients:
     assert_near(by_name(gradients, bases), wanted)
     assert not gradients.raw[:, 14:].any()
     if bases > 1:
-        assert torch.equal(gradients.raw[:, DC], gradients.sh[:, 0])
+        assert torch.equal(gradients.raw[:, COLOUR], gradients.sh[:, 0])
     if scene.deltas is not None:
         w = wanted["deltas"]
         assert (gradients.raw.cpu().double() - w).norm() <= 1e-3 * w.norm()

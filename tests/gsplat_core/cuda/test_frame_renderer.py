@@ -1,4 +1,4 @@
-"""`FrameRenderer`: whole frames from one graph, with room that grows, against `render`."""
+"""`FrameRenderer`: whole frames from one graph, with tile lists that grow, against `render`."""
 
 from __future__ import annotations
 
@@ -72,11 +72,11 @@ def test_lists_that_are_too_short_are_made_longer(make_gaussians, camera, count,
     scene = make_gaussians(count).to("cuda")
     scene = dataclasses.replace(scene, log_scales=torch.full_like(scene.log_scales, 2.3))
     renderer = FrameRenderer(scene, camera)
-    first = renderer.room
+    first = renderer.capacity
     output = renderer.render().result()
     assert first.per_tile
-    assert renderer.room.per_tile == per_tile
-    assert renderer.room.capacity > first.capacity
+    assert renderer.capacity.per_tile == per_tile
+    assert renderer.capacity.capacity > first.capacity
     assert_same_picture(output, render(scene, camera))
 
 

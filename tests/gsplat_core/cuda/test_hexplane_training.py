@@ -8,6 +8,7 @@ import torch
 from gsplat_core import reference
 from gsplat_core.deformation import regularisers
 from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.hexplane.plain_torch import PLANE_AXES
 from gsplat_core.ops.hexplane.training import (
     Penalties,
     hexplane_planes_adam_,
@@ -16,7 +17,7 @@ from gsplat_core.ops.hexplane.training import (
     hexplane_train_backward,
 )
 from gsplat_core.reference.adam import adam_step
-from gsplat_core.reference.deformation import HEAD_COLUMNS, PLANE_AXES
+from gsplat_core.scene.layout import HEAD_COLUMNS
 
 pytestmark = pytest.mark.cuda
 

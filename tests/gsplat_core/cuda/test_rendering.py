@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from gsplat_core.rendering import rasterization as rendering
 
+from gsplat_core.rendering import rasterization as rendering
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 

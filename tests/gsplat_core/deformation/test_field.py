@@ -5,8 +5,8 @@ import json
 import pytest
 import torch
 
-from gsplat_core.deformation import FIELD_KINDS, BasisField, HexPlaneField, field_from_config, new_field
-from gsplat_core.errors import InvalidInput
+from gsplat_core.deformation import FIELDS, BasisField, HexPlaneField, field_from_config, kind_of, new_field
+from gsplat_core.errors import InvalidInput, InvalidSetting
 
 WINDOW = (1.0, 6.0)
 BOTH = pytest.mark.parametrize("kind", ["basis", "hexplane"])
@@ -113,11 +113,27 @@ def test_the_choice_of_field(make_gaussians):
     assert isinstance(new_field("auto", gaussians, WINDOW), BasisField)
     assert isinstance(new_field("basis", gaussians, WINDOW, bumps=9), BasisField)
     assert isinstance(new_field("hexplane", gaussians, WINDOW, channels=8), HexPlaneField)
-    assert FIELD_KINDS == ("auto", "basis", "hexplane")
-    with pytest.raises(InvalidInput, match="'spline'"):
+    assert list(FIELDS) == ["auto", "basis", "hexplane"]
+    with pytest.raises(InvalidSetting, match="'spline'; known are auto, basis, hexplane"):
         new_field("spline", gaussians, WINDOW)
-    with pytest.raises(InvalidInput, match="'spline'"):
-        field_from_config({"kind": "spline"}, gaussians)
+
+
+@pytest.mark.parametrize("kind", ["spline", "auto", None, 3, ["basis"], "b" * 10_000])
+def test_a_configuration_has_to_name_a_field_itself(kind, make_gaussians):
+    with pytest.raises(InvalidSetting, match="known are basis, hexplane") as refused:
+        field_from_config({"kind": kind}, make_gaussians(3))
+    assert len(str(refused.value)) < 200
+
+
+@BOTH
+def test_a_configuration_out_of_range_is_refused_before_a_field_is_made(kind, make_gaussians):
+    config = new_field(kind, make_gaussians(2), WINDOW).config()
+    for name in config.keys() - {"kind"}:
+        below = [] if name == "origin_s" else [-1, 0]
+        for wrong in (*below, None, True, 10**400, float("nan"), float("inf"), "4", [], [1] * 100, {}, [[2]] * 4):
+            with pytest.raises((InvalidInput, InvalidSetting), match=name):
+                kind_of(kind).checked_config(config | {name: wrong})
+    assert kind_of(kind).checked_config(config | {"more": 1}).keys() == config.keys()
 
 
 @pytest.mark.parametrize("window", [(2.0, 1.0), (0.0, float("inf")), (float("nan"), 1.0)])

@@ -5,7 +5,7 @@ import struct
 import pytest
 import torch
 
-from gsplat_core.errors import InvalidInput
+from gsplat_core.errors import BundleCorrupt
 from gsplat_core.io.ply import load_ply, save_ply
 from gsplat_core.scene.gaussians import Gaussians
 
@@ -108,7 +108,7 @@ def test_other_properties_types_orders_and_elements_are_skipped(tmp_path):
 def test_a_malformed_file_is_refused_with_its_reason(change, reason, tmp_path):
     path = tmp_path / "a.ply"
     path.write_bytes(change(header(DEGREE_1) + two_rows()))
-    with pytest.raises(InvalidInput, match=reason) as raised:
+    with pytest.raises(BundleCorrupt, match=reason) as raised:
         load_ply(path)
     assert str(path) in str(raised.value)
 

@@ -1,33 +1,35 @@
-"""How much room the lists of a frame get."""
+"""The capacity that tile lists get."""
 
 from __future__ import annotations
 
 import math
 
 from gsplat_core.ops.frame.frame import MOST_IN_TILE
-from gsplat_core.rendering.tile_capacity import HEADROOM, TILE_STEP, ListRoom, capacity_for
+from gsplat_core.rendering.tile_capacity import HEADROOM, TILE_STEP, TileListCapacity, capacity_for
 
 
-def test_tiles_have_rooms_of_their_own_with_some_to_spare():
-    room = ListRoom.for_frame(needed=2_000_000, most=313)
-    assert room.per_tile
-    assert 313 * HEADROOM <= room.capacity < 313 * HEADROOM + TILE_STEP
+def test_each_tile_has_its_own_buffer_with_headroom():
+    lists = TileListCapacity.for_frame(needed=2_000_000, most_in_tile=313)
+    assert lists.per_tile
+    assert 313 * HEADROOM <= lists.capacity < 313 * HEADROOM + TILE_STEP
 
 
-def test_lists_share_one_room_where_a_tile_has_too_many():
+def test_one_buffer_serves_all_lists_where_a_tile_has_too_many_instances():
     most = math.floor(MOST_IN_TILE / HEADROOM)
-    assert ListRoom.for_frame(needed=120_000, most=most) == ListRoom(MOST_IN_TILE, per_tile=True)
-    room = ListRoom.for_frame(needed=120_000, most=most + 1)
-    assert room == ListRoom(capacity_for(120_000), per_tile=False)
-    assert room.capacity >= 120_000
+    assert TileListCapacity.for_frame(needed=120_000, most_in_tile=most) == TileListCapacity(
+        MOST_IN_TILE, per_tile=True
+    )
+    lists = TileListCapacity.for_frame(needed=120_000, most_in_tile=most + 1)
+    assert lists == TileListCapacity(capacity_for(120_000), per_tile=False)
+    assert lists.capacity >= 120_000
 
 
-def test_nothing_to_show_still_has_room():
-    assert ListRoom.for_frame(0, 0).capacity > 0
-    assert ListRoom.at_first(0, 640, 512).capacity > 0
+def test_an_empty_scene_still_has_capacity():
+    assert TileListCapacity.for_frame(0, 0).capacity > 0
+    assert TileListCapacity.initial(0, 640, 512).capacity > 0
 
 
-def test_the_first_guess_holds_four_tiles_a_gaussian():
-    room = ListRoom.at_first(50_000, 640, 512)
-    assert room.per_tile
-    assert room.capacity * 40 * 32 >= 4 * 50_000
+def test_the_initial_capacity_holds_four_tiles_a_gaussian():
+    lists = TileListCapacity.initial(50_000, 640, 512)
+    assert lists.per_tile
+    assert lists.capacity * 40 * 32 >= 4 * 50_000

@@ -2,7 +2,9 @@
 
 import pytest
 
-from gsplat_core.errors import InvalidInput
+from gsplat_core.deformation.basis_kind import BasisLearningRates
+from gsplat_core.deformation.hexplane_kind import HexPlaneLearningRates
+from gsplat_core.errors import InvalidSetting, UserError
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
 
 
@@ -15,6 +17,8 @@ from gsplat_core.training.config import LearningRates, ReconstructorConfig
         ("sh_degree", 5),
         ("steps_per_frame", 0),
         ("first_frame_steps", -1),
+        ("jump_ratio", 0.0),
+        ("jump_extra", -1),
         ("newest_share", 0.0),
         ("newest_share", 1.1),
         ("window_frames", 0),
@@ -27,15 +31,35 @@ from gsplat_core.training.config import LearningRates, ReconstructorConfig
     ],
 )
 def test_a_wrong_setting_is_named_with_its_value(name, value):
-    with pytest.raises(InvalidInput, match=name) as refused:
+    with pytest.raises(InvalidSetting, match=name) as refused:
         ReconstructorConfig(**{name: value})
     assert str(value) in str(refused.value)
 
 
 @pytest.mark.parametrize("rate", [-1e-3, 10.0, float("nan")])
-def test_a_wrong_rate_is_named_with_its_value(rate):
-    with pytest.raises(InvalidInput, match=f"basis_quats is {rate}"):
-        LearningRates(basis_quats=rate)
+@pytest.mark.parametrize(
+    ("kind", "name"), [(LearningRates, "quats"), (BasisLearningRates, "timing"), (HexPlaneLearningRates, "network")]
+)
+def test_a_wrong_rate_is_named_with_its_value(kind, name, rate):
+    with pytest.raises(InvalidSetting, match=f"{name} is {rate}"):
+        kind(**{name: rate})
+
+
+def test_an_unknown_field_is_the_users_to_change_and_the_names_are_told():
+    with pytest.raises(UserError, match=r"unknown deformation field 'voxels'; known are auto, basis, hexplane"):
+        ReconstructorConfig(field="voxels")
+
+
+def test_the_rates_of_another_field_are_refused():
+    rates = LearningRates(field=HexPlaneLearningRates())
+    with pytest.raises(InvalidSetting, match="HexPlaneLearningRates; a basis field has BasisLearningRates"):
+        ReconstructorConfig(rates=rates)
+    assert ReconstructorConfig(field="hexplane", rates=rates).rates is rates
+
+
+def test_rates_in_pixels_alone_are_scaled_to_the_scene():
+    rates = BasisLearningRates(means_px=2.0, sh=3.0).scaled(mm_per_px=5.0, scale=0.5)
+    assert (rates["means_px"], rates["sh"]) == (5.0, 1.5)
 
 
 @pytest.mark.parametrize(("field", "chosen"), [("auto", "basis"), ("basis", "basis"), ("hexplane", "hexplane")])

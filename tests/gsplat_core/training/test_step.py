@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.deformation import BasisField, HexPlaneField
+from gsplat_core.deformation import FIELDS, BasisField, HexPlaneField
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.photometric import LossWeights, loss_and_gradients
 from gsplat_core.training.step import TrainingStep
 
-STILL = LearningRates(**dict.fromkeys((field.name for field in dataclasses.fields(LearningRates)), 0.0))
+
+def still(field, **learning):
+    """Rates of 0 for Gaussians and field, but those of the field that are given."""
+    none = type(FIELDS[field].rates)(**dict.fromkeys(vars(FIELDS[field].rates), 0.0))
+    return LearningRates(0.0, 0.0, 0.0, 0.0, 0.0, field=dataclasses.replace(none, **learning))
 
 
 @pytest.fixture
@@ -29,7 +33,7 @@ def make_step(make_frame, camera):
             if field == "basis"
             else HexPlaneField(gaussians, window, channels=8, resolution=(8, 8, 8, 5), levels=(1,), width=16, depth=1)
         )
-        settings = ReconstructorConfig(gaussians=300, rates=rates or LearningRates(), **config)
+        settings = ReconstructorConfig(field=field, gaussians=300, rates=rates or LearningRates(), **config)
         return TrainingStep(gaussians, made, settings, camera)
 
     return make
@@ -47,7 +51,7 @@ def test_steps_lower_the_loss_and_report_the_one_before_the_update(make_step, ma
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
 def test_no_rate_changes_nothing(make_step, make_frame, camera, field):
-    step = make_step(field, rates=STILL)
+    step = make_step(field, rates=still(field))
     gaussians, module = step.copy()
     step(Observation.of(make_frame(4, shift_px=2), camera))
     after, module_after = step.copy()
@@ -59,8 +63,8 @@ def test_no_rate_changes_nothing(make_step, make_frame, camera, field):
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
 def test_the_field_alone_learns_when_the_gaussians_stand_still(make_step, make_frame, camera, field):
-    learning = {"basis_means_px": 0.1, "basis_sh": 1e-2, "hexplane_planes": 5e-3, "hexplane_network": 5e-3}
-    step = make_step(field, rates=dataclasses.replace(STILL, **learning))
+    learning = {"basis": {"means_px": 0.1, "sh": 1e-2}, "hexplane": {"planes": 5e-3, "network": 5e-3}}
+    step = make_step(field, rates=still(field, **learning[field]))
     before = step.gaussians.clone()
     rest, moved = Observation.of(make_frame(), camera), Observation.of(make_frame(16, shift_px=2), camera)
     at_rest = step(rest)

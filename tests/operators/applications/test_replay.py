@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsplat_core.errors import InvalidInput, InvalidSetting, RecordingMissing
+from gsplat_core.errors import InvalidSetting, RecordingMissing
 from gsplat_core.io.bundle import load_bundle
 from operators.applications import replay as replay_module
 from operators.applications.replay import ReplaySettings, replay
@@ -113,7 +113,7 @@ def test_what_is_wrong_is_said_before_anything_is_written(tiny, tmp_path, monkey
     for error, settings in (
         (RecordingMissing, ReplaySettings(tmp_path / "nowhere", out)),
         (DeviceMissing, ReplaySettings(tiny, out, device="cuda")),
-        (InvalidInput, ReplaySettings(tiny, out, steps_per_frame=0)),
+        (InvalidSetting, ReplaySettings(tiny, out, steps_per_frame=0)),
         (InvalidSetting, ReplaySettings(tiny, out, max_frames=0)),
         (OutputFolderInUse, ReplaySettings(tiny, tiny)),
     ):

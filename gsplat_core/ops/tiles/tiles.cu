@@ -1,11 +1,12 @@
-#include <cub/device/device_radix_sort.cuh>
-#include <cub/device/device_scan.cuh>
-
+#include "cub_device.cuh"
+#include "cuda_check.h"
+#include "cuda_scratch.h"
 #include "tile_ellipse.cuh"
 
+namespace gsplat::tiles {
 namespace {
 
-__device__ int64_t image_of(const DeviceBoxes& in, int64_t splat) {
+__device__ int64_t image_of(const SplatBoxes& in, int64_t splat) {
   return in.image_ids != nullptr ? in.image_ids[splat] : splat / in.per_image;
 }
 
@@ -13,14 +14,14 @@ __device__ int64_t image_of(const DeviceBoxes& in, int64_t splat) {
 // wait for that one.
 constexpr int kTallRows = 16, kManyTiles = 32;
 
-__device__ int tiles_of(const DeviceBoxes& in, const TileBox& box) {
+__device__ int tiles_of(const SplatBoxes& in, const TileBox& box) {
   int tiles = 0;
   for_tile_rows(box, float(in.tile_size), [&](int, int first, int end) { tiles += end - first; });
   return tiles;
 }
 
 // Tile counts, and what the depth sort needs: depths as bits, so positive ones in front of negative ones, as gsplat sorts.
-__global__ void measure_splats(DeviceBoxes in, int32_t* tile_counts, uint32_t* keys, uint32_t* splats) {
+__global__ void measure_splats(SplatBoxes in, int32_t* tile_counts, uint32_t* keys, uint32_t* splats) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int lane = threadIdx.x % 32;
   const TileBox box = i < in.count ? tile_box(in, i) : TileBox{};
@@ -51,7 +52,7 @@ __global__ void counts_in_order(int64_t count, const uint32_t* splats, const int
 }
 
 // Writes the tiles of one splat from `at` on: every `step`th of a row from the `lane`th on.
-__device__ void emit_splat(const DeviceBoxes& in, int64_t splat, int64_t at, int lane, int step, const TileInstances& to) {
+__device__ void emit_splat(const SplatBoxes& in, int64_t splat, int64_t at, int lane, int step, const TileInstances& to) {
   const uint32_t first_tile = uint32_t(image_of(in, splat) * in.tile_width * in.tile_height) + to.capacity;
   for_tile_rows(tile_box(in, splat), float(in.tile_size), [&](int row, int first, int end) {
     for (int column = first + lane; column < end; column += step) {
@@ -62,7 +63,7 @@ __device__ void emit_splat(const DeviceBoxes& in, int64_t splat, int64_t at, int
   });
 }
 
-__global__ void emit(DeviceBoxes in, TileOrder order, TileInstances to) {
+__global__ void emit(SplatBoxes in, TileOrder order, TileInstances to) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int lane = threadIdx.x % 32;
   int64_t splat = 0, at = 0, count = 0;
@@ -110,7 +111,7 @@ __global__ void offsets_of_ids(const int64_t* ids, int64_t count, int64_t images
 // The bits that n values need, as gsplat counts them: floor(log2(n)) + 1.
 int gsplat_bits(int64_t n) { return n > 0 ? 64 - __builtin_clzll(uint64_t(n)) : 1; }
 
-__global__ void ids_of_instances(DeviceBoxes in, const uint32_t* tiles, const int32_t* splats, int64_t count, int tile_bits,
+__global__ void ids_of_instances(SplatBoxes in, const uint32_t* tiles, const int32_t* splats, int64_t count, int tile_bits,
                                  int64_t* ids) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= count) return;
@@ -120,44 +121,51 @@ __global__ void ids_of_instances(DeviceBoxes in, const uint32_t* tiles, const in
 
 }  // namespace
 
-TileOrder order_splats(const DeviceBoxes& in, bool by_depth, int32_t* tile_counts, CudaScratch& scratch, cudaStream_t stream) {
+TileOrder order_splats(const SplatBoxes& in, bool by_depth, int32_t* tile_counts, CudaScratch& scratch, cudaStream_t stream) {
   TileOrder order = {nullptr, scratch.array<int64_t>(in.count + 1)};
   if (by_depth) {
     cub::DoubleBuffer<uint32_t> keys(scratch.array<uint32_t>(in.count), scratch.array<uint32_t>(in.count));
     cub::DoubleBuffer<uint32_t> splats(scratch.array<uint32_t>(in.count), scratch.array<uint32_t>(in.count));
     measure_splats<<<blocks_for(in.count), kThreads, 0, stream>>>(in, tile_counts, keys.Current(), splats.Current());
     size_t size = 0;
-    cub::DeviceRadixSort::SortPairs(nullptr, size, keys, splats, in.count, 0, 32, stream);
-    cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, keys, splats, in.count, 0, 32, stream);
+    check_cuda(cub::DeviceRadixSort::SortPairs(nullptr, size, keys, splats, in.count, 0, 32, stream), "sorting on the GPU");
+    check_cuda(cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, keys, splats, in.count, 0, 32, stream),
+               "sorting on the GPU");
     order.splats = splats.Current();
   } else {
     measure_splats<<<blocks_for(in.count), kThreads, 0, stream>>>(in, tile_counts, nullptr, nullptr);
   }
   counts_in_order<<<blocks_for(in.count + 1), kThreads, 0, stream>>>(in.count, order.splats, tile_counts, order.starts);
   size_t size = 0;
-  cub::DeviceScan::ExclusiveSum(nullptr, size, order.starts, order.starts, in.count + 1, stream);
-  cub::DeviceScan::ExclusiveSum(scratch.bytes(size), size, order.starts, order.starts, in.count + 1, stream);
+  check_cuda(cub::DeviceScan::ExclusiveSum(nullptr, size, order.starts, order.starts, in.count + 1, stream),
+             "summing on the GPU");
+  check_cuda(cub::DeviceScan::ExclusiveSum(scratch.bytes(size), size, order.starts, order.starts, in.count + 1, stream),
+             "summing on the GPU");
   return order;
 }
 
-void emit_instances(const DeviceBoxes& in, const TileOrder& order, TileInstances& instances, cudaStream_t stream) {
+void emit_instances(const SplatBoxes& in, const TileOrder& order, TileInstances& instances, cudaStream_t stream) {
   instances.current = 0;
   if (instances.count == 0) return;
   if (instances.capacity) {
-    cudaMemsetAsync(instances.tiles[0], 0, size_t(instances.count) * sizeof(uint32_t), stream);
-    cudaMemsetAsync(instances.splats[0], 0xff, size_t(instances.count) * sizeof(int32_t), stream);
+    check_cuda(cudaMemsetAsync(instances.tiles[0], 0, size_t(instances.count) * sizeof(uint32_t), stream),
+               "clearing the tile list");
+    check_cuda(cudaMemsetAsync(instances.splats[0], 0xff, size_t(instances.count) * sizeof(int32_t), stream),
+               "clearing the tile list");
   }
   if (in.count > 0) emit<<<blocks_for(in.count), kThreads, 0, stream>>>(in, order, instances);
 }
 
-void sort_by_tile(const DeviceBoxes& in, TileInstances& instances, CudaScratch& scratch, cudaStream_t stream) {
+void sort_by_tile(const SplatBoxes& in, TileInstances& instances, CudaScratch& scratch, cudaStream_t stream) {
   if (instances.count == 0) return;
   cub::DoubleBuffer<uint32_t> tiles(instances.tiles[0], instances.tiles[1]);
   cub::DoubleBuffer<int32_t> splats(instances.splats[0], instances.splats[1]);
   const int bits = bits_below(int64_t(in.images) * in.tile_width * in.tile_height + instances.capacity);
   size_t size = 0;
-  cub::DeviceRadixSort::SortPairs(nullptr, size, tiles, splats, instances.count, 0, bits, stream);
-  cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, tiles, splats, instances.count, 0, bits, stream);
+  check_cuda(cub::DeviceRadixSort::SortPairs(nullptr, size, tiles, splats, instances.count, 0, bits, stream),
+             "sorting on the GPU");
+  check_cuda(cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, tiles, splats, instances.count, 0, bits, stream),
+             "sorting on the GPU");
   instances.current = tiles.selector;
 }
 
@@ -174,9 +182,11 @@ void encode_offsets(const int64_t* ids, int64_t count, int64_t images, int64_t t
                                                                                 gsplat_bits(tiles_per_image), offsets);
 }
 
-void make_ids(const DeviceBoxes& in, const TileInstances& instances, int64_t* ids, cudaStream_t stream) {
+void make_ids(const SplatBoxes& in, const TileInstances& instances, int64_t* ids, cudaStream_t stream) {
   if (instances.count == 0) return;
   ids_of_instances<<<blocks_for(instances.count), kThreads, 0, stream>>>(
       in, instances.tiles[instances.current], instances.splats[instances.current], instances.count,
       gsplat_bits(int64_t(in.tile_width) * in.tile_height), ids);
 }
+
+}  // namespace gsplat::tiles

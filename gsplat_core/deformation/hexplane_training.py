@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation import HexPlaneField
+from gsplat_core.deformation.hexplane import HexPlaneField
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane.deltas import takes_layers
 from gsplat_core.ops.hexplane.training import (
@@ -67,6 +67,10 @@ class HexPlaneTraining:
         moments = (*self._first, *self._second, self._network_first, self._network_second)
         self._tensors = (*self._planes, *self._network, *moments, self._box)
         self._state: TrainingState | None = None
+
+    def rate_values(self, rates: Mapping[str, float]) -> Sequence[float]:
+        """Of the planes, of the network."""
+        return [rates["planes"], rates["network"]]
 
     def tensors(self) -> Sequence[Tensor]:
         """Everything on the device that a step reads or changes."""

@@ -1,0 +1,92 @@
+"""Copies of a field whose tensors stay at the same addresses while newer states of the field are written over them.
+
+A captured CUDA graph can therefore read the field of every published snapshot. Used by `gsplat_core.scene.snapshots`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+
+if TYPE_CHECKING:
+    from gsplat_core.deformation.basis import BasisField
+    from gsplat_core.deformation.field import DeformationField
+
+INERT_CENTER = 1e9
+"""Centre of a bump that no field has yet, in bump spacings: too far from any time to contribute."""
+BUMP_STEP = 16
+"""The capacity for bumps is a multiple of this."""
+BUMP_HEADROOM = 1.25
+
+
+class FieldSlot(Protocol):
+    """One copy of a field that is written over."""
+
+    @property
+    def field(self) -> DeformationField:
+        """The copy, for as many Gaussians as the slot has rows; only its times and the values of its tensors change."""
+
+    def overwrite(self, source: DeformationField) -> bool:
+        """Take over the state of `source`, queued on the current stream; False, with nothing changed, where it does not fit."""
+
+    def exact_copy(self) -> DeformationField:
+        """The field as it was written last, of its own size and in memory of its own."""
+
+
+class WholeFieldSlot:
+    """For a field without tensors per Gaussian: its tensors never change their shapes."""
+
+    def __init__(self, source: DeformationField) -> None:
+        self.field = source.detached_copy()
+
+    def overwrite(self, source: DeformationField) -> bool:
+        """Copy every parameter and buffer, and the time window."""
+        mine, theirs = self.field.state_dict(keep_vars=True), source.state_dict(keep_vars=True)
+        if {name: t.shape for name, t in mine.items()} != {name: t.shape for name, t in theirs.items()}:
+            return False
+        for name, tensor in mine.items():
+            tensor.data.copy_(theirs[name].data)
+        self.field._time_window_s = source.time_window_s
+        return True
+
+    def exact_copy(self) -> DeformationField:
+        """Another copy."""
+        return self.field.detached_copy()
+
+
+class BasisSlot:
+    """A basis field with capacity for more Gaussians and more bumps than it has; those that are not in use are inert."""
+
+    def __init__(self, source: BasisField, rows: int) -> None:
+        capacity = math.ceil(max(source.bumps * BUMP_HEADROOM, 1) / BUMP_STEP) * BUMP_STEP
+        with torch.device(source.weights.device):
+            self.field = type(source)(rows, source.time_window_s, bumps=capacity).requires_grad_(False)
+        self.field.centers.data.fill_(INERT_CENTER)
+        self._used = 0, 0
+
+    def overwrite(self, source: DeformationField) -> bool:
+        """Copy the bumps and the layout of the columns, and make inert what an earlier state had used beyond them."""
+        if not isinstance(source, type(self.field)):
+            return False
+        count, bumps = source.count, source.bumps
+        if count > self.field.count or bumps > self.field.bumps:
+            return False
+        mine = (self.field.centers.data, self.field.log_widths.data, self.field.weights.data)
+        theirs = (source.centers.data, source.log_widths.data, source.weights.data)
+        for to, values in zip(mine, theirs, strict=True):
+            to[:count, :bumps].copy_(values)
+        rows, columns = self._used
+        for to, inert in zip(mine, (INERT_CENTER, 0.0, 0.0), strict=True):
+            if rows > count:
+                to[count:rows].fill_(inert)
+            if columns > bumps:
+                to[:, bumps:columns].fill_(inert)
+        self._used = count, bumps
+        self.field.adopt_layout(source)
+        return True
+
+    def exact_copy(self) -> DeformationField:
+        """A field of as many Gaussians and bumps as are in use."""
+        return self.field.cropped(*self._used)

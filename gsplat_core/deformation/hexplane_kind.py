@@ -1,0 +1,43 @@
+"""HexPlane with a network as a kind of field: how one is checked and trained. It is made as `HexPlaneField` says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsplat_core.deformation.hexplane import HexPlaneField
+from gsplat_core.deformation.hexplane_training import HexPlaneTraining
+from gsplat_core.deformation.kind import FieldKind
+from gsplat_core.deformation.rates import FieldRates
+from gsplat_core.ops.hexplane.deltas import takes_layers
+from gsplat_core.value_ranges import IntegerIn, ListOf
+
+
+@dataclass(frozen=True)
+class HexPlaneLearningRates(FieldRates):
+    """Rates of the feature planes and of the network."""
+
+    planes: float = 2e-2
+    network: float = 5e-3
+
+    def rate_of(self, parameter: str) -> str:
+        return "planes" if parameter.startswith("planes") else "network"
+
+
+def captured_training(field: HexPlaneField) -> HexPlaneTraining | None:
+    """What trains the field in a CUDA graph; None for sizes that the kernels do not take."""
+    fits = takes_layers(field.channels, len(field.levels), field.width, field.depth)
+    return HexPlaneTraining(field) if fits else None
+
+
+KIND = FieldKind(
+    field=HexPlaneField,
+    config={
+        "channels": IntegerIn(1, 1 << 12),
+        "resolution": ListOf(IntegerIn(2, 1 << 12), 4, 4),
+        "levels": ListOf(IntegerIn(1, 64), 1, 16),
+        "width": IntegerIn(1, 1 << 12),
+        "depth": IntegerIn(1, 64),
+    },
+    rates=HexPlaneLearningRates(),
+    captured_training=captured_training,
+)

@@ -1,0 +1,112 @@
+"""JSON from anyone, read by name and range: no NaN, no duplicate names, bounded nesting."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from gsplat_core.errors import BundleCorrupt, InvalidInput
+from gsplat_core.value_ranges import IntegerIn, ListOf, NumberIn, shortened
+
+MAX_NESTING = 16
+"""Objects and lists inside each other."""
+
+
+class JsonObject:
+    """One object of a document, read by name; a value that is missing or out of its range is BundleCorrupt with the place and the value."""
+
+    def __init__(self, values: object, name: str) -> None:
+        if not isinstance(values, dict):
+            raise BundleCorrupt(f"{name} must be a JSON object, got {shortened(values)}")
+        self.values: dict[str, Any] = values
+        self.name = name
+
+    @staticmethod
+    def parse(text: bytes, name: str) -> JsonObject:
+        """The object that a file holds; `name` is the file's, for messages."""
+        try:
+            values = json.loads(text.decode(), parse_constant=_refuse_constant, object_pairs_hook=_without_duplicates)
+        except (ValueError, RecursionError) as error:
+            raise BundleCorrupt(f"{name} is not valid JSON ({error}); copy the bundle again") from error
+        _check_nesting(values, name)
+        return JsonObject(values, name)
+
+    def nested(self, key: str) -> JsonObject:
+        """The object of that name."""
+        return JsonObject(self.values.get(key), f"{self.name}: {key}")
+
+    def integer(self, key: str, wanted: IntegerIn) -> int:
+        """The integer of that name."""
+        return int(self._checked(key, wanted))
+
+    def number(self, key: str, wanted: NumberIn) -> float:
+        """The number of that name."""
+        return float(self._checked(key, wanted))
+
+    def matrix(self, key: str, size: int, wanted: NumberIn) -> list[list[float]]:
+        """`size` rows of as many numbers."""
+        rows = self.values.get(key)
+        if not isinstance(rows, list) or len(rows) != size:
+            raise BundleCorrupt(f"{self.name}: {key} must be {size} rows of {size} numbers, got {shortened(rows)}")
+        try:
+            return [ListOf(wanted, size, size).checked(f"{key}[{index}]", row) for index, row in enumerate(rows)]
+        except InvalidInput as error:
+            raise BundleCorrupt(f"{self.name}: {error}") from error
+
+    def window(self, key: str, wanted: NumberIn, longest: float) -> tuple[float, float]:
+        """Two numbers in order, at most `longest` apart."""
+        start, end = self._checked(key, ListOf(wanted, 2, 2))
+        if not start <= end <= start + longest:
+            raise BundleCorrupt(
+                f"{self.name}: {key} must be two times in order, at most {longest:g} s apart, got {[start, end]}"
+            )
+        return start, end
+
+    def choice(self, key: str, choices: tuple[str, ...]) -> str:
+        """One of some strings."""
+        value = self.values.get(key)
+        if not isinstance(value, str) or value not in choices:
+            raise BundleCorrupt(f"{self.name}: {key} must be one of {', '.join(choices)}, got {shortened(value)}")
+        return value
+
+    def digest(self, key: str) -> str:
+        """A SHA-256."""
+        value = self.values.get(key)
+        if not isinstance(value, str) or len(value) != 64 or set(value) - set("0123456789abcdef"):
+            raise BundleCorrupt(
+                f"{self.name}: {key} must be a SHA-256 in lower-case hexadecimal, got {shortened(value)}"
+            )
+        return value
+
+    def _checked(self, key: str, wanted: IntegerIn | NumberIn | ListOf) -> Any:
+        try:
+            return wanted.checked(key, self.values.get(key))
+        except InvalidInput as error:
+            raise BundleCorrupt(f"{self.name}: {error}") from error
+
+
+def _refuse_constant(value: str) -> None:
+    raise ValueError(f"{value} is not a number of JSON")
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the name {shortened(twice)} occurs twice in one object")
+    return values
+
+
+def _check_nesting(values: object, name: str) -> None:
+    level = [values]
+    for _ in range(MAX_NESTING):
+        level = [
+            inner
+            for each in level
+            if isinstance(each, dict | list)
+            for inner in (each.values() if isinstance(each, dict) else each)
+        ]
+        if not level:
+            return
+    raise BundleCorrupt(f"{name} nests objects and lists more than {MAX_NESTING} deep; it is not a manifest")

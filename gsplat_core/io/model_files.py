@@ -1,0 +1,46 @@
+"""Opening a file of a model that may come from anyone: plain files only, without waiting, and none outside its folder."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+from gsplat_core.errors import BundleError
+from gsplat_core.memory import available_bytes, in_gib
+
+
+def open_model_file(path: Path, folder: Path | None = None) -> BinaryIO:
+    """The plain file `path`, opened for reading.
+
+    Args:
+        folder: links in the name must not lead out of it; None: they may lead anywhere.
+
+    Raises BundleError for what is missing, is not readable, is no plain file (a pipe, a device, a socket, a folder) or leads out.
+    """
+    try:
+        real = os.path.realpath(path, strict=True)
+        if folder is not None and not Path(real).is_relative_to(os.path.realpath(folder)):
+            raise BundleError(f"{path} is a link that leads out of its folder; copy the file in place of linking it")
+        # Opening a pipe without O_NONBLOCK waits until someone writes to it; for a plain file it means nothing.
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+        descriptor = os.open(real, flags)
+    except FileNotFoundError as error:
+        raise BundleError(f"{path} is missing; check the name, or copy the model again") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise BundleError(f"{path} cannot be read: {reason}; it must be a plain file") from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise BundleError(f"{path} is not a plain file; copy the model again")
+    return os.fdopen(descriptor, "rb")
+
+
+def check_memory(path: Path, needed: int) -> None:
+    """Raise BundleError when `needed` bytes, for what `path` holds, are more than there are."""
+    available = available_bytes()
+    if available is not None and needed > available:
+        raise BundleError(
+            f"{path} needs {in_gib(needed)} of memory to load, and {in_gib(available)} are available; free some, or use a machine with more"
+        )

@@ -1,0 +1,39 @@
+"""How much memory there is, so that what cannot fit is refused before work starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def available_bytes() -> int | None:
+    """Memory that a process can still take without swapping: the system's, or less where a control group limits it. None: not known."""
+    limits = [limit for limit in (_of_system(), _of_control_group()) if limit is not None]
+    return min(limits) if limits else None
+
+
+def in_gib(count: int) -> str:
+    """A number of bytes for people: "3.2 GiB"."""
+    return f"{count / 2**30:.1f} GiB"
+
+
+def _of_system(path: Path = Path("/proc/meminfo")) -> int | None:
+    for line in _text(path).splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    return None
+
+
+def _of_control_group(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
+    limit, current = _text(folder / "memory.max").strip(), _text(folder / "memory.current").strip()
+    if not limit.isdecimal() or not current.isdecimal():
+        return None
+    # Cached files are counted as used, but make room.
+    stated = dict(line.split()[:2] for line in _text(folder / "memory.stat").splitlines() if " " in line)
+    return max(0, int(limit) - int(current) + int(stated.get("inactive_file", "0")))
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:
+        return ""  # another system, or no such limit

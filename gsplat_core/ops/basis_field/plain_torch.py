@@ -1,0 +1,97 @@
+"""The basis-function field's ops in plain torch: any floating dtype and device, differentiable by ordinary autograd.
+
+`BasisField` falls back to them where there are no kernels, and they are the oracle that the kernels are tested against.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gsplat_core.scene.layout import BASIS_GROUPS, RAW_COLUMNS, width_of
+
+BUMP_REACH = 4.0
+"""A bump further than this many widths from the time contributes nothing: exp(-16) is 1e-7 of its height."""
+
+
+def basis_field(
+    centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, padded: bool = False
+) -> Tensor:
+    """Sum of truncated bumps in time: delta[n] = sum_b exp(-u^2) weights[n, b], u = (tau - center) / width, |u| <= 4.
+
+    After the basis functions of Deform3DGS (Yang et al. 2024, eq. 5), with one timing shared by all channels. `centers` and
+    `log_widths` are [N, B], `weights` [N, B, C], `tau` in the units of the centres; returns [N, C]. NaN in a centre or width
+    reaches the Gaussian's deltas (it is not mistaken for an inactive bump). `padded` appends zero columns up to `RAW_COLUMNS`.
+    """
+    u = (tau - centers) * torch.exp(-log_widths)
+    inactive = u.abs() > BUMP_REACH
+    bumps = torch.exp(-(u.masked_fill(inactive, 0.0) ** 2)).masked_fill(inactive, 0.0)
+    # Inactive rows are not read, so that what they hold (even NaN) cannot matter.
+    deltas = (bumps[..., None] * weights.masked_fill(inactive[..., None], 0.0)).sum(dim=1)
+    return torch.nn.functional.pad(deltas, (0, RAW_COLUMNS - deltas.shape[1])) if padded else deltas
+
+
+def basis_field_backward(
+    gradient: Tensor, centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of (centers, log_widths, weights) for dL/d(delta) `gradient` [N, C]; exactly zero for inactive bumps.
+
+    Columns of `gradient` beyond C are not looked at.
+    """
+    gradient = gradient[:, : weights.shape[2]]
+    inverse_width = torch.exp(-log_widths)
+    u = (tau - centers) * inverse_width
+    inactive = u.abs() > BUMP_REACH
+    u = u.masked_fill(inactive, 0.0)
+    bumps = torch.exp(-(u**2)).masked_fill(inactive, 0.0)
+    slope = bumps * 2.0 * u * torch.einsum("nc,nbc->nb", gradient, weights.masked_fill(inactive[..., None], 0.0))
+    return slope * inverse_width.masked_fill(inactive, 0.0), slope * u, bumps[..., None] * gradient[:, None, :]
+
+
+def basis_field_backward_adam_(
+    gradient: Tensor,
+    tau: float | Tensor,
+    centers: Tensor,
+    log_widths: Tensor,
+    weights: Tensor,
+    first_moments: Sequence[Tensor],
+    second_moments: Sequence[Tensor],
+    steps: Tensor,
+    learning_rates: Sequence[float] | Tensor,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-8,
+) -> None:
+    """One lazy Adam step of every bump active at `tau`, in place; the other bumps and their moments are left alone.
+
+    So is a Gaussian whose gradient is zero in every channel: the frame does not show it, and momentum must not move what nobody sees.
+    And one whose gradient, squared, is not finite: it would poison the moments for good.
+
+    `first_moments` and `second_moments` hold (centers, log_widths, weights) shaped tensors; `steps` int32 [N, B] counts the
+    updates of each bump, so that each one sees Adam's bias correction (Kingma and Ba 2015, algorithm 1) from its own first
+    update, however late in a stream it was added. `learning_rates`: position, rotation, log-scale, colour, centres, widths.
+    """
+    with torch.no_grad():
+        gradients = basis_field_backward(gradient, centers, log_widths, weights, tau)
+        active = ~(((tau - centers) * torch.exp(-log_widths)).abs() > BUMP_REACH)
+        gradient = gradient[:, : weights.shape[2]]
+        active &= (gradient != 0).any(dim=1, keepdim=True) & gradient.square().isfinite().all(dim=1, keepdim=True)
+        steps += active.to(steps.dtype)
+        count = steps.clamp(min=1).to(centers.dtype)
+        bias1, bias2 = 1 - beta1**count, 1 - beta2**count
+        each = torch.as_tensor(learning_rates, dtype=centers.dtype, device=centers.device)
+        channel_rates = each[:4].repeat_interleave(
+            torch.tensor([width_of(group) for group in BASIS_GROUPS], device=centers.device)
+        )
+        rates = (each[4], each[5], channel_rates)
+        for parameter, g, m, v, rate in zip(
+            (centers, log_widths, weights), gradients, first_moments, second_moments, rates, strict=True
+        ):
+            shape = active.shape + (1,) * (g.dim() - 2)
+            chosen = active.reshape(shape)
+            m.copy_(torch.where(chosen, m + (1 - beta1) * (g - m), m))
+            v.copy_(torch.where(chosen, v + (1 - beta2) * (g * g - v), v))
+            step = rate * (m / bias1.reshape(shape)) / ((v / bias2.reshape(shape)).sqrt() + epsilon)
+            parameter.copy_(torch.where(chosen, parameter - step, parameter))

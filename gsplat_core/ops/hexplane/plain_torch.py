@@ -1,0 +1,106 @@
+"""The HexPlane field's ops in plain torch: any floating dtype and device, differentiable by ordinary autograd.
+
+`HexPlaneField` trains through them on the CPU and falls back to them where there are no kernels, and they are the oracle that the
+kernels are tested against.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from gsplat_core.scene.layout import HEAD_COLUMNS, RAW_COLUMNS
+
+
+def sample_plane(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Bilinear samples [N, C] of `plane` [V, U, C] at `u`, `v` in [-1, 1] (corners aligned, clamped at the border)."""
+    grid = torch.stack([u, v], dim=-1)[None, None]
+    image = plane.permute(2, 0, 1)[None]
+    sampled = torch.nn.functional.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)
+    return sampled[0, :, 0].T
+
+
+PLANE_AXES = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
+"""Axes (u, v) of the six planes xy, xz, yz, xt, yt, zt; a plane is stored [size of v, size of u, channels]."""
+
+
+def hexplane_features(
+    coordinates: Tensor, xy: Tensor, xz: Tensor, yz: Tensor, xt: Tensor, yt: Tensor, zt: Tensor
+) -> Tensor:
+    """Product of six bilinear plane samples (HexPlane, Cao and Johnson 2023, eq. 3), one level.
+
+    `coordinates` [N, 4] are x, y, z, t in [-1, 1]; planes are [V, U, C] for the axes of PLANE_AXES. Returns [N, C].
+    """
+    product = None
+    for plane, (a, b) in zip((xy, xz, yz, xt, yt, zt), PLANE_AXES, strict=True):
+        value = sample_plane(plane, coordinates[:, a], coordinates[:, b])
+        product = value if product is None else product * value
+    assert product is not None
+    return product
+
+
+def hexplane_space(coordinates: Tensor, xy: Tensor, xz: Tensor, yz: Tensor) -> Tensor:
+    """The part of `hexplane_features` that does not depend on time: the product of the space planes [N, C]."""
+    x, y, z = coordinates[:, 0], coordinates[:, 1], coordinates[:, 2]
+    return sample_plane(xy, x, y) * sample_plane(xz, x, z) * sample_plane(yz, y, z)
+
+
+def hexplane_modulate(space: Tensor, coordinates: Tensor, xt: Tensor, yt: Tensor, zt: Tensor) -> Tensor:
+    """`space` [N, C] times the samples of three lines [U, C], the time planes already interpolated at one time."""
+    product = space
+    for axis, line in enumerate((xt, yt, zt)):
+        u = coordinates[:, axis]
+        product = product * sample_plane(line[None], u, torch.zeros_like(u))
+    return product
+
+
+def hexplane_decode(
+    spaces: Sequence[Tensor],
+    coordinates: Tensor,
+    lines: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+) -> Tensor:
+    """Features through an MLP with ReLU between its layers: [N, outputs].
+
+    The features of a level are its `spaces` [N, C], times its three `lines` [U, C] when these are given; the levels are put
+    side by side. `weights` [outputs, inputs] and `biases` [outputs] are those of `torch.nn.Linear`, layer by layer.
+    """
+    levels = list(spaces)
+    if lines:
+        levels = [
+            hexplane_modulate(space, coordinates, *lines[3 * level : 3 * level + 3])
+            for level, space in enumerate(levels)
+        ]
+    values = torch.cat(levels, dim=1)
+    for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        values = torch.nn.functional.linear(torch.relu(values) if layer else values, weight, bias)
+    return values
+
+
+def hexplane_deltas(
+    spaces: Sequence[Tensor],
+    coordinates: Tensor,
+    time: Tensor,
+    time_planes: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    order: Tensor | None = None,
+    decode: Callable[..., Tensor] | None = None,
+) -> Tensor:
+    """What the field adds to the raw parameters at `time` (a number in [-1, 1]) in the layout of `scene.layout`: [N, 16].
+
+    The time planes [V, U, C], three per level, are interpolated into lines, then `hexplane_decode` (or another `decode`). With `order`,
+    row i of the inputs is Gaussian order[i].
+    """
+    lines = []
+    for plane in time_planes:
+        at = ((time.reshape(()) + 1) / 2 * (plane.shape[0] - 1)).clamp(0, plane.shape[0] - 1)
+        row = at.detach().nan_to_num().long().clamp(max=max(plane.shape[0] - 2, 0))
+        lines.append(torch.lerp(plane[row], plane[(row + 1).clamp(max=plane.shape[0] - 1)], at - row))
+    outputs = (decode or hexplane_decode)(spaces, coordinates, lines, weights, biases)
+    deltas = outputs.new_zeros(outputs.shape[0], RAW_COLUMNS)
+    rows = torch.arange(outputs.shape[0], device=outputs.device) if order is None else order.long()
+    return deltas.index_put((rows[:, None], torch.tensor(HEAD_COLUMNS, device=outputs.device)), outputs)

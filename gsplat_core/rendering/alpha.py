@@ -1,0 +1,144 @@
+"""Alpha blending front to back (Kerbl et al. 2023, section 4) as a `Renderer`: on the CPU and on NVIDIA GPUs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsplat_core.deformation import DeformationField
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.native import CUDA_MISSING
+from gsplat_core.rendering.frame_renderer import FrameRenderer, LaunchedFrame
+from gsplat_core.rendering.rasterization import RenderOutput, render
+from gsplat_core.rendering.renderer import (
+    STANDARD_OUTPUTS,
+    Capabilities,
+    FinishedFrame,
+    PendingFrame,
+    Precision,
+    check_camera,
+    checked_outputs,
+    standard_outputs,
+)
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
+
+
+class AlphaRenderer:
+    """Deforms, projects, sorts and blends.
+
+    On a GPU a frame is one CUDA graph. A snapshot is rendered where it lies, by a graph that is captured once for its slot; a `Model` has a
+    graph of its own, which is captured when it is prepared. On the CPU, and for a field that has no fused frame path, the model is deformed
+    by the field's own function and rendered by `gsplat_core.render`.
+    """
+
+    capabilities = Capabilities(
+        outputs=STANDARD_OUTPUTS,
+        precisions={"cpu": ("fp32",), "cuda": ("fp32", "fp16")},
+        differentiable=False,
+        deterministic=True,
+        reads_snapshots=True,
+    )
+
+    def __init__(
+        self, camera: Camera, device: torch.device, *, precision: Precision = "fp32", background: Tensor | None = None
+    ) -> None:
+        self._camera, self._device, self._precision = camera, torch.device(device), precision
+        self._background = background
+        self._model: Model | Snapshot | None = None
+        self._frames: FrameRenderer | None = None
+        """What renders the prepared model as a CUDA graph; None: the model is rendered by single launches."""
+        self._by_slot: dict[int, tuple[tuple[int, int], FrameRenderer]] = {}
+        """For each slot's number: which slot and layout the graph was captured for, and the graph's owner."""
+
+    def prepare(self, model: Model | Snapshot) -> None:
+        """See `Renderer.prepare`. Raises InvalidInput for a model on another device."""
+        if model.device.type != self._device.type:
+            raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")
+        if model is self._model:
+            return
+        if isinstance(model, Snapshot):
+            self._frames = self._for_slot(model)
+        else:
+            self._frames = self._new_frames(model, recompute=False)
+        self._model = model
+
+    def render(self, camera: Camera, time_s: float, outputs: Iterable[str] = STANDARD_OUTPUTS) -> PendingFrame:
+        """See `Renderer.render`."""
+        asked = checked_outputs("alpha", outputs, self.capabilities)
+        check_camera(self._camera, camera)
+        model = self._model
+        if model is None:
+            raise InvalidInput("no model was prepared; call prepare(model) before render()")
+        if self._frames is None:
+            with torch.no_grad():
+                output = render(model.at(time_s), camera, self._background, depth="depth" in asked)
+            return FinishedFrame(_chosen(output, asked))
+        reading = model.reading if isinstance(model, Snapshot) else nullcontext
+        with reading():
+            launched = self._frames.render(camera, model.clamp_time(time_s))
+        return _FrameInFlight(model, launched, reading, asked)
+
+    def _for_slot(self, snapshot: Snapshot) -> FrameRenderer | None:
+        slot = snapshot.slot
+        key = id(slot), slot.layout
+        known = self._by_slot.get(slot.number)
+        if known is not None and known[0] == key:
+            frames = known[1]
+        else:
+            made = self._new_frames(snapshot, recompute=True)
+            if made is None:
+                return None
+            frames = made
+            self._by_slot[slot.number] = key, frames
+        if self._frames is not None and self._frames.gaussians.count == frames.gaussians.count:
+            frames.capacity = self._frames.capacity  # one overflow is enough for all slots
+        return frames
+
+    def _new_frames(self, model: Model | Snapshot, *, recompute: bool) -> FrameRenderer | None:
+        scene = model.slot if isinstance(model, Snapshot) else model
+        gaussians, field = scene.gaussians, scene.field
+        if gaussians.device.type != "cuda" or gaussians.dtype != torch.float32 or CUDA_MISSING is not None:
+            return None
+        if field is not None and not _has_frame_path(field):
+            return None
+        return FrameRenderer(
+            gaussians,
+            self._camera,
+            field,
+            background=self._background,
+            precision=self._precision,
+            recompute=recompute,
+        )
+
+
+@dataclass(frozen=True)
+class _FrameInFlight:
+    """A launched frame. It holds the model, so that a slot is not overwritten while the frame may have to be rendered again."""
+
+    _model: Model | Snapshot
+    _launched: LaunchedFrame
+    _reading: Callable[[], AbstractContextManager[object]]
+    _asked: tuple[str, ...]
+
+    def outputs(self) -> Mapping[str, Tensor]:
+        """See `PendingFrame.outputs`."""
+        with self._reading():  # longer tile lists may have to be tried
+            return _chosen(self._launched.result(), self._asked)
+
+    def result(self) -> RenderOutput:
+        """See `PendingFrame.result`."""
+        return standard_outputs(self.outputs())
+
+
+def _chosen(output: RenderOutput, asked: tuple[str, ...]) -> dict[str, Tensor]:
+    return {name: tensor for name, tensor in output._asdict().items() if name in asked}
+
+
+def _has_frame_path(field: DeformationField) -> bool:
+    return type(field).frame_deltas is not DeformationField.frame_deltas

@@ -1,0 +1,31 @@
+"""Renderers by name."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsplat_core.registry import Registry
+from gsplat_core.rendering.renderer import Precision, Renderer, RendererKind, check_background, check_choice
+from gsplat_core.scene.cameras import Camera
+
+RENDERERS: Registry[RendererKind] = Registry("renderer", {"alpha": "gsplat_core.rendering.alpha:AlphaRenderer"})
+"""Alpha blending front to back (Kerbl et al. 2023). To add another: CONTRIBUTING.md, "A renderer"."""
+
+
+def new_renderer(
+    name: str,
+    camera: Camera,
+    device: torch.device | str = "cpu",
+    *,
+    precision: Precision = "fp32",
+    background: Tensor | None = None,
+) -> Renderer:
+    """The renderer called `name` for pictures of the camera's size and projection.
+
+    Raises InvalidSetting for an unknown name and for a device or precision that the renderer does not have.
+    """
+    kind, device = RENDERERS[name], torch.device(device)
+    check_choice(name, kind.capabilities, device, precision)
+    check_background(background)
+    return kind(camera, device, precision=precision, background=background)

@@ -1,0 +1,153 @@
+"""What every renderer of published models is, whichever way it turns Gaussians into pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Protocol, get_args
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_shape
+from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.rendering.rasterization import RenderOutput
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
+
+Precision = Literal["fp32", "fp16"]
+STANDARD_OUTPUTS = RenderOutput._fields
+"""What a frame has unless other outputs are asked for: `image`, `alpha`, `depth`."""
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What a renderer can do; a program reads it before it makes one."""
+
+    outputs: tuple[str, ...]
+    """Names of the outputs, `image` among them. Those of `RenderOutput` have its shapes and units; a renderer documents its others."""
+    precisions: Mapping[str, tuple[Precision, ...]]
+    """The devices (`cpu`, `cuda`) on which it runs, each with its precisions, the exact one first."""
+    differentiable: bool
+    """Whether a frame's outputs have gradients with respect to the model's tensors."""
+    deterministic: bool
+    """Whether the same model, camera and time give the same bits on the same device."""
+    reads_snapshots: bool = False
+    """Whether `prepare` takes a `Snapshot`; where not, it is given an immutable `Model` copied from it."""
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """The types of device on which it runs."""
+        return tuple(self.precisions)
+
+
+class PendingFrame(Protocol):
+    """A frame that was asked for; on a GPU it may still be under way. It holds what it is rendered from until it is forgotten."""
+
+    def outputs(self) -> Mapping[str, Tensor]:
+        """Every output that `render` was asked for, by name, whole; waits for it on a GPU.
+
+        The memory is the renderer's and may be used again for the next frame of the renderer: copy what is to last.
+        """
+
+    def result(self) -> RenderOutput:
+        """The three standard outputs; one that was not asked for is 0 everywhere (unknown)."""
+
+
+class Renderer(Protocol):
+    """Renders published models from cameras of one size and projection on one device.
+
+    Made by `new_renderer`. `prepare` once for every published model, then `render` as often as wanted. One thread at a time may use it.
+    """
+
+    capabilities: ClassVar[Capabilities]
+
+    def __init__(
+        self, camera: Camera, device: torch.device, *, precision: Precision = "fp32", background: Tensor | None = None
+    ) -> None:
+        """`camera` gives size and projection of every frame; `background` [3] is what shows where nothing is, black when None."""
+
+    def prepare(self, model: Model | Snapshot) -> None:
+        """Make `model` what the next frames show. What does not depend on camera and time is done here; the host does not wait."""
+
+    def render(self, camera: Camera, time_s: float, outputs: Iterable[str] = STANDARD_OUTPUTS) -> PendingFrame:
+        """Queue the picture of the prepared model at `time_s`, clamped to the model's time window, on the current stream.
+
+        Raises InvalidSetting for an output that the renderer does not have, InvalidInput for a camera of another size or projection and
+        when no model was prepared.
+        """
+
+
+class RendererKind(Protocol):
+    """What a name in the registry stands for: usually the renderer's class."""
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """Known before a renderer is made."""
+
+    def __call__(
+        self, camera: Camera, device: torch.device, *, precision: Precision = "fp32", background: Tensor | None = None
+    ) -> Renderer:
+        """A renderer; the arguments have been checked against `capabilities`."""
+
+
+@dataclass(frozen=True)
+class FinishedFrame:
+    """A `PendingFrame` of a renderer that has nothing to wait for."""
+
+    _outputs: Mapping[str, Tensor]
+
+    def outputs(self) -> Mapping[str, Tensor]:
+        """What the frame was made of."""
+        return self._outputs
+
+    def result(self) -> RenderOutput:
+        """The three standard outputs."""
+        return standard_outputs(self._outputs)
+
+
+def standard_outputs(outputs: Mapping[str, Tensor]) -> RenderOutput:
+    """The three standard outputs of those by name; zeros for what is not there. Needs `image`."""
+    image = outputs["image"]
+    unknown = image.new_zeros(image.shape[:2])
+    return RenderOutput(image, outputs.get("alpha", unknown), outputs.get("depth", unknown))
+
+
+def checked_outputs(name: str, asked: Iterable[str], capabilities: Capabilities) -> tuple[str, ...]:
+    """The asked outputs and `image`, in the renderer's order. Raises InvalidSetting for one that renderer `name` does not have."""
+    wanted = {"image", *asked}
+    for output in sorted(wanted - set(capabilities.outputs)):
+        raise InvalidSetting(f"renderer {name!r} has no output {output!r}; it has {', '.join(capabilities.outputs)}")
+    return tuple(output for output in capabilities.outputs if output in wanted)
+
+
+def check_choice(name: str, capabilities: Capabilities, device: torch.device, precision: str) -> None:
+    """Raises InvalidSetting where renderer `name` does not run on the device or not in the precision."""
+    if precision not in get_args(Precision):
+        raise InvalidSetting(f"unknown precision {precision!r}; choose {' or '.join(get_args(Precision))}")
+    if device.type not in capabilities.precisions:
+        raise InvalidSetting(
+            f"renderer {name!r} does not run on {device.type}, only on {', '.join(capabilities.devices)}"
+        )
+    known = capabilities.precisions[device.type]
+    if precision not in known:
+        raise InvalidSetting(
+            f"renderer {name!r} does not render in {precision} on {device.type}, only in {', '.join(known)}"
+        )
+
+
+def check_camera(wanted: Camera, camera: Camera) -> None:
+    """Raises InvalidInput where `camera` has another size or projection than the one the renderer was made for."""
+    made_for, given = ((c.width_px, c.height_px, c.model) for c in (wanted, camera))
+    if given != made_for:
+        raise InvalidInput(
+            f"this renderer makes {made_for[0]}x{made_for[1]} {made_for[2]} pictures, the camera is"
+            f" {given[0]}x{given[1]} {given[2]}; make another renderer for it"
+        )
+
+
+def check_background(background: Tensor | None) -> None:
+    """Raises InvalidInput where the background is not one colour."""
+    if background is not None:
+        require_shape("background", background, (3,), "[3]")

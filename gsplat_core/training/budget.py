@@ -1,0 +1,150 @@
+"""How much work a frame may take: a number of steps, or the time until a deadline."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from gsplat_core.errors import InvalidInput
+
+Ending = Literal["steps", "deadline", "at_most"]
+"""Why training on a frame ended: its number of steps was made, another step would have ended after the deadline, or `at_most` steps were
+made before it."""
+MAX_IN_FLIGHT = 4
+"""Steps that may be queued on a GPU and not finished while a deadline is watched: enough to keep it busy between two."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The work that one frame may take; made by `of_steps` or `until`."""
+
+    steps: int | None
+    """Exactly so many steps, whatever time they take; None: as many as fit before the deadline."""
+    deadline_s: float = math.inf
+    """When the last step has to be finished, on `clock`."""
+    at_least: int = 1
+    """Steps that are made even when they end after the deadline."""
+    at_most: int | None = None
+    """Steps after which the frame has had enough, though there is time left."""
+    clock: Callable[[], float] = time.monotonic
+    """Seconds; never runs backwards."""
+
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.steps < 0:
+            raise InvalidInput(f"steps is {self.steps}; it must be at least 0")
+        if self.steps is None and not math.isfinite(self.deadline_s):
+            raise InvalidInput(f"deadline_s is {self.deadline_s}; it must be a finite time of the budget's clock")
+        if self.at_least < 0 or (self.at_most is not None and self.at_most < self.at_least):
+            raise InvalidInput(
+                f"at_least is {self.at_least} and at_most {self.at_most}; they must be at least 0 and in order"
+            )
+
+    @staticmethod
+    def of_steps(steps: int) -> Budget:
+        """So many steps: the same frames give the same model on every machine."""
+        return Budget(steps)
+
+    @staticmethod
+    def until(
+        deadline_s: float,
+        *,
+        at_least: int = 1,
+        at_most: int | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> Budget:
+        """The steps that end before `deadline_s` on `clock`, but at least and at most so many."""
+        return Budget(None, deadline_s, at_least, at_most, clock)
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether the number of steps depends on the clock."""
+        return self.steps is None
+
+
+class Spending:
+    """One frame's budget while it is spent: `allows_step` before each step, `step_made` after it."""
+
+    def __init__(self, budget: Budget, step_s: float | None = None) -> None:
+        """`step_s` is how long a step took lately, in seconds; None where that is not known."""
+        self._budget = budget
+        self._expected_s = step_s or 0.0
+        self._in_flight = 0
+        self._started_s = budget.clock() if budget.is_timed else 0.0
+        self.made = 0
+        """Steps made or queued so far."""
+
+    def allows_step(self) -> bool:
+        """Whether another step is to be made."""
+        budget = self._budget
+        if budget.steps is not None:
+            return self.made < budget.steps
+        if self.made < budget.at_least:
+            return True
+        if budget.at_most is not None and self.made >= budget.at_most:
+            return False
+        # Steps that are queued come first; the next one must be over in time as well.
+        return budget.clock() + (self._in_flight + 1) * self.step_s <= budget.deadline_s
+
+    def step_made(self, in_flight: int = 0) -> None:
+        """One more step was made, or queued; `in_flight` queued ones are not finished."""
+        self.made += 1
+        self._in_flight = in_flight
+
+    def all_finished(self) -> None:
+        """No step is in flight any more."""
+        self._in_flight = 0
+
+    def planned(self) -> int:
+        """How many steps are still to come, at least 1: exactly, or as the time that is left lets expect."""
+        budget = self._budget
+        if budget.steps is not None:
+            return max(1, budget.steps - self.made)
+        most = max(1, (budget.at_most or 1 << 30) - self.made)
+        least = max(1, budget.at_least - self.made)
+        if self.step_s <= 0:
+            return min(least, most)
+        left = budget.deadline_s - budget.clock() - self._in_flight * self.step_s
+        return int(min(max(least, left / self.step_s + 1e-9), most))
+
+    @property
+    def step_s(self) -> float:
+        """How long a step takes: measured on this frame once a step of it is finished; 0 where nothing is known. Timed budgets only."""
+        finished = self.made - self._in_flight
+        if finished < 1:
+            return self._expected_s
+        return max(0.0, self._budget.clock() - self._started_s) / finished
+
+    @property
+    def ending(self) -> Ending:
+        """Why no further step is made."""
+        if self._budget.steps is not None:
+            return "steps"
+        return "at_most" if self._budget.at_most is not None and self.made >= self._budget.at_most else "deadline"
+
+
+class StepsInFlight:
+    """Counts the steps that are queued on a device and not finished, and lets no more than a few be."""
+
+    def __init__(self, device: torch.device, most: int = MAX_IN_FLIGHT) -> None:
+        self._device = device
+        self._most = most
+        self._events: deque[torch.cuda.Event] = deque()
+
+    def queued(self) -> int:
+        """Call after a step was queued on the current stream: waits until at most `most` are not finished; returns how many those are."""
+        if self._device.type != "cuda":
+            return 0
+        event = torch.cuda.Event()
+        event.record(torch.cuda.current_stream(self._device))
+        self._events.append(event)
+        if len(self._events) > self._most:
+            self._events.popleft().synchronize()
+        while self._events and self._events[0].query():
+            self._events.popleft()
+        return len(self._events)

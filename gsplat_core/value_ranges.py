@@ -1,0 +1,76 @@
+"""Ranges of values that come from outside (a file, a message): stated once, checked before the values are used."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from gsplat_core.errors import InvalidInput
+
+
+@dataclass(frozen=True)
+class IntegerIn:
+    """An integer from `low` to `high`, both included. A bool is none."""
+
+    low: int
+    high: int
+
+    def __str__(self) -> str:
+        return f"an integer from {self.low} to {self.high}"
+
+    def checked(self, name: str, value: object) -> int:
+        """The value; InvalidInput when it is not in the range."""
+        if not isinstance(value, int) or isinstance(value, bool) or not self.low <= value <= self.high:
+            raise InvalidInput(f"{name} must be {self}, got {shortened(value)}")
+        return value
+
+
+@dataclass(frozen=True)
+class NumberIn:
+    """A finite number from `low` to `high`, both included. A bool is none."""
+
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"a number from {self.low:g} to {self.high:g}"
+
+    def checked(self, name: str, value: object) -> float:
+        """The value; InvalidInput when it is not in the range."""
+        # Compared before it becomes a float: an integer may be larger than any float.
+        if not isinstance(value, int | float) or isinstance(value, bool) or not self.low <= value <= self.high:
+            raise InvalidInput(f"{name} must be {self}, got {shortened(value)}")
+        assert math.isfinite(value)
+        return float(value)
+
+
+@dataclass(frozen=True)
+class ListOf:
+    """A list of `shortest` to `longest` values that are each in the range `item`."""
+
+    item: IntegerIn | NumberIn
+    shortest: int
+    longest: int
+
+    def __str__(self) -> str:
+        lengths = str(self.shortest) if self.shortest == self.longest else f"{self.shortest} to {self.longest}"
+        return f"a list of {lengths} values, each {self.item}"
+
+    def checked(self, name: str, value: object) -> list[float]:
+        """The list; InvalidInput when it is none, has another length, or a value out of its range."""
+        if not isinstance(value, list | tuple) or not self.shortest <= len(value) <= self.longest:
+            raise InvalidInput(f"{name} must be {self}, got {shortened(value)}")
+        return [self.item.checked(f"{name}[{index}]", each) for index, each in enumerate(value)]
+
+
+ValueRange = IntegerIn | NumberIn | ListOf
+
+
+def shortened(value: object, most: int = 80) -> str:
+    """`repr` of a value that may be huge, in at most so many characters."""
+    if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 256:
+        return f"an integer of {value.bit_length()} bits"
+    if isinstance(value, list | tuple | dict | str) and len(value) > 64:
+        return f"a {type(value).__name__} of {len(value)}"
+    text = repr(value)
+    return text if len(text) <= most else text[:most] + "…"

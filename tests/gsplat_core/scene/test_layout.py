@@ -1,0 +1,53 @@
+"""The layout of raw parameters: one description, and the kernels' header says the same."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import gsplat_core
+from gsplat_core.scene import layout
+
+HEADER = Path(gsplat_core.__file__).parent / "native" / "raw_layout.h"
+
+
+@pytest.fixture(scope="module")
+def constants():
+    text = HEADER.read_text(encoding="utf-8")
+    found = dict(re.findall(r"constexpr int (k\w+) = (\w+);", text))
+    return {name: int(found.get(value, value)) for name, value in found.items()}
+
+
+def test_the_kernels_header_has_the_same_columns(constants):
+    assert constants == {
+        "kRawColumns": layout.RAW_COLUMNS,
+        "kRawPosition": layout.POSITION.start,
+        "kRawRotation": layout.ROTATION.start,
+        "kRawLogScale": layout.LOG_SCALE.start,
+        "kRawColor": layout.COLOUR.start,
+        "kRawOpacity": layout.OPACITY.start,
+        "kRawUsed": layout.OPACITY.stop,
+        "kRawBasisChannels": layout.BASIS_CHANNELS,
+        "kHeadOutputs": len(layout.HEAD_COLUMNS),
+    }
+
+
+def test_groups_follow_each_other_without_gap_or_overlap():
+    groups = [layout.POSITION, layout.ROTATION, layout.LOG_SCALE, layout.COLOUR, layout.OPACITY]
+    assert [group.start for group in groups] == [0, *(group.stop for group in groups[:-1])]
+    assert [layout.width_of(group) for group in groups] == [3, 4, 3, 3, 1]
+    assert layout.width_of(*groups) <= layout.RAW_COLUMNS and layout.RAW_COLUMNS % 4 == 0
+
+
+def test_the_hexplane_head_has_log_scales_before_the_rotation():
+    assert layout.HEAD_COLUMNS == (0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 13)
+
+
+def test_kernels_spell_no_column_of_the_layout_themselves():
+    """Sources that move raw rows include the header; nobody declares the numbers a second time."""
+    native = Path(gsplat_core.__file__).parent
+    for path in [*native.rglob("*.h"), *native.rglob("*.cu"), *native.rglob("*.cuh"), *native.rglob("*.cpp")]:
+        if path != HEADER:
+            assert not re.search(r"constexpr \w+ k(Raw|Delta)Columns\b", path.read_text(encoding="utf-8")), path

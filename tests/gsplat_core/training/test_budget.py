@@ -1,0 +1,222 @@
+"""Work per frame: a number of steps, or a deadline with the same loop, on a clock of the test."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.training.budget import Budget, Spending, StepsInFlight
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.step import TrainingStep
+
+CONFIG = ReconstructorConfig(gaussians=200, max_gaussians=400, first_frame_steps=6, steps_per_frame=8)
+
+
+class Clock:
+    """Stands still but for what the test adds."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def step_takes(monkeypatch, clock):
+    """`step_takes(seconds)`: every training step takes so long from now on; returns the `seq` of the frames they were made on."""
+    trained: list[int] = []
+    durations = [0.0]
+    make_step = TrainingStep.__call__
+
+    def timed_step(self, observation, rate_scale=1.0):
+        trained.append(observation.seq)
+        clock.now_s += durations[0]
+        return make_step(self, observation, rate_scale)
+
+    monkeypatch.setattr(TrainingStep, "__call__", timed_step)
+
+    def takes(seconds):
+        durations[0] = seconds
+        trained.clear()
+        return trained
+
+    return takes
+
+
+@pytest.mark.parametrize("step_s", [1.0, 0.125, 3e-4])
+def test_a_deadline_of_so_many_steps_gives_the_model_of_that_number(tissue_video, camera, clock, step_takes, step_s):
+    counted, timed = Reconstructor(CONFIG, camera), Reconstructor(CONFIG, camera)
+    trained = step_takes(step_s)
+    for frame, steps in zip(tissue_video(6), (6, 5, 8, 1, 12, 7), strict=True):
+        trained.clear()
+        expected = counted.observe(frame, steps=steps)
+        order = trained.copy()
+        trained.clear()
+        report = timed.observe(frame, budget=Budget.until(clock() + (steps + 0.01) * step_s, clock=clock))
+        assert trained == order
+        assert (report.steps, report.ending, report.loss) == (steps, "deadline", expected.loss)
+        assert expected.ending == "steps"
+        assert timed.snapshot().sha256() == counted.snapshot().sha256()
+
+
+def test_the_configured_number_of_steps_is_the_default_budget(tissue_video, camera):
+    frames = tissue_video(3)
+    plain, counted = Reconstructor(CONFIG, camera), Reconstructor(CONFIG, camera)
+    for frame, steps in zip(frames, (6, 8, 8), strict=True):
+        assert plain.observe(frame).steps == steps
+        counted.observe(frame, budget=Budget.of_steps(steps))
+    assert plain.snapshot().sha256() == counted.snapshot().sha256()
+
+
+def test_a_step_that_would_end_after_the_deadline_is_not_made(tissue_video, camera, clock, step_takes):
+    learning = Reconstructor(CONFIG, camera)
+    step_takes(1.0)
+    for frame, left_s, steps in zip(tissue_video(4), (4.9, 4.9, 0.5, 2.0), (4, 4, 1, 2), strict=True):
+        start_s = clock()
+        report = learning.observe(frame, budget=Budget.until(start_s + left_s, clock=clock))
+        assert report.steps == steps == clock() - start_s
+
+
+def test_steps_that_become_slow_end_the_frame_in_time(tissue_video, camera, clock, step_takes):
+    learning = Reconstructor(CONFIG, camera)
+    frames = tissue_video(8)
+    step_takes(1.0)
+    for frame in frames[:3]:
+        learning.observe(frame, budget=Budget.until(clock() + 10, clock=clock))
+    step_takes(4.0)
+    late_s = []
+    for frame in frames[3:]:
+        deadline_s = clock() + 10
+        assert learning.observe(frame, budget=Budget.until(deadline_s, clock=clock)).steps == 2
+        late_s.append(clock() - deadline_s)
+    assert max(late_s) <= 0
+
+
+def test_bounds_hold_whatever_the_time(tissue_video, camera, clock, step_takes):
+    learning = Reconstructor(CONFIG, camera)
+    frames = tissue_video(3)
+    step_takes(1.0)
+    late = learning.observe(frames[0], budget=Budget.until(clock() - 5, at_least=3, clock=clock))
+    assert (late.steps, late.ending) == (3, "deadline")
+    early = learning.observe(frames[1], budget=Budget.until(clock() + 1e6, at_most=7, clock=clock))
+    assert (early.steps, early.ending) == (7, "at_most")
+    none = learning.observe(frames[2], budget=Budget.until(clock() - 5, at_least=0, clock=clock))
+    assert (none.steps, none.loss, none.ending) == (0, None, "deadline")
+
+
+def test_with_a_deadline_the_newest_frame_has_its_share_and_the_last_step(tissue_video, camera, clock, step_takes):
+    learning = Reconstructor(CONFIG, camera)
+    trained = step_takes(1.0)
+    for frame in tissue_video(6):
+        trained.clear()
+        learning.observe(frame, budget=Budget.until(clock() + 21, clock=clock))
+    seen = Counter(trained)
+    assert len(trained) == 21 and trained[0] == trained[-1] == 5
+    assert seen[5] == 1 + round(0.7 * 20)
+
+
+def test_after_a_jump_all_the_time_that_is_left_goes_to_the_new_frame(
+    tissue_video, make_frame, camera, clock, step_takes
+):
+    learning = Reconstructor(CONFIG, camera)
+    frames = tissue_video(4)
+    trained = step_takes(1.0)
+    for frame in frames:
+        learning.observe(frame, budget=Budget.until(clock() + 12, clock=clock))
+    cut = make_frame(4)
+    trained.clear()
+    report = learning.observe(
+        cut.with_fields(image=np.ascontiguousarray(255 - cut.image)), budget=Budget.until(clock() + 12, clock=clock)
+    )
+    assert (report.steps, trained) == (12, [4] * 12)
+
+
+def test_queued_steps_count_against_the_deadline(clock):
+    spending = Spending(Budget.until(clock() + 10, clock=clock), step_s=1.0)
+    made = 0
+    while spending.allows_step():
+        made += 1
+        spending.step_made(in_flight=made)  # a device that has finished none of them
+    assert made == 10
+    assert spending.ending == "deadline"
+
+
+def test_the_time_of_a_step_is_that_of_the_finished_ones(clock):
+    spending = Spending(Budget.until(clock() + 100, clock=clock))
+    assert spending.planned() == 1  # nothing is known yet
+    for _ in range(6):
+        spending.step_made(in_flight=4)
+    clock.now_s += 4
+    assert spending.step_s == 2
+    assert spending.planned() == (100 - 4 - 4 * 2) // 2
+    spending.all_finished()
+    assert spending.step_s == pytest.approx(4 / 6)
+
+
+class Event:
+    """A CUDA event that is over when it was waited for."""
+
+    made: ClassVar[list[Event]] = []
+
+    def __init__(self) -> None:
+        self.over = False
+        Event.made.append(self)
+
+    def record(self, stream) -> None:
+        pass
+
+    def query(self) -> bool:
+        return self.over
+
+    def synchronize(self) -> None:
+        for earlier in Event.made[: Event.made.index(self) + 1]:
+            earlier.over = True
+
+
+def test_no_more_than_a_few_steps_are_in_flight(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: None)
+    Event.made = []
+    steps = StepsInFlight(torch.device("cuda"), most=3)
+    assert [steps.queued() for _ in range(8)] == [1, 2, 3, 3, 3, 3, 3, 3]
+    assert sum(event.over for event in Event.made) == 5
+    for event in Event.made:
+        event.over = True
+    assert steps.queued() == 1
+
+
+def test_on_the_cpu_nothing_is_in_flight():
+    assert StepsInFlight(torch.device("cpu")).queued() == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Budget.of_steps(-1), "steps is -1"),
+        (lambda: Budget.until(math.nan), "deadline_s is nan"),
+        (lambda: Budget.until(math.inf), "deadline_s is inf"),
+        (lambda: Budget.until(1.0, at_least=-1), "at_least is -1"),
+        (lambda: Budget.until(1.0, at_least=5, at_most=4), "at_least is 5 and at_most 4"),
+    ],
+)
+def test_a_budget_that_makes_no_sense_is_refused(make, message):
+    with pytest.raises(InvalidInput, match=message):
+        make()
+
+
+def test_two_budgets_at_once_are_refused(make_frame, camera):
+    with pytest.raises(InvalidInput, match="budget and steps are both given"):
+        Reconstructor(CONFIG, camera).observe(make_frame(), budget=Budget.of_steps(3), steps=3)

@@ -1,0 +1,46 @@
+"""What a reconstructor refuses, and that a refusal leaves its model alone."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.reconstructor import Reconstructor
+
+CONFIG = ReconstructorConfig(gaussians=400, max_gaussians=800, first_frame_steps=20, steps_per_frame=6)
+
+
+def test_the_first_frame_has_to_be_trained_on(make_frame, camera):
+    learning = Reconstructor(CONFIG, camera)
+    with pytest.raises(InvalidInput, match="frame 0 is the first one"):
+        learning.observe(make_frame(), train=False)
+    with pytest.raises(InvalidInput, match="observe a frame first"):
+        learning.snapshot()
+    assert learning.gaussians == 0
+
+
+def test_frames_that_do_not_fit_are_refused_and_leave_the_model_alone(make_frame, camera):
+    learning = Reconstructor(dataclasses.replace(CONFIG, first_frame_steps=2), camera)
+    learning.observe(make_frame(4))
+    digest = learning.snapshot().sha256()
+    with pytest.raises(InvalidInput, match=r"frame 3 is at 0.150 s, before the last one at 0.200 s"):
+        learning.observe(make_frame(3))
+    with pytest.raises(InvalidInput, match="frame 5 is 24x20, its camera 48x40"):
+        learning.observe(make_frame(5, width=24, height=20))
+    with pytest.raises(InvalidInput, match="not finite"):
+        learning.observe(make_frame(5, pose=np.full((4, 4), np.nan)))
+    with pytest.raises(InvalidInput, match="steps is -2"):
+        learning.observe(make_frame(4), steps=-2)
+    assert learning.snapshot().sha256() == digest
+
+
+@pytest.mark.parametrize(
+    ("seqs", "steps", "message"), [((), 5, "no frames"), ((0, 2, 1), 5, "in order"), ((0,), 0, "steps is 0")]
+)
+def test_what_cannot_be_fitted_is_refused(make_frame, camera, seqs, steps, message):
+    with pytest.raises(InvalidInput, match=message):
+        Reconstructor(CONFIG, camera).fit([make_frame(seq) for seq in seqs], steps)
