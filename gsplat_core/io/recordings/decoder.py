@@ -18,7 +18,8 @@ from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 
 from gsplat_core.io.recordings.image_files import MAX_PIXELS
-from gsplat_core.io.recordings.packet_checks import packet_check
+from gsplat_core.io.recordings.overrun import PROBED, OverrunProbe, Ticket
+from gsplat_core.io.recordings.packet_checks import length_bytes, packet_check
 
 _DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9", "av1": "libdav1d"}
 _OPTIONS = {
@@ -56,30 +57,23 @@ class PictureDecoder:
         """What spoke against a packet, by its number; whoever has dealt with a packet takes its entry out."""
         self._check = packet_check(name, known.extradata)
         self._at_once = name in _WITHOUT_DELAY
-        if name in _DECODERS:
-            self._context = cast(av.VideoCodecContext, av.CodecContext.create(_DECODERS[name], "r"))
-            self._context.width, self._context.height = known.width, known.height
-            self._context.colorspace, self._context.color_range = known.colorspace, known.color_range
-            if known.extradata:
-                self._context.extradata = known.extradata
-        else:
-            self._context = known
-        self._context.thread_type = "NONE"
-        self._context.thread_count = 1
-        self._context.options = _OPTIONS | _STRICT.get(self._context.name, {})
-        flags = av.codec.context.Flags
-        # A damaged picture is handed out too: something must be shown in its place.
-        self._context.flags |= flags.copy_opaque | flags.output_corrupt
+        self._context = _context(known, _DECODERS.get(name))
+        self._probe: OverrunProbe | None = None
+        if name in PROBED:
+            self._probe = OverrunProbe(_context(known, _DECODERS.get(name, name)), length_bytes(name, known.extradata))
 
     def decode(self, packet: av.Packet | None, number: int, shown: bool) -> list[tuple[int, av.VideoFrame]]:
         """The frames that come out when a packet goes in, each with the number of its own packet; None at the end, for those that
         are still inside. `shown`: the packet has a picture to show."""
         if packet is not None:
-            packet.opaque = number
+            packet.opaque = Ticket(number)
             if packet.is_corrupt:
                 self._doubt(number, "its packet is not complete")
             elif self._check is not None and (wrong := self._check(bytes(packet))):
                 self._doubt(number, wrong)
+        if self._probe is not None:
+            with captured_log():
+                self._probe.decode(packet, number)
         with captured_log() as messages:
             try:
                 frames = self._context.decode(packet)
@@ -88,17 +82,37 @@ class PictureDecoder:
                 frames = []
         if messages:
             self._doubt(number, messages[0][2])
-        numbered = [(frame.opaque, frame) for frame in frames if isinstance(frame.opaque, int)]
+        numbered = [(frame.opaque.number, frame) for frame in frames if isinstance(frame.opaque, Ticket)]
         if packet is not None and self._at_once and shown and number not in (own for own, _ in numbered):
             self._doubt(number, NO_PICTURE)
         for own, frame in numbered:
             if frame.is_corrupt:
                 self._doubt(own, "the decoder marked it as damaged")
+            if self._probe is not None and self._probe.differs(own, frame):
+                self._doubt(own, "the decoder read past its end")
         return numbered
 
     def _doubt(self, number: int, what: str) -> None:
         text = " ".join(what.split())
         self.doubts.setdefault(number, text if text.isprintable() else ascii(text))
+
+
+def _context(known: av.VideoCodecContext, decoder: str | None) -> av.VideoCodecContext:
+    """A decoder for a stream: the stream's own, or one of another name."""
+    context = known
+    if decoder is not None:
+        context = cast(av.VideoCodecContext, av.CodecContext.create(decoder, "r"))
+        context.width, context.height = known.width, known.height
+        context.colorspace, context.color_range = known.colorspace, known.color_range
+        if known.extradata:
+            context.extradata = known.extradata
+    context.thread_type = "NONE"
+    context.thread_count = 1
+    context.options = _OPTIONS | _STRICT.get(context.name, {})
+    flags = av.codec.context.Flags
+    # A damaged picture is handed out too: something must be shown in its place.
+    context.flags |= flags.copy_opaque | flags.output_corrupt
+    return context
 
 
 def picture(frame: av.VideoFrame, rotation: int) -> NDArray[np.uint8]:

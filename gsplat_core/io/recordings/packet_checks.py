@@ -25,7 +25,7 @@ PacketCheck = Callable[[bytes], str | None]
 def packet_check(codec: str, extradata: bytes | None) -> PacketCheck | None:
     """The check for a codec; None where there is none."""
     if codec in ("h264", "hevc"):
-        width = _length_bytes(codec, extradata or b"")
+        width = length_bytes(codec, extradata)
         pictures, kind = (_H264_PICTURES, _h264_kind) if codec == "h264" else (_H265_PICTURES, _h265_kind)
         if width:
             return lambda data: _check_units(data, width, pictures, kind)
@@ -53,8 +53,10 @@ def is_shown(codec: str, data: bytes) -> bool:
     return True
 
 
-def _length_bytes(codec: str, extradata: bytes) -> int:
-    """Bytes of the length before each unit, as MP4 and Matroska store them; 0 for start codes, as AVI does."""
+def length_bytes(codec: str, extradata: bytes | None) -> int:
+    """Bytes of the length before each unit of H.264 and H.265 in MP4 and Matroska; 0 for start codes, as in AVI, and other codecs."""
+    if codec not in ("h264", "hevc") or not extradata:
+        return 0
     at = 4 if codec == "h264" else 21
     if len(extradata) <= at or extradata[0] != 1:
         return 0

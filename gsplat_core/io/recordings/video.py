@@ -41,11 +41,12 @@ class VideoFrames:
         """Frame after frame; a damaged one is marked. A video that ends early is a problem, and so is a change of size."""
         due = 0
         last: Picture | None = None
-        for position, decoded in self._decoded():
+        spread = DamageSpread(self._index)
+        for position, decoded in self._decoded(spread):
             if self._index.ordered and position < due:
                 continue  # given twice, or after its time
             while self._index.ordered and due < position and last is not None:
-                yield Picture(last.image, NO_PICTURE)
+                yield Picture(last.image, spread.damage(due) or NO_PICTURE)
                 due += 1
             image, damage = decoded.image, decoded.damage
             if image.shape != (self.height_px, self.width_px, 3):
@@ -71,7 +72,7 @@ class VideoFrames:
 
     def look_at_first(self) -> Picture | None:
         """The first frame, whose size is that of all; None where there is none."""
-        decoded = self._decoded()
+        decoded = self._decoded(DamageSpread(self._index))
         position, first = next(decoded, (0, None))
         decoded.close()
         if first is not None:
@@ -80,11 +81,10 @@ class VideoFrames:
                 return Picture(first.image, NO_PICTURE)
         return first
 
-    def _decoded(self) -> Generator[tuple[int, Picture], None, None]:
+    def _decoded(self, spread: DamageSpread) -> Generator[tuple[int, Picture], None, None]:
         """The pictures as the decoder gives them, each with its position."""
         with _opened(self.path, self._container) as (container, stream):
             decoder = PictureDecoder(stream)
-            spread = DamageSpread(self._index)
             for number, packet in _numbered(container, stream):
                 shown = number < len(self._index.positions) and self._index.positions[number] >= 0
                 frames = decoder.decode(packet, number, shown)
@@ -92,7 +92,7 @@ class VideoFrames:
                 for own, frame in frames:
                     position = self._index.positions[own]
                     if position >= 0:
-                        yield position, Picture(picture(frame, self._rotation), spread.damage(own))
+                        yield position, Picture(picture(frame, self._rotation), spread.damage(position))
 
 
 class DamageSpread:
@@ -109,7 +109,7 @@ class DamageSpread:
 
     def follow(self, doubts: dict[int, str], last: int) -> None:
         """Take in what the decoder doubts, up to packet `last`."""
-        self._own.update(doubts)
+        self._own = doubts | self._own  # what was said first explains most
         begin = min([self._next, *doubts])  # what is found out late is judged again from there on
         doubts.clear()
         self._next = min(last + 1, len(self._index.positions))
@@ -125,15 +125,15 @@ class DamageSpread:
             self._cause, self._before_position = None, position
         if own is not None:
             self._cause = self._cause or f"frame {position}: {own}"
-            self._damage[number] = own
+            self._damage[position] = own
         elif self._cause is not None:
-            self._damage.setdefault(number, f"{DEPENDS} ({self._cause})")
+            self._damage.setdefault(position, f"{DEPENDS} ({self._cause})")
         elif 0 <= position < self._before_position:
-            self._damage.setdefault(number, f"{DEPENDS} before the key frame that follows it")
+            self._damage.setdefault(position, f"{DEPENDS} before the key frame that follows it")
 
-    def damage(self, number: int) -> str | None:
-        """What is known against the picture of a packet; asked once."""
-        return self._damage.pop(number, None)
+    def damage(self, position: int) -> str | None:
+        """What is known against the picture at a position in the order of showing; asked once."""
+        return self._damage.pop(position, None)
 
 
 @contextmanager
