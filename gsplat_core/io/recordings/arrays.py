@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import BinaryIO
 
 import numpy as np
@@ -18,6 +19,8 @@ MAX_HEADER_BYTES = 4096
 """NumPy writes 128 bytes for a plain array."""
 _NUMBER_KINDS = "fiu"
 _HEADER_READERS = {(1, 0): (2, npy.read_array_header_1_0), (2, 0): (4, npy.read_array_header_2_0)}
+# What NumPy's reading of a header as a Python literal can end in.
+_HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError, OverflowError)
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ def _header(stream: BinaryIO) -> ArrayHeader:
     stream.seek(8)
     try:
         shape, fortran_order, dtype = read(stream, max_header_size=MAX_HEADER_BYTES)
-    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError, OverflowError) as error:
+    except _HEADER_ERRORS as error:
         raise UnreadableFile(
             f"it is not a plain NumPy array, its header cannot be read: {(str(error).splitlines() or ['damaged'])[0]:.200}"
         ) from error

@@ -16,6 +16,9 @@ from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.frame_files import ImageFiles, check_sizes
 from gsplat_core.io.recordings.plain_files import UnreadableFile, check_plain, stays_inside
 
+MAX_NAME = 512
+"""Longest file name, folders included."""
+
 
 def read_cameras_json(root: Path, findings: Findings) -> tuple[ImageFiles, Calibration] | None:
     """The images that `cameras.json` names, in its order, and their cameras."""
@@ -71,7 +74,7 @@ def _pose(value: object, path: Path, index: int, findings: Findings) -> np.ndarr
 
 def _inside(root: Path, name: object, path: Path, index: int, findings: Findings) -> Path | None:
     """The file that a document names, held inside the folder: no absolute path, no `..`, no link that leads out."""
-    relative = isinstance(name, str) and name != "" and "\0" not in name
+    relative = isinstance(name, str) and 0 < len(name) <= MAX_NAME and "\0" not in name
     if relative:
         posix, windows = PurePosixPath(str(name)), PureWindowsPath(str(name))
         relative = not posix.is_absolute() and not windows.anchor and ".." not in (*posix.parts, *windows.parts)

@@ -13,7 +13,7 @@ import numpy as np
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings.contents import Contents
 from gsplat_core.io.recordings.decoded import DEPENDS, DamagedFrames
-from gsplat_core.io.recordings.findings import Findings, ValidationReport
+from gsplat_core.io.recordings.findings import Findings, ValidationReport, printable
 from gsplat_core.io.recordings.frame_files import resize_area, resize_nearest
 from gsplat_core.io.recordings.image_files import MAX_PIXELS
 from gsplat_core.io.recordings.layouts import inspect
@@ -64,7 +64,7 @@ class FileRecording:
     def __init__(self, contents: Contents, scale: float, max_frames: int | None, notes: tuple[str, ...]) -> None:
         self._contents = contents
         # A relative path such as `.` has no name of its own.
-        self.name = contents.root.name or contents.root.resolve().name
+        self.name = printable(contents.root.name or contents.root.resolve().name)
         self.camera = contents.calibration.camera.scaled(scale)
         self.width_px, self.height_px = self.camera.width_px, self.camera.height_px
         self.frame_count = min(contents.images.frame_count, max_frames or contents.images.frame_count)
@@ -146,7 +146,7 @@ def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
     findings = Findings()
     contents = inspect(Path(path), findings)
     if contents is None:
-        return ValidationReport({"path": str(path)}, findings.problems, findings.warnings)
+        return ValidationReport({"path": printable(os.fspath(path))}, findings.problems, findings.warnings)
     decoded = intact = causes = 0
     tissue = 0.0
     damaged = DamagedFrames()
@@ -170,7 +170,7 @@ def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
         findings.warn(contents.root, what, _DAMAGE_ADVICE)
     images, calibration = contents.images, contents.calibration
     facts: dict[str, object] = {
-        "path": str(path),
+        "path": printable(os.fspath(path)),
         "layout": contents.layout,
         "frames": images.frame_count,
         "frames_decoded": decoded,
