@@ -20,8 +20,13 @@ from gpu_timing import Times, Work, captured, compare, extra_mib, gsplat, measur
 from torch import Tensor
 
 import gsplat_core
-from gsplat_core.ops.frame.frame import STATUS_MOST, STATUS_NEEDED, Frame, render_frame
-from gsplat_core.ops.frame.frame_gradients import RATES, render_frame_backward, render_frame_backward_adam_
+from gsplat_core.ops.frame.frame import STATUS_LONGEST, STATUS_NEEDED, Frame, FrameMode, View, render_frame
+from gsplat_core.ops.frame_gradients.frame_gradients import (
+    RATES,
+    GaussianAdam,
+    render_frame_backward,
+    render_frame_backward_adam_,
+)
 from gsplat_core.rendering.frame_renderer import FrameRenderer
 from gsplat_core.rendering.tile_capacity import TileListCapacity, capacity_for
 from gsplat_core.scene.cameras import Camera
@@ -46,10 +51,10 @@ class FramePath:
     def __init__(self, scene: Scene, target: Tensor) -> None:
         self._gaussians = scene.raw()
         self._half_sh = self._gaussians[4].half()
-        self._camera, self._size, self._target = scene.camera, scene.size_px, target
+        self._view, self._target = View(*scene.camera, *scene.size_px), target
         self._capacity = 1 << 16
         status = self._training().status.tolist()
-        self.instances, self.most_in_a_tile = status[STATUS_NEEDED], status[STATUS_MOST]
+        self.instances, self.most_in_a_tile = status[STATUS_NEEDED], status[STATUS_LONGEST]
         self._lists = TileListCapacity.for_frame(self.instances, self.most_in_a_tile)
         self._capacity = capacity_for(self.instances)
 
@@ -63,7 +68,7 @@ class FramePath:
     def step(self) -> None:
         frame = self._training()
         render_frame_backward(
-            self._gaussians, None, *self._camera, None, frame, *l1_gradients(frame.image, frame.alphas, self._target)
+            self._gaussians, None, self._view, frame, *l1_gradients(frame.image, frame.alphas, self._target)
         )
 
     def learning_step(self) -> Work:
@@ -77,20 +82,17 @@ class FramePath:
         def work() -> None:
             frame = self._training()
             render_frame_backward_adam_(
-                gaussians, *moments, rates, step, skipped, None, *self._camera, None, frame,
+                gaussians, GaussianAdam(*moments, rates, step, skipped), None, self._view, frame,
                 *l1_gradients(frame.image, frame.alphas, self._target), needs_raw=False,
             )  # fmt: skip
 
         return work
 
     def _render(self, sh: Tensor) -> Frame:
-        return render_frame(
-            *self._gaussians[:4], sh, None, *self._camera, None, *self._size, self._lists.capacity,
-            per_tile=self._lists.per_tile,
-        )  # fmt: skip
+        return render_frame((*self._gaussians[:4], sh), None, self._view, self._lists.capacity, self._lists.mode)
 
     def _training(self) -> Frame:
-        return render_frame(*self._gaussians, None, *self._camera, None, *self._size, self._capacity, training=True)
+        return render_frame(self._gaussians, None, self._view, self._capacity, FrameMode.TRAINING)
 
 
 def l1_gradients(image: Tensor, alphas: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,14 +22,18 @@ if TYPE_CHECKING:
     from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
     from gsplat_core.rendering.frame_renderer import FrameRenderer
     from gsplat_core.rendering.rasterization import RenderOutput, rasterization, render
+    from gsplat_core.rendering.registry import RENDERERS, new_renderer
+    from gsplat_core.rendering.renderer import Renderer
     from gsplat_core.scene.cameras import Camera
     from gsplat_core.scene.frames import Frame, FrameStatus
     from gsplat_core.scene.gaussians import Gaussians
     from gsplat_core.scene.model import Model
+    from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
     from gsplat_core.training.config import ReconstructorConfig
     from gsplat_core.training.reconstructor import Reconstructor
 
 __all__ = [
+    "RENDERERS",
     "Camera",
     "CoreError",
     "DeformationField",
@@ -42,11 +46,15 @@ __all__ = [
     "Reconstructor",
     "ReconstructorConfig",
     "RenderOutput",
+    "Renderer",
+    "Snapshot",
+    "SnapshotSlots",
     "fully_fused_projection",
     "isect_offset_encode",
     "isect_tiles",
     "load_bundle",
     "load_ply",
+    "new_renderer",
     "open_recording",
     "quat_scale_to_covar_preci",
     "rasterization",
@@ -58,6 +66,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "RENDERERS": "rendering.registry",
     "Camera": "scene.cameras",
     "CoreError": "errors",
     "DeformationField": "deformation",
@@ -70,11 +79,15 @@ _HOME = {
     "Reconstructor": "training.reconstructor",
     "ReconstructorConfig": "training.config",
     "RenderOutput": "rendering.rasterization",
+    "Renderer": "rendering.renderer",
+    "Snapshot": "scene.snapshots",
+    "SnapshotSlots": "scene.snapshots",
     "fully_fused_projection": "ops.projection.projection",
     "isect_offset_encode": "ops.tiles.tiles",
     "isect_tiles": "ops.tiles.tiles",
     "load_bundle": "io.bundle",
     "load_ply": "io.ply",
+    "new_renderer": "rendering.registry",
     "open_recording": "io.recordings",
     "quat_scale_to_covar_preci": "ops.covariance.covariance",
     "rasterization": "rendering.rasterization",

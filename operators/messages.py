@@ -13,6 +13,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
+from gsplat_core.transfers import HostCopy
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,8 @@ class Reconstruction:
     """False for a held-out frame: it is shown and scored, and no step has seen it."""
     steps: int = 0
     """Optimiser steps that the frame was given."""
-    loss: float | None = None
-    """Loss of the last of these steps; None when there was none."""
+    arriving_loss: HostCopy | None = None
+    """Loss of the last of these steps, which a GPU may not have finished; None when there was none."""
 
     def __post_init__(self) -> None:
         if self.steps < 0:
@@ -36,6 +37,11 @@ class Reconstruction:
             raise InvalidInput(
                 f"frame {self.frame.seq}: a held-out frame had {self.steps} training steps; it must have none"
             )
+
+    @property
+    def loss(self) -> float | None:
+        """Loss of the last step; waits for it."""
+        return None if self.arriving_loss is None else self.arriving_loss.item()
 
 
 @dataclass(frozen=True)

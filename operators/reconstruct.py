@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from gsplat_core.scene.frames import Frame, FrameStatus
@@ -11,6 +12,15 @@ from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.graph import Operator, OperatorSpec
 from operators.messages import Reconstruction
+from operators.outcome import OutcomeBuilder
+
+
+@dataclass(frozen=True)
+class ModelResult:
+    """The model of a run."""
+
+    model: Model
+    """The newest one, in memory of its own."""
 
 
 def never_held_out(frame: Frame) -> bool:
@@ -74,6 +84,12 @@ class ReconstructOp(Operator):
         # A held-out frame changes no parameter, but the model's time window now reaches it.
         self.newest = self._reconstructor.publish()
         op_output.emit(
-            Reconstruction(frame, self.newest, trained=train, steps=report.steps, loss=report.loss),
+            Reconstruction(frame, self.newest, trained=train, steps=report.steps, arriving_loss=report.arriving_loss),
             "reconstruction",
         )
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        model = self.model
+        if model is not None:
+            outcome.add(ModelResult(model))

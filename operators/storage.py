@@ -9,23 +9,29 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsplat_core.io.atomic_files import replace_durably, write_durably
-from operators.errors import StorageFull
+from gsplat_core.io.atomic_files import PartialFile
+from operators.errors import OutputError, StorageFull
+
+STAGING_PREFIX = ".run-"
+"""What a run has written lies in a folder of such a name, inside the output folder, until the run ends."""
 
 
-def _mebibytes(count: int) -> str:
-    return f"{count / 2**20:.1f} MiB"
+def mebibytes(count: float) -> str:
+    """A number of bytes for people."""
+    return f"{count / 2**20:.1f} MiB" if count < 2**30 else f"{count / 2**30:.1f} GiB"
 
 
-def _advice(folder: Path) -> str:
-    return f"free some space on that disk or choose another --out; what was already written to {folder} is complete"
+def shown(folder: Path) -> Path:
+    """The folder by the name that the user gave, where it is the one in which a run collects its results."""
+    return folder.parent if folder.name.startswith(STAGING_PREFIX) else folder
 
 
 @dataclass
 class StorageReserve:
     """Keeps `reserve_bytes` free on the disk of `folder`, for the video's index, the model and the report.
 
-    A video encoder does not say that its disk is full: it writes a file that cannot be played. So the room is asked for before each write.
+    A video encoder does not always say that its disk is full: it writes a file that cannot be played. So the room is asked for before
+    each write.
     """
 
     folder: Path
@@ -33,35 +39,47 @@ class StorageReserve:
     """Asked before each write: the model that has to fit grows."""
 
     def require(self, bytes_to_write: int = 0) -> None:
-        """Raises StorageFull when writing `bytes_to_write` would use the reserve."""
-        free = shutil.disk_usage(self.folder).free
+        """Raises StorageFull when writing `bytes_to_write` would use the reserve, OutputError when the folder is gone."""
+        with storage_errors(self.folder):
+            free = shutil.disk_usage(self.folder).free
         needed = bytes_to_write + self.reserve_bytes()
         if free < needed:
             raise StorageFull(
-                f"the disk of {self.folder} is full: {_mebibytes(free)} are free and {_mebibytes(needed)} are needed to go on; "
-                f"{_advice(self.folder)}"
+                f"the disk of {shown(self.folder)} is full: {mebibytes(free)} are free and {mebibytes(needed)} are needed to go on; "
+                "free some space on that disk or choose another --out"
             )
 
 
 @contextmanager
 def storage_errors(folder: Path) -> Iterator[None]:
-    """Turns the system's "no space left" into StorageFull; other errors pass."""
+    """Turns what the system says while something is written to `folder` into StorageFull or OutputError; both name the folder."""
     try:
         yield
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise StorageFull(f"the disk of {folder} is full ({error.strerror}); {_advice(folder)}") from error
-        raise
+        raise _sentence(shown(folder), error) from error
+
+
+def _sentence(folder: Path, error: OSError) -> OutputError:
+    said = error.strerror or str(error)
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return StorageFull(
+            f"the disk of {folder} is full ({said}); free some space on that disk or choose another --out"
+        )
+    if error.errno == errno.EFBIG:
+        return StorageFull(
+            f"a file in {folder} would be larger than this process may write ({said}); raise `ulimit -f`"
+        )
+    if error.errno in (errno.ENOENT, errno.ENOTDIR) and not folder.is_dir():
+        return OutputError(f"{folder} is not there; it must exist, and stay, until what is written into it is complete")
+    return OutputError(f"cannot write to {folder} ({said}); check the path, its permissions and its disk")
 
 
 def write_whole(path: Path, data: bytes, reserve: StorageReserve | None = None) -> None:
     """Write a file under another name and rename it, so that nobody ever sees half of it, and an earlier one stays until then.
 
-    Raises StorageFull.
+    Raises StorageFull, OutputError.
     """
     if reserve is not None:
         reserve.require(len(data))
-    partial = path.with_name(path.name + ".part")
-    with storage_errors(path.parent):
-        write_durably(partial, [data])
-        replace_durably(partial, path)
+    with storage_errors(path.parent), PartialFile(path) as partial:
+        partial.file.write(data)

@@ -73,12 +73,17 @@ class CapturedBasisTraining:
 
     def __init__(self, field: BasisField) -> None:
         self._field = field
+        self._tensors: Sequence[Tensor] = ()
+        self._tensors_of: object = None
 
     def rate_values(self, rates: Mapping[str, float]) -> Sequence[float]:
         return list(vars(basis_rates(rates)).values())
 
     def tensors(self) -> Sequence[Tensor]:
-        return self._field.training_tensors()
+        # Asked for at every step; a field that is extended or appended to gets other parameters.
+        if self._tensors_of is not self._field.weights:
+            self._tensors, self._tensors_of = self._field.training_tensors(), self._field.weights
+        return self._tensors
 
     def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor:
         return self._field.frame_deltas(gaussians)(time)

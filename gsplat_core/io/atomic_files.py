@@ -12,7 +12,7 @@ import errno
 import os
 import secrets
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -28,6 +28,16 @@ def remove_unfinished() -> None:
     """Remove every file and folder that this process has begun and not finished; for a program that is about to end at once."""
     for path in list(_unfinished):
         _remove(path)
+        _unfinished.discard(path)
+
+
+@contextlib.contextmanager
+def unfinished(path: Path) -> Iterator[None]:
+    """While entered, `remove_unfinished` removes `path` too."""
+    _unfinished.add(path)
+    try:
+        yield
+    finally:
         _unfinished.discard(path)
 
 
@@ -47,7 +57,10 @@ class PartialFile:
         _unfinished.add(self.path)
 
     def finish(self) -> None:
-        """Force the file to the disk and give it its name; when that fails it is removed and the OSError passed on."""
+        """Force the file to the disk and give it its name; when that fails it is removed and the OSError passed on. Once it has its name, or was
+        discarded, nothing happens."""
+        if self.path not in _unfinished:
+            return
         try:
             self.file.flush()
             os.fsync(self.file.fileno())
@@ -63,7 +76,9 @@ class PartialFile:
         _unfinished.discard(self.path)
 
     def discard(self) -> None:
-        """Remove what was written."""
+        """Remove what was written, unless it has its name already."""
+        if self.path not in _unfinished:
+            return
         with contextlib.suppress(OSError):  # buffered bytes of a full disk: they are given up anyway
             self.file.close()
         self.path.unlink(missing_ok=True)

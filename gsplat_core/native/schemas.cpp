@@ -71,33 +71,30 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
       "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 
-  // One frame from raw Gaussians (CUDA only): image [H, W, 4] with depth, and what its gradient needs.
+  // One frame from raw Gaussians (CUDA only): image [H, W, 4] with depth, and what its gradient needs. gaussians: means, quats,
+  // log_scales, logit_opacities, sh. mode: 0 tile lists in one buffer, 1 the same for training, 2 a segment per tile.
   m.def(
-      "render_frame(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_opacities, Tensor sh, Tensor? deltas, "
-      "Tensor viewmat, Tensor K, Tensor? background, int width, int height, float eps2d, float near_plane, float far_plane, "
-      "int camera_model, int capacity, bool per_tile, bool training) -> (Tensor image, Tensor alphas, Tensor last, "
-      "Tensor records, Tensor tile_offsets, Tensor sorted, Tensor splat_starts, Tensor instance_splats, Tensor status)");
-  // The gradient of render_frame by what its forward pass left: of the raw parameters in one row per Gaussian (position 3,
-  // rotation 4, log-scale 3, colour coefficient 3, opacity logit 1, 2 unused), and of sh where it has more than one basis.
+      "render_frame(Tensor[] gaussians, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, int width, int height, "
+      "float eps2d, float near_plane, float far_plane, int camera_model, int capacity, int mode) -> (Tensor image, "
+      "Tensor alphas, Tensor last, Tensor records, Tensor tile_offsets, Tensor sorted, Tensor splat_starts, "
+      "Tensor instance_splats, Tensor status)");
+  // The gradient of render_frame: of the raw parameters as rows of raw_layout.h, and of sh if it has more than one basis.
+  // forward: the results of render_frame in training mode, after the image.
   m.def(
-      "render_frame_backward(Tensor means, Tensor quats, Tensor log_scales, Tensor logit_opacities, Tensor sh, Tensor? deltas, "
-      "Tensor viewmat, Tensor K, Tensor? background, Tensor records, Tensor tile_offsets, Tensor sorted, Tensor splat_starts, "
-      "Tensor instance_splats, Tensor status, Tensor alphas, Tensor last, Tensor v_image, Tensor? v_alphas, int width, "
-      "int height, float eps2d, int camera_model, bool deterministic) -> (Tensor v_raw, Tensor v_sh)");
+      "render_frame_backward(Tensor[] gaussians, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, "
+      "Tensor[] forward, Tensor v_image, Tensor? v_alphas, float eps2d, int camera_model, bool deterministic) -> "
+      "(Tensor v_raw, Tensor v_sh)");
   // The same and one Adam step of the Gaussians, in place; rates [5] and step [1] are read on the device, rows that were left
-  // alone are added to skipped [5]. v_raw is empty if not asked for.
+  // unchanged are added to skipped [5]. v_raw is empty if not asked for.
   m.def(
-      "render_frame_backward_adam_(Tensor(a!) means, Tensor(b!) quats, Tensor(c!) log_scales, Tensor(d!) logit_opacities, "
-      "Tensor(e!) sh, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, Tensor records, Tensor tile_offsets, "
-      "Tensor sorted, Tensor splat_starts, Tensor instance_splats, Tensor status, Tensor alphas, Tensor last, Tensor v_image, "
-      "Tensor? v_alphas, Tensor(f!) m_means, Tensor(g!) m_quats, Tensor(h!) m_log_scales, Tensor(i!) m_logit_opacities, "
-      "Tensor(j!) m_sh, Tensor(k!) v_means, Tensor(l!) v_quats, Tensor(m!) v_log_scales, Tensor(n!) v_logit_opacities, "
-      "Tensor(o!) v_sh, Tensor rates, Tensor step, Tensor(p!) skipped, int width, int height, float eps2d, int camera_model, "
-      "float beta1, float beta2, float epsilon, bool needs_raw, bool deterministic) -> Tensor v_raw");
+      "render_frame_backward_adam_(Tensor(a!)[] gaussians, Tensor(b!)[] first_moments, Tensor(c!)[] second_moments, Tensor rates, "
+      "Tensor step, Tensor(d!) skipped, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, Tensor[] forward, "
+      "Tensor v_image, Tensor? v_alphas, float eps2d, int camera_model, float beta1, float beta2, float epsilon, bool needs_raw, "
+      "bool deterministic) -> Tensor v_raw");
 
-  // What a series of frames keeps of each one's status: the most of every word [4], but the sum of those that were cut. The step
-  // goes on by one unless this frame was cut; fits [1] is then 0, otherwise 1.
-  m.def("count_frame_(Tensor status, Tensor(a!) most, Tensor(b!) step) -> Tensor fits");
+  // Folds a frame's status [4] into `totals`: the maximum of every entry, but the number of frames that overflowed. Unless this
+  // frame overflowed, step is incremented and fits [1] is 1, otherwise 0.
+  m.def("accumulate_status_(Tensor status, Tensor(a!) totals, Tensor(b!) step) -> Tensor fits");
 
   // Deformation by per-Gaussian basis functions in time: deltas [N, 13] at tau, its gradients, and gradients with lazy Adam.
   // tau and the six rates (position, rotation, log-scale, colour, centres, widths) are float32 on the device of the field. Deltas

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsplat_core.deformation import DeformationField
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.frame.frame import Frame, render_frame
+from gsplat_core.ops.frame.frame import Frame, View, render_frame
 from gsplat_core.ops.scalars.scalars import store_scalars_
 from gsplat_core.rendering.capture import CapturedSequence, GraphMemory
 from gsplat_core.rendering.rasterization import RenderOutput
@@ -134,23 +134,12 @@ class FrameRenderer:
         if self._recompute:
             sh, field_deltas = self.gaussians.sh.to(self._dtype), self._field_deltas()
         deltas = None if field_deltas is None else field_deltas(self._controls.time)
-        scene = self.gaussians
-        frame = render_frame(
-            scene.means,
-            scene.quats,
-            scene.log_scales,
-            scene.logit_opacities,
-            sh,
-            deltas,
-            self._controls.viewmat,
-            self._controls.intrinsics,
-            self._background,
-            self._camera.width_px,
-            self._camera.height_px,
-            self.capacity.capacity,
-            camera_model=self._camera.model,
-            per_tile=self.capacity.per_tile,
+        scene, camera, controls = self.gaussians, self._camera, self._controls
+        gaussians = scene.means, scene.quats, scene.log_scales, scene.logit_opacities, sh
+        view = View(
+            controls.viewmat, controls.intrinsics, camera.width_px, camera.height_px, self._background, camera.model
         )
+        frame = render_frame(gaussians, deltas, view, self.capacity.capacity, self.capacity.mode)
         self._status.queue(frame.status)
         return frame
 

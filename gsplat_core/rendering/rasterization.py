@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsplat_core.argument_checks import require_shape
 from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
-from gsplat_core.ops.frame.frame import STATUS_CUT, STATUS_NEEDED, render_frame
+from gsplat_core.ops.frame.frame import STATUS_NEEDED, STATUS_OVERFLOW, View, render_frame
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.tiles import bin_splats, isect_tiles
@@ -87,13 +87,11 @@ def _render_frame(
     gaussians: Gaussians, camera: Camera, viewmat: Tensor, intrinsics: Tensor, background: Tensor | None, depth: bool
 ) -> RenderOutput:
     capacity = INSTANCES_PER_GAUSSIAN * max(gaussians.count, SMALLEST_SCENE)
+    view = View(viewmat, intrinsics, camera.width_px, camera.height_px, background, camera.model)
     while True:
-        frame = render_frame(
-            gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh, None,
-            viewmat, intrinsics, background, camera.width_px, camera.height_px, capacity, camera_model=camera.model,
-        )  # fmt: skip
+        frame = render_frame(tuple(gaussians.tensors().values()), None, view, capacity)
         status = HostCopy(frame.status).numpy()
-        if not status[STATUS_CUT]:
+        if not status[STATUS_OVERFLOW]:
             z = frame.image[..., 3] if depth else torch.zeros_like(frame.alphas)
             return RenderOutput(frame.image[..., :3], frame.alphas, z)
         capacity = int(status[STATUS_NEEDED])

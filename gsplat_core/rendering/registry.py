@@ -13,6 +13,11 @@ RENDERERS: Registry[RendererKind] = Registry("renderer", {"alpha": "gsplat_core.
 """Alpha blending front to back (Kerbl et al. 2023). To add another: CONTRIBUTING.md, "A renderer"."""
 
 
+def check_renderer(name: str, device: torch.device | str = "cpu", precision: str = "fp32") -> None:
+    """Raises InvalidSetting where there is no renderer of the name, or where it does not run on the device or in the precision."""
+    check_choice(name, RENDERERS[name].capabilities, torch.device(device), precision)
+
+
 def new_renderer(
     name: str,
     camera: Camera,
@@ -25,7 +30,6 @@ def new_renderer(
 
     Raises InvalidSetting for an unknown name and for a device or precision that the renderer does not have.
     """
-    kind, device = RENDERERS[name], torch.device(device)
-    check_choice(name, kind.capabilities, device, precision)
+    check_renderer(name, device, precision)
     check_background(background)
-    return kind(camera, device, precision=precision, background=background)
+    return RENDERERS[name](camera, torch.device(device), precision=precision, background=background)

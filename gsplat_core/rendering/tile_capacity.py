@@ -12,7 +12,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.frame.frame import MOST_IN_TILE, STATUS_CUT, STATUS_MOST, STATUS_NEEDED, TILE_SIZE
+from gsplat_core.ops.frame.frame import (
+    MAX_SEGMENT,
+    STATUS_LONGEST,
+    STATUS_NEEDED,
+    STATUS_OVERFLOW,
+    TILE_SIZE,
+    FrameMode,
+)
 
 CAPACITY_STEP = 1 << 16
 """The capacity of one buffer for all lists is a multiple of this many instances."""
@@ -29,10 +36,15 @@ def capacity_for(needed: int) -> int:
 
 @dataclass(frozen=True)
 class TileListCapacity:
-    """`capacity` and `per_tile` as `render_frame` takes them: one buffer for all lists, or one of that size for each tile."""
+    """The capacity of one buffer for all tile lists, or of a segment for each tile."""
 
     capacity: int
     per_tile: bool
+
+    @property
+    def mode(self) -> FrameMode:
+        """In which `render_frame` takes this capacity."""
+        return FrameMode.SEGMENTS if self.per_tile else FrameMode.SHARED
 
     @staticmethod
     def for_frame(needed: int, most_in_tile: int) -> TileListCapacity:
@@ -41,7 +53,7 @@ class TileListCapacity:
         Separate buffers are faster and take up to 32 bytes a pixel. Where a tile has more instances than that allows, one buffer serves all.
         """
         of_tile = max(1, math.ceil(most_in_tile * HEADROOM / TILE_STEP)) * TILE_STEP
-        if of_tile <= MOST_IN_TILE:
+        if of_tile <= MAX_SEGMENT:
             return TileListCapacity(of_tile, per_tile=True)
         return TileListCapacity(capacity_for(needed), per_tile=False)
 
@@ -88,4 +100,4 @@ class FrameStatusCopy:
         """Wait until the copy has arrived, and return it."""
         self._arrived.synchronize()
         values = self._values.tolist()
-        return FrameNeeds(values[STATUS_NEEDED], values[STATUS_MOST], values[STATUS_CUT])
+        return FrameNeeds(values[STATUS_NEEDED], values[STATUS_LONGEST], values[STATUS_OVERFLOW])

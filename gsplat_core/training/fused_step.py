@@ -9,9 +9,8 @@ from torch import Tensor
 
 from gsplat_core.deformation.kind import CapturedTraining
 from gsplat_core.ops.adam.adam import adam_step_at_
-from gsplat_core.ops.frame.frame import render_frame
-from gsplat_core.ops.frame.frame_count import count_frame_
-from gsplat_core.ops.frame.frame_gradients import render_frame_backward_adam_
+from gsplat_core.ops.frame.frame import GAUSSIAN_TENSORS, FrameMode, View, accumulate_status_, render_frame
+from gsplat_core.ops.frame_gradients.frame_gradients import GaussianAdam, render_frame_backward_adam_
 from gsplat_core.ops.image_loss.frame_loss import frame_loss
 from gsplat_core.rendering.capture import CapturedSequence, GraphMemory
 from gsplat_core.rendering.frame_renderer import FrameControls
@@ -22,15 +21,12 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
 from gsplat_core.training.photometric import LossWeights
 
-GAUSSIAN_TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh")
-"""The Gaussians' tensors in the order in which the ops take them, their moments and their learning rates."""
-
 
 class FusedStep:
     """Training steps for one set of tensors and one camera size, captured once and replayed.
 
     Parameters, moments and the field's state change in place. Where any of them was replaced by another tensor (Gaussians added, the
-    field's window moved), the next step is recorded anew.
+    field's window moved), the next step captures a new graph.
 
     A frame whose splats do not fit its lists changes nothing: the device sees it and leaves every parameter and moment alone. `settle`
     notices, makes room and says how many steps were lost, which the owner then takes again.
@@ -41,10 +37,10 @@ class FusedStep:
     ) -> None:
         device = gaussians.device
         self._gaussians, self._field, self._adam = gaussians, field, adam
-        self._field_tensors: Sequence[Tensor] = ()
-        self._field_places: tuple[int, ...] = ()
-        self._recorded: tuple[int, ...] = ()
-        """Where the tensors were when the graph was recorded."""
+        self._in_use: tuple[object, object, object] = None, None, None
+        self._addresses: tuple[int, ...] = ()
+        """Of all tensors when the graph was captured."""
+        self._taken: Observation | None = None
         self._weights = weights
         self._camera = camera
         shape = (camera.height_px, camera.width_px)
@@ -55,8 +51,8 @@ class FusedStep:
         """With the rates of the Gaussians in the frame's pass, of the positions behind it, of the field."""
         self._step = torch.full((1,), adam.steps, dtype=torch.int64, device=device)
         self._skipped = torch.zeros(len(GAUSSIAN_TENSORS), dtype=torch.int64, device=device)
-        self._most = torch.zeros(4, dtype=torch.int32, device=device)
-        """The frames' status since the last `settle`: the largest of each value, but the sum of those that were cut."""
+        self._totals = torch.zeros(4, dtype=torch.int32, device=device)
+        """The frames' status since the last `settle`, as `accumulate_status_` folds it."""
         self._unread: tuple[Tensor, Tensor] | None = None
         self._status = FrameStatusCopy()
         self._memory = GraphMemory(device)
@@ -81,6 +77,25 @@ class FusedStep:
             gaussian_rates: Adam's learning rates of the Gaussians' tensors, by name.
             field_rates: those of the field, as many as it takes.
         """
+        self._take(observation)
+        rates = [gaussian_rates[name] for name in GAUSSIAN_TENSORS]
+        in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
+        self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates])
+        self._gaussians = gaussians
+        self._adam.steps += 1
+        if not self._warm:  # kernels are loaded by their first launch, which is not possible during a capture
+            self._warm = True
+            return self._sequence()
+        if self._was_replaced() or self._captured is None:
+            self._captured = None  # its memory serves the next capture
+            self._captured = CapturedSequence(self._sequence, self._image.device, self._memory, warm_up=False)
+        return self._captured.replay().clone()
+
+    def _take(self, observation: Observation) -> None:
+        """Copy an observation to where the graph reads it."""
+        if observation is self._taken:
+            return
+        self._taken = observation
         self._image.copy_(observation.image, non_blocking=True)
         self._mask.copy_(observation.mask, non_blocking=True)
         if self._depth is not None:
@@ -88,62 +103,49 @@ class FusedStep:
                 self._depth.zero_()  # unknown everywhere: the term is 0
             else:
                 self._depth.copy_(observation.depth, non_blocking=True)
-        rates = [gaussian_rates[name] for name in GAUSSIAN_TENSORS]
-        in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
-        self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates])
-        self._gaussians = gaussians
-        self._adam.steps += 1
-        if not self._warm:  # kernels are loaded by their first launch, which a recording does not allow
-            self._warm = True
-            return self._sequence()
-        in_use = self._places()
-        if self._captured is None or in_use != self._recorded:
-            self._captured = None  # its memory serves the next recording
-            self._captured = CapturedSequence(self._sequence, self._image.device, self._memory, warm_up=False)
-            self._recorded = in_use
-        return self._captured.replay().clone()
 
     def settle(self) -> int:
         """Wait for the steps since the last call; returns how many of them changed nothing because their splats did not fit.
 
-        There is room for them now: take them again.
+        The tile lists have more capacity now: take those steps again.
         """
-        self._status.queue(self._most)
-        self._status.launched(self._most.device)
+        self._status.queue(self._totals)
+        self._status.launched(self._totals.device)
         needs = self._status.wait()
-        self._most.zero_()
+        self._totals.zero_()
         if needs.overflowed:
             self._adam.steps -= needs.overflowed
             self._capacity = capacity_for(needs.instances)
             self._captured = None
         return needs.overflowed
 
-    def _places(self) -> tuple[int, ...]:
+    def _was_replaced(self) -> bool:
+        """Whether any tensor lies at another address, or has another size, than when the graph was captured."""
+        in_use = self._gaussians, self._adam.first_moments["means"], self._field.tensors()
+        if all(now is before for now, before in zip(in_use, self._in_use, strict=True)):
+            return False  # the same objects: they need not be asked for their addresses
+        self._in_use = in_use
         moments = (*self._adam.first_moments.values(), *self._adam.second_moments.values())
-        of_field = self._field.tensors()
-        if of_field is not self._field_tensors:  # a field has many: those that stay the same are not asked again
-            self._field_tensors, self._field_places = of_field, _places_of(of_field)
-        return *_places_of((*self._gaussians.tensors().values(), *moments)), *self._field_places
+        before = self._addresses
+        self._addresses = _addresses_of((*self._gaussians.tensors().values(), *moments, *in_use[2]))
+        return self._addresses != before
 
     def _sequence(self) -> Tensor:
         in_frame, of_means, of_field = self._controls.rates.split([len(GAUSSIAN_TENSORS), 1, self._field.rates])
         scene, controls = self._gaussians, self._controls
         gaussians = tuple(scene.tensors().values())
         deltas = self._field.deltas(scene, controls.time)
-        viewmat, intrinsics = controls.viewmat, controls.intrinsics
-        size, model = (self._camera.width_px, self._camera.height_px), self._camera.model
-        frame = render_frame(
-            scene.means, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh, deltas, viewmat,
-            intrinsics, None, *size, self._capacity, camera_model=model, training=True,
-        )  # fmt: skip
+        camera = self._camera
+        view = View(controls.viewmat, controls.intrinsics, camera.width_px, camera.height_px, camera_model=camera.model)
+        frame = render_frame(gaussians, deltas, view, self._capacity, FrameMode.TRAINING)
         loss = frame_loss(
             frame.image, frame.alphas, self._image, self._mask, self._depth, self._weights.ssim, self._weights.depth
         )
-        fits = count_frame_(frame.status, self._most, self._step)
-        gradient = render_frame_backward_adam_(
-            gaussians, *self._moments(), in_frame, self._step, self._skipped, deltas, viewmat, intrinsics, None, frame,
-            loss.grad_image, loss.grad_alphas, camera_model=model, betas=self._adam.betas, epsilon=self._adam.epsilon,
-        )  # fmt: skip
+        fits = accumulate_status_(frame.status, self._totals, self._step)
+        adam = GaussianAdam(
+            *self._moments(), in_frame, self._step, self._skipped, betas=self._adam.betas, epsilon=self._adam.epsilon
+        )
+        gradient = render_frame_backward_adam_(gaussians, adam, deltas, view, frame, loss.grad_image, loss.grad_alphas)
         assert gradient is not None
         self._field.update(gradient, controls.time, of_field, self._step, frame.status)
         if self._field.reads_positions:
@@ -172,5 +174,5 @@ class FusedStep:
         )  # fmt: skip
 
 
-def _places_of(tensors: Sequence[Tensor]) -> tuple[int, ...]:
+def _addresses_of(tensors: Sequence[Tensor]) -> tuple[int, ...]:
     return tuple(number for tensor in tensors for number in (tensor.data_ptr(), tensor.numel()))

@@ -12,14 +12,10 @@ from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.coverage import UNCOVERED_ALPHA, are_worth_filling, uncovered_pixels
 from gsplat_core.training.initialisation import gaussians_at_pixels, tissue_colours, tissue_depth
 from gsplat_core.training.observations import Observation
 from gsplat_core.transfers import HostCopy
-
-UNCOVERED_ALPHA = 0.5
-"""A pixel whose accumulated opacity is below this shows nothing of the model."""
-SMALLEST_SHARE = 0.002
-"""Uncovered share of the frame from which on Gaussians are added; single pixels between Gaussians close by training."""
 
 
 def gaussians_for_uncovered_tissue(
@@ -35,9 +31,9 @@ def gaussians_for_uncovered_tissue(
     camera = observation.camera
     with torch.no_grad():
         output = render(current, camera, depth=frame.depth is None)
-        uncovered = (output.alpha < UNCOVERED_ALPHA) & (observation.mask > 0)
+        uncovered = uncovered_pixels(output.alpha, observation.mask)
     height, width = frame.image.shape[:2]
-    if HostCopy(torch.count_nonzero(uncovered)).item() < SMALLEST_SHARE * height * width:
+    if not are_worth_filling(uncovered):
         return None
     bare = HostCopy(uncovered).numpy()
     spacing = math.sqrt(height * width / config.gaussians)

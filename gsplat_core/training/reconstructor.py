@@ -20,6 +20,7 @@ from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.training.budget import Budget, Ending, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.coverage import CapturedCoverage
 from gsplat_core.training.growth import gaussians_for_uncovered_tissue
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation, ObservationWindow
@@ -38,11 +39,16 @@ class ObserveReport:
 
     seq: int
     steps: int
-    loss: float | None
-    """Loss of the last step, None when the frame was not trained on."""
+    arriving_loss: HostCopy | None
+    """Loss of the last step, which a GPU may not have finished; None when the frame was not trained on."""
     gaussians: int
     ending: Ending = "steps"
     """Why training on the frame ended."""
+
+    @property
+    def loss(self) -> float | None:
+        """Loss of the last step; waits for it."""
+        return None if self.arriving_loss is None else self.arriving_loss.item()
 
 
 class Reconstructor:
@@ -52,8 +58,8 @@ class Reconstructor:
     settings and seed give the same model. With the basis field that holds for any number of threads; the HexPlane's network is
     trained by torch's matrix products, which round differently with another number.
 
-    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares what follows; the host waits for
-    it where a frame is searched for uncovered tissue, and for the frame's losses.
+    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares the next frame; the host waits for
+    it where that one is searched for uncovered tissue.
     """
 
     def __init__(
@@ -72,6 +78,9 @@ class Reconstructor:
         self._recording_digest = recording_digest
         self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
         self._step: TrainingStep | None = None
+        self._coverage: CapturedCoverage | None = None
+        self._unsettled: Observation | None = None
+        """The frame whose steps are queued and not yet known to have had room in the tile lists."""
         self._in_flight = StepsInFlight(self.device)
         self._step_s: float | None = None
         """How long a step took lately, where budgets are timed."""
@@ -113,6 +122,7 @@ class Reconstructor:
                 f"frame {frame.seq} is at {observation.time_s:.3f} s, before the last one at {self._last_time_s:.3f} s;"
                 " frames must come in order"
             )
+        self._settle()
         assert self._step is not None
         self._step.field.cover(observation.time_s, self._last_time_s)
         self._last_time_s = observation.time_s
@@ -149,14 +159,23 @@ class Reconstructor:
             extra = spending.made * self.config.jump_extra
         for _ in range(extra):
             loss = self._step(observation)
-        self._step.settle(observation)
+        self._unsettled = observation
+        if budget.is_timed or first:
+            self._settle()
         if budget.is_timed:
             self._learn_step_time(spending)
         if not first:
             self._learn_surprise(arriving.item())
-        return ObserveReport(
-            observation.seq, spending.made + extra, HostCopy(loss).item(), self.gaussians, spending.ending
-        )
+        return ObserveReport(observation.seq, spending.made + extra, HostCopy(loss), self.gaussians, spending.ending)
+
+    def _settle(self) -> None:
+        """Wait for the queued steps, and take again those that found no room in the tile lists.
+
+        With a number of steps this is done when the next frame comes: until then the host prepares it while a GPU trains.
+        """
+        if self._step is not None and self._unsettled is not None:
+            self._step.settle(self._unsettled)
+        self._unsettled = None
 
     def _is_jump(self, arriving: HostCopy | None, first: bool) -> bool:
         """Whether the loss with which a frame arrived shows a cut or a pull. Waits for it."""
@@ -206,12 +225,13 @@ class Reconstructor:
             if progress is not None:
                 progress(step + 1, loss)
         self._step.settle(observations[-1][1], rate_scale=0.1)
-        return ObserveReport(observations[-1][0].seq, steps, HostCopy(loss).item(), self.gaussians)
+        return ObserveReport(observations[-1][0].seq, steps, HostCopy(loss), self.gaussians)
 
     def snapshot(self) -> Model:
         """An immutable copy of the model as it is now; each one has the next version number."""
         if self._step is None:
             raise InvalidInput("there is no model yet: observe a frame first")
+        self._settle()
         self._version += 1
         gaussians, field = self._step.copy()
         return Model(
@@ -256,14 +276,20 @@ class Reconstructor:
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config, self.camera)
+        if self.device.type == "cuda" and SnapshotSlots.can_hold(field):
+            self._coverage = CapturedCoverage(self.camera, self.device)
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
         """Add Gaussians where the frame shows tissue that the model does not cover."""
         assert self._step is not None
-        room = self.config.max_gaussians - self._step.gaussians.count
-        if room > 0:
-            added = gaussians_for_uncovered_tissue(
-                frame, observation, self._step.at(observation.time_s), self.config, room
-            )
-            if added is not None:
-                self._step.append(added)
+        step = self._step
+        room = self.config.max_gaussians - step.gaussians.count
+        if room <= 0:
+            return
+        if self._coverage is not None and not self._coverage.leaves_much_uncovered(
+            step.gaussians, step.field, observation
+        ):
+            return
+        added = gaussians_for_uncovered_tissue(frame, observation, step.at(observation.time_s), self.config, room)
+        if added is not None:
+            step.append(added)

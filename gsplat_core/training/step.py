@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -51,7 +53,10 @@ class TrainingStep:
                 f" {type(kind.rates).__name__}"
             )
         self._captured: FusedStep | None = None
-        self._captured_steps = 0
+        self._unsettled_steps = 0
+        self._has_settled = False
+        self._scaled_for: float | None = None
+        self._scaled_rates: tuple[dict[str, float], Sequence[float]] = {}, ()
         if gaussians.device.type == "cuda" and kind.captured_training is not None:
             training = kind.captured_training(field)
             if training is not None:
@@ -77,6 +82,7 @@ class TrainingStep:
     def settle(self, observation: Observation, rate_scale: float = 1.0) -> None:
         """Wait for the captured steps. Those that changed nothing, because a tile list was beyond its capacity, are taken again on
         `observation`."""
+        self._unsettled_steps, self._has_settled = 0, True
         while self._captured is not None and (lost := self._captured.settle()):
             for _ in range(lost):
                 self._captured_step(self._captured, observation, rate_scale)
@@ -98,11 +104,17 @@ class TrainingStep:
         self._adam.append(added.count)
 
     def _captured_step(self, captured: FusedStep, observation: Observation, rate_scale: float) -> Tensor:
-        field_rates = self._rate_values(self._field_rates.scaled(self._mm_per_px, rate_scale))
+        if rate_scale != self._scaled_for:
+            # Online the scale is always 1: worked out once, not for every step.
+            self._scaled_for = rate_scale
+            self._scaled_rates = (
+                self._gaussian_rates(rate_scale),
+                self._rate_values(self._field_rates.scaled(self._mm_per_px, rate_scale)),
+            )
         time = self.field.frame_time(observation.time_s)
-        loss = captured(self.gaussians, observation, time, self._gaussian_rates(rate_scale), field_rates)
-        self._captured_steps += 1
-        if self._captured_steps % SETTLE_EVERY == 1:
+        loss = captured(self.gaussians, observation, time, *self._scaled_rates)
+        first, self._unsettled_steps = not self._has_settled, self._unsettled_steps + 1
+        if first or self._unsettled_steps >= SETTLE_EVERY:
             self.settle(observation, rate_scale)
         return loss
 

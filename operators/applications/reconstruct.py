@@ -11,16 +11,20 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from gsplat_core.errors import InvalidInput
-from gsplat_core.io.recordings import Recording, is_heldout
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.recordings import is_heldout
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
-from gsplat_core.training.reconstructor import ObserveReport, Reconstructor
+from gsplat_core.training.reconstructor import ObserveReport
+from operators.applications.delivery import Report, delivered
 from operators.applications.device import seeded
-from operators.applications.execution import Execution, Start
+from operators.applications.finishing import FirstFrames, measures_baselines, saves_model
+from operators.applications.limits import check_steps
 from operators.applications.progress import Progress, ProgressCallback
-from operators.applications.replay import ReplayApplication, ReplaySettings, prepare
+from operators.applications.replay import ReplayApplication, ReplaySettings, new_reconstructor, prepare
 from operators.applications.result import RunOutcome
+from operators.applications.session import Session, Start
+from operators.sources.source import FrameSource
 
 
 class FittedModel:
@@ -47,36 +51,43 @@ def reconstruct(
     steps: int,
     progress: ProgressCallback | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
+    report: Report | None = None,
 ) -> RunOutcome:
     """Train offline for `steps` steps, then evaluate; writes what a replay writes.
 
     When `stop_requested` answers True while training, the model is saved as it is then and not evaluated; while evaluating, as in a replay.
 
-    Raises as `replay`; InvalidInput for fewer steps than one.
+    Raises as `replay`; InvalidSetting for fewer steps than one.
     """
-    if steps < 1:
-        raise InvalidInput(f"steps is {steps}; it must be at least 1")
-    settings = replace(settings, heldout=True)
-    recording, notes = prepare(settings, "reconstruct")
-    start = Start.now()
-    config = settings.reconstructor_config(recording.width_px * recording.height_px)
-    learning = Reconstructor(
-        config, recording.camera, seed=settings.seed, recording_digest=recording.digest, device=settings.device
-    )
-    done = _fit(learning, recording, settings, steps, progress, stop_requested)
-    if done < steps:
-        notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
-    model = learning.snapshot()
-    app = ReplayApplication(
-        recording,
-        settings,
-        video=settings.out / "reconstruction.mp4",
-        progress=progress,
-        stop_requested=stop_requested,
-        make_reconstructor=lambda: FittedModel(model),
-        stage="evaluate",
-    )
-    return Execution(app, notes, stop_requested, command="reconstruct", fitted=model, start=start).execute()
+    check_steps("steps", steps)
+
+    def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
+        source = prepare(inside, notes)
+        start = Start.now()
+        model, done = _fit(source, inside, steps, progress, stop_requested)
+        if done < steps:
+            notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
+        graph = ReplayApplication(
+            source,
+            inside,
+            progress=progress,
+            stop_requested=stop_requested,
+            make_reconstructor=lambda: FittedModel(model),
+            stage="evaluate",
+        )
+        graph.announce()
+        return Session(
+            graph,
+            inside.stated(online=False),
+            command="reconstruct",
+            engine=inside.engine,
+            finish=[saves_model(inside.out, model), measures_baselines(source)],
+            notes=notes,
+            stop_requested=stop_requested,
+            started=start,
+        ).execute()
+
+    return delivered(replace(settings, heldout=True), "reconstruct", run, report)
 
 
 def _trains(frame: Frame) -> bool:
@@ -84,14 +95,17 @@ def _trains(frame: Frame) -> bool:
 
 
 def _fit(
-    learning: Reconstructor,
-    recording: Recording,
+    source: FrameSource,
     settings: ReplaySettings,
     steps: int,
     progress: ProgressCallback | None,
     stop_requested: Callable[[], bool],
-) -> int:
-    """Train; returns how many steps were made."""
+) -> tuple[Model, int]:
+    """Train; returns the model and how many steps were made."""
+    description = source.description
+    if description.digest is None or description.frame_count is None:
+        raise InvalidSetting(f"{description.name} can be read only once; reconstruct needs a recording, or use replay")
+    learning = new_reconstructor(settings, source)
     done = 0
 
     def after_step(step: int, loss: Tensor) -> None:
@@ -102,6 +116,7 @@ def _fit(
         if stop_requested():
             raise _StopFitting
 
+    frames = FirstFrames(source, description.frame_count)
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
-        learning.fit((frame for frame in recording if _trains(frame)), steps, after_step)
-    return done
+        learning.fit((frame for frame in frames if _trains(frame)), steps, after_step)
+    return learning.snapshot(), done

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from gsplat_core.errors import InvalidInput
+from numpy.typing import NDArray
+
+from gsplat_core.errors import RecordingError, UserError
+from gsplat_core.io.atomic_files import PartialFile
 from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.recordings import open_recording
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.model import Model
 from operators.applications.device import check_device
+from operators.applications.limits import check_picture, check_scale, frames_to_render
 from operators.applications.progress import Progress, ProgressCallback
 from operators.errors import OutputError
-from operators.output_folder import check_output_folder, claim_output_folder
+from operators.output_folder import OutputFolder
+from operators.output_paths import check_file_path
 from operators.rasterize import displayed
-from operators.sinks.display import write_png
+from operators.sinks.images import write_png
 from operators.sinks.video_file import VideoFile
-from operators.storage import StorageReserve
+from operators.storage import StorageReserve, storage_errors
 
 RESERVE_BYTES = 2**20
 VIDEO_SUFFIX = ".mp4"
@@ -28,47 +36,109 @@ def render_model(
     fps: float = 30.0,
     scale: float = 1.0,
     device: str = "cpu",
+    overwrite: bool = False,
     progress: ProgressCallback | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> int:
     """Render the model at `fps` frames per second of its own time, to `out`: a file ending in .mp4, or a folder of PNG images.
 
-    Returns the number of frames written; what was written before a stop is complete.
+    A video that is there already is replaced only with `overwrite`, a folder of images only when an earlier run made it; either stays as it
+    was until the new one is complete. Returns the number of frames written; what was written before a stop is complete.
 
-    Raises BundleError, DeviceMissing, InvalidInput, OutputFolderInUse, OutputError, StorageFull.
+    Raises BundleError, DeviceMissing, InvalidSetting, OutputError.
     """
-    if not (math.isfinite(fps) and 0 < fps <= 1000):
-        raise InvalidInput(f"fps is {fps}; it must be above 0 and at most 1000")
+    check_scale(scale)
+    frames_to_render((0, 0), fps)
+    to_video = out.suffix.lower() == VIDEO_SUFFIX
+    if to_video:
+        _check_video_path(bundle, out, overwrite)
     check_device(device)
     model = load_bundle(bundle).to(device)
     camera = model.camera.scaled(scale)
-    start_s, end_s = model.time_window_s
-    count = math.floor((end_s - start_s) * fps + 1e-6) + 1
-    video = None
-    try:
-        if out.suffix.lower() == VIDEO_SUFFIX:
-            if out.is_dir():
-                raise OutputError(f"{out} is a folder; give the name of a video file that ends in {VIDEO_SUFFIX}")
-            if not out.parent.is_dir():
-                raise OutputError(f"there is no folder {out.parent} to write {out.name} into; make it first")
-            video = VideoFile(
-                out, camera.width_px, camera.height_px, fps, StorageReserve(out.parent, lambda: RESERVE_BYTES)
-            )
+    check_picture(camera, scale)
+    images = _images(model, camera, fps, progress, stop_requested)
+    if not to_video:
+        return _write_images(images, bundle, out)
+    if overwrite:
+        _check_not_trained_on(model, out)
+    return _write_video(images, out, camera, fps, overwrite)
+
+
+def _images(
+    model: Model,
+    camera: Camera,
+    fps: float,
+    progress: ProgressCallback | None,
+    stop_requested: Callable[[], bool],
+) -> Iterator[NDArray]:
+    """RGB uint8 [H, W, 3], over the time window, until a stop is requested."""
+    count = frames_to_render(model.time_window_s, fps)
+    for k in range(count):
+        if stop_requested():
+            return
+        yield displayed(model.render(model.time_window_s[0] + k / fps, camera, depth=False).image)
+        if progress is not None:
+            progress(Progress("render", k + 1, count))
+
+
+def _write_video(images: Iterator[NDArray], out: Path, camera: Camera, fps: float, overwrite: bool) -> int:
+    """Write the video beside its name and rename it. One that ends early is kept where there was none before."""
+    replaces = os.path.lexists(out)
+    reserve = StorageReserve(out.parent, lambda: RESERVE_BYTES)
+    with storage_errors(out.parent), PartialFile(out, overwrite=overwrite) as partial:
+        video = VideoFile(partial.path, camera.width_px, camera.height_px, fps, reserve)
+        try:
+            with video:
+                for image in images:
+                    video.write(image)
+        except UserError:
+            if video.frames and not replaces:
+                partial.finish()
+            raise
+        if not video.frames:
+            partial.discard()
         else:
-            check_output_folder(out)
-            claim_output_folder(out, "render")
-        reserve = StorageReserve(out if video is None else out.parent, lambda: RESERVE_BYTES)
-        for k in range(count):
-            if stop_requested():
-                return k
-            image = displayed(model.render(start_s + k / fps, camera, depth=False).image)
-            if video is None:
-                write_png(out / f"{k:06d}.png", image, reserve)
-            else:
-                video.write(image)
-            if progress is not None:
-                progress(Progress("render", k + 1, count))
-    finally:
-        if video is not None:
-            video.close()
-    return count
+            partial.finish()
+    return video.frames
+
+
+def _write_images(images: Iterator[NDArray], bundle: Path, out: Path) -> int:
+    """Write numbered PNG files. A run that ends early delivers its images where none were before."""
+    written = 0
+    with OutputFolder(out, "render", [bundle]) as output:
+        reserve = StorageReserve(output.path, lambda: RESERVE_BYTES)
+        try:
+            for image in images:
+                write_png(output.path / f"{written:06d}.png", image, reserve)
+                written += 1
+        except UserError:
+            if not output.earlier:
+                output.publish()
+            raise
+        output.publish()
+    return written
+
+
+def _check_video_path(bundle: Path, out: Path, overwrite: bool) -> None:
+    with storage_errors(out.parent):
+        if out.is_dir():
+            raise OutputError(f"{out} is a folder; give the name of a video file that ends in {VIDEO_SUFFIX}")
+        if not out.parent.is_dir():
+            raise OutputError(f"there is no folder {out.parent} to write {out.name} into; make it first")
+        check_file_path(out, [bundle])
+        if os.path.lexists(out) and not overwrite:
+            raise OutputError(f"{out} is there already; give another --out, or --overwrite to replace it")
+        if os.path.lexists(out) and not out.is_file():
+            raise OutputError(f"{out} is not a plain file, so that it is not replaced; give another --out")
+
+
+def _check_not_trained_on(model: Model, out: Path) -> None:
+    """A recording is worth more than any rendering of a model that was made from it."""
+    if model.training_digest is None or not out.is_file():
+        return
+    try:
+        digest = open_recording(out).digest
+    except RecordingError:
+        return
+    if digest == model.training_digest:
+        raise OutputError(f"{out} is the recording that the model was trained on; choose another --out")

@@ -9,6 +9,4 @@ from services.cli.runs import report_run
 
 def reconstruct_command(settings: ReplaySettings, steps: int, *, as_json: bool) -> int:
     """Reconstruct offline, write the reports, print where they are; returns the exit code."""
-    return report_run(
-        lambda progress, stop: reconstruct(settings, steps, progress, stop), settings.out, as_json=as_json
-    )
+    return report_run(lambda *callbacks: reconstruct(settings, steps, *callbacks), settings.out, as_json=as_json)

@@ -13,11 +13,20 @@ from services.cli.interrupt import InterruptRequest
 from services.cli.progress import ProgressPrinter
 
 
-def render_command(model: Path, out: Path, fps: float, scale: float, device: str, *, as_json: bool) -> int:
+def render_command(
+    model: Path, out: Path, fps: float, scale: float, device: str, *, overwrite: bool, as_json: bool
+) -> int:
     """Render a model and print where the result is."""
     with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as progress:
         frames = render_model(
-            model, out, fps=fps, scale=scale, device=device, progress=progress, stop_requested=interrupt
+            model,
+            out,
+            fps=fps,
+            scale=scale,
+            device=device,
+            overwrite=overwrite,
+            progress=progress,
+            stop_requested=interrupt,
         )
     if as_json:
         typer.echo(

@@ -8,4 +8,4 @@ from services.cli.runs import report_run
 
 def replay_command(settings: ReplaySettings, *, as_json: bool) -> int:
     """Replay, write the reports, print where they are; returns the exit code."""
-    return report_run(lambda progress, stop: replay(settings, progress, stop), settings.out, as_json=as_json)
+    return report_run(lambda *callbacks: replay(settings, *callbacks), settings.out, as_json=as_json)

@@ -7,34 +7,32 @@ from pathlib import Path
 
 import typer
 
+from operators.applications.delivery import Report
 from operators.applications.progress import ProgressCallback
 from operators.applications.result import RunOutcome
-from operators.errors import RunFailed
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.interrupt import InterruptRequest
 from services.cli.progress import ProgressPrinter
+from services.cli.streams import printable
 from services.reports.build import write_reports
 from services.reports.schema import RunReport
 
-Run = Callable[[ProgressCallback, Callable[[], bool]], RunOutcome]
+Run = Callable[[ProgressCallback, Callable[[], bool], Report], RunOutcome]
 
 
 def report_run(run: Run, out: Path, *, as_json: bool) -> int:
     """Run, write the reports whatever the end, print the result; returns the exit code."""
+    written: list[RunReport] = []
+
+    def report(outcome: RunOutcome, folder: Path) -> None:
+        written.append(write_reports(outcome, folder))
+
     with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as progress:
-        try:
-            outcome = run(progress, interrupt)
-        except RunFailed as failed:
-            # What the run had reached is worth a report, whatever ended it.
-            assert isinstance(failed.result, RunOutcome)
-            if failed.result.outputs:
-                write_reports(failed.result, out)
-            raise
-        if not outcome.outputs:
-            typer.echo("interrupted before there was anything to write", err=True)
-            return INTERRUPTED
-        report = write_reports(outcome, out)
-    print_report(report, out, as_json=as_json)
+        run(progress, interrupt, report)
+    if not written:
+        typer.echo("interrupted before there was anything to write", err=True)
+        return INTERRUPTED
+    print_report(written[0], out, as_json=as_json)
     return INTERRUPTED if interrupt.requested else OK
 
 
@@ -46,7 +44,7 @@ def print_report(report: RunReport, out: Path, *, as_json: bool) -> None:
     if report.run.interrupted:
         typer.echo("interrupted: the figures cover the frames that were displayed", err=True)
     for note in report.notes:
-        typer.echo(f"note: {note}", err=True)
+        typer.echo(f"note: {printable(note)}", err=True)
     frames, run, quality = report.frames, report.run, report.quality
     lines = [
         f"{frames.displayed} of {frames.ingested} frames displayed, {frames.dropped} dropped, in {run.wall_s:.1f} s"

@@ -16,8 +16,12 @@ from torch.fx.experimental.symbolic_shapes import ShapeEnv
 import gsplat_core.ops
 from gsplat_core.ops import native
 from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
-from gsplat_core.ops.frame.frame import render_frame
-from gsplat_core.ops.frame.frame_gradients import render_frame_backward, render_frame_backward_adam_
+from gsplat_core.ops.frame.frame import FrameMode, View, render_frame
+from gsplat_core.ops.frame_gradients.frame_gradients import (
+    GaussianAdam,
+    render_frame_backward,
+    render_frame_backward_adam_,
+)
 from gsplat_core.ops.image_loss.frame_loss import frame_loss
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
@@ -129,12 +133,12 @@ def test_a_picture_is_traced_on_cuda_without_a_gpu(cuda_library):
 def test_a_frame_and_its_gradient_are_traced_on_cuda_without_a_gpu(cuda_library):
     with FakeTensorMode():
         raw = gaussians(16)
-        view = (floats(N, 16), floats(4, 4), floats(3, 3), None)
-        frame = render_frame(*raw, *view, 64, 48, 1000, training=True)
+        deltas, view = floats(N, 16), View(floats(4, 4), floats(3, 3), 64, 48)
+        frame = render_frame(raw, deltas, view, 1000, FrameMode.TRAINING)
         assert frame.image.shape == (48, 64, 4) and frame.records.shape == (N, 12) and frame.sorted.shape == (1000,)
         loss = frame_loss(frame.image, frame.alphas, floats(48, 64, 3, dtype=torch.uint8), None, None, 0.2, 0.0)
         assert loss.loss.shape == () and loss.grad_image.shape == frame.image.shape
-        gradients = render_frame_backward(raw, *view, frame, loss.grad_image, loss.grad_alphas)
+        gradients = render_frame_backward(raw, deltas, view, frame, loss.grad_image, loss.grad_alphas)
         assert gradients.raw.shape == (N, 16) and gradients.sh.shape == (N, 16, 3) and gradients.sh.is_cuda
 
 
@@ -142,12 +146,10 @@ def test_a_frame_and_its_gradient_are_traced_on_cuda_without_a_gpu(cuda_library)
 def test_adam_in_the_gradient_is_traced_on_cuda_without_a_gpu(cuda_library, bases):
     with FakeTensorMode():
         raw, first, second = gaussians(bases), gaussians(bases), gaussians(bases)
-        view = (None, floats(4, 4), floats(3, 3), floats(3))
-        frame = render_frame(*raw, *view, 64, 48, 1000, training=True)
-        numbers = (floats(5), floats(1, dtype=torch.int64), floats(5, dtype=torch.int64))
-        raw_gradient = render_frame_backward_adam_(
-            raw, first, second, *numbers, *view, frame, frame.image, frame.alphas
-        )
+        view = View(floats(4, 4), floats(3, 3), 64, 48, floats(3))
+        frame = render_frame(raw, None, view, 1000, FrameMode.TRAINING)
+        adam = GaussianAdam(first, second, floats(5), floats(1, dtype=torch.int64), floats(5, dtype=torch.int64))
+        raw_gradient = render_frame_backward_adam_(raw, adam, None, view, frame, frame.image, frame.alphas)
         assert raw_gradient is not None and raw_gradient.shape == (N, 16)
 
 

@@ -12,8 +12,9 @@ from gsplat_core import reference
 
 PUBLIC = [
     "Camera", "CoreError", "DeformationField", "Frame", "FrameRenderer", "FrameStatus", "Gaussians", "InvalidInput",
-    "Model", "Reconstructor", "ReconstructorConfig", "RenderOutput", "fully_fused_projection", "isect_offset_encode",
-    "isect_tiles", "load_bundle", "load_ply", "open_recording", "quat_scale_to_covar_preci", "rasterization",
+    "Model", "RENDERERS", "Reconstructor", "ReconstructorConfig", "RenderOutput", "Renderer", "Snapshot", "SnapshotSlots",
+    "fully_fused_projection", "isect_offset_encode",
+    "isect_tiles", "load_bundle", "load_ply", "new_renderer", "open_recording", "quat_scale_to_covar_preci", "rasterization",
     "rasterize_to_pixels", "render", "save_bundle", "save_ply", "spherical_harmonics",
 ]  # fmt: skip
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import torch
+
+from gsplat_core.transfers import HostCopy
 from operators.reconstruct import ReconstructOp
 
 
@@ -17,7 +20,12 @@ class FakeReconstructor:
 
     def observe(self, frame, *, steps=None, train=True):
         self.calls.append(("observe", frame.seq, train))
-        return SimpleNamespace(seq=frame.seq, steps=7 if train else 0, loss=0.5 if train else None, gaussians=60)
+        return SimpleNamespace(
+            seq=frame.seq,
+            steps=7 if train else 0,
+            arriving_loss=HostCopy(torch.tensor(0.5)) if train else None,
+            gaussians=60,
+        )
 
     def publish(self):
         self.version += 1

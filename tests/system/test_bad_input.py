@@ -135,7 +135,8 @@ def test_a_model_of_a_later_format(bundle, tmp_path, refused):
 
 
 def test_no_model_at_all(tmp_path, refused):
-    refused("render", tmp_path, "--out", tmp_path / "v.mp4", match="missing")
+    (tmp_path / "model").mkdir()
+    refused("render", tmp_path / "model", "--out", tmp_path / "v.mp4", match="missing")
 
 
 @pytest.fixture
@@ -169,7 +170,7 @@ def test_a_disk_that_is_full_from_the_start(small_disk, tiny, refused):
 
 def test_a_disk_that_fills_up_on_the_way(small_disk, tiny, refused, monkeypatch):
     """Somebody else takes the room after three frames: video, model and report of these are still written, and whole."""
-    from operators.sinks.display import VideoSinkOp
+    from operators.sinks.video import VideoSinkOp
 
     compute = VideoSinkOp.compute
 
@@ -215,7 +216,7 @@ def test_a_folder_of_somebody_else(tiny, tmp_path, refused):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
     refused("replay", tiny, "--out", tmp_path / "thesis", match="not made by intrasplat")
-    refused("replay", tiny, "--out", tiny, match="not made by intrasplat")
+    refused("replay", tiny, "--out", tiny, match="lies inside --out")
     assert [p.name for p in (tmp_path / "thesis").iterdir()] == ["chapter1.tex"]
 
 

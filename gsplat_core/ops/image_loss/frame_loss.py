@@ -33,7 +33,7 @@ def frame_loss(
     ssim_weight: float = 0.0,
     depth_weight: float = 0.0,
 ) -> FrameLoss:
-    """`image_loss` of colours and expected depth as `render_frame(training=True)` leaves them, without a wait for the device.
+    """`image_loss` of colours and expected depth as `render_frame` returns them in FrameMode.TRAINING, without a wait for the device.
 
     The expected depth is the last channel over max(alpha, 1e-10). Nothing is differentiable: the gradients are results.
 

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core import rasterization, reference
-from gsplat_core.ops.frame.frame import MOST_IN_TILE, Frame, render_frame
+from gsplat_core.ops.frame.frame import MAX_SEGMENT, Frame, FrameMode, View, render_frame
+from gsplat_core.scene.layout import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION
 
 
 @dataclass(frozen=True)
@@ -30,15 +31,18 @@ class Scene:
     camera_model: str = "pinhole"
 
     def tensors(self, device: str, dtype: torch.dtype) -> list[Tensor | None]:
-        """The arguments of `render_frame` that are tensors, in order."""
+        """Gaussians, deltas, viewmat, K, background."""
         values = [getattr(self, field.name) for field in fields(self)[:9]]
         return [None if value is None else value.to(device, dtype) for value in values]
 
-    def render(self, capacity: int = 1 << 16, training: bool = False, **options: object) -> Frame:
-        return render_frame(
-            *self.tensors("cuda", torch.float32), self.width, self.height, capacity,
-            camera_model=self.camera_model, training=training, **options,
-        )  # fmt: skip
+    def render(self, capacity: int = 1 << 16, mode: FrameMode = FrameMode.SHARED) -> Frame:
+        return self.render_tensors(self.tensors("cuda", torch.float32), capacity, mode)
+
+    def render_tensors(self, tensors: list[Tensor | None], capacity: int, mode: FrameMode) -> Frame:
+        """With others in place of `tensors`."""
+        gaussians, (deltas, viewmat, K, background) = tensors[:5], tensors[5:]
+        view = View(viewmat, K, self.width, self.height, background, self.camera_model)
+        return render_frame(gaussians, deltas, view, capacity, mode)
 
     def exact(self, training: bool = False) -> tuple[Tensor, Tensor]:
         return reference.render_frame(
@@ -95,14 +99,14 @@ def assert_near(frame: Frame, exact: tuple[Tensor, Tensor]) -> None:
 def check(s: Scene, capacity: int = 1 << 16) -> Frame:
     """All modes against the reference; returns the training one."""
     frame = s.render(capacity)
-    needed, most, cut = frame.status.tolist()[:3]
-    assert needed <= capacity and not cut and most <= needed
+    needed, longest, overflow = frame.status.tolist()[:3]
+    assert needed <= capacity and not overflow and longest <= needed
     assert_near(frame, s.exact())
-    if most <= MOST_IN_TILE:
-        apart = s.render(max(most, 1), per_tile=True)
+    if longest <= MAX_SEGMENT:
+        apart = s.render(max(longest, 1), FrameMode.SEGMENTS)
         for name in ("image", "alphas", "status"):
             assert torch.equal(getattr(apart, name), getattr(frame, name)), name
-    training = s.render(capacity, training=True)
+    training = s.render(capacity, FrameMode.TRAINING)
     assert_near(training, s.exact(training=True))
     assert torch.equal(frame.status, training.status)
     assert torch.equal(frame.alphas, training.alphas)
@@ -112,11 +116,11 @@ def check(s: Scene, capacity: int = 1 << 16) -> Frame:
 
 def check_lists(frame: Frame) -> None:
     """Every instance is in one tile's list, each list is in the order of depth, and splats are numbered in order."""
-    needed, most, _ = frame.status.tolist()[:3]
+    needed, longest, _ = frame.status.tolist()[:3]
     starts, offsets = frame.splat_starts.cpu().long(), frame.tile_offsets.cpu().long()
     assert starts[0] == 0 and offsets[0] == 0
     assert starts[-1] == offsets[-1] == needed
-    assert most == (offsets.diff().max() if len(offsets) > 1 else 0)
+    assert longest == (offsets.diff().max() if len(offsets) > 1 else 0)
     instances = frame.sorted[:needed].cpu().long()
     assert torch.equal(instances.sort().values, torch.arange(needed))
     owners = frame.instance_splats[:needed].cpu().long()
@@ -138,12 +142,12 @@ def plain(s: Scene) -> tuple[Tensor, Tensor]:
     means, quats, log_scales, logits, sh, d, viewmat, K, background = s.tensors("cuda", torch.float32)
     if d is not None:
         means, quats, log_scales, logits = (
-            means + d[:, :3],
-            quats + d[:, 3:7],
-            log_scales + d[:, 7:10],
-            logits + d[:, 13],
+            means + d[:, POSITION],
+            quats + d[:, ROTATION],
+            log_scales + d[:, LOG_SCALE],
+            logits + d[:, OPACITY.start],
         )
-        sh = torch.cat([sh[:, :1] + d[:, None, 10:13], sh[:, 1:]], 1)
+        sh = torch.cat([sh[:, :1] + d[:, None, COLOUR], sh[:, 1:]], 1)
     image, alphas, _ = rasterization(
         means, quats, log_scales.exp(), torch.sigmoid(logits), sh, viewmat[None], K[None], s.width, s.height,
         sh_degree=math.isqrt(sh.shape[1]) - 1, backgrounds=None if background is None else background[None],

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core import fully_fused_projection, spherical_harmonics
-from gsplat_core.ops.frame.frame import Frame, render_frame
-from gsplat_core.ops.frame.frame_gradients import RawGradients, render_frame_backward
+from gsplat_core.ops.frame.frame import Frame, FrameMode, View, render_frame
+from gsplat_core.ops.frame_gradients.frame_gradients import RawGradients, render_frame_backward
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.reference.frame import render_frame as reference_frame
 from gsplat_core.rendering.settings import FAR_PLANE, NEAR_PLANE
@@ -41,6 +41,10 @@ class FrameScene:
     @property
     def gaussians(self) -> list[Tensor]:
         return [getattr(self, name) for name in NAMES]
+
+    @property
+    def view(self) -> View:
+        return View(self.viewmat, self.K, self.width, self.height, self.background, self.camera_model)
 
     def to(self, *kind: torch.device | torch.dtype | str) -> FrameScene:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -127,10 +131,8 @@ def frame_scene(
 def rendered(scene: FrameScene) -> Frame:
     """The forward pass of a training step; the scene is on the GPU."""
     tiles = math.ceil(scene.width / TILE) * math.ceil(scene.height / TILE)
-    frame = render_frame(
-        *scene.gaussians, scene.deltas, scene.viewmat, scene.K, scene.background, scene.width, scene.height,
-        1 + tiles * len(scene.means), camera_model=scene.camera_model, training=True,
-    )  # fmt: skip
+    capacity = 1 + tiles * len(scene.means)
+    frame = render_frame(scene.gaussians, scene.deltas, scene.view, capacity, FrameMode.TRAINING)
     assert not frame.status[2]
     return frame
 
@@ -190,12 +192,6 @@ def forward_of_plain_ops(scene: FrameScene) -> Frame:
     )
 
 
-def lists_of(forward: Frame) -> tuple[Tensor, ...]:
-    """In the order of the raw ops' arguments."""
-    f = forward
-    return f.records, f.tile_offsets, f.sorted, f.splat_starts, f.instance_splats, f.status, f.alphas, f.last
-
-
 def on_gpu(scene: FrameScene) -> FrameScene:
     return scene.to("cuda")
 
@@ -206,8 +202,8 @@ def backward(
     """The gradients of `scene.picture_gradients`; the scene is on the GPU."""
     v_image, v_alphas = scene.picture_gradients(with_alphas)
     return render_frame_backward(
-        scene.gaussians, scene.deltas, scene.viewmat, scene.K, scene.background, forward or rendered(scene),
-        v_image.cuda(), None if v_alphas is None else v_alphas.cuda(), camera_model=scene.camera_model, deterministic=deterministic,
+        scene.gaussians, scene.deltas, scene.view, forward or rendered(scene), v_image.cuda(),
+        None if v_alphas is None else v_alphas.cuda(), deterministic=deterministic,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from gsplat_core.ops.frame.frame import MOST_IN_TILE, STATUS_NEEDED, Frame, render_frame
+from gsplat_core.ops.frame.frame import MAX_SEGMENT, STATUS_NEEDED, Frame, FrameMode
 from tests.gsplat_core.cuda.frame_checks import assert_near, check, plain, scene
 
 pytestmark = pytest.mark.cuda
@@ -86,12 +86,12 @@ def test_values_that_are_not_finite_leave_their_gaussian_out() -> None:
     frame = check(s)
     assert not frame.splat_starts.diff()[: row + 1].any()
     good = {field.name: getattr(s, field.name)[row + 1 :] for field in fields(s)[:6]}
-    assert torch.equal(replace(s, **good).render(training=True).image, frame.image)
+    assert torch.equal(replace(s, **good).render(mode=FrameMode.TRAINING).image, frame.image)
 
 
 def test_the_same_bits_every_time() -> None:
     s = scene(20_000, 320, 240, degree=3, seed=10, size=0.1)
-    first, *others = (s.render(1 << 20, training=True) for _ in range(3))
+    first, *others = (s.render(1 << 20, FrameMode.TRAINING) for _ in range(3))
     needed = int(first.status[STATUS_NEEDED])
     assert needed > 50_000
     for other in others:
@@ -101,8 +101,8 @@ def test_the_same_bits_every_time() -> None:
             assert torch.equal(getattr(first, name)[:needed], getattr(other, name)[:needed]), name
 
 
-@pytest.mark.parametrize(("training", "per_tile"), [(False, False), (False, True), (True, False)])
-def test_a_captured_frame_follows_camera_and_deltas(training: bool, per_tile: bool) -> None:
+@pytest.mark.parametrize("mode", FrameMode)
+def test_a_captured_frame_follows_camera_and_deltas(mode: FrameMode) -> None:
     s = scene(2000, 160, 120, degree=3, seed=12)
     tensors = s.tensors("cuda", torch.float32)
     controls = torch.empty(1 + 16 + 9 + 3, device="cuda")  # views that begin anywhere
@@ -112,10 +112,8 @@ def test_a_captured_frame_follows_camera_and_deltas(training: bool, per_tile: bo
     deltas = tensors[5]
 
     def render() -> Frame:
-        capacity = MOST_IN_TILE if per_tile else 1 << 16
-        return render_frame(
-            *tensors[:6], viewmat, K, background, s.width, s.height, capacity, training=training, per_tile=per_tile
-        )
+        capacity = MAX_SEGMENT if mode == FrameMode.SEGMENTS else 1 << 16
+        return s.render_tensors([*tensors[:6], viewmat, K, background], capacity, mode)
 
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
@@ -139,13 +137,13 @@ def test_a_captured_frame_follows_camera_and_deltas(training: bool, per_tile: bo
 def test_strided_and_misaligned_inputs_and_a_side_stream() -> None:
     s = scene(700, 160, 120, degree=3, seed=13)
     tensors = s.tensors("cuda", torch.float32)
-    wanted = s.render(training=True)
+    wanted = s.render(mode=FrameMode.TRAINING)
     shifted = [torch.cat([t.new_zeros(1), t.flatten()])[1:].view(t.shape) for t in tensors]
     strided = [torch.stack([t, t], -1)[..., 0] for t in tensors]
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
-        frames = [render_frame(*t, s.width, s.height, 1 << 16, training=True) for t in (shifted, strided)]
+        frames = [s.render_tensors(t, 1 << 16, FrameMode.TRAINING) for t in (shifted, strided)]
     side.synchronize()
     for frame in frames:
         assert torch.equal(frame.image, wanted.image)
@@ -153,17 +151,17 @@ def test_strided_and_misaligned_inputs_and_a_side_stream() -> None:
 
 
 @pytest.mark.parametrize(
-    ("training", "half", "per_tile"),
-    [(False, False, False), (True, False, False), (False, True, False), (False, False, True)],
+    ("mode", "half"),
+    [(FrameMode.SHARED, False), (FrameMode.TRAINING, False), (FrameMode.SHARED, True), (FrameMode.SEGMENTS, False)],
 )
 @pytest.mark.parametrize("optional", [False, True])
-def test_op_passes_opcheck(training: bool, half: bool, per_tile: bool, optional: bool) -> None:
+def test_op_passes_opcheck(mode: FrameMode, half: bool, optional: bool) -> None:
     s = scene(30, 20, 18, deltas=optional, background=optional)
     tensors = s.tensors("cuda", torch.float32)
     if half:
         tensors[4] = tensors[4].half()
-    arguments = (*tensors, 20, 18, 0.3, 0.01, 1e10, 0, 1000, per_tile, training)
-    # What is not written (rows of culled Gaussians, the room behind the lists) differs from call to call.
+    arguments = (tensors[:5], *tensors[5:], 20, 18, 0.3, 0.01, 1e10, 0, 1000, int(mode))
+    # What is not written (rows of culled Gaussians, unused capacity of the lists) differs from call to call.
     torch.library.opcheck(
         torch.ops.gsplat_core.render_frame.default, arguments, test_utils=["test_schema", "test_faketensor"]
     )

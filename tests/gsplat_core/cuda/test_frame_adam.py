@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.frame.frame import Frame
-from gsplat_core.ops.frame.frame_gradients import render_frame_backward_adam_
+from gsplat_core.ops.frame.frame import STATUS_OVERFLOW, Frame
+from gsplat_core.ops.frame_gradients.frame_gradients import GaussianAdam, render_frame_backward_adam_
 from gsplat_core.reference.adam import adam_step
 from tests.gsplat_core.cuda.frame_scenes import (
     NAMES,
@@ -18,7 +18,6 @@ from tests.gsplat_core.cuda.frame_scenes import (
     backward,
     by_name,
     frame_scene,
-    lists_of,
     on_gpu,
     rendered,
 )
@@ -48,11 +47,20 @@ class AdamState:
         s = self.scene
         v_image, v_alphas = s.picture_gradients()
         controls = torch.tensor([0.0, *self.rates], device="cuda")  # a view that starts between 16 bytes
+        adam = self.adam(controls[1:], torch.tensor([number], dtype=dtype, device="cuda"))
         return render_frame_backward_adam_(
-            s.gaussians, self.first, self.second, controls[1:], torch.tensor([number], dtype=dtype, device="cuda"),
-            self.skipped, s.deltas, s.viewmat, s.K, s.background, forward, scale * v_image.cuda(), scale * v_alphas.cuda(),
-            camera_model=s.camera_model, needs_raw=needs_raw,
-        )  # fmt: skip
+            s.gaussians,
+            adam,
+            s.deltas,
+            s.view,
+            forward,
+            scale * v_image.cuda(),
+            scale * v_alphas.cuda(),
+            needs_raw=needs_raw,
+        )
+
+    def adam(self, rates: Tensor, step: Tensor) -> GaussianAdam:
+        return GaussianAdam(self.first, self.second, rates, step, self.skipped)
 
 
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
@@ -113,10 +121,8 @@ def test_fused_adam_reads_rates_and_step_from_the_device_in_a_graph() -> None:
     with torch.cuda.stream(stream):
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, stream=stream):
-            render_frame_backward_adam_(
-                graphed.scene.gaussians, graphed.first, graphed.second, rates, number, graphed.skipped, None, scene.viewmat,
-                scene.K, scene.background, forward, v_image, v_alphas,
-            )  # fmt: skip
+            adam = graphed.adam(rates, number)
+            render_frame_backward_adam_(graphed.scene.gaussians, adam, None, scene.view, forward, v_image, v_alphas)
     torch.cuda.synchronize()
     for step in (1, 2, 3):
         rates.copy_(torch.tensor(AdamState.rates))
@@ -129,10 +135,10 @@ def test_fused_adam_reads_rates_and_step_from_the_device_in_a_graph() -> None:
     assert all(torch.equal(a, b) for a, b in zip(graphed.scene.gaussians, plain.scene.gaussians, strict=True))
 
 
-def test_a_frame_whose_lists_were_cut_changes_nothing() -> None:
+def test_a_frame_that_overflowed_changes_nothing() -> None:
     scene = on_gpu(frame_scene(300, degree=1))
     forward = rendered(scene)
-    forward.status[2] = 1
+    forward.status[STATUS_OVERFLOW] = 1
     state = AdamState(scene)
     raw = state.step(forward, 1)
     assert raw is not None
@@ -146,10 +152,8 @@ def test_op_passes_opcheck(degree: int) -> None:
     scene = on_gpu(frame_scene(30, 20, 18, degree=degree, deltas=degree > 0))
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
     state = AdamState(scene)
-    lists = lists_of(rendered(scene))
-    inputs = (scene.deltas, scene.viewmat, scene.K, scene.background, *lists, v_image, v_alphas)
+    inputs = (scene.deltas, *scene.view.tensors, list(rendered(scene)[1:]), v_image, v_alphas)
     rates, step = torch.full((5,), 0.01, device="cuda"), torch.ones(1, dtype=torch.int64, device="cuda")
-    moments = (*state.first, *state.second, rates, step, state.skipped)
-    options = (scene.width, scene.height, 0.3, 0, 0.9, 0.999, 1e-8, degree > 0, True)
-    op = torch.ops.gsplat_core.render_frame_backward_adam_.default
-    torch.library.opcheck(op, (*state.scene.gaussians, *inputs, *moments, *options))
+    adam = (state.scene.gaussians, state.first, state.second, rates, step, state.skipped)
+    options = (0.3, 0, 0.9, 0.999, 1e-8, degree > 0, True)
+    torch.library.opcheck(torch.ops.gsplat_core.render_frame_backward_adam_.default, (*adam, *inputs, *options))

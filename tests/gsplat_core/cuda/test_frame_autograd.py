@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.frame.frame import render_frame
+from gsplat_core.ops.frame.frame import FrameMode, render_frame
 from tests.gsplat_core.cuda.frame_scenes import NAMES, backward, by_name, frame_scene, on_gpu, rendered
 
 pytestmark = pytest.mark.cuda
@@ -30,7 +30,7 @@ def test_autograd_takes_the_same_way(degree: int) -> None:
 def test_autograd_is_registered_as_it_should_be() -> None:
     scene = on_gpu(frame_scene(30, 20, 18, deltas=True))
     leaves = [t.clone().requires_grad_() for t in (*scene.gaussians, scene.deltas)]
-    arguments = (*leaves, scene.viewmat, scene.K, scene.background, 20, 18, 0.3, 0.01, 1e10, 0, 1000, False, True)
+    arguments = (leaves[:5], leaves[5], *scene.view.tensors, 20, 18, 0.3, 0.01, 1e10, 0, 1000, int(FrameMode.TRAINING))
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
     torch.library.opcheck(torch.ops.gsplat_core.render_frame.default, arguments, test_utils=checks)
 
@@ -38,9 +38,10 @@ def test_autograd_is_registered_as_it_should_be() -> None:
 def test_autograd_refuses_what_has_no_gradient() -> None:
     scene = on_gpu(frame_scene(30, 20, 18))
     means = scene.means.clone().requires_grad_()
-    inputs = (means, *scene.gaussians[1:], None, scene.viewmat, scene.K, None, 20, 18, 1000)
-    with pytest.raises(InvalidInput, match="training=True"):
-        render_frame(*inputs).image.sum().backward()
+    gaussians = [means, *scene.gaussians[1:]]
+    with pytest.raises(InvalidInput, match=r"FrameMode\.TRAINING"):
+        render_frame(gaussians, None, scene.view, 1000).image.sum().backward()
     camera = scene.viewmat.clone().requires_grad_()
     with pytest.raises(InvalidInput, match="no gradient for the camera"):
-        render_frame(*inputs[:6], camera, *inputs[7:], training=True).image.sum().backward()
+        view = scene.view._replace(viewmat=camera)
+        render_frame(gaussians, None, view, 1000, FrameMode.TRAINING).image.sum().backward()

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.frame.frame_gradients import RawGradients, render_frame_backward
+from gsplat_core.ops.frame.frame import STATUS_OVERFLOW
+from gsplat_core.ops.frame_gradients.frame_gradients import RawGradients, render_frame_backward
 from gsplat_core.scene.layout import COLOUR
 from tests.gsplat_core.cuda.frame_scenes import (
     NAMES,
@@ -19,7 +20,6 @@ from tests.gsplat_core.cuda.frame_scenes import (
     by_name,
     forward_of_plain_ops,
     frame_scene,
-    lists_of,
     on_gpu,
     rendered,
 )
@@ -180,8 +180,7 @@ def test_the_same_bits_every_time_and_in_a_graph() -> None:
     with torch.cuda.stream(stream):
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, stream=stream):
-            arguments = (scene.deltas, scene.viewmat, scene.K, scene.background, forward, v_image, v_alphas)
-            seen = render_frame_backward(scene.gaussians, *arguments)
+            seen = render_frame_backward(scene.gaussians, scene.deltas, scene.view, forward, v_image, v_alphas)
     v_image /= 3
     v_alphas /= 3
     graph.replay()
@@ -195,17 +194,17 @@ def test_the_same_bits_every_time_and_in_a_graph() -> None:
     assert torch.equal(seen.sh, first[1])
 
 
-def test_sums_by_arrival_are_the_same_but_for_rounding() -> None:
+def test_atomic_sums_are_the_same_but_for_rounding() -> None:
     scene = on_gpu(frame_scene(2000, 200, 150, degree=2))
     wanted, seen = backward(scene), backward(scene, deterministic=False)
     for s, w in zip(seen, wanted, strict=True):
         assert (s - w).norm() <= 1e-5 * w.norm()
 
 
-def test_a_frame_whose_lists_were_cut_has_no_gradient() -> None:
+def test_a_frame_that_overflowed_has_no_gradient() -> None:
     scene = on_gpu(frame_scene(300, degree=1))
     forward = rendered(scene)
-    forward.status[2] = 1
+    forward.status[STATUS_OVERFLOW] = 1
     gradients = backward(scene, forward)
     assert not gradients.raw.any()
     assert not gradients.sh.any()
@@ -215,26 +214,24 @@ def test_wrong_arguments_are_refused() -> None:
     scene = on_gpu(frame_scene(20, 20, 18))
     forward = rendered(scene)
     v_image = scene.picture_gradients()[0].cuda()
-    camera = (scene.viewmat, scene.K, None, forward)
+    view = scene.view._replace(background=None)
     with pytest.raises(InvalidInput, match="float32"):
-        render_frame_backward([t.double() for t in scene.gaussians], None, *camera, v_image)
+        render_frame_backward([t.double() for t in scene.gaussians], None, view, forward, v_image)
     with pytest.raises(InvalidInput, match="v_image"):
-        render_frame_backward(scene.gaussians, None, *camera, v_image[:5])
+        render_frame_backward(scene.gaussians, None, view, forward, v_image[:5])
     with pytest.raises(InvalidInput, match="deltas"):
-        render_frame_backward(scene.gaussians, torch.zeros(20, 13, device="cuda"), *camera, v_image)
+        render_frame_backward(scene.gaussians, torch.zeros(20, 13, device="cuda"), view, forward, v_image)
     with pytest.raises(InvalidInput, match="CUDA only"):
         on_cpu = scene.to("cpu")
-        render_frame_backward(on_cpu.gaussians, None, on_cpu.viewmat, on_cpu.K, None, forward, v_image.cpu())
+        render_frame_backward(on_cpu.gaussians, None, on_cpu.view, forward, v_image.cpu())
     with pytest.raises(RuntimeError, match="tile_offsets must have"):
         short = forward._replace(tile_offsets=forward.tile_offsets[:-1])
-        render_frame_backward(scene.gaussians, None, *camera[:3], short, v_image)
+        render_frame_backward(scene.gaussians, None, view, short, v_image)
 
 
 @pytest.mark.parametrize("degree", [0, 1])
 def test_op_passes_opcheck(degree: int) -> None:
     scene = on_gpu(frame_scene(30, 20, 18, degree=degree, deltas=degree > 0))
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
-    lists = lists_of(rendered(scene))
-    inputs = (scene.deltas, scene.viewmat, scene.K, scene.background, *lists, v_image, v_alphas)
-    sizes = (scene.width, scene.height, 0.3, 0, True)
-    torch.library.opcheck(torch.ops.gsplat_core.render_frame_backward.default, (*scene.gaussians, *inputs, *sizes))
+    inputs = (scene.gaussians, scene.deltas, *scene.view.tensors, list(rendered(scene)[1:]), v_image, v_alphas)
+    torch.library.opcheck(torch.ops.gsplat_core.render_frame_backward.default, (*inputs, 0.3, 0, True))

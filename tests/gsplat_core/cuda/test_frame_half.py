@@ -9,9 +9,18 @@ import torch
 from torch import Tensor
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.frame.frame import MOST_IN_TILE, STATUS_CUT, STATUS_MOST, STATUS_NEEDED, Frame, render_frame
+from gsplat_core.ops.frame.frame import (
+    MAX_SEGMENT,
+    STATUS_LONGEST,
+    STATUS_NEEDED,
+    STATUS_OVERFLOW,
+    Frame,
+    FrameMode,
+    render_frame,
+)
 from gsplat_core.reference.frame import render_frame as reference_frame
 from gsplat_core.rendering.settings import EPS2D
+from gsplat_core.scene.layout import COLOUR
 from tests.gsplat_core.cuda.frame_scenes import FrameScene, frame_scene
 
 pytestmark = pytest.mark.cuda
@@ -21,10 +30,7 @@ STOP = 1e-4
 def rendered(scene: FrameScene, half: bool = True, capacity: int = 1 << 20, eps2d: float = EPS2D) -> Frame:
     s = scene.to("cuda")
     sh = s.sh.half() if half else s.sh
-    return render_frame(
-        *s.gaussians[:4], sh, s.deltas, s.viewmat, s.K, s.background, s.width, s.height, capacity,
-        camera_model=s.camera_model, eps2d=eps2d,
-    )  # fmt: skip
+    return render_frame([*s.gaussians[:4], sh], s.deltas, s.view._replace(eps2d=eps2d), capacity)
 
 
 def exact(scene: FrameScene) -> tuple[Tensor, Tensor]:
@@ -52,7 +58,7 @@ def assert_near(frame: Frame, image: Tensor, alphas: Tensor, psnr_db: float = 58
 
 def check(scene: FrameScene, capacity: int = 1 << 20, psnr_db: float = 58.0) -> Frame:
     frame = rendered(scene, capacity=capacity)
-    assert not frame.status[STATUS_CUT]
+    assert not frame.status[STATUS_OVERFLOW]
     assert_near(frame, *exact(scene), psnr_db=psnr_db)
     assert torch.equal(rendered(scene, capacity=capacity).image, frame.image)
     return frame
@@ -98,7 +104,7 @@ def test_lists_of_different_lengths_side_by_side(seed: int) -> None:
 def test_very_many_splats_in_one_tile(count: int) -> None:
     scene = frame_scene(count, 16, 16, median_px=60.0, seed=3)
     scene.logit_opacities[:] = -5.0 + torch.rand(count, generator=torch.Generator().manual_seed(4))
-    assert check(scene, psnr_db=50.0).status[STATUS_MOST] == count
+    assert check(scene, psnr_db=50.0).status[STATUS_LONGEST] == count
 
 
 def test_splats_that_cover_the_screen() -> None:
@@ -163,13 +169,13 @@ def test_splats_without_a_least_size(eps2d: float) -> None:
 def test_colours_end_at_the_largest_half() -> None:
     """Such a colour is seen where its splat is drawn, finite, and changes no other pixel."""
     scene = frame_scene(300, deltas=True, seed=12)
-    scene.deltas[0, 10:13] = 1e9
+    scene.deltas[0, COLOUR] = 1e9
     bright = rendered(scene)
     assert bright.image.isfinite().all()
     assert 1e3 < bright.image[..., :3].max() <= 65504
     elsewhere = rendered(scene.select(torch.tensor([0]))).alphas == 0
     assert 0.5 < elsewhere.float().mean() < 1
-    scene.deltas[0, 10:13] = 0
+    scene.deltas[0, COLOUR] = 0
     assert torch.equal(bright.image[elsewhere], rendered(scene).image[elsewhere])
 
 
@@ -178,10 +184,10 @@ def test_the_same_bits_every_time_and_from_anywhere_in_memory() -> None:
     first = rendered(scene)
     half = scene.sh.half()
     shifted = torch.cat([half.new_zeros(1), half.flatten()])[1:].view(half.shape)
-    rest = (scene.deltas, scene.viewmat, scene.K, scene.background, 320, 240)
-    for sh, per_tile in [(half, False), (shifted, False), (half, True), *[(half, False)] * 20]:
-        capacity = MOST_IN_TILE if per_tile else 1 << 20
-        again = render_frame(*scene.gaussians[:4], sh, *rest, capacity, per_tile=per_tile)
+    shared, segments = FrameMode.SHARED, FrameMode.SEGMENTS
+    for sh, mode in [(half, shared), (shifted, shared), (half, segments), *[(half, shared)] * 20]:
+        capacity = MAX_SEGMENT if mode == segments else 1 << 20
+        again = render_frame([*scene.gaussians[:4], sh], scene.deltas, scene.view, capacity, mode)
         assert torch.equal(first.image, again.image)
         assert torch.equal(first.alphas, again.alphas)
     full = rendered(scene, half=False)
@@ -189,12 +195,12 @@ def test_the_same_bits_every_time_and_from_anywhere_in_memory() -> None:
     assert_near(first, full.image, full.alphas)
 
 
-def test_too_little_room_is_told_and_a_second_go_is_right() -> None:
+def test_overflow_is_reported_and_a_second_frame_is_right() -> None:
     scene = frame_scene(3000, 200, 131, median_px=8.0, seed=14)
     wanted = rendered(scene)
     needed = int(wanted.status[STATUS_NEEDED])
     for capacity in (1, 100, needed // 2, needed - 1):
-        assert rendered(scene, capacity=capacity).status.tolist()[:3] == [needed, int(wanted.status[STATUS_MOST]), 1]
+        assert rendered(scene, capacity=capacity).status.tolist()[:3] == [needed, int(wanted.status[STATUS_LONGEST]), 1]
     torch.cuda.synchronize()
     assert torch.equal(rendered(scene, capacity=needed).image, wanted.image)
 
@@ -202,6 +208,4 @@ def test_too_little_room_is_told_and_a_second_go_is_right() -> None:
 def test_coefficients_in_half_precision_are_refused_for_training() -> None:
     s = frame_scene(10).to("cuda")
     with pytest.raises(InvalidInput, match="sh must be float32"):
-        render_frame(
-            *s.gaussians[:4], s.sh.half(), s.deltas, s.viewmat, s.K, s.background, s.width, s.height, 100, training=True
-        )
+        render_frame([*s.gaussians[:4], s.sh.half()], s.deltas, s.view, 100, FrameMode.TRAINING)

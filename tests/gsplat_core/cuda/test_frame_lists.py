@@ -1,4 +1,4 @@
-"""The tiles' lists of the fused frame path: crowded tiles, equal depths, large scenes and too little room."""
+"""The tiles' lists of the fused frame path: crowded tiles, equal depths, large scenes and overflow."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.frame.frame import STATUS_CUT, STATUS_MOST, STATUS_NEEDED
+from gsplat_core.ops.frame.frame import STATUS_LONGEST, STATUS_NEEDED, STATUS_OVERFLOW, FrameMode
 from tests.gsplat_core.cuda.frame_checks import assert_near, check, check_lists, plain, scene
 
 pytestmark = pytest.mark.cuda
@@ -23,7 +23,7 @@ def test_very_many_splats_in_one_tile(count: int) -> None:
     s.log_scales[:] = 0.0  # wide, so that no pixel is near the cut-off of 1/255
     s.logit_opacities[:] = -5.4
     frame = check(s, capacity=4 * count)
-    assert frame.status[STATUS_MOST] == count
+    assert frame.status[STATUS_LONGEST] == count
 
 
 @pytest.mark.parametrize("count", [100, 128, 200, 256, 500, 512, 900, 1024, 1025])
@@ -35,17 +35,17 @@ def test_depths_that_are_equal_or_next_to_each_other(count: int, far: bool) -> N
     s.means[:, :2] = 0.1 * torch.randn(count, 2, generator=g)
     s.means[:, 2] = 2 + torch.randint(0, 40, (count,), generator=g) * 2.0**-22
     s.log_scales[:] = 3.0  # over the whole tile, so that no pixel is near the cut-off of 1/255
-    if far:  # told apart from this one, the others are not told apart at once
+    if far:  # beside this one, the depths of the others fall into one bucket
         s.means[-1] = torch.tensor([0.0, 0.0, 1e8])
         s.log_scales[-1] = math.log(1e9)
     s.logit_opacities[:] = -4.6
-    assert check(s).status[STATUS_MOST] == count
+    assert check(s).status[STATUS_LONGEST] == count
 
 
 @pytest.mark.parametrize("clump", [1, 2, 11, 12, 13, 100])
 @pytest.mark.parametrize("count", [120, 250, 500, 1000])
 def test_depths_in_clumps(count: int, clump: int) -> None:
-    """Evenly spread depths are sorted by buckets, and others, with too many in one bucket, in the general way."""
+    """Evenly spread depths are sorted by buckets, and others, with too many in one bucket, bitonically."""
     s = scene(count, 16, 16, seed=18, deltas=False)
     g = torch.Generator().manual_seed(3)
     s.viewmat[:] = torch.eye(4)
@@ -54,7 +54,7 @@ def test_depths_in_clumps(count: int, clump: int) -> None:
     s.means[:, 2] = 2 + at * clump / count + 1e-6 * torch.rand(count, generator=g)
     s.log_scales[:] = 3.0  # over the whole tile, so that no pixel is near the cut-off of 1/255
     s.logit_opacities[:] = -4.6
-    assert check(s).status[STATUS_MOST] == count
+    assert check(s).status[STATUS_LONGEST] == count
 
 
 def test_a_large_scene() -> None:
@@ -63,15 +63,15 @@ def test_a_large_scene() -> None:
     s.log_scales[1::2000] = -1.5
     s.means[2::100] = math.nan
     assert_near(s.render(1 << 19), plain(s))
-    frame = s.render(1 << 19, training=True)
+    frame = s.render(1 << 19, FrameMode.TRAINING)
     check_lists(frame)
     assert frame.splat_starts.diff().max() == 10 * 7
-    again = s.render(1 << 19, training=True)
+    again = s.render(1 << 19, FrameMode.TRAINING)
     for name in ("image", "last", "tile_offsets", "splat_starts"):
         assert torch.equal(getattr(frame, name), getattr(again, name)), name
     needed = int(frame.status[STATUS_NEEDED])
-    assert s.render(needed - 1, training=True).status[STATUS_CUT]
-    assert torch.equal(s.render(needed, training=True).image, frame.image)
+    assert s.render(needed - 1, FrameMode.TRAINING).status[STATUS_OVERFLOW]
+    assert torch.equal(s.render(needed, FrameMode.TRAINING).image, frame.image)
 
 
 def test_a_large_scene_on_very_many_tiles() -> None:
@@ -79,34 +79,32 @@ def test_a_large_scene_on_very_many_tiles() -> None:
     assert_near(s.render(1 << 20), plain(s))
 
 
-@pytest.mark.parametrize("training", [False, True])
-def test_too_little_room_is_told_and_a_second_go_is_right(training: bool) -> None:
+@pytest.mark.parametrize("mode", [FrameMode.SHARED, FrameMode.TRAINING])
+def test_overflow_is_reported_and_a_second_frame_is_right(mode: FrameMode) -> None:
     s = scene(3000, 200, 131, seed=11, size=0.2)
     s.log_scales[::50] = 1.0
-    wanted = s.render(1 << 20, training)
+    wanted = s.render(1 << 20, mode)
     needed = int(wanted.status[STATUS_NEEDED])
     for capacity in (1, 100, needed // 2, needed - 1):
-        cut = s.render(capacity, training)
-        assert cut.status.tolist() == [needed, int(wanted.status[STATUS_MOST]), 1, 0]
+        cut = s.render(capacity, mode)
+        assert cut.status.tolist() == [needed, int(wanted.status[STATUS_LONGEST]), 1, 0]
         torch.cuda.synchronize()
-    again = s.render(needed, training)
-    assert not again.status[STATUS_CUT]
+    again = s.render(needed, mode)
+    assert not again.status[STATUS_OVERFLOW]
     assert torch.equal(again.image, wanted.image)
 
 
-def test_a_tile_with_too_little_room_is_told_and_a_second_go_is_right() -> None:
+def test_overflow_of_a_segment_is_reported_and_a_second_frame_is_right() -> None:
     s = scene(3000, 200, 131, seed=11, size=0.2)
     s.log_scales[::50] = 1.0
     wanted = s.render(1 << 20)
     needed, most = wanted.status.tolist()[:2]
     for capacity in (1, 50, most - 1):
-        cut = s.render(capacity, per_tile=True)
+        cut = s.render(capacity, FrameMode.SEGMENTS)
         assert cut.status.tolist() == [needed, most, 1, 0]
         torch.cuda.synchronize()
-    again = s.render(most, per_tile=True)
+    again = s.render(most, FrameMode.SEGMENTS)
     assert again.status.tolist() == [needed, most, 0, 0]
     assert torch.equal(again.image, wanted.image)
     with pytest.raises(InvalidInput, match="at most 1024"):
-        s.render(1025, per_tile=True)
-    with pytest.raises(InvalidInput, match="per_tile=False"):
-        s.render(most, training=True, per_tile=True)
+        s.render(1025, FrameMode.SEGMENTS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from gsplat_core import InvalidInput, reference
-from gsplat_core.ops.frame.frame import Frame, render_frame
+from gsplat_core.ops.frame.frame import Frame, FrameMode, View, render_frame
 
 WIDTH, HEIGHT = 40, 30
 
@@ -28,6 +29,13 @@ def raw_gaussians(count: int = 40, dtype: torch.dtype = torch.float64, degree: i
         means, random(count, 4), 0.3 * random(count, 3) - 1.5, random(count), 0.3 * random(count, (degree + 1) ** 2, 3),
         0.05 * random(count, 16), torch.eye(4, dtype=dtype), K, torch.rand(3, generator=g, dtype=dtype),
     ]  # fmt: skip
+
+
+def rendered(inputs: list[Tensor], capacity: int = 100, mode: FrameMode = FrameMode.SHARED, **view: Any) -> Frame:
+    """`render_frame` of what `raw_gaussians` gives."""
+    gaussians, (deltas, viewmat, K, background) = inputs[:5], inputs[5:]
+    sizes = {"width": WIDTH, "height": HEIGHT} | view
+    return render_frame(gaussians, deltas, View(viewmat, K, background=background, **sizes), capacity, mode)
 
 
 @pytest.mark.parametrize("expected_depth", [False, True])
@@ -72,9 +80,9 @@ def test_reference_refuses_wrong_shapes():
 
 def test_cpu_tensors_and_float64_are_refused_with_what_to_use_instead():
     with pytest.raises(InvalidInput, match=r"runs on CUDA only .* gsplat_core.render"):
-        render_frame(*raw_gaussians(dtype=torch.float32), WIDTH, HEIGHT, 100)
+        rendered(raw_gaussians(dtype=torch.float32))
     with pytest.raises(InvalidInput, match=r"must be float32, got torch.float64.*gsplat_core.reference"):
-        render_frame(*raw_gaussians(), WIDTH, HEIGHT, 100)
+        rendered(raw_gaussians())
 
 
 @pytest.mark.parametrize(
@@ -86,7 +94,7 @@ def test_wrong_shapes_are_named(index, name):
     inputs = raw_gaussians(dtype=torch.float32)
     inputs[index] = inputs[index][..., :-1] if name != "logit_opacities" else inputs[index][:, None]
     with pytest.raises(InvalidInput, match=f"^{name} must be"):
-        render_frame(*inputs, WIDTH, HEIGHT, 100)
+        rendered(inputs)
 
 
 @pytest.mark.parametrize(
@@ -95,28 +103,34 @@ def test_wrong_shapes_are_named(index, name):
         ({"width": 0}, "at least 1x1"),
         ({"capacity": 0}, "capacity"),
         ({"camera_model": "ftheta"}, "camera_model"),
-        ({"per_tile": True, "training": True}, "per_tile=False"),
-        ({"per_tile": True, "capacity": 1025}, "at most 1024"),
+        ({"mode": FrameMode.SEGMENTS, "capacity": 1025}, "at most 1024"),
     ],
 )
 def test_wrong_options_are_refused(options, message):
-    arguments = {"width": WIDTH, "height": HEIGHT, "capacity": 100} | options
     with pytest.raises(InvalidInput, match=message):
-        render_frame(*raw_gaussians(dtype=torch.float32), **arguments)
+        rendered(raw_gaussians(dtype=torch.float32), **options)
 
 
-@pytest.mark.parametrize(("training", "per_tile"), [(False, False), (False, True), (True, False)])
-def test_fake_kernel_has_the_shapes_of_a_frame(training, per_tile):
+def test_gaussians_are_five_tensors():
+    inputs = raw_gaussians(dtype=torch.float32)
+    view = View(*inputs[6:8], WIDTH, HEIGHT)
+    with pytest.raises(InvalidInput, match=r"means, quats, log_scales, logit_opacities, sh, got 4 tensors"):
+        render_frame(inputs[:4], None, view, 100)
+
+
+@pytest.mark.parametrize("mode", FrameMode)
+def test_fake_kernel_has_the_shapes_of_a_frame(mode):
+    training = mode == FrameMode.TRAINING
     with FakeTensorMode():
         inputs = [torch.empty_like(t, device="cpu") for t in raw_gaussians(dtype=torch.float32)]
         frame = Frame(
-            *torch.ops.gsplat_core.render_frame(*inputs, WIDTH, HEIGHT, 0.3, 0.01, 1e10, 0, 100, per_tile, training)
+            *torch.ops.gsplat_core.render_frame(inputs[:5], *inputs[5:], WIDTH, HEIGHT, 0.3, 0.01, 1e10, 0, 100, mode)
         )
     assert frame.image.shape == (HEIGHT, WIDTH, 4)
     assert frame.alphas.shape == (HEIGHT, WIDTH)
     assert frame.last.shape == ((HEIGHT, WIDTH) if training else (0, 0))
     assert frame.records.shape == (40, 12)
-    assert frame.tile_offsets.shape == ((0,) if per_tile else (3 * 2 + 1,))
+    assert frame.tile_offsets.shape == ((0,) if mode == FrameMode.SEGMENTS else (3 * 2 + 1,))
     assert frame.sorted.shape == frame.instance_splats.shape == ((100,) if training else (0,))
     assert frame.splat_starts.shape == ((41,) if training else (0,))
     assert frame.status.shape == (4,)

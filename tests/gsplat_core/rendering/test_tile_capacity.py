@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from gsplat_core.ops.frame.frame import MOST_IN_TILE
+from gsplat_core.ops.frame.frame import MAX_SEGMENT
 from gsplat_core.rendering.tile_capacity import HEADROOM, TILE_STEP, TileListCapacity, capacity_for
 
 
@@ -15,10 +15,8 @@ def test_each_tile_has_its_own_buffer_with_headroom():
 
 
 def test_one_buffer_serves_all_lists_where_a_tile_has_too_many_instances():
-    most = math.floor(MOST_IN_TILE / HEADROOM)
-    assert TileListCapacity.for_frame(needed=120_000, most_in_tile=most) == TileListCapacity(
-        MOST_IN_TILE, per_tile=True
-    )
+    most = math.floor(MAX_SEGMENT / HEADROOM)
+    assert TileListCapacity.for_frame(needed=120_000, most_in_tile=most) == TileListCapacity(MAX_SEGMENT, per_tile=True)
     lists = TileListCapacity.for_frame(needed=120_000, most_in_tile=most + 1)
     assert lists == TileListCapacity(capacity_for(120_000), per_tile=False)
     assert lists.capacity >= 120_000

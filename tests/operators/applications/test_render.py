@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.errors import InvalidInput
+from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.bundle import save_bundle
 from operators.applications.render import render_model
 from operators.errors import DeviceMissing, OutputError, OutputFolderInUse
@@ -54,15 +54,19 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_written(bundle
 
 @pytest.mark.parametrize("fps", [0, -1, math.nan, math.inf, 1e6])
 def test_a_rate_that_makes_no_sense_is_refused(bundle, tmp_path, fps):
-    with pytest.raises(InvalidInput, match="fps is"):
+    with pytest.raises(InvalidSetting, match="fps is"):
         render_model(bundle, tmp_path / "v.mp4", fps=fps)
 
 
 def test_nothing_is_written_where_it_does_not_belong(bundle, tmp_path):
     with pytest.raises(OutputError, match="there is no folder"):
         render_model(bundle, tmp_path / "missing" / "v.mp4")
-    with pytest.raises(OutputFolderInUse, match="not made by intrasplat"):
+    with pytest.raises(OutputError, match="lies inside --out"):
         render_model(bundle, bundle)
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter1.tex").touch()
+    with pytest.raises(OutputFolderInUse, match="not made by intrasplat"):
+        render_model(bundle, tmp_path / "thesis")
     (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(OutputError, match="is a folder"):
         render_model(bundle, tmp_path / "folder.mp4")

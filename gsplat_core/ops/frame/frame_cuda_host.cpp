@@ -1,0 +1,99 @@
+// render_frame and accumulate_status_: checks, memory and the order of the launches.
+#include <algorithm>
+#include <tuple>
+
+#include "frame_inputs.h"
+
+namespace gsplat::frame {
+namespace {
+
+constexpr int64_t kMaxInts = (int64_t(1) << 31) - 1;
+constexpr int64_t kFewTiles = 4096;  // for so many, every tile's counter can have 128 bytes to itself
+
+using Frame = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+void check_capacity(int64_t capacity, int64_t tiles, Mode mode) {
+  if (mode == kSegments) {
+    const int64_t most = std::min<int64_t>(kMaxSegment, kMaxInts / tiles);
+    check(capacity > 0 && capacity <= most, "render_frame: a tile's segment must have a capacity of 1 to ", most,
+          " instances with ", tiles, " tiles, got ", capacity);
+  } else {
+    check(capacity > 0 && capacity <= kMaxInts, "render_frame: capacity must be 1 to ", kMaxInts, " instances, got ", capacity);
+  }
+}
+
+Frame render_frame(std::vector<Tensor> gaussians, OptionalTensor deltas, Tensor viewmat, Tensor intrinsics,
+                   OptionalTensor background, int64_t width, int64_t height, double eps2d, double near_plane, double far_plane,
+                   int64_t camera_model, int64_t capacity, int64_t mode) {
+  check(mode >= kShared && mode <= kSegments, "render_frame: mode must be 0 (shared), 1 (training) or 2 (segments), got ", mode);
+  const bool training = mode == kTraining, segments = mode == kSegments;
+  Inputs inputs(gaussians, deltas, viewmat, intrinsics, background, {width, height, eps2d, near_plane, far_plane, camera_model},
+                !training);
+  CudaCall& call = inputs.call;
+  const Scene& in = inputs.scene;
+  const int64_t tiles = in.tiles();
+  check_capacity(capacity, tiles, Mode(mode));
+  const auto ints = [&](int64_t when_training) { return call.empty({training ? when_training : 0}, ScalarType::Int); };
+  Tensor image = call.empty({height, width, 4}), alphas = call.empty({height, width});
+  Tensor last = call.empty({training ? height : 0, training ? width : 0}, ScalarType::Int);
+  Tensor records = call.empty({in.count, 12}), tile_offsets = call.empty({segments ? 0 : tiles + 1}, ScalarType::Int);
+  Tensor sorted = ints(capacity), splat_starts = ints(in.count + 1), instance_splats = ints(capacity);
+  Tensor status = call.empty({kStatusSize}, ScalarType::Int);
+  const Lists lists = {.records = records.mutable_data_ptr<float>(),
+                       .tile_offsets = segments ? nullptr : tile_offsets.mutable_data_ptr<int32_t>(),
+                       .keys = call.array<uint64_t>(segments ? tiles * capacity : capacity),
+                       .sorted = training ? sorted.mutable_data_ptr<int32_t>() : nullptr,
+                       .splat_starts = training ? splat_starts.mutable_data_ptr<int32_t>() : nullptr,
+                       .instance_splats = training ? instance_splats.mutable_data_ptr<int32_t>() : nullptr,
+                       .status = status.mutable_data_ptr<int32_t>(),
+                       .capacity = capacity,
+                       .segment = segments ? int32_t(capacity) : 0};
+  const int64_t blocks = blocks_for(in.count, kGaussianThreads), states = scan_state_count(tiles, blocks);
+  const int32_t stride = tiles <= kFewTiles ? 32 : 8;
+  uint64_t* const zeros = call.array<uint64_t>(states + tiles * stride / 2);
+  const Scratch scratch = {.footprints = segments ? nullptr : call.array<uint2>(in.count),
+                           .depths = segments ? nullptr : call.array<uint32_t>(in.count),
+                           .counters = reinterpret_cast<uint32_t*>(zeros + states),
+                           .scan_states = zeros,
+                           .block_counts = training ? call.array<uint32_t>(blocks) : nullptr,
+                           .block_starts = training ? call.array<uint32_t>(blocks) : nullptr,
+                           .counter_stride = stride};
+  const Pixels out = {mutable_data(image), mutable_data(alphas), training ? last.mutable_data_ptr<int32_t>() : nullptr};
+  check_cuda(cudaMemsetAsync(zeros, 0, size_t(states + tiles * stride / 2) * sizeof(uint64_t), call.stream),
+             "clearing the tile counters");
+  preprocess(in, lists, scratch, call.stream);
+  if (!segments) {
+    scan(in, lists, scratch, call.stream);
+    fill(in, lists, scratch, call.stream);
+  } else if (in.count == 0) {
+    check_cuda(cudaMemsetAsync(lists.status, 0, kStatusSize * sizeof(int32_t), call.stream), "clearing the frame's status");
+  }
+  blend(in, lists, scratch, out, call.stream);
+  call.finish("render_frame");
+  return {image, alphas, last, records, tile_offsets, sorted, splat_starts, instance_splats, status};
+}
+
+Tensor accumulate_status_(Tensor status, Tensor totals, Tensor step) {
+  CudaCall call(status);
+  for (const Tensor* t : {&status, &totals}) {
+    call.ints(*t, "accumulate_status_'s status");
+    check(t->is_contiguous() && t->numel() == kStatusSize, "accumulate_status_: status and totals must be contiguous, with ",
+          kStatusSize, " entries each, got ", t->numel());
+  }
+  call.take(step, ScalarType::Long, "step");
+  check(step.numel() == 1, "accumulate_status_: step must be one number, got ", step.numel());
+  Tensor fits = call.empty({1});
+  accumulate_status(status.const_data_ptr<int32_t>(), totals.mutable_data_ptr<int32_t>(), step.mutable_data_ptr<int64_t>(),
+                    mutable_data(fits), call.stream);
+  call.finish("accumulate_status_");
+  return fits;
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
+  m.impl("render_frame", GSPLAT_BOX(&render_frame));
+  m.impl("accumulate_status_", GSPLAT_BOX(&accumulate_status_));
+}
+
+}  // namespace gsplat::frame

@@ -1,0 +1,202 @@
+// One thread per Gaussian: deform, activate, project, colour, and count or emit its instances.
+#include <cuda_fp16.h>
+
+#include "../spherical_harmonics/spherical_harmonics_bases.h"
+#include "dependent_launch.cuh"
+#include "gaussian.cuh"
+#include "instances.cuh"
+
+namespace gsplat::frame {
+namespace {
+
+using namespace GSPLAT_ISA;
+using namespace GSPLAT_ISA::spherical_harmonics;
+
+template <int bytes>
+__device__ inline void copy_async(void* to, const void* from) {
+  const unsigned at = unsigned(__cvta_generic_to_shared(to));
+  if constexpr (bytes == 16) {
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(at), "l"(from));
+  } else {
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(at), "l"(from));
+  }
+}
+
+__device__ inline float to_float(float x) { return x; }
+__device__ inline float to_float(__half x) { return __half2float(x); }
+
+// Spherical-harmonics coefficients of a warp's 32 Gaussians in shared memory. Rows are an odd number of 16-byte words apart, so
+// that eight lanes reading theirs have no bank conflict.
+template <int degree, class Coefficient>
+struct StagedHarmonics {
+  static constexpr int kBases = (degree + 1) * (degree + 1), kRow = 3 * kBases, kInQuad = 16 / sizeof(Coefficient);
+  static constexpr int kQuads = (kRow + kInQuad - 1) / kInQuad, kStride = kInQuad * (kQuads | 1);
+  uint4 rows[32 * kStride / kInQuad];
+
+  // Called by a warp; starts asynchronous copies for the Gaussians with a bit in `visible`, which `wait` completes.
+  __device__ void load(const Coefficient* from, unsigned visible, bool aligned) {
+    const int lane = threadIdx.x & 31;
+    Coefficient* const to = reinterpret_cast<Coefficient*>(rows);
+    if (kRow % kInQuad == 0 && aligned) {
+#pragma unroll 4
+      for (int i = lane; i < 32 * kQuads; i += 32) {
+        const int row = i / kQuads;
+        if (visible >> row & 1) copy_async<16>(to + row * kStride + kInQuad * (i % kQuads), from + kInQuad * i);
+      }
+    } else {
+#pragma unroll 4
+      for (int i = lane; i < 32 * kRow; i += 32) {
+        const int row = i / kRow;
+        if (!(visible >> row & 1)) continue;
+        if constexpr (sizeof(Coefficient) == 4) {
+          copy_async<4>(to + row * kStride + i % kRow, from + i);
+        } else {
+          to[row * kStride + i % kRow] = from[i];
+        }
+      }
+    }
+  }
+
+  __device__ static void wait() {
+    asm volatile("cp.async.wait_all;" ::: "memory");
+    __syncwarp();
+  }
+
+  __device__ void color_at(const float direction[3], float color[3]) const {
+    float bases[kBases], values[kInQuad * kQuads];
+    bases_at<degree>(direction[0], direction[1], direction[2], bases);
+    const uint4* const row = rows + (threadIdx.x & 31) * (kStride / kInQuad);
+#pragma unroll
+    for (int i = 0; i < kQuads; ++i) {
+      const uint4 quad = row[i];
+      Coefficient of_quad[kInQuad];
+      memcpy(of_quad, &quad, sizeof(quad));
+#pragma unroll
+      for (int j = 0; j < kInQuad; ++j) values[kInQuad * i + j] = to_float(of_quad[j]);
+    }
+#pragma unroll
+    for (int k = 0; k < kBases; ++k)
+      for (int j = 0; j < 3; ++j) color[j] = fmaf(bases[k], values[3 * k + j], color[j]);
+  }
+};
+
+__device__ inline Projected project_with(const Scene& in, const ProjectionInput& settings, const float mean[3],
+                                         const Geometry& geometry, float opacity) {
+  switch (in.camera_model) {
+    case kOrtho: return project(settings, View<kOrtho>(settings), mean, geometry, &opacity, false);
+    case kFisheye: return project(settings, View<kFisheye>(settings), mean, geometry, &opacity, false);
+    default: return project(settings, View<kPinhole>(settings), mean, geometry, &opacity, false);
+  }
+}
+
+constexpr float kConstantBase = 0.28209479177387814f;
+
+// A warp's shared memory: the coefficients, later the (splat, tile) pairs of its small footprints.
+template <int degree, class Coefficient>
+union WarpShared {
+  StagedHarmonics<degree, Coefficient> harmonics;
+  uint32_t touched[kMaxSmallTiles];
+};
+
+template <int degree, class Coefficient>
+__global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
+    preprocess_gaussians(Scene in, Lists lists, Scratch scratch) {
+  allow_dependent_launch();
+  __shared__ Camera camera;
+  __shared__ WarpShared<degree, Coefficient> warps[kGaussianThreads / 32];
+  const int64_t n = int64_t(blockIdx.x) * kGaussianThreads + threadIdx.x;
+  const int lane = threadIdx.x & 31;
+  WarpShared<degree, Coefficient>& shared = warps[threadIdx.x / 32];
+  Record<4>* const records = static_cast<Record<4>*>(lists.records);
+  const Coefficient* const sh = reinterpret_cast<const Coefficient*>(in.sh);
+
+  RawGaussian g;
+  g.usable = false;
+  if (n < in.count) g = load_gaussian(in, n);
+  load_camera(in, camera);
+  Projected p;
+  p.valid = 0;
+  float opacity = 0;
+  if (g.usable) {
+    opacity = opacity_of(g);
+    p = project_with(in, projection_input(in, camera), g.mean, geometry_of(g), opacity);
+  }
+  const unsigned visible = __ballot_sync(kAll, p.valid);
+  if constexpr (degree > 0)
+    shared.harmonics.load(sh + (n - lane) * StagedHarmonics<degree, Coefficient>::kRow, visible,
+                          in.aligned);  // in flight while the boxes are computed
+
+  Record<4> r = {};
+  Footprint footprint = {0, 0};
+  if (p.valid) {
+    r.xyab = make_float4(p.u, p.v, -0.5f * kLog2E * p.conic[0], -kLog2E * p.conic[1]);
+    r.c = -0.5f * kLog2E * p.conic[2];
+    r.l = log2f(opacity);
+    r.cap = INFINITY;  // the conic is positive definite
+    TileBox box = box_around(p.u, p.v, p.radius_x, p.radius_y, kTile, in.tile_width, in.tile_height);
+    box.ellipse = ellipse_of_record(r.xyab, r.c, r.l);
+    footprint = footprint_of(box);
+  }
+  if constexpr (degree > 0) StagedHarmonics<degree, Coefficient>::wait();
+  if (footprint.y != 0) {
+    float color[3], direction[3];
+    for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, g.color[j], 0.5f);
+    if constexpr (degree > 0) {
+      unit_direction(camera, g.mean, direction);
+      shared.harmonics.color_at(direction, color);
+    } else {
+      for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, to_float(sh[3 * n + j]), color[j]);
+    }
+    if (0 * color[0] + 0 * color[1] + 0 * color[2] == 0) {
+      for (int j = 0; j < 3; ++j) r.colors[j] = fmaxf(color[j], 0.0f);
+      r.colors[3] = p.depth;
+      records[n] = r;
+    } else {
+      footprint = {0, 0};
+    }
+  }
+  const uint32_t depth = footprint.y != 0 ? __float_as_uint(p.depth) : 0;
+  if (lists.segment > 0) {
+    // Every tile has a segment of its own, so keys can be written before the lists' lengths are known.
+    if (n == 0)
+      for (int i = 0; i < kStatusSize; ++i) lists.status[i] = 0;  // blend adds the tiles up
+    __syncwarp();                                                 // records are written, coefficients have been read
+    emit_small<kSegments>(in, lists, scratch, footprint, n, depth, 0, shared.touched);
+    emit_large<kSegments>(in, lists, scratch, footprint, n, depth, 0);
+    return;
+  }
+  if (n < in.count) {
+    scratch.footprints[n] = make_uint2(footprint.x, footprint.y);
+    if (footprint.y != 0) scratch.depths[n] = depth;
+  }
+  const auto count = [&](int tile, int) { atomicAdd(scratch.counters + tile * scratch.counter_stride, 1u); };
+  for_each_small_tile(footprint, in.tile_width, count);
+  uint32_t tiles = uint32_t(footprint.small_count());
+  __syncwarp();  // records of large footprints are written
+  for_each_large(footprint, [&](int owner) {
+    const int of_large = for_each_large_tile(footprint, records, n, owner, in.tile_width, count);
+    if (lane == owner) tiles = uint32_t(of_large);
+  });
+  if (scratch.block_counts == nullptr) return;
+  __shared__ uint32_t warp_sums[32];
+  const uint32_t sum = sum_over_block(tiles, warp_sums).all;
+  if (threadIdx.x == 0) scratch.block_counts[blockIdx.x] = sum;
+}
+
+template <class Coefficient>
+void preprocess_by_degree(const Scene& in, const Lists& lists, const Scratch& scratch, cudaStream_t stream) {
+  constexpr decltype(&preprocess_gaussians<0, Coefficient>) by_degree[] = {
+      preprocess_gaussians<0, Coefficient>, preprocess_gaussians<1, Coefficient>, preprocess_gaussians<2, Coefficient>,
+      preprocess_gaussians<3, Coefficient>, preprocess_gaussians<4, Coefficient>};
+  by_degree[in.sh_degree]<<<blocks_for(in.count, kGaussianThreads), kGaussianThreads, 0, stream>>>(in, lists, scratch);
+}
+
+}  // namespace
+
+void preprocess(const Scene& in, const Lists& lists, const Scratch& scratch, cudaStream_t stream) {
+  if (in.count == 0) return;
+  const auto run = in.half_sh ? preprocess_by_degree<__half> : preprocess_by_degree<float>;
+  run(in, lists, scratch, stream);
+}
+
+}  // namespace gsplat::frame

@@ -1,0 +1,150 @@
+"""The gradient of `render_frame` with respect to raw Gaussians and their deltas, and the same with Adam over the Gaussians.
+
+Formulas of Kerbl et al. 2023, appendix A, with the chain rule through the activations; CUDA only, float32. Neither waits for the
+device, and both can be captured in a CUDA graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_shape
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.frame.view import GAUSSIAN_TENSORS, View, check_inputs
+from gsplat_core.scene.layout import RAW_COLUMNS
+
+if TYPE_CHECKING:
+    from gsplat_core.ops.frame.frame import Frame
+
+RATES = len(GAUSSIAN_TENSORS)
+"""Learning rates of the fused Adam: one for each of `GAUSSIAN_TENSORS`."""
+
+
+class RawGradients(NamedTuple):
+    """Gradients of one frame's raw Gaussians, all zero if the frame's lists overflowed."""
+
+    raw: Tensor
+    """[N, 16] in the layout of `scene.layout`, which is that of the deltas, whose gradient it is too."""
+    sh: Tensor
+    """[N, B, 3]; empty for B = 1, where `raw[:, COLOUR]` is all there is."""
+
+
+class GaussianAdam(NamedTuple):
+    """Adam's state over the Gaussians (Kingma and Ba 2015). Tensors are read on the device, so that a captured graph sees new values."""
+
+    first_moments: Sequence[Tensor]
+    """Five tensors of the Gaussians' shapes, contiguous, each of memory of its own; so are the next ones."""
+    second_moments: Sequence[Tensor]
+    rates: Tensor
+    """float32 [5], the learning rates in the order of the tensors."""
+    step: Tensor
+    """int64 or int32 [1], counted from 1 (less is taken for 1)."""
+    skipped: Tensor
+    """int64 [5]; the rows that were left unchanged are added to it."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    epsilon: float = 1e-8
+
+
+def render_frame_backward(
+    gaussians: Sequence[Tensor],
+    deltas: Tensor | None,
+    view: View,
+    forward: Frame,
+    v_image: Tensor,
+    v_alphas: Tensor | None = None,
+    *,
+    deterministic: bool = True,
+) -> RawGradients:
+    """Gradients of the raw parameters for dL/dimage and dL/dalphas.
+
+    Args:
+        gaussians, deltas, view: as `render_frame` had them.
+        forward: what it returned in FrameMode.TRAINING.
+        v_image: [H, W, 4], dL/d(red, green, blue, sum of w z). v_alphas: [H, W], zero where None.
+        deterministic: the same bits every time. False: sums are taken as the tiles finish, with atomics, in 48 B of scratch memory per
+            Gaussian and not per instance.
+
+    Neither the camera nor the background gets a gradient. Raises InvalidInput for wrong shapes, types or devices.
+    """
+    _check("render_frame_backward", gaussians, deltas, view, v_image, v_alphas)
+    raw, sh = torch.ops.gsplat_core.render_frame_backward(
+        list(gaussians), deltas, *view.tensors, list(forward[1:]), v_image, v_alphas, view.eps2d, view.model_index,
+        deterministic,
+    )  # fmt: skip
+    return RawGradients(raw, sh)
+
+
+def render_frame_backward_adam_(
+    gaussians: Sequence[Tensor],
+    adam: GaussianAdam,
+    deltas: Tensor | None,
+    view: View,
+    forward: Frame,
+    v_image: Tensor,
+    v_alphas: Tensor | None = None,
+    *,
+    needs_raw: bool = True,
+    deterministic: bool = True,
+) -> Tensor | None:
+    """As `render_frame_backward`, and one step of Adam over every Gaussian, in place.
+
+    A Gaussian's row of a tensor stays as it is, moments and all, where its gradient (or the square of it) is not finite. If
+    the frame's lists overflowed, nothing changes.
+
+    Args:
+        gaussians: five contiguous tensors, of memory of their own.
+        needs_raw: whether the raw gradients are wanted.
+
+    Returns the raw gradients [N, 16] for a deformation field, with zeros for a Gaussian that has one that is not finite; None
+    unless `needs_raw`.
+    """
+    _check("render_frame_backward_adam_", gaussians, deltas, view, v_image, v_alphas)
+    _check_adam(gaussians, adam)
+    raw: Tensor = torch.ops.gsplat_core.render_frame_backward_adam_(
+        list(gaussians), list(adam.first_moments), list(adam.second_moments), adam.rates, adam.step, adam.skipped, deltas,
+        *view.tensors, list(forward[1:]), v_image, v_alphas, view.eps2d, view.model_index, *adam.betas, adam.epsilon, needs_raw,
+        deterministic,
+    )  # fmt: skip
+    return raw if needs_raw else None
+
+
+def _check(
+    op: str, gaussians: Sequence[Tensor], deltas: Tensor | None, view: View, v_image: Tensor, v_alphas: Tensor | None
+) -> None:
+    """The ops check the forward results against these sizes."""
+    check_inputs(op, gaussians, deltas, view, v_image=v_image, v_alphas=v_alphas)
+    require_shape("v_image", v_image, (view.height, view.width, 4), "[H, W, 4]")
+    if v_alphas is not None:
+        require_shape("v_alphas", v_alphas, (view.height, view.width), "[H, W]")
+
+
+def _check_adam(gaussians: Sequence[Tensor], adam: GaussianAdam) -> None:
+    for kind, moments in (("first moment", adam.first_moments), ("second moment", adam.second_moments)):
+        if len(moments) != RATES:
+            raise InvalidInput(f"render_frame_backward_adam_ takes {RATES} tensors of {kind}s, got {len(moments)}")
+        for parameter, moment in zip(gaussians, moments, strict=True):
+            require_shape(f"a {kind}", moment, tuple(parameter.shape), "its parameter's shape")
+    require_shape("rates", adam.rates, (RATES,), "one per tensor")
+    require_shape("skipped", adam.skipped, (RATES,), "one per tensor")
+    step, skipped = adam.step, adam.skipped
+    if step.numel() != 1 or step.dtype not in (torch.int32, torch.int64) or skipped.dtype != torch.int64:
+        raise InvalidInput(
+            f"step must be one int32 or int64 and skipped int64, got {step.dtype} {list(step.shape)} and {skipped.dtype}"
+        )
+
+
+@torch.library.register_fake("gsplat_core::render_frame_backward")
+def _backward_fake(gaussians: list[Tensor], *rest: Tensor | float | None) -> tuple[Tensor, Tensor]:
+    means, *_, sh = gaussians
+    return means.new_empty(means.shape[0], RAW_COLUMNS), torch.empty_like(sh) if sh.shape[1] > 1 else sh.new_empty(0)
+
+
+@torch.library.register_fake("gsplat_core::render_frame_backward_adam_")
+def _backward_adam_fake(gaussians: list[Tensor], *rest: Tensor | float | None) -> Tensor:
+    needs_raw = rest[-2]
+    return gaussians[0].new_empty(gaussians[0].shape[0], RAW_COLUMNS) if needs_raw else gaussians[0].new_empty(0)

@@ -1,0 +1,110 @@
+"""Renderers by name: what each can do, what it refuses, and that alpha blending is `render` of the deformed model."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsplat_core import RENDERERS, Camera, InvalidInput, Model, SnapshotSlots, new_renderer, render
+from gsplat_core.deformation import new_field
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.rendering.renderer import Capabilities, FinishedFrame, checked_outputs
+
+CAMERA = Camera.from_focal(40.0, 32, 24)
+WINDOW_S = (1.0, 3.0)
+
+
+@pytest.fixture
+def moving(make_gaussians) -> Model:
+    gaussians = make_gaussians(60)
+    field = new_field("basis", gaussians, WINDOW_S).detached_copy()
+    for parameter in field.parameters():
+        parameter += 0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
+    return Model(1, gaussians, field, CAMERA, WINDOW_S)
+
+
+def assert_equal(output, expected):
+    for name in ("image", "alpha", "depth"):
+        assert torch.equal(getattr(output, name), getattr(expected, name)), name
+
+
+@pytest.mark.parametrize("time_s", [1.0, 2.2, 9.0])
+def test_alpha_is_render_of_the_deformed_model(moving, time_s):
+    background = torch.tensor([0.1, 0.5, 0.9])
+    renderer = new_renderer("alpha", CAMERA, background=background)
+    renderer.prepare(moving)
+    assert_equal(renderer.render(CAMERA, time_s).result(), render(moving.at(time_s), CAMERA, background))
+
+
+def test_a_snapshot_and_the_model_that_it_was_made_from_look_the_same(moving):
+    snapshot = SnapshotSlots("cpu").publish(
+        moving.gaussians, moving.field, version=1, camera=CAMERA, time_window_s=WINDOW_S
+    )
+    renderer = new_renderer("alpha", CAMERA)
+    pictures = []
+    for model in (moving, snapshot):
+        renderer.prepare(model)
+        pictures.append(renderer.render(CAMERA, 2.2).result())
+    assert_equal(*pictures)
+
+
+def test_the_newest_prepared_model_is_shown(moving, make_gaussians):
+    renderer = new_renderer("alpha", CAMERA)
+    other = Model(2, make_gaussians(60, seed=1), None, CAMERA, WINDOW_S)
+    for model in (moving, other, moving):
+        renderer.prepare(model)
+        assert_equal(renderer.render(CAMERA, 2.0).result(), render(model.at(2.0), CAMERA))
+
+
+def test_outputs_are_asked_for_by_name(moving):
+    renderer = new_renderer("alpha", CAMERA)
+    renderer.prepare(moving)
+    frame = renderer.render(CAMERA, 2.0, outputs=["alpha"])
+    assert list(frame.outputs()) == ["image", "alpha"]
+    assert not frame.result().depth.any() and frame.result().alpha.any()
+    with pytest.raises(InvalidSetting, match="'alpha' has no output 'normals'; it has image, alpha, depth"):
+        renderer.render(CAMERA, 2.0, outputs=["depth", "normals"])
+
+
+def test_a_renderer_has_outputs_of_its_own():
+    capabilities = Capabilities(("image", "normals"), {"cpu": ("fp32",)}, differentiable=False, deterministic=True)
+    assert checked_outputs("mine", ["normals"], capabilities) == ("image", "normals")
+    frame = FinishedFrame({"image": torch.ones(2, 3, 3), "normals": torch.ones(2, 3, 3)})
+    assert frame.result().alpha.shape == (2, 3) and not frame.result().alpha.any()
+    with pytest.raises(InvalidSetting, match="has no output 'depth'"):
+        checked_outputs("mine", ["depth"], capabilities)
+
+
+def test_what_a_user_chose_is_refused_with_what_there_is():
+    for arguments, sentence in (
+        (("beta", CAMERA), "unknown renderer 'beta'; known are alpha"),
+        (("alpha", CAMERA, "mps"), "does not run on mps, only on cpu, cuda"),
+    ):
+        with pytest.raises(InvalidSetting, match=sentence):
+            new_renderer(*arguments)
+    with pytest.raises(InvalidSetting, match="does not render in fp16 on cpu, only in fp32"):
+        new_renderer("alpha", CAMERA, precision="fp16")
+    with pytest.raises(InvalidSetting, match="unknown precision 'fp8'"):
+        new_renderer("alpha", CAMERA, precision="fp8")
+
+
+def test_misuse_is_refused(moving):
+    renderer = new_renderer("alpha", CAMERA)
+    with pytest.raises(InvalidInput, match="prepare"):
+        renderer.render(CAMERA, 0.0)
+    renderer.prepare(moving)
+    for camera in (CAMERA.scaled(2), dataclasses.replace(CAMERA, model="fisheye")):
+        with pytest.raises(InvalidInput, match="make another renderer"):
+            renderer.render(camera, 0.0)
+    with pytest.raises(InvalidInput, match=r"background must be \[3\]"):
+        new_renderer("alpha", CAMERA, background=torch.zeros(4))
+    with pytest.raises(InvalidInput, match="nan"):
+        renderer.render(CAMERA, float("nan"))
+
+
+def test_the_registry_says_what_a_renderer_can_do_without_making_one():
+    capabilities = RENDERERS["alpha"].capabilities
+    assert capabilities.outputs == ("image", "alpha", "depth") and capabilities.devices == ("cpu", "cuda")
+    assert capabilities.precisions["cuda"] == ("fp32", "fp16") and capabilities.deterministic
