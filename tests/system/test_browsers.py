@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -56,12 +57,12 @@ def server(finished: Path) -> Iterator[str]:
 def test_the_video_plays_from_the_file(browser: Page, finished: Path) -> None:
     browser.open((finished / "report.html").as_uri())
     browser.evaluate("document.querySelector('video').play()")
-    browser.evaluate(
-        "new Promise(done => { document.querySelector('video').ontimeupdate = e => e.target.currentTime > 0 && done(); })"
-    )
-    state, time_s, width, error = browser.evaluate(STATE)
-    assert error is None
-    assert state >= 2 and time_s > 0 and width > 0
+    end, states = time.monotonic() + 30, []
+    # A frame is there, and time goes on; between two rounds of so short a video the player has none for a moment.
+    while time.monotonic() < end and not any(state >= 2 and time_s > 0 for state, time_s, *_ in states):
+        states.append(browser.evaluate(STATE))
+    assert any(state >= 2 and time_s > 0 and width > 0 for state, time_s, width, _ in states), states[-1]
+    assert all(error is None for *_, error in states)
 
 
 def test_the_first_frame_has_the_colours_of_the_file(browser: Page, finished: Path, server: str) -> None:
