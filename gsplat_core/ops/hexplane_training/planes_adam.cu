@@ -1,15 +1,17 @@
+// Adam over planes and network; or the planes' gradient itself, by the same passes.
+#include "../frame/frame.h"
 #include "cuda_branch.h"
+#include "cuda_scratch.h"
 #include "plane_update.cuh"
 
-using namespace hexplane;
-
+namespace gsplat::hexplane {
 namespace {
 
 __device__ AdamScalars scalars_of(const PlanesAdam& options) {
   const double t = double(*options.step), bias1 = 1 - pow(options.beta1, t), bias2 = 1 - pow(options.beta2, t);
   return {{float(double(*options.rate) / bias1), float(1 / sqrt(bias2)), float(1 - options.beta1), float(1 - options.beta2),
            float(options.epsilon), 1},
-          options.status != nullptr && options.status[2] != 0};
+          options.status != nullptr && options.status[frame::kStatusOverflow] != 0};
 }
 
 __global__ void prepare_scalars(PlanesAdam options, AdamScalars* scalars) { *scalars = scalars_of(options); }
@@ -20,20 +22,20 @@ __global__ void __launch_bounds__(kThreads) update_network(NetworkParameters par
   if (threadIdx.x == 0) scalars = scalars_of(options);
   __syncthreads();
   const int i = int(blockIdx.x) * kThreads + int(threadIdx.x);
-  if (scalars.leave || i >= parameters.starts[parameters.count]) return;
+  if (scalars.skip || i >= parameters.starts[parameters.count]) return;
   int tensor = 0;
   while (i >= parameters.starts[tensor + 1]) ++tensor;
   const int start = parameters.starts[tensor];
-  const PlaneMoments shifted = {parameters.values[tensor] - start, first, second};  // the moments of all tensors are one
+  const PlaneMoments shifted = {parameters.values[tensor] - start, first, second};  // the moments of all tensors are concatenated
   update<1>(
       shifted, i, [&] { return Channels<1>::load(shifted.values + i); }, [&] { return Channels<1>::load(gradient + i); },
       scalars.step);
 }
 
-// A thread has the neighbouring channels of one node.
+// A thread has consecutive channels of one node.
 template <int kLane, class Sink>
 __global__ void __launch_bounds__(kThreads, 5)
-    space_nodes(FieldPlanes planes, FieldCells cells, FieldRows rows, Slots slots, Sink sink) {
+    space_nodes(FieldPlanes planes, FieldCells cells, FieldRows rows, PlaneBlocks slots, Sink sink) {
   const int slot = slot_of_block(slots), level = slot / 3, p = slot % 3, channels = planes.channels;
   const int width = planes.sizes[level][u_axis(p)], height = planes.sizes[level][v_axis(p)];
   const int64_t at = (int64_t(int(blockIdx.x) - slots.first_block[slot]) * kThreads + threadIdx.x) * kLane;
@@ -46,14 +48,14 @@ __global__ void __launch_bounds__(kThreads, 5)
 
 template <int kLane, class Sink>
 __global__ void __launch_bounds__(kThreads) time_nodes(FieldLines lines, const float* __restrict__ line_gradient,
-                                                       const float* time, const int32_t channels, Slots slots, Sink sink) {
+                                                       const float* time, const int32_t channels, PlaneBlocks slots, Sink sink) {
   const int slot = slot_of_block(slots), level = slot / 3, axis = slot % 3;
   const int64_t row_size = int64_t(lines.widths[level][axis]) * channels;
   const int64_t at = (int64_t(int(blockIdx.x) - slots.first_block[slot]) * kThreads + threadIdx.x) * kLane;
   const int row = int(at / row_size), rows = sink.time_rows(level, axis);
   if (row >= rows) return;
   sink.template take<kLane>(level, axis, true, at, [&] {
-    const float share = share_of(position_on(*time, rows), row);
+    const float share = weight_of(position_on(*time, rows), row);
     if (share == 0.0f) return Channels<kLane>::all(0.0f);
     return Channels<kLane>::all(share) * Channels<kLane>::load(line_gradient + lines.starts[level][axis] + at % row_size);
   });
@@ -66,7 +68,7 @@ struct UpdateSink {
   __device__ int time_rows(int level, int axis) const { return state.time_rows[level][axis]; }
   template <int kLane, class Gradient>
   __device__ void take(int level, int p, bool time, int64_t at, const Gradient& gradient) const {
-    if (scalars->leave) return;
+    if (scalars->skip) return;
     const PlaneMoments& plane = time ? state.time[level][p] : state.space[level][p];
     update<kLane>(plane, at, [&] { return Channels<kLane>::load(plane.values + at); }, gradient, scalars->step);
   }
@@ -84,9 +86,9 @@ struct StoreSink {
 
 template <int kLane, class Sink>
 void visit_nodes(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, const FieldRows& rows,
-                 const float* line_gradient, const float* time, const int32_t (&time_rows)[kFieldLevels][3], const Sink& sink,
+                 const float* line_gradient, const float* time, const int32_t (&time_rows)[kMaxFieldLevels][3], const Sink& sink,
                  bool space, bool times, cudaStream_t stream) {
-  Slots slots = {}, time_slots = {};
+  PlaneBlocks slots = {}, time_slots = {};
   slots.count = time_slots.count = 3 * planes.levels;
   for (int slot = 0; slot < slots.count; ++slot) {
     const int level = slot / 3, p = slot % 3;
@@ -107,7 +109,7 @@ void visit_nodes(const FieldPlanes& planes, const FieldLines& lines, const Field
 
 // Whether all planes and rows can be read 16 bytes at a time.
 uintptr_t alignment(const FieldPlanes& planes, const FieldRows& rows, const float* line_gradient) {
-  return uintptr_t(planes.channels) * 4 | uintptr_t(rows.space) | uintptr_t(rows.crowds) | uintptr_t(line_gradient);
+  return uintptr_t(planes.channels) * 4 | uintptr_t(rows.space) | uintptr_t(rows.dense_sums) | uintptr_t(line_gradient);
 }
 
 }  // namespace
@@ -146,3 +148,5 @@ void network_adam(const NetworkParameters& parameters, const float* gradient, fl
   update_network<<<blocks_for(parameters.starts[parameters.count]), kThreads, 0, stream>>>(parameters, gradient, first, second,
                                                                                            options);
 }
+
+}  // namespace gsplat::hexplane

@@ -1,24 +1,26 @@
-// Features in the order in which the matrix units want them: four lanes share a Gaussian and take 16 bytes each of 64 bytes of
-// its features, so that loads are wide and nothing is exchanged between lanes. A warp has 16 Gaussians.
+// Features and network in one kernel. A warp has 16 Gaussians, four lanes each. The four take 16 bytes each of 64 bytes of
+// features, which is the order in which the tensor cores take their operands: loads are wide and nothing is exchanged between
+// lanes.
 #include <type_traits>
 
-#include "field_layers.cuh"
-#include "line_position.h"
-#include "network_cuda.h"
+#include "../hexplane/line_position.h"
+#include "cuda_check.h"
+#include "cuda_scratch.h"
+#include "network_layers.cuh"
 
-using namespace GSPLAT_ISA;
-using namespace hexplane;
-
+namespace gsplat::hexplane {
 namespace {
+
+using namespace GSPLAT_ISA::hexplane;
 
 constexpr int kRowsPerWarp = 16;
 
-// Where a row falls on the three lines of a level. Each of the four lanes of a row works out one axis and tells the others.
+// Where a row falls on the three lines of a level. Each of a row's four lanes computes one axis and shares it by shuffles.
 struct LinePlaces {
   int offset[3];  // of the left node, in items
   float fraction[3];
 
-  // own: of the axis that the lane worked out; group: the row's lanes
+  // own: of the axis that this lane computed; group: the row's lanes
   __device__ LinePlaces(const LinePosition& own, int group, int channels) {
 #pragma unroll
     for (int axis = 0; axis < 3; ++axis) {
@@ -28,21 +30,20 @@ struct LinePlaces {
   }
 };
 
-// Warps of a block, which share the weights, and blocks that a multiprocessor should hold at once, by the registers that the
-// layers need.
+// Warps of a block, which share the weights, and blocks per multiprocessor, by the registers that the layers need.
 constexpr int warps_of(int item, int width) { return item == 2 ? 4 : width == 32 ? 12 : 8; }
 constexpr int blocks_of(int item, int width) {
   return item == 2 ? (width == 32 ? 6 : width == 64 ? 4 : 2) : width == 128 ? 1 : 2;
 }
 
-// kChannels: channels where they are known and every line has two nodes or more; 0: read from the input.
+// kChannels: the number of channels if known at compile time and if every line has two nodes or more; 0: read from the input.
 template <class T, int kWidth, bool kLines, int kChannels>
 __global__ void __launch_bounds__(32 * warps_of(int(sizeof(T)), kWidth), blocks_of(int(sizeof(T)), kWidth))
     deltas_kernel(FieldInput in, FieldNetwork net, const void* packed, float* deltas, float* hidden) {
   extern __shared__ uint4 shared[];
   constexpr int kItem = int(sizeof(T)), kPiece = 16 / kItem, kQuad = 4 * kPiece, kBlocks = kWidth / 8;
   constexpr int kWarps = warps_of(kItem, kWidth);
-  constexpr int kParts = kChannels * kItem % 128 == 0 && kChannels > 0 ? 2 : 1;  // of 64 bytes that are loaded together
+  constexpr int kParts = kChannels * kItem % 128 == 0 && kChannels > 0 ? 2 : 1;  // pieces of 64 bytes that are loaded together
   for (int i = int(threadIdx.x); i < int(net.packed_bytes(kItem) / 16); i += 32 * kWarps)
     copy_16(shared + i, static_cast<const uint4*>(packed) + i);
   const T* weights = reinterpret_cast<const T*>(shared);
@@ -64,9 +65,8 @@ __global__ void __launch_bounds__(32 * warps_of(int(sizeof(T)), kWidth), blocks_
   start_with_bias(sums, biases, place.quad);
   const int stride = net.first_stride(kItem);
   const T* w = weights + place.group * stride + place.quad * kPiece;
-  // Where rows are multiples of 128 bytes, the eight lanes of two neighbouring rows load one row after the other, all of it at
-  // once: a load then touches 4 lines of the cache and not 8, and that is what it takes its time for. They exchange halves
-  // afterwards.
+  // If rows are multiples of 128 bytes, the eight lanes of two adjacent rows load first one row, then the other, 128 bytes at a
+  // time, and exchange halves afterwards: a load then touches 4 cache lines instead of 8, which bounds this kernel.
   const int odd = kParts == 2 ? place.group % 2 : 0;
   const int lane_at = place.quad * kPiece + odd * kQuad;
   for (int level = 0; level < in.levels; ++level) {
@@ -94,7 +94,7 @@ __global__ void __launch_bounds__(32 * warps_of(int(sizeof(T)), kWidth), blocks_
         }
       }
     }
-    constexpr int kAhead = kLines ? 1 : 4;  // without lines a turn is two loads, and several turns' are made together
+    constexpr int kAhead = kLines ? 1 : 4;  // without lines an iteration has only two loads: unroll for more in flight
 #pragma unroll kAhead
     for (int c = 0; c < channels; c += kParts * kQuad, w += kParts * kQuad) {
       Piece<T> value[kParts][2];
@@ -171,7 +171,7 @@ void launch(const FieldInput& in, const FieldNetwork& net, const void* packed, f
   }
   constexpr int kWarps = warps_of(int(sizeof(T)), kWidth);
   const int bytes = int(net.packed_bytes(int(sizeof(T))));
-  cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
+  check_cuda(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes), "reserving shared memory");
   kernel<<<blocks_for(in.count, kRowsPerWarp * kWarps), 32 * kWarps, bytes, stream>>>(in, net, packed, deltas, hidden);
 }
 
@@ -192,3 +192,5 @@ void field_deltas(const FieldInput& in, const FieldNetwork& net, const void* pac
   if (in.count == 0) return;
   (half ? launch_width<__half> : launch_width<float>)(in, net, packed, deltas, hidden, stream);
 }
+
+}  // namespace gsplat::hexplane

@@ -1,8 +1,10 @@
 // The planes of a field as the CUDA ops of its training take them, checked.
 #pragma once
 
-#include "field_arguments.h"
-#include "training_cuda.h"
+#include "../hexplane_deltas/field_arguments.h"
+#include "training.h"
+
+namespace gsplat::hexplane {
 
 using Tensors = std::vector<Tensor>;
 
@@ -15,8 +17,8 @@ struct Field {
   int64_t line_size = 0, features = 0;
 
   Field(const CudaCall& call, Tensors& tensors, int64_t count) {
-    check(!tensors.empty() && tensors.size() % 6 == 0 && tensors.size() / 6 <= size_t(kFieldLevels),
-          "planes must be six per level, 1 to ", kFieldLevels, " levels, got ", tensors.size());
+    check(!tensors.empty() && tensors.size() % 6 == 0 && tensors.size() / 6 <= size_t(kMaxFieldLevels),
+          "planes must be six per level, 1 to ", kMaxFieldLevels, " levels, got ", tensors.size());
     planes.levels = int32_t(tensors.size() / 6);
     planes.channels = int32_t(tensors[0].size(2));
     features = int64_t(planes.levels) * planes.channels;
@@ -48,3 +50,5 @@ struct Field {
           "too many cells or Gaussians for 32-bit places: ", cells.cells, " cells, ", count, " Gaussians");
   }
 };
+
+}  // namespace gsplat::hexplane

@@ -1,19 +1,21 @@
-// The way back through the network: gradients of the layers' sums and of the features, on the matrix units as the way forward.
+// Backward pass of the network on the tensor cores: gradients of the layers' sums and of the features.
 //
-// Which column of a layer a column of the product stands for is free. Here it is so that a lane has four neighbours of each row,
-// at 16 half + 4 quad of 32 columns, and reads and writes 16 bytes everywhere.
+// The assignment of a layer's columns to columns of the product is free. Here a lane has four consecutive ones of each row, at
+// 16 half + 4 quad of 32 columns, and reads and writes 16 bytes everywhere.
+#include "cuda_check.h"
+#include "cuda_scratch.h"
 #include "matrix_units.cuh"
-#include "network_cuda.h"
-#include "training_cuda.h"
+#include "training.h"
 
+namespace gsplat::hexplane {
 namespace {
 
 constexpr int kRowsPerWarp = 16;
 constexpr int kRowsPerBlock = kRowsPerWarp * kThreads / 32;
-constexpr int kFeatureColumns = 64;  // that a warp works out at once
+constexpr int kFeatureColumns = 64;  // that a warp computes at once
 
-// Weights as [outputs, inputs] with 4 floats between rows, and in every 16 rows row 4 a + b at place 4 b + a: the lanes of a
-// warp, whose quads are 4 rows apart, meet in no bank.
+// Weights as [outputs, inputs], rows padded by 4 floats, and in every 16 rows row 4 a + b stored at 4 b + a: the lanes of a warp,
+// whose quads are 4 rows apart, have no bank conflicts.
 struct BackwardLayout {
   int width, features;  // padded
   __device__ __host__ explicit BackwardLayout(const FieldNetwork& net)
@@ -47,7 +49,7 @@ struct Columns {
   __device__ float4 at(int r, int half) const {
     return make_float4(sums[0][2 * r + half], sums[1][2 * r + half], sums[2][2 * r + half], sums[3][2 * r + half]);
   }
-  // Keeps what `outputs`, the layer's own at the same place, let through.
+  // The gradient of ReLU, whose outputs at the same place are `outputs`.
   __device__ void rectify(int r, int half, const float4& outputs) {
     const float out[4] = {outputs.x, outputs.y, outputs.z, outputs.w};
 #pragma unroll
@@ -68,7 +70,7 @@ __device__ __forceinline__ void multiply_rows(Columns (&out)[kOut], const SplitL
   }
 }
 
-// out += in W for 32 of the weights' rows; `w` points to the lane's columns of the quad's first one.
+// out += in W for 32 of the weights' rows; `w` points to the lane's columns of the quad's first row.
 template <int kOut>
 __device__ __forceinline__ void multiply_columns(Columns (&out)[kOut], const Columns& in, const float* w, int stride) {
 #pragma unroll
@@ -124,7 +126,7 @@ __global__ void __launch_bounds__(kThreads, kWidth == 128 ? 1 : 2)
 #pragma unroll
       for (int b = 0; b < kBlocks - 1; ++b) multiply_columns(before, now[b], w + 32 * b * stride, stride);
     }
-    float4 outputs[kBlocks][2][2];  // asked for ahead of the last products; rows that there are not read the last one
+    float4 outputs[kBlocks][2][2];  // loaded ahead of the last products; rows past the end read the last row
 #pragma unroll
     for (int r = 0; r < 2; ++r) {
       const float* row = hidden + (start + (rows[r] < count ? rows[r] : count - 1)) * kWidth + 4 * place.quad;
@@ -165,7 +167,8 @@ template <int kWidth>
 void launch(const FieldNetwork& net, const float* v_raw, const float* hidden, float* v_features, float* v_hidden, float* v_head,
             int64_t count, CudaScratch& scratch, cudaStream_t stream) {
   const int bytes = BackwardLayout(net).floats(net.layers) * int(sizeof(float));
-  cudaFuncSetAttribute(backward_kernel<kWidth>, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
+  check_cuda(cudaFuncSetAttribute(backward_kernel<kWidth>, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes),
+             "reserving shared memory");
   float* packed = scratch.array<float>(BackwardLayout(net).floats(net.layers));
   pack_weights<<<dim3(16, unsigned(net.layers)), kThreads, 0, stream>>>(net, packed);
   backward_kernel<kWidth><<<blocks_for(count, kRowsPerBlock), kThreads, bytes, stream>>>(
@@ -183,3 +186,5 @@ void network_backward(const FieldNetwork& net, const float* v_raw, const float* 
     default: return launch<128>(net, v_raw, hidden, v_features, v_hidden, v_head, count, scratch, stream);
   }
 }
+
+}  // namespace gsplat::hexplane

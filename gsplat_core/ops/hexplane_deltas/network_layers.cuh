@@ -1,12 +1,12 @@
-// Pieces of features and the layers of the network in the registers of a warp that has 16 Gaussians, in float32 or half
-// precision.
+// Layers of the network in the registers of a warp that has 16 Gaussians, in float32 or half precision.
 #pragma once
 
 #include "matrix_units.cuh"
+#include "network.h"
 
-namespace hexplane {
+namespace gsplat::hexplane {
 
-// 16 bytes of features, and what is done to all of them.
+// 16 bytes of features.
 template <class T>
 struct Piece;
 
@@ -41,8 +41,9 @@ struct Piece<__half> {
 
 __device__ __forceinline__ uint32_t bits_of(__half2 x) { return *reinterpret_cast<uint32_t*>(&x); }
 
-// Of the halves of two neighbouring rows, even lanes' groups have the first and odd ones the second. Afterwards `a` and `b` are
-// the first and the second half of the lane's own row: the even one's for even groups, the odd one's for odd groups.
+// Transposes halves of two adjacent rows between lanes: before, the lanes of the even row have the first half of both rows (`a`
+// of the even, `b` of the odd one), those of the odd row the second. Afterwards `a` and `b` are the two halves of the lane's own
+// row.
 template <class T>
 __device__ __forceinline__ void exchange_halves(Piece<T>& a, Piece<T>& b, bool odd) {
 #pragma unroll
@@ -53,7 +54,7 @@ __device__ __forceinline__ void exchange_halves(Piece<T>& a, Piece<T>& b, bool o
   }
 }
 
-// sums[t] += the pieces of two rows times the first layer's weights; `w` points to the lane's place in the row of block 0.
+// sums[t] += the pieces of two rows times the first layer's weights; `w` points to the lane's column in the row of block 0.
 template <int kBlocks>
 __device__ __forceinline__ void first_layer(float (&sums)[kBlocks][4], const Piece<__half> (&x)[2], const __half* w, int stride) {
   const uint32_t a0[4] = {bits_of(x[0].v[0]), bits_of(x[1].v[0]), bits_of(x[0].v[1]), bits_of(x[1].v[1])};
@@ -77,7 +78,7 @@ __device__ __forceinline__ void first_layer(float (&sums)[kBlocks][4], const Pie
   }
 }
 
-// The next layer: its inputs are the sums of the layer before, as they lie in the registers.
+// The next layer. Its inputs are the sums of the previous layer as they are in registers.
 template <int kIn, int kOut>
 __device__ __forceinline__ void next_layer(const float (&in)[kIn][4], float (&sums)[kOut][4], const __half* w, int stride) {
 #pragma unroll
@@ -114,4 +115,4 @@ __device__ __forceinline__ void start_with_bias(float (&sums)[kBlocks][4], const
   }
 }
 
-}  // namespace hexplane
+}  // namespace gsplat::hexplane

@@ -1,17 +1,21 @@
+// Lines from the time planes at one time, and the network packed for shared memory.
 #include <cuda_fp16.h>
 
-#include "line_position.h"
-#include "network_cuda.h"
+#include "../hexplane/line_position.h"
+#include "cuda_scratch.h"
+#include "network.h"
 
-using namespace GSPLAT_ISA;
-
+namespace gsplat::hexplane {
 namespace {
+
+using namespace GSPLAT_ISA::hexplane;
 
 __device__ void put(float* to, int64_t at, float x) { to[at] = x; }
 __device__ void put(__half* to, int64_t at, float x) { to[at] = __float2half_rn(x); }
 
-// The weight at place `at` of the packed network. Behind the first layer the inputs are in the order in which a lane has them in
-// its registers from the layer before: with half pairs of two column blocks of 8 side by side, with float as they are.
+// The weight at index `at` of the packed network. After the first layer, inputs are in the order in which a lane has them in
+// registers from the previous layer: with half, pairs of two column blocks of 8 are interleaved; with float, the order is
+// unchanged.
 template <class T>
 __device__ float packed_weight(const FieldNetwork& net, int at) {
   constexpr int kItem = int(sizeof(T));
@@ -37,7 +41,7 @@ __device__ float packed_bias(const FieldNetwork& net, int at) {
   return output >= 0 && (head || output < net.width) ? net.biases[layer][output] : 0.0f;
 }
 
-// Rows of the grid: one per line, and the last for the network.
+// blockIdx.y is a line, and the last one the network.
 template <class T>
 __global__ void __launch_bounds__(kThreads)
     prepare(FieldTimePlanes planes, FieldInput input, const float* time, FieldNetwork net, void* packed) {
@@ -75,3 +79,5 @@ void prepare_field(const FieldTimePlanes& planes, const FieldInput& input, const
   if (grid.y == 0) return;
   (half ? prepare<__half> : prepare<float>)<<<grid, kThreads, 0, stream>>>(planes, input, time, net, packed);
 }
+
+}  // namespace gsplat::hexplane

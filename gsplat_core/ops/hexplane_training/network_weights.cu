@@ -1,29 +1,30 @@
-// The gradient of the network's weights on the matrix units: outer products of what came back to a layer and what went into it,
-// summed over Gaussians. A block sums a tile of one layer over its share of the Gaussians; the shares are then added in their
-// order.
+// The gradient of the network's weights on the tensor cores: outer products of the gradients of a layer's outputs and its inputs,
+// summed over Gaussians. Split-K: a block sums a tile of one layer over its split of the Gaussians; the partial sums are then
+// added in their order.
+#include "cuda_scratch.h"
 #include "matrix_units.cuh"
-#include "network_cuda.h"
-#include "training_cuda.h"
+#include "training.h"
 
+namespace gsplat::hexplane {
 namespace {
 
-constexpr int kTile = 64;           // outputs, and inputs, of a block: a quarter for each of its warps
+constexpr int kTile = 64;           // outputs, and inputs, of a block, whose four warps have a quarter each
 constexpr int kPart = kTile / 2;    // outputs, and inputs, of a warp
-constexpr int kDeep = 16;           // Gaussians whose values are copied together
-constexpr int kStages = 4;          // of copies, of which the last one is multiplied
-constexpr int kStride = kTile + 8;  // floats: no two lanes meet in a bank
+constexpr int kDeep = 16;           // Gaussians of one stage
+constexpr int kStages = 4;          // in the pipeline of copies, of which the oldest is multiplied
+constexpr int kStride = kTile + 8;  // floats: no bank conflicts
 constexpr int kTileThreads = 128;
-constexpr int kBlocks = 512;  // about what a large GPU holds at once
-constexpr int kMostShares = 128;
+constexpr int kBlocks = 512;  // about as many as are resident on a large GPU
+constexpr int kMaxSplits = 128;
 
 struct LayerTiles {
-  const float *inputs[kFieldLayers], *v_outputs[kFieldLayers];    // [N, input_count], [N, output_count]
-  int32_t input_count[kFieldLayers], output_count[kFieldLayers];  // padded
-  int32_t first_tile[kFieldLayers + 1];
-  int32_t first_value[kFieldLayers + 1];  // of a layer in a share: weights [outputs, inputs], then biases
-  int32_t layers, shares;
+  const float *inputs[kMaxFieldLayers], *v_outputs[kMaxFieldLayers];    // [N, input_count], [N, output_count]
+  int32_t input_count[kMaxFieldLayers], output_count[kMaxFieldLayers];  // padded
+  int32_t first_tile[kMaxFieldLayers + 1];
+  int32_t first_value[kMaxFieldLayers + 1];  // of a layer in a partial sum: weights [outputs, inputs], then biases
+  int32_t layers, splits;
 
-  __device__ int layer_of(const int32_t (&first)[kFieldLayers + 1], int at) const {
+  __device__ int layer_of(const int32_t (&first)[kMaxFieldLayers + 1], int at) const {
     int layer = 0;
     while (at >= first[layer + 1]) ++layer;
     return layer;
@@ -34,8 +35,8 @@ struct Stage {
   float v[kDeep][kStride], x[kDeep][kStride];
 };
 
-// Four neighbouring columns of the lane's Gaussians, `quad` and `quad + 4` of eight. Which output or input a row or column of the
-// product stands for is free, so these 16 bytes are operands of four products.
+// Four consecutive columns of the lane's Gaussians, `quad` and `quad + 4` of eight. The assignment of outputs and inputs to rows
+// and columns of the product is free, so these 16 bytes are operands of four products.
 struct Operand {
   float v[2][4];
 
@@ -48,15 +49,15 @@ struct Operand {
   }
 };
 
-__global__ void __launch_bounds__(kTileThreads, 4) sum_shares(LayerTiles tiles, float* __restrict__ shares, int64_t count) {
+__global__ void __launch_bounds__(kTileThreads, 4) partial_sums(LayerTiles tiles, float* __restrict__ partials, int64_t count) {
   __shared__ __align__(16) Stage stages[kStages];
   const int layer = tiles.layer_of(tiles.first_tile, int(blockIdx.x)), tile = int(blockIdx.x) - tiles.first_tile[layer];
   const int inputs = tiles.input_count[layer], outputs = tiles.output_count[layer], across = (inputs + kTile - 1) / kTile;
   const int first_output = tile / across * kTile, first_input = tile % across * kTile;
-  const int64_t begin = count * blockIdx.y / tiles.shares, end = count * (blockIdx.y + 1) / tiles.shares;
+  const int64_t begin = count * blockIdx.y / tiles.splits, end = count * (blockIdx.y + 1) / tiles.splits;
   const int steps = int((end - begin + kDeep - 1) / kDeep);
 
-  // A thread copies 16 bytes of some rows; what lies outside is zero.
+  // A thread copies 16 bytes of some rows, zeros past the end.
   constexpr int kPieces = kTile / 4, kRows = kTileThreads / kPieces;
   const int row = int(threadIdx.x) / kPieces, column = int(threadIdx.x) % kPieces * 4;
   const bool has_v = first_output + column < outputs, has_x = first_input + column < inputs;
@@ -83,7 +84,7 @@ __global__ void __launch_bounds__(kTileThreads, 4) sum_shares(LayerTiles tiles, 
   }
   for (int step = 0; step < steps; ++step) {
     wait_for_copies<kStages - 2>();
-    __syncthreads();  // the copies of all threads are there, and nobody reads the stage before any more
+    __syncthreads();  // the copies of all threads have arrived, and nobody reads the previous stage any more
     if (step + kStages - 1 < steps) copy(step + kStages - 1);
     commit_copies();
     if (idle) continue;
@@ -103,7 +104,7 @@ __global__ void __launch_bounds__(kTileThreads, 4) sum_shares(LayerTiles tiles, 
   }
   if (idle) return;
 
-  float* to = shares + int64_t(blockIdx.y) * tiles.first_value[tiles.layers] + tiles.first_value[layer];
+  float* to = partials + int64_t(blockIdx.y) * tiles.first_value[tiles.layers] + tiles.first_value[layer];
 #pragma unroll
   for (int i = 0; i < 4; ++i) {
     const int lane_output = first_output + output + 4 * place.group + i;
@@ -121,7 +122,7 @@ __global__ void __launch_bounds__(kTileThreads, 4) sum_shares(LayerTiles tiles, 
   }
 }
 
-// Where the gradient has the value that a share has at `at`, or -1: padding.
+// The index in the gradient of value `at` of a partial sum, or -1: padding.
 __device__ int place_in_gradient(const FieldNetwork& net, const LayerTiles& tiles, int at) {
   const int layer = tiles.layer_of(tiles.first_value, at);
   at -= tiles.first_value[layer];
@@ -136,7 +137,7 @@ __device__ int place_in_gradient(const FieldNetwork& net, const LayerTiles& tile
 }
 
 __global__ void __launch_bounds__(kThreads)
-    add_shares(FieldNetwork net, LayerTiles tiles, const float* __restrict__ shares, float* gradient) {
+    reduce_partials(FieldNetwork net, LayerTiles tiles, const float* __restrict__ partials, float* gradient) {
   constexpr int kParts = 4, kValues = kThreads / kParts;
   __shared__ float partial[kParts][kValues];
   const int value = int(threadIdx.x) % kValues, part = int(threadIdx.x) / kValues;
@@ -144,7 +145,7 @@ __global__ void __launch_bounds__(kThreads)
   float sum = 0.0f;
   if (at < total)
 #pragma unroll 8
-    for (int share = part; share < tiles.shares; share += kParts) sum += shares[int64_t(share) * total + at];
+    for (int split = part; split < tiles.splits; split += kParts) sum += partials[int64_t(split) * total + at];
   partial[part][value] = sum;
   __syncthreads();
   if (part != 0 || at >= total) return;
@@ -170,8 +171,10 @@ void network_weight_gradient(const FieldNetwork& net, const float* features, con
   }
   const int total = tiles.first_value[net.layers];
   const int blocks = tiles.first_tile[net.layers];
-  tiles.shares = blocks * kMostShares < kBlocks ? kMostShares : (kBlocks + blocks - 1) / blocks;
-  float* shares = scratch.array<float>(int64_t(tiles.shares) * total);
-  sum_shares<<<dim3(unsigned(blocks), unsigned(tiles.shares)), kTileThreads, 0, stream>>>(tiles, shares, count);
-  add_shares<<<blocks_for(total, kThreads / 4), kThreads, 0, stream>>>(net, tiles, shares, gradient);
+  tiles.splits = blocks * kMaxSplits < kBlocks ? kMaxSplits : (kBlocks + blocks - 1) / blocks;
+  float* partials = scratch.array<float>(int64_t(tiles.splits) * total);
+  partial_sums<<<dim3(unsigned(blocks), unsigned(tiles.splits)), kTileThreads, 0, stream>>>(tiles, partials, count);
+  reduce_partials<<<blocks_for(total, kThreads / 4), kThreads, 0, stream>>>(net, tiles, partials, gradient);
 }
+
+}  // namespace gsplat::hexplane

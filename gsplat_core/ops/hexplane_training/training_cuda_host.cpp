@@ -1,14 +1,16 @@
+// hexplane_train and its backward pass: checks, memory and the order of the launches.
 #include <tuple>
 
 #include "cuda_branch.h"
-#include "training_arguments.h"
+#include "field_planes.h"
 
+namespace gsplat::hexplane {
 namespace {
 
 FieldNetwork checked_network(const CudaCall& call, Tensors& weights, Tensors& biases, const Field& field) {
   const FieldNetwork net = network_of(call, weights, biases, field.features);
   check(field.planes.channels % 16 == 0 && net.fits(4), "training on CUDA takes a multiple of 16 channels, layers up to 128 ",
-        "wide, and weights that fit into ", kRoomForWeights, " bytes; got ", field.planes.channels, " channels, width ",
+        "wide, and weights that fit into ", kMaxPackedBytes, " bytes; got ", field.planes.channels, " channels, width ",
         net.width, ", ", net.layers, " layers; train with autograd");
   return net;
 }
@@ -44,22 +46,24 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_trai
   lines_only.lines = field.lines, lines_only.levels = field.planes.levels, lines_only.channels = field.planes.channels;
   void* packed = call.bytes(net.packed_bytes(4));
   place_gaussians(data(m), data(b), field.cells, call.stream);
-  CudaBranch branch(call.stream);  // sorting, which only the way back needs
+  CudaBranch branch(call.stream);  // sorting is needed by the backward pass only
   sort_gaussians(field.planes, field.cells, call, branch.stream);
   prepare_field(field.times, lines_only, data(t), &net, packed, false, call.stream);
   field_features(field.planes, field.lines, field.cells, mutable_data(features), call.stream);
   FieldInput in = {};
   in.spaces[0] = data(features), in.count = n, in.levels = 1, in.channels = int32_t(field.features);
   field_deltas(in, net, packed, false, mutable_data(deltas), mutable_data(hidden), call.stream);
-  check_cuda(cudaGetLastError(), "hexplane_train");
+  call.finish("hexplane_train");
   return {deltas, coordinates, lines, features, hidden, order, starts};
 }
 
-// (network gradient, rows [2, slots * N, C], shares, crowds, line gradient); adds the positions' gradient to v_raw.
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tensor v_raw, Tensor box, Tensor coordinates,
-                                                                           Tensor lines, Tensor features, Tensor hidden,
-                                                                           Tensor order, Tensor starts, Tensors planes,
-                                                                           Tensors weights, Tensors biases) {
+// (network gradient, rows [2, slots * N, C], fractions, dense_sums, line gradient); adds the positions' gradient to v_raw.
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tensor v_raw, Tensor box, Tensors state,
+                                                                           Tensors planes, Tensors weights, Tensors biases) {
+  check(state.size() == 6, "hexplane_train_backward: state must be the results of hexplane_train after the deltas, got ",
+        state.size(), " tensors");
+  const Tensor &coordinates = state[0], &lines = state[1], &features = state[2], &hidden = state[3], &order = state[4],
+               &starts = state[5];
   CudaCall call(v_raw);
   const Tensor b = call.floats(box, "box"), x = call.floats(coordinates, "coordinates");
   const Tensor o = call.ints(order, "order"), s = call.ints(starts, "starts");
@@ -78,23 +82,23 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> hexplane_train_backward(Tenso
   int64_t parameters = 0;
   for (size_t i = 0; i < weights.size(); ++i) parameters += weights[i].numel() + biases[i].numel();
   Tensor network_gradient = call.empty({parameters}), rows = call.empty({2, slots * n, field.planes.channels});
-  Tensor shares = call.empty({slots * n, 2});
-  Tensor v_lines = call.empty({field.line_size}), crowds = call.empty({(slots * n + 31) / 32, 5, 4, field.planes.channels});
+  Tensor fractions = call.empty({slots * n, 2});
+  Tensor v_lines = call.empty({field.line_size}), dense_sums = call.empty({(slots * n + 31) / 32, 5, 4, field.planes.channels});
   field.lines.values = const_cast<float*>(data(l));
   set_cells(field.cells, x, o, s);
-  const FieldRows r = {mutable_data(rows), mutable_data(rows) + slots * n * field.planes.channels, mutable_data(shares),
-                       mutable_data(crowds)};
+  const FieldRows r = {mutable_data(rows), mutable_data(rows) + slots * n * field.planes.channels, mutable_data(fractions),
+                       mutable_data(dense_sums)};
   float *v_features = call.array<float>(n * field.features), *v_hidden = call.array<float>(h.numel());
   float* v_head = call.array<float>(n * kRawColumns);
   network_backward(net, data(v_raw), data(h), v_features, v_hidden, v_head, n, call, call.stream);
-  CudaBranch branch(call.stream);  // the network and the lines, beside the space planes
+  CudaBranch branch(call.stream);  // network and lines run beside the space planes
   network_weight_gradient(net, data(f), data(h), v_hidden, v_head, mutable_data(network_gradient), n, call, branch.stream);
   field_rows(field.planes, field.lines, field.cells, data(b), v_features, r, mutable_data(v_raw), call.stream);
   branch.fork();
   line_gradient(field.planes, field.lines, field.cells, r, mutable_data(v_lines), call, branch.stream);
-  sum_crowds(field.planes, field.cells, r, call.stream);
-  check_cuda(cudaGetLastError(), "hexplane_train_backward");
-  return {network_gradient, rows, shares, crowds, v_lines};
+  sum_dense_cells(field.planes, field.cells, r, call.stream);
+  call.finish("hexplane_train_backward");
+  return {network_gradient, rows, fractions, dense_sums, v_lines};
 }
 
 }  // namespace
@@ -103,3 +107,5 @@ STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
   m.impl("hexplane_train", GSPLAT_BOX(&hexplane_train));
   m.impl("hexplane_train_backward", GSPLAT_BOX(&hexplane_train_backward));
 }
+
+}  // namespace gsplat::hexplane

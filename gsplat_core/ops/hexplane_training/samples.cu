@@ -1,12 +1,58 @@
-#include "plane_samples.cuh"
-#include "team_launch.h"
-#include "training_cuda.h"
+// Gaussians sorted by cell, their features, and the gradient rows of their samples.
+#include "../hexplane/plane_samples.cuh"
+#include "cub_device.cuh"
+#include "cuda_check.h"
+#include "cuda_scratch.h"
+#include "training.h"
 
-using namespace hexplane;
-
+namespace gsplat::hexplane {
 namespace {
 
-// A team has one Gaussian at one level.
+__global__ void __launch_bounds__(kThreads)
+    coordinates_of(const float* __restrict__ means, const float* __restrict__ box, float* coordinates, int64_t count) {
+  const int64_t n = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (n >= count) return;
+  float x[3];
+  bool finite = true;
+  for (int axis = 0; axis < 3; ++axis) {
+    const float mean = means[3 * n + axis], low = box[axis], high = box[3 + axis];
+    finite &= isfinite(mean);
+    x[axis] = fminf(fmaxf(2.0f * (mean - low) / (high - low) - 1.0f, -1.0f), 1.0f);
+    finite &= isfinite(x[axis]);
+  }
+  const float4 placed = finite ? make_float4(x[0], x[1], x[2], 1.0f) : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+  *reinterpret_cast<float4*>(coordinates + 4 * n) = placed;
+}
+
+// One thread per item. Counts are integers, so their atomic sums do not depend on the order.
+__global__ void __launch_bounds__(kThreads)
+    cells_of(FieldPlanes planes, FieldCells cells, uint32_t* keys, int32_t* items, int32_t* counts) {
+  const int64_t n = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (n >= cells.count) return;
+  const int slot = int(blockIdx.y), level = slot / 3, p = slot % 3;
+  const int64_t item = slot * cells.count + n;
+  const float* x = cells.coordinates + 4 * n;
+  int64_t key = cells.cells;
+  if (x[3] != 0.0f) {
+    const int major = major_axis(p), minor = minor_axis(p);
+    const int32_t minor_size = planes.sizes[level][minor];
+    key = cells.first[level][p] + position_on(x[major], planes.sizes[level][major]).cell * minor_size +
+          position_on(x[minor], minor_size).cell;
+    atomicAdd(counts + key, 1);
+  }
+  keys[item] = uint32_t(key);
+  items[item] = int32_t(item);
+}
+
+__global__ void __launch_bounds__(kThreads) rank_items(FieldCells cells, int64_t count) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= count) return;
+  cells.ranks[cells.items[i]] = int32_t(i);
+  const uint32_t cell = cells.keys[i];
+  if (cell < cells.cells && cells.starts[cell + 1] - cells.starts[cell] >= kDenseCell) cells.keys[i] = cell | kDenseBit;
+}
+
+// A team of lanes has one Gaussian at one level.
 template <int kLane, int kTeam>
 __global__ void __launch_bounds__(kThreads, 3)
     features_kernel(FieldPlanes planes, FieldLines lines, FieldCells cells, float* __restrict__ features) {
@@ -36,14 +82,15 @@ __global__ void __launch_bounds__(kThreads, 3)
   }
 }
 
-// A team has one Gaussian at all levels, so that the gradient of its position has one sum. Teams take Gaussians in the order of
-// the first plane's cells, where neighbours read the same nodes.
+// A team of lanes has one Gaussian at all levels, so that the gradient of its position is one sum. Teams take Gaussians in the
+// order of the first plane's cells, in which neighbours read the same nodes.
 template <int kLane, int kTeam>
 __global__ void __launch_bounds__(kThreads, 2)
     rows_kernel(FieldPlanes planes, FieldLines lines, FieldCells cells, const float* __restrict__ box,
                 const float* __restrict__ v_features, FieldRows rows, float* v_raw) {
   const int64_t index = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / kTeam;
-  const int64_t item = index < cells.count ? cells.items[index] : cells.count;  // behind the first plane's items come others
+  const int64_t item =
+      index < cells.count ? cells.items[index] : cells.count;  // after the first plane's items come the next plane's
   const bool inside = item < cells.count;
   const int64_t n = inside ? item : 0;  // lanes without a Gaussian take part in the sums
   const int lane = int(threadIdx.x) % kTeam, channels = planes.channels;
@@ -57,7 +104,7 @@ __global__ void __launch_bounds__(kThreads, 2)
     for (int p = 0; p < 3; ++p) ranks[p] = cells.ranks[(3 * level + p) * cells.count + n];
     const int32_t* sizes = planes.sizes[level];
     const LinePosition places[3] = {position_on(at4.x, sizes[0]), position_on(at4.y, sizes[1]), position_on(at4.z, sizes[2])};
-    float v_place[3] = {};  // the gradient of the place in cells
+    float v_place[3] = {};  // gradient of the position in cells
     for (int c = lane * kLane; c < channels; c += kTeam * kLane) {
       const auto v = Channels<kLane>::load(v_features + (n * planes.levels + level) * channels + c);
       Channels<kLane> value[6], along_u[6], along_v[3];
@@ -93,11 +140,11 @@ __global__ void __launch_bounds__(kThreads, 2)
     }
 #pragma unroll
     for (int axis = 0; axis < 3; ++axis) v_x[axis] += v_place[axis] * places[axis].slope;
-    // After the loads of the level, none of which may pass a store.
+    // Stored after all loads of the level, which the compiler may not move across a store.
 #pragma unroll
     for (int p = 0; p < 3; ++p) {
       if (lane != p) continue;
-      *reinterpret_cast<float2*>(rows.shares + 2 * int64_t(ranks[p])) =
+      *reinterpret_cast<float2*>(rows.fractions + 2 * int64_t(ranks[p])) =
           make_float2(places[major_axis(p)].fraction, places[minor_axis(p)].fraction);
     }
   }
@@ -117,6 +164,34 @@ bool wide(const FieldPlanes& planes, const FieldLines& lines) {
 
 }  // namespace
 
+void place_gaussians(const float* means, const float* box, const FieldCells& cells, cudaStream_t stream) {
+  if (cells.count > 0)
+    coordinates_of<<<blocks_for(cells.count), kThreads, 0, stream>>>(means, box, cells.coordinates, cells.count);
+}
+
+void sort_gaussians(const FieldPlanes& planes, const FieldCells& cells, CudaScratch& scratch, cudaStream_t stream) {
+  const int64_t slots = 3 * planes.levels, count = slots * cells.count;
+  if (count == 0) {
+    check_cuda(cudaMemsetAsync(cells.starts, 0, size_t(cells.cells + 1) * sizeof(int32_t), stream), "clearing cell starts");
+    return;
+  }
+  uint32_t* keys = scratch.array<uint32_t>(count);
+  int32_t *items = scratch.array<int32_t>(count), *counts = scratch.array<int32_t>(cells.cells + 1);
+  check_cuda(cudaMemsetAsync(counts, 0, size_t(cells.cells + 1) * sizeof(int32_t), stream), "clearing cell counts");
+  cells_of<<<dim3(blocks_for(cells.count), unsigned(slots)), kThreads, 0, stream>>>(planes, cells, keys, items, counts);
+  size_t size = 0;
+  check_cuda(cub::DeviceScan::ExclusiveSum(nullptr, size, counts, cells.starts, cells.cells + 1, stream), "summing cell counts");
+  check_cuda(cub::DeviceScan::ExclusiveSum(scratch.bytes(size), size, counts, cells.starts, cells.cells + 1, stream),
+             "summing cell counts");
+  const int bits = bits_below(cells.cells + 1);
+  check_cuda(cub::DeviceRadixSort::SortPairs(nullptr, size, keys, cells.keys, items, cells.items, count, 0, bits, stream),
+             "sorting Gaussians by cell");
+  check_cuda(
+      cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, keys, cells.keys, items, cells.items, count, 0, bits, stream),
+      "sorting Gaussians by cell");
+  rank_items<<<blocks_for(count), kThreads, 0, stream>>>(cells, count);
+}
+
 void field_features(const FieldPlanes& planes, const FieldLines& lines, const FieldCells& cells, float* features,
                     cudaStream_t stream) {
   if (cells.count == 0) return;
@@ -134,3 +209,5 @@ void field_rows(const FieldPlanes& planes, const FieldLines& lines, const FieldC
         <<<blocks_for(cells.count * team()), kThreads, 0, stream>>>(planes, lines, cells, box, v_features, rows, v_raw);
   });
 }
+
+}  // namespace gsplat::hexplane

@@ -1,13 +1,14 @@
-// From the tensors of a field to what its CUDA kernels take, checked; shared by the ops of inference and of training.
+// From the tensors of a field to what its CUDA kernels take, checked; shared by inference and training.
 #pragma once
 
 #include <vector>
 
 #include "cuda_call.h"
-#include "network_cuda.h"
+#include "network.h"
 
-// Contiguous float32 on the call's device and aligned to 16 bytes, as the kernels' wide loads need it; a view that is not is
-// copied.
+namespace gsplat::hexplane {
+
+// Contiguous float32 on the call's device, aligned to 16 bytes for the kernels' wide loads; a view that is not aligned is copied.
 inline Tensor aligned_floats(const CudaCall& call, const Tensor& t, const char* name) {
   const Tensor c = call.floats(t, name);
   return reinterpret_cast<uintptr_t>(c.const_data_ptr()) % 16 == 0 ? c : torch::stable::clone(c);
@@ -16,8 +17,8 @@ inline Tensor aligned_floats(const CudaCall& call, const Tensor& t, const char* 
 // The network's layers; the tensors are made contiguous in place, and must outlive the result.
 inline FieldNetwork network_of(const CudaCall& call, std::vector<Tensor>& weights, std::vector<Tensor>& biases,
                                int64_t features) {
-  check(weights.size() >= 2 && weights.size() <= size_t(kFieldLayers) && weights.size() == biases.size(),
-        "the network must have 2 to ", kFieldLayers, " layers with a bias each, got ", weights.size(), " weights and ",
+  check(weights.size() >= 2 && weights.size() <= size_t(kMaxFieldLayers) && weights.size() == biases.size(),
+        "the network must have 2 to ", kMaxFieldLayers, " layers with a bias each, got ", weights.size(), " weights and ",
         biases.size(), " biases");
   FieldNetwork net = {};
   net.layers = int32_t(weights.size());
@@ -52,3 +53,5 @@ inline int64_t lines_of(const CudaCall& call, std::vector<Tensor>& planes, int64
   }
   return size;
 }
+
+}  // namespace gsplat::hexplane

@@ -1,25 +1,25 @@
 // Adam over the planes with penalties, whose gradients need the old values of a node's neighbours while the plane is updated in
 // place.
 //
-// Space planes: a block has a tile of nodes and goes down its rows. It keeps the old row above and the old current row, which its
-// threads show each other in shared memory; neighbours in other tiles are read from copies of all tiles' borders that a first
-// pass made, so that no block depends on how far another one is. Time planes: a thread goes along time, where all its neighbours
-// are its own.
+// Space planes: a block has a tile of nodes and goes down its rows. It keeps the old previous row and the old current row, which
+// its threads exchange in shared memory. Neighbours in other tiles are read from copies of all tiles' borders that a first pass
+// made, so blocks do not depend on each other's progress. Time planes: a thread goes along time, where all its neighbours are its
+// own.
+#include "cuda_scratch.h"
 #include "plane_update.cuh"
 
-using namespace hexplane;
-
+namespace gsplat::hexplane {
 namespace {
 
 constexpr int kTileThreads = 512, kTileRows = 32;
 
 // The tiles of all space planes; borders are copies of rows and columns beside the boundaries between tiles.
 struct Tiles {
-  Slots blocks;
-  int32_t nodes;                      // of a tile along U
-  int32_t across[3 * kFieldLevels];   // tiles along U
-  int64_t rows[3 * kFieldLevels];     // in `borders`: [tiles along V + 1, 2, U * C], above and below a boundary
-  int64_t columns[3 * kFieldLevels];  // [tiles along U + 1, 2, V, C], left and right of it
+  PlaneBlocks blocks;
+  int32_t nodes;                         // of a tile along U
+  int32_t across[3 * kMaxFieldLevels];   // tiles along U
+  int64_t rows[3 * kMaxFieldLevels];     // in `borders`: [tiles along V + 1, 2, U * C], above and below a boundary
+  int64_t columns[3 * kMaxFieldLevels];  // [tiles along U + 1, 2, V, C], left and right of it
   float* borders;
 };
 
@@ -71,8 +71,8 @@ template <int kLane>
 __global__ void __launch_bounds__(kTileThreads, 2)
     space_tiles(FieldPlanes planes, FieldCells cells, FieldRows rows, PlanesState state, Tiles tiles, float smoothness,
                 const AdamScalars* scalars) {
-  __shared__ float shown[2][kTileThreads * kLane];
-  if (scalars->leave) return;
+  __shared__ float row_values[2][kTileThreads * kLane];
+  if (scalars->skip) return;
   const Tile tile(planes, tiles, kLane);
   const AdamStep step = scalars->step;
   const int channels = planes.channels, width = tile.width, height = tile.height;
@@ -87,8 +87,8 @@ __global__ void __launch_bounds__(kTileThreads, 2)
     above = tile.row > 0 ? Channels<kLane>::load(tile.border_row(tiles, tile.row, 0, channels)) : current;
   }
   for (int v = tile.first_v; v < tile.end_v; ++v) {
-    float* show = shown[v % 2];  // two, so that one barrier a row is enough
-    current.store(show + threadIdx.x * kLane);
+    float* row_now = row_values[v % 2];  // two buffers, so that one barrier per row is enough
+    current.store(row_now + threadIdx.x * kLane);
     __syncthreads();
     if (!tile.inside) continue;
     Channels<kLane> below = current, left = current, right = current;
@@ -98,12 +98,12 @@ __global__ void __launch_bounds__(kTileThreads, 2)
       below = Channels<kLane>::load(tile.border_row(tiles, tile.row + 1, 1, channels));
     }
     if (tile.u > tile.first_u) {
-      left = Channels<kLane>::load(show + threadIdx.x * kLane - channels);
+      left = Channels<kLane>::load(row_now + threadIdx.x * kLane - channels);
     } else if (tile.u > 0) {
       left = Channels<kLane>::load(tile.border_column(tiles, tile.column, 0, v, channels));
     }
     if (tile.u + 1 < tile.end_u) {
-      right = Channels<kLane>::load(show + threadIdx.x * kLane + channels);
+      right = Channels<kLane>::load(row_now + threadIdx.x * kLane + channels);
     } else if (tile.u + 1 < width) {
       right = Channels<kLane>::load(tile.border_column(tiles, tile.column + 1, 1, v, channels));
     }
@@ -118,9 +118,9 @@ __global__ void __launch_bounds__(kTileThreads, 2)
 
 template <int kLane>
 __global__ void __launch_bounds__(kThreads)
-    time_columns(FieldLines lines, const float* __restrict__ line_gradient, const float* time, int32_t channels, Slots slots,
-                 PlanesState state, float smoothness, float sparsity, const AdamScalars* scalars) {
-  if (scalars->leave) return;
+    time_columns(FieldLines lines, const float* __restrict__ line_gradient, const float* time, int32_t channels,
+                 PlaneBlocks slots, PlanesState state, float smoothness, float sparsity, const AdamScalars* scalars) {
+  if (scalars->skip) return;
   const int slot = slot_of_block(slots), level = slot / 3, axis = slot % 3, rows = state.time_rows[level][axis];
   const int64_t size = int64_t(lines.widths[level][axis]) * channels;
   const int64_t column = (int64_t(int(blockIdx.x) - slots.first_block[slot]) * kThreads + threadIdx.x) * kLane;
@@ -132,14 +132,14 @@ __global__ void __launch_bounds__(kThreads)
   const float bend = rows > 2 ? 2.0f * smoothness / (float(rows - 2) * float(size)) : 0.0f;
   const float away = sparsity / (float(rows) * float(size));
   const auto old = [&](int v) { return Channels<kLane>::load(plane.values + (v < rows ? v : rows - 1) * size + column); };
-  // bends[i]: second difference at rows v - 2 + i; 0 where it would leave the plane
+  // bends[i]: second difference at rows v - 2 + i; 0 where it would skip the plane
   Channels<kLane> bends[3] = {Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f), Channels<kLane>::all(0.0f)};
   Channels<kLane> window[3] = {old(0), old(1), old(2)};  // old values of rows v, v + 1, v + 2
 #pragma unroll 2
   for (int v = 0; v < rows; ++v) {
     const Channels<kLane> next = old(v + 3);
     bends[2] = v + 2 < rows ? (window[0] - window[1]) - (window[1] - window[2]) : Channels<kLane>::all(0.0f);
-    Channels<kLane> gradient = Channels<kLane>::all(share_of(now, v)) * v_line;
+    Channels<kLane> gradient = Channels<kLane>::all(weight_of(now, v)) * v_line;
     gradient = plus(gradient, bend, (bends[2] - bends[1]) - (bends[1] - bends[0]));
 #pragma unroll
     for (int i = 0; i < kLane; ++i) {
@@ -185,7 +185,7 @@ void smooth_space(const FieldPlanes& planes, const FieldCells& cells, const Fiel
 template <int kLane>
 void smooth_time(const FieldPlanes& planes, const FieldLines& lines, const float* line_gradient, const float* time,
                  const PlanesState& state, const PlanePenalties& penalties, const AdamScalars* scalars, cudaStream_t stream) {
-  Slots slots = {};
+  PlaneBlocks slots = {};
   slots.count = 3 * planes.levels;
   for (int slot = 0; slot < slots.count; ++slot)
     slots.first_block[slot + 1] =
@@ -209,3 +209,5 @@ void smooth_time_planes(const FieldPlanes& planes, const FieldLines& lines, cons
                         cudaStream_t stream) {
   smooth_time<1>(planes, lines, line_gradient, time, state, penalties, scalars, stream);
 }
+
+}  // namespace gsplat::hexplane

@@ -1,18 +1,17 @@
-// Sums of rows that many Gaussians share. The gradient of the lines: the Gaussians of a line's cell lie together in the order of
-// the plane that has the axis as its major. And the sums of the crowded cells of the space planes.
+// Sums of gradient rows over many Gaussians: the gradient of the lines, where the Gaussians of a line's cell are contiguous in
+// the order of the plane that has the axis as its major; and the sums of dense cells of the space planes.
+#include "cuda_scratch.h"
 #include "plane_update.cuh"
-#include "team_launch.h"
 
-using namespace hexplane;
-
+namespace gsplat::hexplane {
 namespace {
 
-constexpr int kRun = 32;        // sorted Gaussians that a team goes through
-constexpr int kRunBatch = 8;    // of them on their way at once
-constexpr int kCrowdBatch = 4;  // the same of the planes, which have four sums
+constexpr int kRun = 32;        // sorted Gaussians of one team
+constexpr int kRunBatch = 8;    // of their rows in flight
+constexpr int kDenseBatch = 4;  // the same for dense cells, which have four sums
 
-// One line's Gaussians, and where their sums go: those of run r that are in cell c at place r + c, which no other run and cell
-// have, because from one item to the next either may only grow.
+// One line's Gaussians, and where their sums go: those of run r in cell c go to index r + c, which no other run and cell have,
+// because neither decreases from one item to the next.
 struct LineRuns {
   int32_t begin, end, minor_size, width;
   float* sums;  // [runs + cells, 2, C]: for the left node, for the right one
@@ -36,7 +35,7 @@ __global__ void __launch_bounds__(kThreads) sum_runs(FieldPlanes planes, FieldCe
   const int32_t begin = line.begin + run * kRun, end = min(begin + kRun, line.end);
   if (begin >= end) return;
   const int level = slot / 3, axis = slot % 3;
-  SortedCells sorted = {nullptr, rows.space, rows.shares, nullptr, 0};
+  SortedCells sorted = {nullptr, rows.space, rows.fractions, nullptr, 0};
   sorted.rows = rows.lines;
   const int64_t first_cell = cells.first[level][plane_of_major(axis)];
   for (int c = int(threadIdx.x) % kTeam * kLane; c < channels; c += kTeam * kLane) {
@@ -59,7 +58,7 @@ __global__ void __launch_bounds__(kThreads) sum_runs(FieldPlanes planes, FieldCe
   }
 }
 
-// A block adds up one node's runs: those of its cell for its left node, and those of the cell before for its right one.
+// A block adds up the runs of one node: of the cell on its right, whose left node it is, and of the cell on its left.
 template <int kLane, int kTeam>
 __global__ void __launch_bounds__(kThreads)
     add_runs(FieldPlanes planes, FieldLines lines, FieldCells cells, int runs, float* all, float* gradient) {
@@ -94,40 +93,41 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// A team goes through one run and adds up the rows that are in crowded cells, cell by cell, for the cells' four corners.
+// A team goes through one run and sums the rows of dense cells, cell by cell, for the cells' four corners.
 template <int kLane, int kTeam>
-__global__ void __launch_bounds__(kThreads) sum_crowds_kernel(FieldCells cells, FieldRows rows, int channels, int runs) {
+__global__ void __launch_bounds__(kThreads) dense_cell_sums(FieldCells cells, FieldRows rows, int channels, int runs) {
   const int run = (int(blockIdx.x) * kThreads + int(threadIdx.x)) / kTeam;
   if (run >= runs) return;
-  const int32_t begin = run * kCrowdRun, end = min(begin + kCrowdRun, cells.starts[cells.cells]);  // behind: those without part
+  const int32_t begin = run * kDenseRun,
+                end = min(begin + kDenseRun, cells.starts[cells.cells]);  // after these come Gaussians that are left out
   for (int c = int(threadIdx.x) % kTeam * kLane; c < channels; c += kTeam * kLane) {
     Channels<kLane> sums[4];
     uint32_t now = 0;
     int64_t place = 0;
     const auto flush = [&] {
 #pragma unroll
-      for (int corner = 0; corner < 4; ++corner) sums[corner].store(rows.crowds + (place + corner) * channels + c);
+      for (int corner = 0; corner < 4; ++corner) sums[corner].store(rows.dense_sums + (place + corner) * channels + c);
     };
-    for (int32_t i = begin; i < end; i += kCrowdBatch) {
-      uint32_t key[kCrowdBatch];
-      Channels<kLane> row[kCrowdBatch];
-      float2 share[kCrowdBatch];
+    for (int32_t i = begin; i < end; i += kDenseBatch) {
+      uint32_t key[kDenseBatch];
+      Channels<kLane> row[kDenseBatch];
+      float2 share[kDenseBatch];
 #pragma unroll
-      for (int k = 0; k < kCrowdBatch; ++k) key[k] = i + k < end ? cells.keys[i + k] : 0;
+      for (int k = 0; k < kDenseBatch; ++k) key[k] = i + k < end ? cells.keys[i + k] : 0;
 #pragma unroll
-      for (int k = 0; k < kCrowdBatch; ++k) {
-        if (!is_crowded(key[k])) continue;
+      for (int k = 0; k < kDenseBatch; ++k) {
+        if (!is_dense(key[k])) continue;
         row[k] = Channels<kLane>::load(rows.space + int64_t(i + k) * channels + c);
-        share[k] = *reinterpret_cast<const float2*>(rows.shares + 2 * int64_t(i + k));
+        share[k] = *reinterpret_cast<const float2*>(rows.fractions + 2 * int64_t(i + k));
       }
 #pragma unroll
-      for (int k = 0; k < kCrowdBatch; ++k) {
-        if (!is_crowded(key[k])) continue;
+      for (int k = 0; k < kDenseBatch; ++k) {
+        if (!is_dense(key[k])) continue;
         if (key[k] != now) {
           if (now != 0) flush();
           now = key[k];
           const bool begins = i + k > begin || begin == 0 || cells.keys[begin - 1] != now;
-          place = crowd_place(run, begins, i + k, 0);
+          place = dense_place(run, begins, i + k, 0);
 #pragma unroll
           for (int corner = 0; corner < 4; ++corner) sums[corner] = Channels<kLane>::all(0.0f);
         }
@@ -143,11 +143,11 @@ __global__ void __launch_bounds__(kThreads) sum_crowds_kernel(FieldCells cells, 
 
 }  // namespace
 
-void sum_crowds(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows, cudaStream_t stream) {
-  const int runs = int(blocks_for(3 * planes.levels * cells.count, kCrowdRun));
+void sum_dense_cells(const FieldPlanes& planes, const FieldCells& cells, const FieldRows& rows, cudaStream_t stream) {
+  const int runs = int(blocks_for(3 * planes.levels * cells.count, kDenseRun));
   if (runs == 0) return;
   with_wide_team(planes.channels, [&](auto lane, auto team) {
-    sum_crowds_kernel<lane(), team()>
+    dense_cell_sums<lane(), team()>
         <<<blocks_for(int64_t(runs) * team()), kThreads, 0, stream>>>(cells, rows, planes.channels, runs);
   });
 }
@@ -171,3 +171,5 @@ void line_gradient(const FieldPlanes& planes, const FieldLines& lines, const Fie
         <<<dim3(unsigned(widest), unsigned(slots)), kThreads, 0, stream>>>(planes, lines, cells, runs, sums, gradient);
   });
 }
+
+}  // namespace gsplat::hexplane

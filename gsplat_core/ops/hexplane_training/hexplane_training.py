@@ -2,11 +2,11 @@
 
     state = hexplane_train(means, box, time, planes, weights, biases)           # state.deltas into the frame
     gradient = hexplane_train_backward(v_raw, box, state, planes, weights, biases)
-    hexplane_planes_adam_(planes, first, second, time, gradient, rate, step, ...)
+    hexplane_planes_adam_(planes, first, second, time, gradient, adam)
 
 Nothing waits for the host and every call can be captured in a CUDA graph; time, rate and step are read from device memory. The same
-inputs give the same bits: no sum is made by atomic additions. The gradient of the planes stays factored, one row per Gaussian, level
-and plane, until the pass that updates the planes adds up each node's rows; `hexplane_planes_gradient` gives it as tensors.
+inputs give the same bits: no sum is made by atomic additions. The gradient of the planes stays factored, one gradient row per Gaussian,
+level and plane, until the pass that updates the planes adds up each node's rows; `hexplane_planes_gradient` gives it as tensors.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.ops.hexplane.deltas import padded_width
+from gsplat_core.ops.hexplane_deltas.hexplane_deltas import padded_width
 from gsplat_core.scene.layout import RAW_COLUMNS
 
 
@@ -27,18 +27,18 @@ class TrainingState(NamedTuple):
     """What the forward pass leaves for the backward pass."""
 
     deltas: Tensor
-    """[N, 16] in the columns of the frame path."""
+    """[N, 16] in the layout of `scene.layout`."""
     coordinates: Tensor
-    """[N, 4]: x, y, z in [-1, 1], and 1; a Gaussian whose position is not finite has zeros and takes no part."""
+    """[N, 4]: x, y, z in [-1, 1], and 1; a Gaussian whose position is not finite has zeros and is left out."""
     lines: Tensor
-    """The time planes at the time, one after the other: [U, C] each."""
+    """The time planes interpolated at the time, [U, C] each, concatenated."""
     features: Tensor
     """[N, levels * C]."""
     hidden: Tensor
-    """[depth, N, padded width]: what leaves each layer of the trunk, and zeros beside it."""
+    """[depth, N, padded width]: the outputs of each layer of the trunk, padded with zeros."""
     order: Tensor
-    """int32 [3, 3 * levels * N]: items (plane after plane, Gaussian after Gaussian) by the cell of the plane, the place of each item
-    among these, and the cells in this order, with their highest bit set where they have 8 items or more."""
+    """int32 [3, 3 * levels * N]: items (plane after plane, Gaussian after Gaussian) sorted by the cell of the plane; the index of each
+    item among the sorted ones; and the cells of the sorted items, with their highest bit set if they have 8 items or more (dense)."""
     starts: Tensor
     """int32 [cells + 1]: where each cell's items start."""
 
@@ -47,18 +47,41 @@ class FieldGradient(NamedTuple):
     """The gradient of a field, that of its planes factored."""
 
     network: Tensor
-    """Weight and bias of every layer, one after the other."""
+    """Weight and bias of every layer, concatenated."""
     rows: Tensor
     """[2, 3 * levels * N, C]: gradients of the samples of the space planes (xy, xz, yz of every level) and of the lines of their major
     axes (y, x, z), sorted by the cell of the plane."""
-    shares: Tensor
-    """[3 * levels * N, 2]: fractions of the way to the next node along the major and the minor axis, in the same order."""
-    crowds: Tensor
-    """[3 * levels * N / 32, 5, 4, C]: of 32 sorted rows each, sums for the four corners of those cells that have 8 rows or more."""
+    fractions: Tensor
+    """[3 * levels * N, 2]: of the way to the next node along the major and the minor axis, in the same order."""
+    dense_sums: Tensor
+    """[3 * levels * N / 32, 5, 4, C]: of each run of 32 sorted rows, sums of the dense cells' rows for the four corners of the cell."""
     v_lines: Tensor
     """The gradient of the lines."""
     starts: Tensor
     """int32 [cells + 1]: where each cell's rows start."""
+
+    @property
+    def of_planes(self) -> list[Tensor]:
+        """All but the network's, as the ops over the planes take it."""
+        return list(self[1:])
+
+
+class AdamOnDevice(NamedTuple):
+    """Adam's settings of one step, read from device memory (Kingma and Ba 2015, algorithm 1)."""
+
+    rate: Tensor
+    """float32 [1], the learning rate."""
+    step: Tensor
+    """int64 [1], counted from 1."""
+    status: Tensor | None = None
+    """int32 [4] of a frame; if its lists overflowed nothing is changed."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    epsilon: float = 1e-8
+
+    @property
+    def arguments(self) -> tuple[Tensor | float | None, ...]:
+        """In the order in which the ops take them."""
+        return self.rate, self.step, self.status, *self.betas, self.epsilon
 
 
 class Penalties(NamedTuple):
@@ -77,7 +100,7 @@ def hexplane_train(
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
 ) -> TrainingState:
-    """The field's deltas at `time`, with what the way back needs.
+    """The field's deltas at `time`, with what the backward pass needs.
 
     Args:
         means: canonical positions [N, 3]; outside the box they are clamped to it.
@@ -102,28 +125,20 @@ def hexplane_train_backward(
     weights: Sequence[Tensor],
     biases: Sequence[Tensor],
 ) -> FieldGradient:
-    """Gradients for dL/d(deltas) `v_raw` [N, 16]; what goes back to the positions through the field is added to its first 3 columns.
+    """Gradients for dL/d(deltas) `v_raw` [N, 16], to whose first 3 columns the gradient of the positions through the field is added.
 
     A row of `v_raw` that is not finite counts as zero.
     """
     _check(v_raw, box, *planes, *weights, *biases)
-    network, rows, shares, crowds, v_lines = torch.ops.gsplat_core.hexplane_train_backward(
-        v_raw, box, *state[1:], list(planes), list(weights), list(biases)
+    network, rows, fractions, dense_sums, v_lines = torch.ops.gsplat_core.hexplane_train_backward(
+        v_raw, box, list(state[1:]), list(planes), list(weights), list(biases)
     )
-    return FieldGradient(network, rows, shares, crowds, v_lines, state.starts)
+    return FieldGradient(network, rows, fractions, dense_sums, v_lines, state.starts)
 
 
 def hexplane_planes_gradient(time: Tensor, gradient: FieldGradient, planes: Sequence[Tensor]) -> list[Tensor]:
     """The gradient of every plane as a tensor of its size."""
-    return torch.ops.gsplat_core.hexplane_planes_gradient(
-        time,
-        gradient.rows,
-        gradient.shares,
-        gradient.crowds,
-        gradient.starts,
-        gradient.v_lines,
-        list(planes),
-    )
+    return torch.ops.gsplat_core.hexplane_planes_gradient(time, gradient.of_planes, list(planes))
 
 
 def hexplane_planes_adam_(
@@ -132,49 +147,32 @@ def hexplane_planes_adam_(
     second: Sequence[Tensor],
     time: Tensor,
     gradient: FieldGradient,
-    rate: Tensor,
-    step: Tensor,
-    *,
-    status: Tensor | None = None,
+    adam: AdamOnDevice,
     penalties: Penalties = Penalties(),
-    betas: tuple[float, float] = (0.9, 0.999),
-    epsilon: float = 1e-8,
 ) -> None:
     """One step of Adam over all planes in place, gradients and penalties computed in the same pass.
 
-    A value whose gradient is not finite, and its moments, are left alone.
+    A value whose gradient is not finite, and its moments, stay unchanged.
 
     Args:
         first, second: moments of the planes' shapes.
-        rate: float32 [1]. step: int64 [1], counts from 1.
-        status: int32 [4] of a frame; where status[2] is not 0 (its lists were cut) nothing is changed.
     """
-    _check(*planes, *first, *second, rate)
+    _check(*planes, *first, *second, adam.rate)
     torch.ops.gsplat_core.hexplane_planes_adam_(
-        list(planes), list(first), list(second), time, gradient.rows, gradient.shares, gradient.crowds, gradient.starts,
-        gradient.v_lines, rate, step, status, *betas, epsilon, *penalties,
-    )  # fmt: skip
+        list(planes), list(first), list(second), time, gradient.of_planes, *adam.arguments, *penalties
+    )
 
 
 def network_adam_(
-    parameters: Sequence[Tensor],
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    rate: Tensor,
-    step: Tensor,
-    *,
-    status: Tensor | None = None,
-    betas: tuple[float, float] = (0.9, 0.999),
-    epsilon: float = 1e-8,
+    parameters: Sequence[Tensor], gradient: Tensor, first: Tensor, second: Tensor, adam: AdamOnDevice
 ) -> None:
     """One step of Adam over a network's small tensors in one launch, in place; as `hexplane_planes_adam_` otherwise.
 
     Args:
-        parameters: weight and bias of every layer; `gradient`, `first` and `second` have their values one after the other.
+        parameters: weight and bias of every layer; `gradient`, `first` and `second` have their values concatenated.
     """
-    _check(*parameters, gradient, first, second, rate)
-    torch.ops.gsplat_core.network_adam_(list(parameters), gradient, first, second, rate, step, status, *betas, epsilon)
+    _check(*parameters, gradient, first, second, adam.rate)
+    torch.ops.gsplat_core.network_adam_(list(parameters), gradient, first, second, *adam.arguments)
 
 
 def _check(*tensors: Tensor) -> None:
@@ -214,12 +212,7 @@ def _(
 def _(
     v_raw: Tensor,
     box: Tensor,
-    coordinates: Tensor,
-    lines: Tensor,
-    features: Tensor,
-    hidden: Tensor,
-    order: Tensor,
-    starts: Tensor,
+    state: list[Tensor],
     planes: list[Tensor],
     weights: list[Tensor],
     biases: list[Tensor],
@@ -235,53 +228,15 @@ def _(
 
 
 @torch.library.register_fake("gsplat_core::hexplane_planes_gradient")
-def _(
-    time: Tensor,
-    rows: Tensor,
-    shares: Tensor,
-    crowds: Tensor,
-    starts: Tensor,
-    v_lines: Tensor,
-    planes: list[Tensor],
-) -> list[Tensor]:
+def _(time: Tensor, gradient: list[Tensor], planes: list[Tensor]) -> list[Tensor]:
     return [plane.new_empty(plane.shape) for plane in planes]
 
 
 @torch.library.register_fake("gsplat_core::hexplane_planes_adam_")
-def _(
-    planes: list[Tensor],
-    first: list[Tensor],
-    second: list[Tensor],
-    time: Tensor,
-    rows: Tensor,
-    shares: Tensor,
-    crowds: Tensor,
-    starts: Tensor,
-    v_lines: Tensor,
-    rate: Tensor,
-    step: Tensor,
-    status: Tensor | None,
-    beta1: float,
-    beta2: float,
-    epsilon: float,
-    smoothness: float,
-    time_smoothness: float,
-    sparsity: float,
-) -> None:
+def _(planes: list[Tensor], *rest: object) -> None:
     return None
 
 
 @torch.library.register_fake("gsplat_core::network_adam_")
-def _(
-    parameters: list[Tensor],
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    rate: Tensor,
-    step: Tensor,
-    status: Tensor | None,
-    beta1: float,
-    beta2: float,
-    epsilon: float,
-) -> None:
+def _(parameters: list[Tensor], *rest: object) -> None:
     return None

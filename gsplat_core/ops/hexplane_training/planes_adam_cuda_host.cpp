@@ -1,38 +1,38 @@
-#include <optional>
+// The planes' gradient, and Adam over planes and network: checks and launches.
+#include "field_planes.h"
 
-#include "planes_adam_cuda.h"
-#include "training_arguments.h"
-
+namespace gsplat::hexplane {
 namespace {
 
-// N, by the rows of all slots, three per six planes.
-int64_t gaussians_of(const Tensor& rows, const Tensors& planes) {
-  check(rows.dim() == 3 && planes.size() >= 6, "rows must be [2, items, C], and planes six per level");
-  return rows.size(1) / int64_t(planes.size() / 2);
+// N, from the rows of all slots, three per six planes.
+int64_t count_of(const Tensors& gradient, const Tensors& planes) {
+  check(gradient.size() == 5, "gradient must be rows, fractions, dense sums, line gradient and starts, got ", gradient.size(),
+        " tensors");
+  check(gradient[0].dim() == 3 && planes.size() >= 6, "rows must be [2, items, C], and planes six per level");
+  return gradient[0].size(1) / int64_t(planes.size() / 2);
 }
 
-// What hexplane_train_backward left, as the pass over the planes takes it.
-struct Backward {
-  Tensor time, rows, shares, crowds, starts, v_lines;
+// The gradient of the planes that hexplane_train_backward returned, as the passes over the planes take it.
+struct PlanesGradient {
+  Tensor time, rows, fractions, dense_sums, v_lines, starts;
   FieldRows raw = {};
 
-  Backward(const CudaCall& call, Field& field, const Tensor& time_, const Tensor& rows_, const Tensor& shares_,
-           const Tensor& crowds_, const Tensor& starts_, const Tensor& v_lines_)
-      : time(call.floats(time_, "time")),
-        rows(call.floats(rows_, "rows")),
-        shares(call.floats(shares_, "shares")),
-        crowds(call.floats(crowds_, "crowds")),
-        starts(call.ints(starts_, "starts")),
-        v_lines(call.floats(v_lines_, "line gradient")) {
+  PlanesGradient(const CudaCall& call, Field& field, const Tensor& time_in, const Tensors& gradient)
+      : time(call.floats(time_in, "time")),
+        rows(call.floats(gradient[0], "rows")),
+        fractions(call.floats(gradient[1], "fractions")),
+        dense_sums(call.floats(gradient[2], "dense sums")),
+        v_lines(call.floats(gradient[3], "line gradient")),
+        starts(call.ints(gradient[4], "starts")) {
     const int64_t values = 3 * field.planes.levels * field.cells.count;
-    check(shares.numel() == 2 * values && rows.numel() == 2 * values * field.planes.channels &&
-              crowds.numel() == (values + 31) / 32 * 20 * field.planes.channels && starts.numel() == field.cells.cells + 1 &&
+    check(fractions.numel() == 2 * values && rows.numel() == 2 * values * field.planes.channels &&
+              dense_sums.numel() == (values + 31) / 32 * 20 * field.planes.channels && starts.numel() == field.cells.cells + 1 &&
               v_lines.numel() == field.line_size && time.numel() == 1,
-          "rows, shares, crowds, starts and line gradient must be those that hexplane_train_backward gave");
+          "rows, fractions, dense sums, line gradient and starts must be those that hexplane_train_backward returned");
     field.cells.starts = const_cast<int32_t*>(starts.const_data_ptr<int32_t>());
     raw.space = const_cast<float*>(data(rows));
-    raw.shares = const_cast<float*>(data(shares));
-    raw.crowds = const_cast<float*>(data(crowds));
+    raw.fractions = const_cast<float*>(data(fractions));
+    raw.dense_sums = const_cast<float*>(data(dense_sums));
     raw.lines = raw.space + values * field.planes.channels;
   }
 };
@@ -40,11 +40,11 @@ struct Backward {
 // Rate, step and status of an update, from their tensors, which must outlive the result.
 struct UpdateOptions {
   Tensor rate, step;
-  std::optional<Tensor> status;
+  OptionalTensor status;
   PlanesAdam raw = {};
 
-  UpdateOptions(const CudaCall& call, const Tensor& rate_, const Tensor& step_, const std::optional<Tensor>& status_,
-                double beta1, double beta2, double epsilon)
+  UpdateOptions(const CudaCall& call, const Tensor& rate_, const Tensor& step_, const OptionalTensor& status_, double beta1,
+                double beta2, double epsilon)
       : rate(call.floats(rate_, "rate")), step(call.take(step_, ScalarType::Long, "step")) {
     if (status_.has_value()) status = call.ints(*status_, "status");
     check(rate.numel() == 1 && step.numel() == 1 && (!status.has_value() || status->numel() >= 3),
@@ -59,11 +59,11 @@ struct UpdateOptions {
   }
 };
 
-Tensors hexplane_planes_gradient(Tensor time, Tensor rows, Tensor shares, Tensor crowds, Tensor starts, Tensor v_lines,
-                                 Tensors planes) {
-  CudaCall call(rows);
-  Field field(call, planes, gaussians_of(rows, planes));
-  const Backward backward(call, field, time, rows, shares, crowds, starts, v_lines);
+Tensors hexplane_planes_gradient(Tensor time, Tensors gradient, Tensors planes) {
+  const int64_t count = count_of(gradient, planes);
+  CudaCall call(gradient[0]);
+  Field field(call, planes, count);
+  const PlanesGradient from(call, field, time, gradient);
   PlaneGradients gradients = {};
   Tensors out;
   for (size_t i = 0; i < planes.size(); ++i) {
@@ -72,18 +72,18 @@ Tensors hexplane_planes_gradient(Tensor time, Tensor rows, Tensor shares, Tensor
     (p < 3 ? gradients.space[level][p] : gradients.time[level][p - 3]) = mutable_data(out.back());
     if (p >= 3) gradients.time_rows[level][p - 3] = int32_t(planes[i].size(0));
   }
-  planes_gradient(field.planes, field.lines, field.cells, backward.raw, data(backward.v_lines), data(backward.time), gradients,
-                  call.stream);
-  check_cuda(cudaGetLastError(), "hexplane_planes_gradient");
+  planes_gradient(field.planes, field.lines, field.cells, from.raw, data(from.v_lines), data(from.time), gradients, call.stream);
+  call.finish("hexplane_planes_gradient");
   return out;
 }
 
-void hexplane_planes_adam_(Tensors planes, Tensors first, Tensors second, Tensor time, Tensor rows, Tensor shares, Tensor crowds,
-                           Tensor starts, Tensor v_lines, Tensor rate, Tensor step, std::optional<Tensor> status, double beta1,
-                           double beta2, double epsilon, double smoothness, double time_smoothness, double sparsity) {
-  CudaCall call(rows);
-  Field field(call, planes, gaussians_of(rows, planes));
-  const Backward backward(call, field, time, rows, shares, crowds, starts, v_lines);
+void hexplane_planes_adam_(Tensors planes, Tensors first, Tensors second, Tensor time, Tensors gradient, Tensor rate, Tensor step,
+                           OptionalTensor status, double beta1, double beta2, double epsilon, double smoothness,
+                           double time_smoothness, double sparsity) {
+  const int64_t count = count_of(gradient, planes);
+  CudaCall call(gradient[0]);
+  Field field(call, planes, count);
+  const PlanesGradient from(call, field, time, gradient);
   check(first.size() == planes.size() && second.size() == planes.size(), "every plane needs its two moments");
   PlanesState state = {};
   for (size_t i = 0; i < planes.size(); ++i) {
@@ -101,16 +101,16 @@ void hexplane_planes_adam_(Tensors planes, Tensors first, Tensors second, Tensor
         field.planes.channels);
   UpdateOptions options(call, rate, step, status, beta1, beta2, epsilon);
   options.raw.penalties = {float(smoothness), float(time_smoothness), float(sparsity)};
-  planes_adam(field.planes, field.lines, field.cells, backward.raw, data(backward.v_lines), data(backward.time), state,
-              options.raw, call, call.stream);
-  check_cuda(cudaGetLastError(), "hexplane_planes_adam_");
+  planes_adam(field.planes, field.lines, field.cells, from.raw, data(from.v_lines), data(from.time), state, options.raw, call,
+              call.stream);
+  call.finish("hexplane_planes_adam_");
 }
 
 void network_adam_(Tensors parameters, Tensor gradient, Tensor first, Tensor second, Tensor rate, Tensor step,
-                   std::optional<Tensor> status, double beta1, double beta2, double epsilon) {
+                   OptionalTensor status, double beta1, double beta2, double epsilon) {
   CudaCall call(gradient);
   const Tensor g = call.floats(gradient, "gradient");
-  check(!parameters.empty() && parameters.size() <= size_t(2 * kFieldLayers), "network_adam_ takes 1 to ", 2 * kFieldLayers,
+  check(!parameters.empty() && parameters.size() <= size_t(2 * kMaxFieldLayers), "network_adam_ takes 1 to ", 2 * kMaxFieldLayers,
         " tensors, got ", parameters.size());
   NetworkParameters list = {};
   for (const Tensor& t : parameters) {
@@ -128,7 +128,7 @@ void network_adam_(Tensors parameters, Tensor gradient, Tensor first, Tensor sec
   }
   const UpdateOptions options(call, rate, step, status, beta1, beta2, epsilon);
   network_adam(list, data(g), mutable_data(first), mutable_data(second), options.raw, call.stream);
-  check_cuda(cudaGetLastError(), "network_adam_");
+  call.finish("network_adam_");
 }
 
 }  // namespace
@@ -138,3 +138,5 @@ STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CUDA, m) {
   m.impl("hexplane_planes_adam_", GSPLAT_BOX(&hexplane_planes_adam_));
   m.impl("network_adam_", GSPLAT_BOX(&network_adam_));
 }
+
+}  // namespace gsplat::hexplane
