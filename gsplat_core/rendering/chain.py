@@ -120,9 +120,10 @@ def render_splats(
 
 def isect_ids_of(flatten_ids: Tensor, isect_offsets: Tensor, depths: Tensor, tiles_of_image: int) -> Tensor:
     """gsplat's key of every entry of the tiles' lists, int64: image | tile | the 32 bits of the depth as float32."""
-    positions = torch.arange(len(flatten_ids), dtype=torch.int32, device=flatten_ids.device)
-    tiles = torch.searchsorted(isect_offsets.reshape(-1), positions, right=True) - 1
-    tile_bits = tiles_of_image.bit_length()
+    starts, length = isect_offsets.reshape(-1), flatten_ids.shape[0]
+    counts = torch.diff(starts, append=starts.new_full((1,), length))
+    tiles = torch.arange(len(starts), device=starts.device)
     images = torch.div(tiles, tiles_of_image, rounding_mode="floor")
+    keys = (images << (32 + tiles_of_image.bit_length())) | ((tiles - images * tiles_of_image) << 32)
     bits = depths.detach().float().reshape(-1).view(torch.int32)[flatten_ids].long() & 0xFFFFFFFF
-    return (images << (32 + tile_bits)) | ((tiles - images * tiles_of_image) << 32) | bits
+    return torch.repeat_interleave(keys, counts, output_size=length) | bits

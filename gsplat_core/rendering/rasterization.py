@@ -36,9 +36,9 @@ rasterization = _operations.rasterization
 
 
 INSTANCES_PER_GAUSSIAN = 8
-"""Room in the frame path's lists, in tiles touched by a Gaussian on average. A frame that needs more is rendered again."""
+"""Capacity of the frame path's tile lists, per Gaussian. A frame with more instances is rendered again with a larger one."""
 SMALLEST_SCENE = 1 << 14
-"""Fewer Gaussians get the room of so many: a handful of large ones touches every tile."""
+"""The capacity is at least that of so many Gaussians, because a handful of large ones touches every tile."""
 
 
 class RenderOutput(NamedTuple):

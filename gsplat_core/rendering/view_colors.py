@@ -24,8 +24,8 @@ def view_colors(
 ) -> tuple[Tensor, DenseProjection]:
     """Colours [..., C, N, D] seen by each camera; Gaussians whose colour is not finite are culled.
 
-    On CUDA nothing here makes the host wait. The colours of those that are culled for them stay as they are: they are in no
-    list, compositing skips what is not finite, and a colour without a gradient passes none on.
+    On CUDA the host does not wait here, so the colours of culled Gaussians are not replaced. They have no effect: culled Gaussians
+    are in no tile's list, compositing skips what is not finite, and a colour with a zero gradient adds nothing to its coefficients'.
     """
     shape = dense.depths.shape
     visible = dense.radii[..., 0] > 0
@@ -43,12 +43,12 @@ def view_colors(
     def shown(values: Tensor) -> Tensor:
         return values if settings.sh_degree is None else (values + 0.5).clamp_min(0)
 
-    values = evaluate(visible)  # looked at before they are clamped: minus infinity would be black
+    values = evaluate(visible)  # tested before they are clamped, which would turn minus infinity into black
     if values.is_cuda and ops.zero_gradients_stay_zero:
         finite = (values.detach() * 0).sum(-1) == 0  # 0 times a number is 0, unless it is a NaN or an infinity
         return shown(values), dense._replace(radii=dense.radii * finite.to(dense.radii.dtype)[..., None])
-    # One cheap sum in the common case; it can only miss nothing, as a sum with a NaN or an infinity is not finite. A compiled
-    # graph cannot branch on it, and always takes the long way.
+    # One cheap sum in the common case: a sum with a NaN or an infinity in it is not finite. A compiled graph cannot branch on a
+    # value, and always tests every colour.
     if torch.compiler.is_compiling() or not torch.isfinite(values.detach().sum()):
         finite = values.detach().isfinite().all(-1)
         visible = visible & finite

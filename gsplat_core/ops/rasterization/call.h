@@ -41,7 +41,7 @@ inline float* float_data(const Tensor& t) { return t.numel() > 0 ? t.mutable_dat
 inline int32_t* int_data(const Tensor& t) { return t.numel() > 0 ? t.mutable_data_ptr<int32_t>() : nullptr; }
 inline int64_t* long_data(const Tensor& t) { return t.numel() > 0 ? t.mutable_data_ptr<int64_t>() : nullptr; }
 
-// Arrays behind one another in one allocation: first their places are asked for, then the memory is made.
+// Consecutive arrays in one allocation: `place` returns the offset of each, then `make` allocates.
 class Arena {
  public:
   template <class T>

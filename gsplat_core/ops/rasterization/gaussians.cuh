@@ -129,7 +129,7 @@ struct Coefficients {
     __syncwarp();
   }
 
-  // Writes `rows` rows, and zeros behind what the degree uses. The warp's lanes have written theirs before a __syncwarp.
+  // Writes `rows` rows, with zeros for coefficients that the degree does not use. Call it after a __syncwarp.
   __device__ void store(float* to, int row_floats, int rows, int lane) const {
     if (row_floats % 4 == 0 && reinterpret_cast<uintptr_t>(to) % 16 == 0) {
       const int quads = row_floats / 4;

@@ -31,7 +31,7 @@ struct Scene {
   int32_t degree;     // of the harmonics, or kPlainColors
   int32_t color_row;  // floats per Gaussian in `colors`
   int32_t channels;   // colours in the picture, 0 to 3
-  bool depth;         // behind the colours, the sum of weight and z ...
+  bool depth;         // the last channel is the sum of weight and z ...
   bool expected;      // ... divided by alpha
   bool colors_per_camera, antialiased;
   int32_t width, height, tile_width, tile_height;
@@ -49,7 +49,7 @@ struct Splats {
   float* records;  // [images, N, kSplatFloats]
 };
 
-// All lists, behind one another; lengths in instances.
+// The lists of all tiles and images, concatenated; lengths in instances.
 struct Lists {
   int32_t* tile_offsets;     // [images * tiles]; scan writes one more, the length
   int32_t* splat_starts;     // [images * N + 1]
@@ -61,7 +61,7 @@ struct Lists {
   int64_t length;
   int64_t tiles;  // of all images
 
-  // Where the list of a tile begins, and behind the last tile where its list ends.
+  // Where the list of a tile begins; for tile = tiles, the end of the last list.
   __host__ __device__ int begin(int64_t tile) const { return tile < tiles ? tile_offsets[tile] : int(length); }
 };
 

@@ -1,4 +1,4 @@
-// What the ops are given, checked, and what the kernels are told about it.
+// Checks of the ops' inputs, and the description of the scene that the kernels get.
 #pragma once
 
 #include "call.h"

@@ -12,7 +12,8 @@ constexpr int kRowFloat4s = kSplatFloats / 4;
 static_assert(quads_of(shape_size(kChannels, false), kChannels) == kRowFloat4s);
 static_assert(quads_of(shape_size(kChannels, true), kChannels) == kRowFloat4s);
 
-// A pixel behind the last splat, and dL/d(its channels). The background is behind everything, and so is its part of dL/dalpha.
+// The state of a pixel before the backward pass, and dL/d(its channels). The background counts as one more splat after the last,
+// and so does the gradient of alpha.
 __device__ inline Pixel start_pixel(const Scene& scene, const PictureGradient& from, int64_t image, int64_t pixel,
                                     float (&v_color)[kChannels]) {
   const float alpha = from.alphas[pixel], left = 1 - alpha;
