@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation.field_slots import copy_each
 from gsplat_core.deformation.kind import CapturedTraining
 from gsplat_core.ops.adam.adam import adam_step_at_
 from gsplat_core.ops.frame.frame import GAUSSIAN_TENSORS, FrameMode, View, accumulate_status_, render_frame
@@ -96,8 +97,7 @@ class FusedStep:
         if observation is self._taken:
             return
         self._taken = observation
-        self._image.copy_(observation.image, non_blocking=True)
-        self._mask.copy_(observation.mask, non_blocking=True)
+        copy_each([self._image, self._mask], [observation.image, observation.mask])
         if self._depth is not None:
             if observation.depth is None:
                 self._depth.zero_()  # unknown everywhere: the term is 0
