@@ -216,3 +216,19 @@ def test_image_numbers_that_repeat_are_refused(tmp_path: Path, refused: Refused)
     for name in ("f1.png", "f2.png", "f2.jpg", "f3.png"):
         assert cv2.imwrite(str(tmp_path / name), videos.pictures(1)[0])
     refused(tmp_path, RecordingInvalid, "number 2")
+
+
+@pytest.mark.parametrize("codec", ["h264", "h264_mkv", "vp9", "mjpeg", "mpeg4"])
+@pytest.mark.parametrize("part", ["beginning", "end"])
+def test_damage_to_the_container_never_ends_in_anything_but_findings(codec: str, part: str, tmp_path: Path) -> None:
+    path = videos.encode(tmp_path / videos.name_of(codec), codec, videos.pictures(6))
+    data = path.read_bytes()
+    region = (0, 1500) if part == "beginning" else (len(data) - 1500, len(data))
+    for seed in range(12):
+        choice = random.Random(seed)
+        damaged = bytearray(data)
+        for _ in range(choice.choice([1, 2, 8])):
+            damaged[choice.randrange(*region)] = choice.choice([0, 255, choice.randrange(256)])
+        path.write_bytes(damaged)
+        report = validate_recording(path)
+        assert report.ok or report.problems[0].message
