@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.training.metrics import FrameQuality, QualityTracker, psnr_tissue_db
 from operators.frame_log import MAX_SERIES, Entry, FrameLog, frames_per_entry, read_frames, series
 from operators.graph import Operator, OperatorSpec
@@ -56,18 +56,16 @@ class QualityResult:
     """One entry per displayed frame, in order; of a long run, one per bin of frames (see `frame_log.series`)."""
     frames_per_entry: int
     frames_sha256: str
-
-    @property
-    def frames(self) -> int:
-        """How many frames were displayed and scored."""
-        return self.trained.count + self.held_out.count
+    frames: int
+    """How many frames were displayed; damaged ones are among them, and are not scored."""
 
 
 class MetricsOp(Operator):
     """Scores each displayed frame against its raw frame, over tissue, and takes a digest of the bytes that were displayed.
 
     The digest is SHA-256 over, for each frame in order, the line `seq width height\\n` and the RGB bytes of the reconstruction.
-    In memory only means are kept; each frame's own figures go to the log.
+    In memory only means are kept; each frame's own figures go to the log. A damaged frame is part of the digest and of the log, without
+    figures: a reconstruction is not measured against what the decoder guessed.
 
     Inputs:
         rendered: `RenderedFrame`.
@@ -85,6 +83,8 @@ class MetricsOp(Operator):
         """Frames that were trained on before they were shown."""
         self.held_out = QualityTracker()
         """Frames that were shown and never trained on."""
+        self.frames = 0
+        """How many frames arrived so far."""
         self._digest = hashlib.sha256()
         self._previous: Frame | None = None
         super().__init__(fragment, *args, **kwargs)
@@ -94,7 +94,7 @@ class MetricsOp(Operator):
         spec.output("scored", type=ScoredFrame)
 
     def start(self) -> None:
-        self.live, self.held_out = QualityTracker(), QualityTracker()
+        self.live, self.held_out, self.frames = QualityTracker(), QualityTracker(), 0
         self._digest = hashlib.sha256()
         self._previous = None
         if self.log is not None:
@@ -110,10 +110,13 @@ class MetricsOp(Operator):
         frame, previous = rendered.frame, self._previous
         self._digest.update(f"{frame.seq} {frame.width_px} {frame.height_px}\n".encode())
         self._digest.update(np.ascontiguousarray(rendered.image).data)
-        tracker = self.live if rendered.trained else self.held_out
-        quality = tracker.observe(frame.seq, rendered.image, frame.image, frame.mask)
-        comparable = previous is not None and previous.image.shape == frame.image.shape
-        before_db = psnr_tissue_db(previous.image, frame.image, frame.mask) if comparable and previous else math.nan
+        self.frames += 1
+        quality, before_db = FrameQuality(frame.seq, math.nan, math.nan, math.nan), math.nan
+        if frame.status is not FrameStatus.DAMAGED:
+            tracker = self.live if rendered.trained else self.held_out
+            quality = tracker.observe(frame.seq, rendered.image, frame.image, frame.mask)
+            if previous is not None and previous.image.shape == frame.image.shape:
+                before_db = psnr_tissue_db(previous.image, frame.image, frame.mask)
         scored = ScoredFrame(rendered, quality, before_db)
         if self.log is not None:
             self.log.write(scored.as_json())
@@ -127,12 +130,7 @@ class MetricsOp(Operator):
         if self.log is not None and self.frames:
             entries = tuple(series(read_frames(self.log.path), per_entry))
             outcome.output("frames", self.log.path)
-        outcome.add(QualityResult(self.live, self.held_out, entries, per_entry, self.frames_sha256))
-
-    @property
-    def frames(self) -> int:
-        """How many frames were scored so far."""
-        return self.live.count + self.held_out.count
+        outcome.add(QualityResult(self.live, self.held_out, entries, per_entry, self.frames_sha256, self.frames))
 
     @property
     def frames_sha256(self) -> str:

@@ -2,7 +2,7 @@
 
 A copy of the previous frame is a strong baseline in slow endoscopy; a reconstruction that scores below it shows nothing that a frozen
 video would not. Two passes over the recording, three frames and one sum in memory, however long the recording. Frames are held out by
-their number, `Frame.seq`; where numbers are missing, "the frame before" is the one that came before.
+their number, `Frame.seq`; a damaged frame is neither scored nor part of a mean. Where numbers are missing, "the frame before" is the one that came before.
 """
 
 from __future__ import annotations
@@ -62,19 +62,20 @@ def measure_baselines(recording: Iterable[Frame]) -> Baselines:
             middle = (earlier.image.astype(np.float32) + frame.image) / np.float32(2 * 255)
             heldout_neighbours.add(psnr_tissue_db(middle, heldout.image, heldout.mask))
             pending = None
-        if before is not None:
+        scored = frame.status is not FrameStatus.DAMAGED
+        if before is not None and scored:
             value = psnr_tissue_db(before.image, frame.image, frame.mask)
             previous.add(value)
             if is_heldout(frame.seq):
                 heldout_previous.add(value)
                 pending = frame, before
-        if not is_heldout(frame.seq) and frame.status is not FrameStatus.DAMAGED:
+        if not is_heldout(frame.seq) and scored:
             train_mean.add(frame.image)
         before = frame
     mean_image = train_mean.image()
     heldout_train_mean = ScoredMean()
     for frame in recording:
-        if mean_image is not None and is_heldout(frame.seq):
+        if mean_image is not None and is_heldout(frame.seq) and frame.status is not FrameStatus.DAMAGED:
             heldout_train_mean.add(psnr_tissue_db(mean_image, frame.image, frame.mask))
     return Baselines(
         previous_frame_db=previous.mean,

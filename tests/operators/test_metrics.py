@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from gsplat_core.scene.frames import FrameStatus
 from operators import metrics
 from operators.frame_log import FrameLog
 from operators.metrics import MetricsOp, QualityResult
@@ -57,6 +58,19 @@ def test_the_baseline_is_the_previous_raw_frame(rendered, compute, tmp_path):
     assert math.isnan(scored[0].previous_frame_db)
     assert scored[1].previous_frame_db == pytest.approx(-10 * math.log10((error**2).mean()), abs=1e-3)
     assert result(operator)[0].series[0]["previous_frame_db"] is None, "NaN is not JSON"
+
+
+def test_a_damaged_frame_is_shown_and_not_scored(rendered, frame, compute, tmp_path):
+    damaged = frame(1, status=FrameStatus.DAMAGED)
+    operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    scored = score(operator, compute, [rendered(0), rendered(frame=damaged, trained=False), rendered(2)])
+    quality, _ = result(operator)
+    assert (quality.frames, quality.trained.count, quality.held_out.count) == (3, 2, 0)
+    assert math.isnan(scored[1].quality.psnr_tissue_db) and math.isnan(scored[1].previous_frame_db)
+    assert [entry["psnr_tissue_db"] is None for entry in quality.series] == [False, True, False]
+    whole = MetricsOp(None)
+    score(whole, compute, [rendered(0), rendered(1, trained=False), rendered(2)])
+    assert quality.frames_sha256 == whole.frames_sha256, "what was displayed is the same"
 
 
 def test_without_a_frame_there_is_a_result_and_no_file_to_show(tmp_path, compute):

@@ -10,7 +10,7 @@ import pytest
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings import is_heldout
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.training.baselines import measure_baselines
 
 RECORDINGS = Path(
@@ -43,6 +43,14 @@ def test_frames_are_held_out_by_their_number_where_some_are_missing():
     measured = measure_baselines([frame(7, 100), frame(9, 120), frame(10, 180)])
     assert measured.heldout_previous_frame_db == pytest.approx(decibels(20), abs=1e-4)
     assert measured.heldout_neighbour_mean_db == pytest.approx(decibels(20), abs=1e-4)
+
+
+def test_a_damaged_frame_is_not_scored():
+    damaged = Frame(seq=1, pts_ns=1, image=np.full((2, 3, 3), 7, np.uint8), status=FrameStatus.DAMAGED)
+    measured = measure_baselines([frame(0, 100), damaged, frame(2, 27)])
+    assert measured.previous_frame_db == pytest.approx(decibels(20), abs=1e-4), "shown before frame 2, as it came"
+    assert measured.heldout_previous_frame_db is measured.heldout_neighbour_mean_db is None
+    assert measured.heldout_train_mean_db is None
 
 
 def test_a_stream_too_short_for_a_baseline_says_none():
