@@ -141,14 +141,9 @@ def _composite_fake(
     colors: Tensor,
     opacities: Tensor,
     isect_offsets: Tensor,
-    flatten_ids: Tensor,
-    backgrounds: Tensor | None,
-    masks: Tensor | None,
-    absgrad_probe: Tensor | None,
-    width: int,
-    height: int,
-    tile_size: int,
+    *rest: Any,
 ) -> tuple[Tensor, Tensor, Tensor]:
+    *_, width, height, _tile_size = rest
     shape = (isect_offsets.shape[0], height, width)
     last = isect_offsets.new_empty(shape)
     return colors.new_empty(*shape, colors.shape[-1]), colors.new_empty(*shape, 1), last
@@ -163,16 +158,9 @@ def _composite_backward_fake(
     isect_offsets: Tensor,
     flatten_ids: Tensor,
     backgrounds: Tensor | None,
-    masks: Tensor | None,
-    width: int,
-    height: int,
-    tile_size: int,
-    alphas: Tensor,
-    last: Tensor,
-    v_colors: Tensor,
-    v_alphas: Tensor,
-    absgrad: bool,
+    *rest: Any,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    *_, absgrad = rest
     count, channels = colors.shape
     return (
         colors.new_empty(count, 2),
