@@ -23,7 +23,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from gsplat_core.io.atomic_files import replace_durably, sync_folder
+from gsplat_core.io.atomic_files import replace_durably, sync_folder, unfinished
 from operators.errors import OutputFolderInUse
 from operators.folder_lock import LOCK, FolderLock
 from operators.output_paths import MARKER, check_folder_path
@@ -31,7 +31,7 @@ from operators.storage import STAGING_PREFIX, storage_errors, write_whole
 
 _FORMAT = "intrasplat-output"
 _COMPLETE, _OLD = ".complete-", ".old-"
-_RESULT = re.compile(r"reconstruction\.mp4|model|report\.json|report\.html|\d{6,}\.png")
+_RESULT = re.compile(r"reconstruction\.mp4|model|frames\.jsonl|report\.json|report\.html|\d{6,}\.png")
 """The names of results. In a folder of an earlier version, whose marker lists no files, all of them are ours."""
 
 
@@ -67,6 +67,7 @@ class OutputFolder:
             self.path = self.folder / f"{STAGING_PREFIX}{self._token}"
             self.path.mkdir()
             stack.callback(shutil.rmtree, self.path, ignore_errors=True)
+            stack.enter_context(unfinished(self.path))
             self._stack = stack.pop_all()
         return self
 
@@ -81,7 +82,11 @@ class OutputFolder:
             complete = self.folder / f"{_COMPLETE}{self._token}"
             sync_folder(self.path)
             replace_durably(self.path, complete)
-            _switch_to(self.folder, complete, self.made_by)
+            try:
+                _switch_to(self.folder, complete, self.made_by)
+            except KeyboardInterrupt:
+                _switch_to(self.folder, complete, self.made_by)  # a moment's work: rather than leave it to the next run
+                raise
 
     def _make(self) -> None:
         missing = [part for part in (self.folder, *self.folder.parents) if not os.path.lexists(part)]

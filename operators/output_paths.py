@@ -12,6 +12,7 @@ SIDECARS = frozenset({"images", "images_right", "masks", "depth"})
 """Folders inside a recording whose every file belongs to it."""
 DESCRIPTIONS = ("recording.json", "cameras.json", "poses_bounds.npy")
 """Files that only a recording's folder has."""
+MAX_PATH_BYTES = 4096
 MARKER = ".intrasplat.json"
 """Lies in every folder that this program has made, and only there."""
 _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".npy", ".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})
@@ -19,6 +20,8 @@ _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".npy", ".mp4", ".avi", ".mkv", 
 
 def check_folder_path(out: Path, inputs: Sequence[Path] = ()) -> None:
     """Raises OutputError where a run with these inputs must not collect its results in the folder `out`."""
+    if len(os.fsencode(out)) >= MAX_PATH_BYTES:
+        raise OutputError(f"--out has {len(os.fsencode(out))} bytes; a path has at most {MAX_PATH_BYTES - 1}")
     real = Path(os.path.realpath(out))
     for place, what in ((Path("/"), "the root of the file system"), (_home(), "your home folder")):
         if _same(real, place):

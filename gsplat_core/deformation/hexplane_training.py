@@ -13,7 +13,6 @@ from gsplat_core.ops.hexplane_deltas.hexplane_deltas import takes_layers
 from gsplat_core.ops.hexplane_training.hexplane_training import (
     AdamOnDevice,
     FieldGradient,
-    Penalties,
     TrainingState,
     hexplane_planes_adam_,
     hexplane_train,
@@ -31,7 +30,6 @@ class HexPlaneTraining:
 
     Args:
         field: float32 on a CUDA device. Its tensors are taken now: where they are replaced by others, another `HexPlaneTraining` is due.
-        penalties: weights in the loss of the penalties of `gsplat_core.deformation.regularisers`.
 
     Raises:
         InvalidInput: the field is elsewhere, or its sizes are not those that the kernels take; train it with autograd then.
@@ -45,7 +43,6 @@ class HexPlaneTraining:
     def __init__(
         self,
         field: HexPlaneField,
-        penalties: Penalties = Penalties(),
         betas: tuple[float, float] = (0.9, 0.999),
         epsilon: float = 1e-8,
     ) -> None:
@@ -59,7 +56,6 @@ class HexPlaneTraining:
         self._planes = field.plane_tensors()
         self._weights, self._biases = field.network_tensors()
         self._network = [t for pair in zip(self._weights, self._biases, strict=True) for t in pair]
-        self._penalties = penalties
         self._betas = betas
         self._epsilon = epsilon
         self._first, self._second = ([torch.zeros_like(p) for p in self._planes] for _ in range(2))
@@ -103,6 +99,6 @@ class HexPlaneTraining:
         of_planes, of_network = (
             AdamOnDevice(rate, step, status, self._betas, self._epsilon) for rate in (rates[:1], rates[1:])
         )
-        hexplane_planes_adam_(self._planes, self._first, self._second, time, gradient, of_planes, self._penalties)
+        hexplane_planes_adam_(self._planes, self._first, self._second, time, gradient, of_planes)
         network_adam_(self._network, gradient.network, self._network_first, self._network_second, of_network)
         self._state = None

@@ -12,7 +12,7 @@ import errno
 import os
 import secrets
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -28,6 +28,16 @@ def remove_unfinished() -> None:
     """Remove every file and folder that this process has begun and not finished; for a program that is about to end at once."""
     for path in list(_unfinished):
         _remove(path)
+        _unfinished.discard(path)
+
+
+@contextlib.contextmanager
+def unfinished(path: Path) -> Iterator[None]:
+    """While entered, `remove_unfinished` removes `path` too."""
+    _unfinished.add(path)
+    try:
+        yield
+    finally:
         _unfinished.discard(path)
 
 

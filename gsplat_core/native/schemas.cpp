@@ -96,7 +96,8 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // The same and one Adam step of the Gaussians, in place; rates [5] and step [1] are read on the device, rows that were left
   // unchanged are added to skipped [5]. v_raw is empty if not asked for.
   m.def(
-      "render_frame_backward_adam_(Tensor(a!)[] gaussians, Tensor(b!)[] first_moments, Tensor(c!)[] second_moments, Tensor rates, "
+      "render_frame_backward_adam_(Tensor(a!)[] gaussians, Tensor(b!)[] first_moments, Tensor(c!)[] second_moments, Tensor "
+      "rates, "
       "Tensor step, Tensor(d!) skipped, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, Tensor[] forward, "
       "Tensor v_image, Tensor? v_alphas, float eps2d, int camera_model, float beta1, float beta2, float epsilon, bool needs_raw, "
       "bool deterministic) -> Tensor v_raw");

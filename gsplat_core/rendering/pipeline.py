@@ -78,7 +78,10 @@ class Operations(StepOperations):
         rolling_shutter: Any = None,
         viewmats_rs: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Meta]:
-        """Render 3D Gaussians (Kerbl et al. 2023) with gsplat 1.5.3's arguments and results.
+        """Render 3D Gaussians (Kerbl et al. 2023) with gsplat 1.5.3's arguments, in its order, and its results.
+
+        Constants are those of gsplat 1.6, here and in all operations: alpha is at most 0.99, and the compensation for
+        antialiasing at least 0.005. gsplat 1.5.3 has 0.999 and 0; that is not offered.
 
         Shapes; `...` are any batch dimensions, the same everywhere:
             means [..., N, 3]; quats [..., N, 4] wxyz, of any length but zero; scales [..., N, 3]; opacities [..., N];
@@ -102,8 +105,11 @@ class Operations(StepOperations):
             covars: [..., N, 3, 3] in place of quats and scales.
             channel_chunk, segmented: accepted and without effect; neither changes the result.
 
+        On CUDA one native call per pass renders tiles of 16 px and spherical harmonics or up to 3 plain colours; the rest goes
+        through the chain of operations. Either way the host waits once, for the length of the tiles' lists.
+
         Returns:
-            render_colors [..., C, H, W, X], render_alphas [..., C, H, W, 1] and `meta` with batch_ids, camera_ids and
+            render_colors [..., C, H, W, X], render_alphas [..., C, H, W, 1] and `meta`, a dict with batch_ids, camera_ids and
             gaussian_ids (None unless packed), radii, means2d (call retain_grad() on it to see its gradient), depths,
             conics, opacities, tile_width, tile_height, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets, width,
             height, tile_size, n_batches and n_cameras.
@@ -129,7 +135,19 @@ class Operations(StepOperations):
         rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
         if rendered is not None:
             return _named_as_in_gsplat(rendered, arguments, settings)
-        return _step_by_step(self, arguments, settings)
+        image, splats = _step_by_step(self, arguments, settings)
+        ids = splats.rows[:3] if isinstance(splats.rows, PackedProjection) else (None, None, None)
+        keys = isect_ids_of(splats.flatten_ids, splats.isect_offsets, splats.rows.depths, math.prod(settings.tile_grid))
+        meta = _meta(splats, splats.rows, ids, splats.opacities, keys, settings, viewmats.shape[:-2])
+        return image, splats.alphas, meta
+
+    def pictures(self, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor]:
+        """The colours and alphas of `rasterization`, without what it computes for `meta` alone."""
+        rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
+        if rendered is not None:
+            return rendered.image, rendered.alphas
+        image, splats = _step_by_step(self, arguments, settings)
+        return image, splats.alphas
 
 
 def _named_as_in_gsplat(out: Rasterized, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor, Meta]:
@@ -142,7 +160,8 @@ def _named_as_in_gsplat(out: Rasterized, arguments: Arguments, settings: RenderS
     return out.image, out.alphas, meta
 
 
-def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor, Meta]:
+def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, RenderedSplats]:
+    """Colours and depth [..., C, H, W, X], and what was computed on the way."""
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars = arguments
     batch_dims, n_gaussians = _check_shapes(means, opacities, colors, viewmats, backgrounds, settings)
     if covars is not None:
@@ -159,11 +178,7 @@ def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSet
     if settings.render_mode.endswith("ED"):
         expected = image[..., -1:] / splats.alphas.clamp(min=1e-10)
         image = torch.cat([image[..., :-1], expected], -1) if settings.has_colors else expected
-    ids: tuple[Tensor | None, ...] = (None, None, None)
-    if isinstance(splats.rows, PackedProjection):
-        ids = splats.rows[:3]
-    keys = isect_ids_of(splats.flatten_ids, splats.isect_offsets, splats.rows.depths, math.prod(settings.tile_grid))
-    return image, splats.alphas, _meta(splats, splats.rows, ids, splats.opacities, keys, settings, viewmats.shape[:-2])
+    return image, splats
 
 
 def _meta(

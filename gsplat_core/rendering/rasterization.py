@@ -15,6 +15,7 @@ from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.rendering.pipeline import Operations
+from gsplat_core.rendering.settings import Arguments, RenderSettings
 from gsplat_core.rendering.single_call import rasterize_in_one_call
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
@@ -30,7 +31,8 @@ step_by_step = Operations(
     zero_gradients_stay_zero=True,
 )
 """The chain of compiled operations, on any device they run on."""
-rasterization = replace(step_by_step, in_one_call=rasterize_in_one_call).rasterization
+_operations = replace(step_by_step, in_one_call=rasterize_in_one_call)
+rasterization = _operations.rasterization
 
 
 INSTANCES_PER_GAUSSIAN = 8
@@ -65,22 +67,18 @@ def render(gaussians: Gaussians, camera: Camera, background: Tensor | None = Non
     )
     if gaussians.device.type == "cuda" and gaussians.dtype == torch.float32 and not followed:
         return _render_frame(gaussians, camera, viewmat, intrinsics, background, depth)
-    colors, alphas, _ = rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        viewmat[None],
-        intrinsics[None],
-        camera.width_px,
-        camera.height_px,
-        sh_degree=gaussians.sh_degree,
-        packed=False,
-        backgrounds=None if background is None else background[None],
-        render_mode="RGB+ED" if depth else "RGB",
-        camera_model=camera.model,
-    )
+    settings = RenderSettings(
+        width=camera.width_px, height=camera.height_px, sh_degree=gaussians.sh_degree,
+        render_mode="RGB+ED" if depth else "RGB", camera_model=camera.model,
+    )  # fmt: skip
+    behind = None if background is None else background[None]
+    colors, alphas = _operations.pictures(
+        Arguments(
+            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, viewmat[None],
+            intrinsics[None], behind, None,
+        ),
+        settings,
+    )  # fmt: skip
     alpha = alphas[0, ..., 0]
     z = colors[0, ..., 3] if depth else alpha.new_zeros(alpha.shape)
     return RenderOutput(colors[0, ..., :3], alpha, z)

@@ -41,17 +41,17 @@ class RenderSettings:
 
     width: int
     height: int
-    near_plane: float
-    far_plane: float
-    radius_clip: float
-    eps2d: float
-    sh_degree: int | None
-    packed: bool
-    tile_size: int
-    render_mode: RenderMode
-    absgrad: bool
-    rasterize_mode: RasterizeMode
-    camera_model: str
+    near_plane: float = NEAR_PLANE
+    far_plane: float = FAR_PLANE
+    radius_clip: float = 0.0
+    eps2d: float = EPS2D
+    sh_degree: int | None = None
+    packed: bool = False
+    tile_size: int = TILE_SIZE
+    render_mode: RenderMode = "RGB"
+    absgrad: bool = False
+    rasterize_mode: RasterizeMode = "classic"
+    camera_model: str = "pinhole"
 
     def __post_init__(self) -> None:
         for name, value, known in (

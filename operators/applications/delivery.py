@@ -31,13 +31,14 @@ def delivered(
 
     Raises as `OutputFolder` and as `run`; a RunFailed carries the outcome with the final paths.
     """
-    with OutputFolder(settings.out, command, [settings.recording]) as output:
+    with OutputFolder(settings.out, command, [Path(settings.recording)]) as output:
         notes = ["the output folder held an earlier run; this one replaces its files"] if output.earlier else []
 
         def deliver(outcome: RunOutcome) -> RunOutcome:
-            if outcome.outputs and report is not None:
-                report(outcome, output.path)
-            output.publish()
+            if outcome.outputs:
+                if report is not None:
+                    report(outcome, output.path)
+                output.publish()
             paths = {name: settings.out / path.relative_to(output.path) for name, path in outcome.outputs.items()}
             return replace(outcome, outputs=paths)
 

@@ -15,6 +15,7 @@ MAX_PIXELS = 64 * 2**20
 MAX_SIDE_PX = 2**15
 """Of one picture; two stand side by side in a video, and video formats count to 65535."""
 MAX_STEPS = 100_000_000
+MAX_FRAMES = 10**9
 MAX_RENDERED_FRAMES = 1_000_000
 """Of one `render`: nine hours at 30 frames a second."""
 
@@ -29,6 +30,16 @@ def check_steps(name: str, steps: int) -> None:
     """Raises InvalidSetting for a number of training steps, called `name`, that is out of range."""
     if not 1 <= steps <= MAX_STEPS:
         raise InvalidSetting(f"{name} is {steps}; it must be from 1 to {MAX_STEPS}")
+
+
+def check_max_frames(max_frames: int | None) -> None:
+    """Raises InvalidSetting for a number of frames that is out of range; None is all of them."""
+    if max_frames is None:
+        return
+    if max_frames < 1:
+        raise InvalidSetting(f"max_frames must be at least 1, got {max_frames}")
+    if max_frames > MAX_FRAMES:
+        raise InvalidSetting(f"max_frames must be at most {MAX_FRAMES}, got {max_frames}")
 
 
 def check_scale(scale: float) -> None:

@@ -5,10 +5,15 @@ import sys
 
 
 def main() -> None:
-    """Entry point of the console script; exits with 0, 1 (a bug), 2 (bad input) or 130 (interrupted)."""
+    """Entry point of the console script; exits with 0, 1 (a bug), 2 (bad input), 130 (interrupted) or 141 (nobody reads the output)."""
+    from services.cli.interrupt import end_on_interrupt
+    from services.cli.streams import StandardStreams
+
+    end_on_interrupt()
+    streams = StandardStreams()
     # Threads of the C++ core that wait must sleep, not spin: on a busy machine spinning can make a render many times slower. Read once,
     # when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from services.cli.app import run
 
-    sys.exit(run(sys.argv[1:]))
+    sys.exit(streams.code(run(sys.argv[1:])))

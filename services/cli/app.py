@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
+from services.cli.streams import printable
 
 # Wrong options and their like. Where the class lives has changed between releases of typer; what derives from it has not.
 _USAGE_ERRORS: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
@@ -21,13 +22,30 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+
+def _path(text: str) -> Path:
+    if not text:
+        # An empty name would stand for the current folder.
+        raise typer.BadParameter("it is empty; give a path")
+    if "\0" in text:
+        raise typer.BadParameter(f"{text!r} holds a zero byte, which no name of a file can")
+    return Path(text)
+
+
+def _path_argument(name: str, help_text: str) -> Any:
+    return typer.Argument(parser=_path, metavar=name, help=help_text, show_default=False)
+
+
+def _path_option(name: str, help_text: str) -> Any:
+    return typer.Option(name, parser=_path, metavar="<path>", help=help_text, show_default=False)
+
+
 RecordingArgument = Annotated[
-    Path, typer.Argument(help="A video, or a folder with video.mp4, images/ or cameras.json.", show_default=False)
+    Path, _path_argument("RECORDING", "A video, or a folder with video.mp4, images/ or cameras.json.")
 ]
-OutOption = Annotated[
-    Path,
-    typer.Option("--out", help="Folder for the results: new, empty, or left by an earlier run.", show_default=False),
-]
+ModelArgument = Annotated[Path, _path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
+OutOption = Annotated[Path, _path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
+RenderOutOption = Annotated[Path, _path_option("--out", "A video (name.mp4) or a folder of images.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
 FieldOption = Annotated[str, typer.Option(help="Deformation field: auto, basis or hexplane.")]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
@@ -44,11 +62,21 @@ def run(arguments: list[str]) -> int:
     except typer.Abort:
         return INTERRUPTED
     except _USAGE_ERRORS as error:
+        return _say_usage(error)
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the one place where errors become exit codes
+        return exit_code_of(error, arguments)
+    return code if isinstance(code, int) else OK
+
+
+def _say_usage(error: Any) -> int:
+    """One sentence for a command line that cannot be understood; the help for one without a command."""
+    if type(error).__name__ == "NoArgsIsHelpError":
         error.show()
         return BAD_INPUT
-    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the one place where errors become exit codes
-        return exit_code_of(error)
-    return code if isinstance(code, int) else OK
+    command = error.ctx.command_path if getattr(error, "ctx", None) is not None else "intrasplat"
+    said = " ".join(error.format_message().split()).rstrip(".")
+    typer.echo(f"error: {printable(said)}; `{command} --help` lists what there is", err=True)
+    return BAD_INPUT
 
 
 def _print_version(wanted: bool) -> None:
@@ -138,8 +166,8 @@ def reconstruct(
 
 @app.command()
 def render(
-    model: Annotated[Path, typer.Argument(help="A model folder that replay or reconstruct wrote.", show_default=False)],
-    out: Annotated[Path, typer.Option("--out", help="A video (name.mp4) or a folder of images.", show_default=False)],
+    model: ModelArgument,
+    out: RenderOutOption,
     fps: Annotated[float, typer.Option(help="Frames per second of the model's time.")] = 30.0,
     scale: ScaleOption = 1.0,
     device: DeviceOption = "cpu",

@@ -2,26 +2,44 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+
+from services.cli.interrupt import INTERRUPTED as INTERRUPTED
+from services.cli.streams import printable
 
 OK = 0
 BUG = 1
 BAD_INPUT = 2
-INTERRUPTED = 130
+
+_MACHINE = {
+    errno.ENOSPC: "free space on that disk",
+    errno.EDQUOT: "free space in that quota",
+    errno.EFBIG: "raise the file-size limit (`ulimit -f`)",
+    errno.EMFILE: "raise the limit of open files (`ulimit -n`)",
+    errno.ENFILE: "close other programs' files",
+    errno.ENOMEM: "free memory, or give a smaller --scale",
+    errno.EROFS: "choose a place that can be written",
+    errno.EIO: "check the disk",
+    errno.ESTALE: "check the network drive",
+}
+"""What the system says about itself, whatever the file, and what to do."""
+_MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memory", "bad_alloc", "insufficient memory")
 
 
-def exit_code_of(error: BaseException) -> int:
+def exit_code_of(error: BaseException, arguments: Iterable[str] = ()) -> int:
     """Print what went wrong to stderr and return the exit code.
 
-    An error on purpose whose cause the user can change (a file, an option, a disk) is one sentence and 2. Everything else is a bug
-    in this program: traceback and 1.
+    What the user can change (UserError: a file, an option, a disk) is one sentence and 2. Everything else is a bug in this program: traceback
+    and 1. arguments: the command line; the system's errors about files that it names are the user's too.
     """
     if isinstance(error, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)  # noqa: T201
         return INTERRUPTED
-    sentence = user_sentence(error)
+    sentence = user_sentence(error, arguments)
     if sentence is not None:
         print(f"error: {sentence}", file=sys.stderr)  # noqa: T201
         return BAD_INPUT
@@ -30,10 +48,10 @@ def exit_code_of(error: BaseException) -> int:
     return BUG
 
 
-def user_sentence(error: BaseException) -> str | None:
+def user_sentence(error: BaseException, arguments: Iterable[str] = ()) -> str | None:
     """What happened, the value, what to do; None for a bug."""
-    from gsplat_core.errors import CoreError
-    from operators.errors import EngineError, OperatorFailed, OutputError, RunError, RunFailed
+    from gsplat_core.errors import UserError
+    from operators.errors import OperatorFailed, RunFailed
 
     where = ""
     for link in _causes(error):
@@ -41,13 +59,42 @@ def user_sentence(error: BaseException) -> str | None:
             # The operator is where it happened; its cause is what happened.
             frame = "" if link.seq is None else f" on frame {link.seq}"
             where = f"\n  in operator {link.operator}{frame}"
-        elif isinstance(link, RunFailed):
-            continue  # says that a run ended early; what it is raised from says why
-        elif isinstance(link, CoreError | EngineError | OutputError | RunError):
-            return f"{link}{where}"
-        elif isinstance(link, OSError) and link.filename is not None:
-            return f"{link.filename}: {link.strerror}; check the path and its permissions{where}"
+        elif not isinstance(link, RunFailed):  # that one says that a run ended early; what it is raised from says why
+            said = str(link) if isinstance(link, UserError) else _of_the_machine(link, arguments)
+            return None if said is None else printable(said) + where
     return None
+
+
+def _of_the_machine(error: BaseException, arguments: Iterable[str]) -> str | None:
+    """A sentence where memory, a disk or a file that the user named is at fault."""
+    if _is_out_of_memory(error):
+        said = str(error).strip().splitlines() or ["an allocation failed"]
+        return f"there is not enough memory ({said[0][:200]}); free some, or give a smaller --scale or fewer frames"
+    if not isinstance(error, OSError):
+        return None
+    named = None if error.filename is None else os.fsdecode(error.filename)
+    if error.errno in _MACHINE:
+        return f"{named or 'this machine'}: {error.strerror}; {_MACHINE[error.errno]}"
+    if named is not None and any(_related(named, argument) for argument in arguments):
+        return f"{named}: {error.strerror}; check the path and its permissions"
+    return None
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    if isinstance(error, MemoryError):
+        return True
+    # torch's allocators raise RuntimeError, OpenCV's an error of its own; neither has a class for it on the CPU.
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    text = str(error).lower()
+    return bool(kinds & {"RuntimeError", "error"}) and any(words in text for words in _MEMORY_WORDS)
+
+
+def _related(named: str, argument: str) -> bool:
+    """Whether a file is what an argument names, lies in it, or is a folder on the way there."""
+    _, equals, value = argument.partition("=")
+    given = os.path.abspath(value if equals and argument.startswith("-") else argument)
+    named = os.path.abspath(named)
+    return named == given or named.startswith(given.rstrip("/") + "/") or given.startswith(named.rstrip("/") + "/")
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

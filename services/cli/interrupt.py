@@ -2,23 +2,64 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
+import sys
+import threading
 from types import FrameType, TracebackType
+
+INTERRUPTED = 130
+ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+INSISTING = (signal.SIGINT, signal.SIGTERM)
+"""A terminal that is closed sends SIGHUP more than once: that never counts as insisting."""
+GRACE_S = 2.0
+"""How long a run that must end at once has to leave what it is in, before the process ends without it."""
+
+
+def end_on_interrupt() -> None:
+    """From here on Ctrl-C ends the process at once: while the program starts there is nothing to save, and an import that is cut short would
+    show a traceback."""
+    signal.signal(signal.SIGINT, _end)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    _say("interrupted")
+    _end_now()
+
+
+def _end_now() -> None:
+    files = sys.modules.get("gsplat_core.io.atomic_files")
+    if files is not None:
+        files.remove_unfinished()
+    os._exit(INTERRUPTED)
 
 
 class InterruptRequest:
-    """While entered, SIGINT and SIGTERM set `requested`; a second signal raises KeyboardInterrupt. Called, it answers whether one came."""
+    """While entered, SIGINT, SIGTERM and SIGHUP set `requested`, and that is acknowledged on stderr at once, whatever the program computes.
+
+    A second SIGINT or SIGTERM raises KeyboardInterrupt; where that is not heard within GRACE_S, in a long computation, the process ends
+    without it. Called, it answers whether a signal came.
+    """
 
     def __init__(self) -> None:
         self.requested = False
         self._before: dict[int, object] = {}
+        self._wakeup_before = -1
 
     def __call__(self) -> bool:
         return self.requested
 
     def __enter__(self) -> InterruptRequest:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        # The interpreter writes each signal's number into the pipe as it arrives; the handlers run only when the main thread gets to them.
+        receiver, self._sender = os.pipe()
+        os.set_blocking(self._sender, False)
+        self._wakeup_before = signal.set_wakeup_fd(self._sender, warn_on_full_buffer=False)
+        for number in ASKING:
+            if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                continue  # nohup: the run is to outlive its terminal
             self._before[number] = signal.signal(number, self._handle)
+        threading.Thread(target=_acknowledge, args=(receiver,), name="signals", daemon=True).start()
         return self
 
     def __exit__(
@@ -27,8 +68,41 @@ class InterruptRequest:
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
         self._before.clear()
+        signal.set_wakeup_fd(self._wakeup_before)
+        os.close(self._sender)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.requested:
+        if self.requested and number in INSISTING:
             raise KeyboardInterrupt
         self.requested = True
+
+
+def _acknowledge(receiver: int) -> None:
+    """Answer each signal when it arrives; ends when the other end of the pipe is closed."""
+    seen = 0
+    ended = threading.Event()
+    with os.fdopen(receiver, "rb", buffering=0) as signals:
+        while numbers := signals.read(64):
+            for number in numbers:
+                if number not in ASKING or (seen and number not in INSISTING):
+                    continue
+                seen += 1
+                if seen == 1:
+                    _say(
+                        "interrupted: finishing the frame on its way, then writing what there is; once more ends at once"
+                    )
+                elif seen == 2:
+                    _say("interrupted again: ending at once")
+                    threading.Thread(target=_end_after, args=(ended,), name="end", daemon=True).start()
+    ended.set()
+
+
+def _end_after(ended: threading.Event) -> None:
+    if not ended.wait(GRACE_S):
+        _end_now()
+
+
+def _say(text: str) -> None:
+    """A line on stderr from any thread, past all buffers."""
+    with contextlib.suppress(OSError):  # the terminal is gone
+        os.write(2, f"{text}\n".encode())

@@ -13,6 +13,7 @@ from operators.applications.result import RunOutcome
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.interrupt import InterruptRequest
 from services.cli.progress import ProgressPrinter
+from services.cli.streams import printable
 from services.reports.build import write_reports
 from services.reports.schema import RunReport
 
@@ -43,7 +44,7 @@ def print_report(report: RunReport, out: Path, *, as_json: bool) -> None:
     if report.run.interrupted:
         typer.echo("interrupted: the figures cover the frames that were displayed", err=True)
     for note in report.notes:
-        typer.echo(f"note: {note}", err=True)
+        typer.echo(f"note: {printable(note)}", err=True)
     frames, run, quality = report.frames, report.run, report.quality
     lines = [
         f"{frames.displayed} of {frames.ingested} frames displayed, {frames.dropped} dropped, in {run.wall_s:.1f} s"

@@ -10,6 +10,7 @@ import typer
 
 from gsplat_core.io.recordings import validate_recording
 from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.streams import printable
 
 
 def validate_command(recording: Path, *, as_json: bool) -> int:
@@ -22,9 +23,9 @@ def validate_command(recording: Path, *, as_json: bool) -> int:
     for name, value in report.facts.items():
         typer.echo(f"{name:{width}}  {_shown(value)}")
     for warning in report.warnings:
-        typer.echo(f"warning: {warning}")
+        typer.echo(f"warning: {printable(str(warning))}")
     for problem in report.problems:
-        typer.echo(f"error: {problem}", err=True)
+        typer.echo(f"error: {printable(str(problem))}", err=True)
     if report.ok:
         typer.echo("the recording can be used")
     return OK if report.ok else BAD_INPUT
@@ -35,4 +36,4 @@ def _shown(value: object) -> str:
         return f"{value:.4g}"
     if isinstance(value, list):
         return ", ".join(_shown(part) for part in value)
-    return "-" if value is None else str(value)
+    return "-" if value is None else printable(str(value))

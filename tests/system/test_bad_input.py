@@ -143,7 +143,9 @@ def test_no_model_at_all(tmp_path, refused):
 def small_disk(tmp_path):
     """A file system of 12 MiB: a tmpfs where this process may mount one."""
     if os.geteuid() != 0:
-        pytest.skip("only root may mount a small tmpfs; tests/operators/test_display.py shows the same with a reserve")
+        pytest.skip(
+            "only root may mount a small tmpfs; tests/operators/sinks/test_video.py shows the same with a reserve"
+        )
     folder = tmp_path / "disk"
     folder.mkdir()
     mounted = subprocess.run(
@@ -170,7 +172,7 @@ def test_a_disk_that_is_full_from_the_start(small_disk, tiny, refused):
 
 def test_a_disk_that_fills_up_on_the_way(small_disk, tiny, refused, monkeypatch):
     """Somebody else takes the room after three frames: video, model and report of these are still written, and whole."""
-    from operators.sinks.display import VideoSinkOp
+    from operators.sinks.video import VideoSinkOp
 
     compute = VideoSinkOp.compute
 

@@ -1,21 +1,23 @@
 #include "adam.h"
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::adam {
+
+using gsplat::adam::AdamStep;
 
 constexpr int64_t kBlock = 2048;  // values checked and then updated while they are in the first-level cache
 
 // Whether every gradient, squared, is finite: an infinite second moment would stop its parameter for good.
 static bool usable(const float* g, int64_t n) {
-  vfloat poison{};
+  vfloat nan_if_unusable{};
   int64_t i = 0;
   for (; i + kLanes <= n; i += kLanes) {
     const vfloat x = load(g + i);
-    poison += x * x * 0.0f;
+    nan_if_unusable += x * x * 0.0f;
   }
   float rest = 0;
   for (; i < n; ++i) rest += g[i] * g[i] * 0.0f;
-  return bits(poison == 0) == bits(vfloat{} == 0) && rest == 0;
+  return bits(nan_if_unusable == 0) == bits(vfloat{} == 0) && rest == 0;
 }
 
 static void update(float* __restrict__ p, const float* __restrict__ g, float* __restrict__ m, float* __restrict__ v, int64_t n,
@@ -51,6 +53,6 @@ static int64_t step(float* p, const float* g, float* m, float* v, int64_t rows, 
   return skipped;
 }
 
-extern const AdamKernels adam_kernels = {step};
+extern const gsplat::adam::Kernels kernels = {step};
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::adam

@@ -13,6 +13,8 @@
 
 namespace gsplat::hexplane {
 
+using adam::AdamStep;
+
 // The cells of space plane p are ordered along its major axis, so that those around a node of that axis are contiguous.
 constexpr int major_axis(int p) { return p == 0 ? 1 : p == 1 ? 0 : 2; }  // xy: y, xz: x, yz: z
 constexpr int minor_axis(int p) { return p == 0 ? 0 : p == 1 ? 2 : 1; }

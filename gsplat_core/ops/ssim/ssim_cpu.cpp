@@ -4,7 +4,9 @@
 #include "simd.h"
 #include "ssim.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::ssim {
+
+using namespace gsplat::ssim;
 
 constexpr float kC1 = 0.01f * 0.01f;
 constexpr float kC2 = 0.03f * 0.03f;
@@ -204,7 +206,7 @@ static void load_upstream(const Strip& s, int64_t row) {
   for (int64_t i = 0; i < (to - from) * c; ++i) out[i] = source[i];
 }
 
-// What a row that the band owns gives away: its sum and its map.
+// The outputs of a row that the band owns: its sum and its map.
 static void emit_row(const Strip& s, int64_t strip, int64_t row) {
   const SsimTask& task = s.task;
   const int first = s.begin(0), last = s.end(0);
@@ -250,6 +252,6 @@ static void band(const SsimTask& task, int64_t strip, int64_t row_begin, int64_t
   }
 }
 
-extern const SsimKernels ssim_kernels = {band};
+extern const Kernels kernels = {band};
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::ssim

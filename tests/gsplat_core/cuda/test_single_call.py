@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from gsplat_core import quat_scale_to_covar_preci, rasterization, reference
-from gsplat_core.rendering import pipeline, single_call
+from gsplat_core.rendering import single_call
 from gsplat_core.rendering.rasterization import step_by_step
+from tests.gsplat_core.cuda.single_call_checks import assert_same, check_lists, inputs, run
 
 pytestmark = pytest.mark.cuda
-NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats")
 
 
 @pytest.fixture(autouse=True)
@@ -28,45 +28,6 @@ def calls(monkeypatch) -> list[bool]:
 
     monkeypatch.setattr(single_call, "_takes", taken)
     return found
-
-
-def inputs(scene, **changes) -> dict[str, Tensor]:
-    """The scene's tensors as leaves in float32 on the GPU."""
-    names = {"colors": "sh"}
-    tensors = {name: getattr(scene, names.get(name, name)) for name in NAMES} | changes
-    return {name: t.detach().float().cuda().requires_grad_() for name, t in tensors.items()}
-
-
-def run(function, scene, leaves: dict[str, Tensor], **options):
-    """Image, alphas and the gradients of a random weighting of both, by name; and the meta."""
-    leaves = {name: t.detach().clone().requires_grad_(t.requires_grad) for name, t in leaves.items()}
-    arguments = {"sh_degree": 3, "Ks": scene.Ks.float().cuda(), "width": scene.width, "height": scene.height} | options
-    image, alphas, meta = function(**leaves, **arguments)
-    random = torch.Generator().manual_seed(3)
-    weights = [torch.rand(t.shape, generator=random).cuda() for t in (image, alphas)]
-    wanted = [t for t in leaves.values() if t.requires_grad]
-    found = torch.autograd.grad((image * weights[0]).sum() + (alphas * weights[1]).sum(), wanted, allow_unused=True)
-    gradients = iter(found)
-    result = {"image": image.detach(), "alphas": alphas.detach()}
-    for name, t in leaves.items():
-        if t.requires_grad:
-            gradient = next(gradients)
-            result[name] = torch.zeros_like(t) if gradient is None else gradient
-    return result, meta
-
-
-def assert_same(seen: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
-    """Pictures within 2e-4 but for single pixels at a cut-off, gradients within 2e-3 of their norm."""
-    for name, w in wanted.items():
-        s = seen[name]
-        assert s.shape == w.shape and s.isfinite().all(), name
-        error = (s - w).abs()
-        if name in ("image", "alphas"):
-            scale = max(1.0, float(w.abs().max())) if w.numel() else 1.0
-            assert (error > 2e-4 * scale).double().mean() < 2e-3, name
-            assert error.square().mean() <= 1e-6 * scale**2, name
-        else:
-            assert error.norm() <= 2e-3 * w.norm() + 1e-6, (name, float(error.norm()), float(w.norm()))
 
 
 VARIANTS = [
@@ -111,18 +72,6 @@ def test_every_variant_equals_the_chain(make_scene, calls, options, packed, batc
     check_lists(meta)
 
 
-def check_lists(meta: dict) -> None:
-    """The lists are sorted, complete, and say of themselves what gsplat's would."""
-    length = len(meta["flatten_ids"])
-    assert length == len(meta["isect_ids"]) == int(meta["tiles_per_gauss"].sum())
-    tiles = meta["tile_width"] * meta["tile_height"]
-    keys = pipeline.isect_ids_of(meta["flatten_ids"], meta["isect_offsets"], meta["depths"], tiles)
-    assert torch.equal(meta["isect_ids"], keys)
-    assert torch.equal(keys, keys.sort().values)
-    counts = torch.bincount(meta["flatten_ids"], minlength=meta["depths"].numel())
-    assert torch.equal(counts.int(), meta["tiles_per_gauss"].flatten())
-
-
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_degrees_and_camera_models_equal_the_reference(make_scene, model, degree):
@@ -160,17 +109,6 @@ def test_coefficients_per_camera(make_scene):
     assert_same(*(run(f, scene, leaves, packed=False)[0] for f in (rasterization, step_by_step.rasterization)))
 
 
-@pytest.mark.parametrize("mode", ["RGB", "RGB+ED", "ED"])
-def test_gradient_of_the_background(make_scene, mode):
-    scene = make_scene(100, cameras=2)
-    found = []
-    for function in (rasterization, step_by_step.rasterization):
-        background = torch.rand(2, 3, generator=torch.Generator().manual_seed(1)).cuda().requires_grad_()
-        result, _ = run(function, scene, inputs(scene) | {"backgrounds": background}, render_mode=mode)
-        found.append(result)
-    assert_same(*found)
-
-
 def test_covariances_in_place_of_quaternions(make_scene):
     scene = make_scene(100)
     covars, _ = quat_scale_to_covar_preci(scene.quats.float(), scene.scales.float(), compute_preci=False)
@@ -178,55 +116,6 @@ def test_covariances_in_place_of_quaternions(make_scene):
     del leaves["quats"], leaves["scales"]
     options = {"quats": None, "scales": None}
     assert_same(*(run(f, scene, leaves, **options)[0] for f in (rasterization, step_by_step.rasterization)))
-
-
-@pytest.mark.parametrize("wanted", [("means",), ("colors",), ("quats", "opacities"), ("viewmats",), ("scales",)])
-def test_gradients_only_where_they_are_asked_for(make_scene, wanted):
-    scene = make_scene(100, cameras=2)
-    every = inputs(scene)
-    all_gradients, _ = run(rasterization, scene, every)
-    some = {name: t.detach().requires_grad_(name in wanted) for name, t in every.items()}
-    seen, _ = run(rasterization, scene, some)
-    assert set(seen) == {"image", "alphas", *wanted}
-    for name, value in seen.items():
-        torch.testing.assert_close(value, all_gradients[name], rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("packed", [False, True])
-def test_means2d_keeps_its_gradient_and_the_absolute_one(make_scene, packed):
-    scene = make_scene(200, cameras=2, width=90, height=70)
-    found = []
-    for function in (rasterization, step_by_step.rasterization):
-        leaves = inputs(scene)
-        image, _, meta = function(
-            **leaves, Ks=scene.Ks.float().cuda(), width=90, height=70, sh_degree=3, packed=packed, absgrad=True,
-            render_mode="RGB+ED",
-        )  # fmt: skip
-        meta["means2d"].retain_grad()
-        image.square().sum().backward()
-        found.append({"grad": meta["means2d"].grad, "absgrad": meta["means2d"].absgrad, "means": leaves["means"].grad})
-    assert_same(*found)
-    assert (found[0]["absgrad"] >= found[0]["grad"].abs() * (1 - 1e-4) - 1e-5).all()
-
-
-@pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_losses_over_meta_reach_the_inputs(make_scene, packed, mode):
-    scene = make_scene(100, cameras=2)
-    found = []
-    for function in (rasterization, step_by_step.rasterization):
-        leaves = inputs(scene)
-        _, _, meta = function(
-            **leaves, Ks=scene.Ks.float().cuda(), width=scene.width, height=scene.height, sh_degree=3, packed=packed,
-            rasterize_mode=mode,
-        )  # fmt: skip
-        rows = meta["radii"][..., 0] > 0
-        total = sum((meta[name][rows] ** 2).sum() for name in ("depths", "conics", "opacities"))
-        total = total + meta["means2d"][rows].sin().sum()
-        names = ("means", "quats", "scales", "opacities", "viewmats")
-        gradients = torch.autograd.grad(total, [leaves[name] for name in names])
-        found.append(dict(zip(names, gradients, strict=True)))
-    assert_same(*found)
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -281,19 +170,6 @@ def test_the_tile_size_and_subclasses_are_left_to_the_chain(make_scene, calls):
     assert calls == [False, False, True]
     for image in images:
         torch.testing.assert_close(image.as_subclass(Tensor), images[2], rtol=1e-3, atol=1e-4)
-
-
-def test_a_second_backward_and_a_second_order_are_refused_or_right(make_scene):
-    scene = make_scene(40)
-    leaves = inputs(scene)
-    image, _, _ = rasterization(
-        **leaves, Ks=scene.Ks.float().cuda(), width=scene.width, height=scene.height, sh_degree=3
-    )
-    first, second = (torch.autograd.grad(image.sum(), leaves["means"], retain_graph=True)[0] for _ in range(2))
-    assert torch.equal(first, second)
-    gradient = torch.autograd.grad(image.sum(), leaves["means"], create_graph=True)[0]
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        gradient.sum().backward()
 
 
 @pytest.mark.parametrize("packed", [False, True])

@@ -24,18 +24,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.errors import InvalidInput
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.atomic_files import PartialFolder
 from gsplat_core.io.recordings.calibration import DEFAULT_FOCAL_FACTOR
-from gsplat_core.io.recordings.layouts import RECORDING_FORMAT, RECORDING_VERSION
+from gsplat_core.io.recordings.sidecars import RECORDING_FORMAT, RECORDING_VERSION
 from gsplat_core.io.recordings.synthetic.renderer import Eye, render_eye
+from gsplat_core.io.recordings.synthetic.target import GENERATOR, check_target
 from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM, Tissue
 from gsplat_core.io.recordings.synthetic.tool import CYCLE_S, ToolMotion
 from gsplat_core.scene.cameras import Camera
 
 BASELINE_MM = 4.4
 DEPTH_UNIT_MM = 0.01
-GENERATOR = "intrasplat synthesize"
-_WRITTEN = ("images", "images_right", "masks", "depth", "poses_bounds.npy", "tracks.npy", "recording.json")
+MAX_SEED = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -105,49 +106,34 @@ def synthesize(
     The same arguments give the same bytes. The folder appears when it is complete; one that an earlier call wrote is
     replaced, any other that is not empty is refused. `progress(done, frames)` is called after each frame.
 
-    Raises InvalidInput for arguments out of range, or an `out` that holds something else.
+    Raises InvalidSetting for arguments out of range, and for an `out` that holds anything else, is a link or the root of a disk.
     """
-    if not 1 <= frames <= 100_000:
-        raise InvalidInput(f"frames must be 1 to 100000, got {frames}")
-    if not (32 <= width_px <= 4096 and 32 <= height_px <= 4096):
-        raise InvalidInput(f"the size must be from 32x32 to 4096x4096 px, got {width_px}x{height_px}")
-    if not 1 <= fps <= 240:
-        raise InvalidInput(f"fps must be from 1 to 240, got {fps}")
-    if seed < 0:
-        raise InvalidInput(f"seed must be 0 or more, got {seed}")
-    if camera not in ("fixed", "moving"):
-        raise InvalidInput(f"camera must be 'fixed' or 'moving', got {camera!r}")
+    _check_arguments(frames, width_px, height_px, fps, seed, camera)
     target = Path(out)
-    _check_target(target)
+    check_target(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.parent / f".{target.name}.partial-{os.getpid()}"
-    partial.mkdir()
-    try:
+    with PartialFolder(target) as partial:
         scene = SyntheticScene.from_seed(seed, width_px, height_px, frames / fps, camera == "moving")
-        _write(scene, partial, frames, fps, stereo, progress)
-        _describe(partial, scene, frames, fps, seed, stereo)
-        if target.exists():
-            for name in _WRITTEN:
-                entry = target / name
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
-            target.rmdir()
-        partial.rename(target)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        _write(scene, partial.path, frames, fps, stereo, progress)
+        _describe(partial.path, scene, frames, fps, seed, stereo)
+        check_target(target)  # something may have been put there meanwhile
+        earlier = partial.finish()
+        if earlier is not None:
+            shutil.rmtree(earlier)
     return target
 
 
-def _check_target(target: Path) -> None:
-    if not target.exists():
-        return
-    if not target.is_dir():
-        raise InvalidInput(f"{target} is a file; give a folder that does not exist yet")
-    names = {entry.name for entry in target.iterdir()}
-    ours = "recording.json" in names and GENERATOR in (target / "recording.json").read_text(errors="replace")
-    if names and not (ours and names <= set(_WRITTEN)):
-        raise InvalidInput(
-            f"{target} holds other files ({', '.join(sorted(names)[:5])}); give a new or an empty folder"
-        )
+def _check_arguments(frames: int, width_px: int, height_px: int, fps: float, seed: int, camera: str) -> None:
+    if not 1 <= frames <= 100_000:
+        raise InvalidSetting(f"frames must be 1 to 100000, got {frames}")
+    if not (32 <= width_px <= 4096 and 32 <= height_px <= 4096):
+        raise InvalidSetting(f"the size must be from 32x32 to 4096x4096 px, got {width_px}x{height_px}")
+    if not 1 <= fps <= 240:
+        raise InvalidSetting(f"fps must be from 1 to 240, got {fps}")
+    if not 0 <= seed <= MAX_SEED:
+        raise InvalidSetting(f"seed must be 0 to {MAX_SEED}, got {seed}")
+    if camera not in ("fixed", "moving"):
+        raise InvalidSetting(f"camera must be 'fixed' or 'moving', got {camera!r}")
 
 
 def _write(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsplat_core.errors import InvalidInput
+from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize, validate_recording
 
 
@@ -68,10 +68,10 @@ def test_replaces_its_own_work_and_nothing_else(tmp_path: Path) -> None:
     folder = synthesize(tmp_path / "x", frames=2, **arguments)
     assert open_recording(synthesize(folder, frames=1, **arguments)).frame_count == 1
     (folder / "thesis.txt").write_text("mine")
-    with pytest.raises(InvalidInput, match="holds other files"):
+    with pytest.raises(InvalidSetting, match="holds what synthesize did not write"):
         synthesize(folder, frames=1, **arguments)
     assert (folder / "thesis.txt").read_text() == "mine"
-    with pytest.raises(InvalidInput, match="is a file"):
+    with pytest.raises(InvalidSetting, match="is a file"):
         synthesize(folder / "thesis.txt", frames=1, **arguments)
 
 
@@ -88,6 +88,6 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     "arguments", [{"frames": 0}, {"width_px": 8}, {"fps": 0}, {"seed": -1}, {"camera": "flying"}, {"height_px": 10**6}]
 )
 def test_arguments_out_of_range(tmp_path: Path, arguments: dict) -> None:
-    with pytest.raises(InvalidInput, match=str(next(iter(arguments.values())))):
+    with pytest.raises(InvalidSetting, match=str(next(iter(arguments.values())))):
         synthesize(tmp_path / "x", **arguments)
     assert list(tmp_path.iterdir()) == []
