@@ -43,10 +43,8 @@ def rasterize_to_pixels(
         backgrounds: [..., D]; masks: bool [..., tile_height, tile_width], a tile with False shows the background only.
         absgrad: the backward pass leaves the sum over pixels of |dL/dmeans2d| in `means2d.absgrad` (AbsGS, Ye et al. 2024).
 
-    Returns:
-        colors [..., image_height, image_width, D] and alphas [..., image_height, image_width, 1], float32.
-
-    Raises InvalidInput for wrong shapes or types. The result is the same for any number of threads.
+    Returns colors [..., image_height, image_width, D] and alphas [..., image_height, image_width, 1], float32. Raises InvalidInput
+    for wrong shapes or types. The result is the same for any number of threads.
     """
     channels = colors.shape[-1] if colors.ndim else 0
     image_dims = isect_offsets.shape[:-2]
