@@ -2,13 +2,13 @@
 //
 // With w_i = alpha_i T_i the weight of splat i and g_i = <dL/dcolour, c_i> at a pixel,
 //   dL/dalpha_i = T_i g_i - (sum of w_j g_j behind i, the background's included) / (1 - alpha_i),
-// so one running sum per pixel serves all channels. Over the pixels only moments of s = alpha dL/dalpha are summed; what they
-// mean for mean, conic and opacity is worked out once per splat. Every instance (a splat in a tile) has a row of its own, and
-// the rows of a splat are summed in a fixed order: no atomics, the same bits with any number of threads.
+// so one running sum per pixel serves all channels. Over the pixels only moments of s = alpha dL/dalpha are summed; from these
+// the gradients of mean, conic and opacity are computed once per splat. Every instance (a splat in a tile) has a gradient row of
+// its own, and the rows of a splat are summed in a fixed order: no atomics, the same bits for any number of threads.
 #include "blocks.h"
-#include "passes.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::compositing {
+
 namespace {
 
 constexpr float kLn2 = 0.69314718f;
@@ -23,8 +23,8 @@ struct Window {
 
 // One splat over its blocks; adds its moments, colours and absolute gradients up in `sum`.
 template <int D, bool kAbs>
-GSPLAT_INLINE void splat_backward(const Compositing& in, int32_t id, int64_t position, uint64_t blocks, vfloat block_x,
-                                  vfloat block_y, const Window& w, vfloat* sum, vfloat* color_sum) {
+GSPLAT_INLINE void splat_backward(const Splats& in, int32_t id, int64_t position, uint64_t blocks, vfloat block_x, vfloat block_y,
+                                  const Window& w, vfloat* sum, vfloat* color_sum) {
   const SplatRecord& record = in.records[id];
   const float* const color = D > 0 ? record.colors : in.colors + int64_t(id) * in.channels;
   const int channels = D > 0 ? D : in.channels;
@@ -34,9 +34,9 @@ GSPLAT_INLINE void splat_backward(const Compositing& in, int32_t id, int64_t pos
         falloff(record, block_x + float(block % kColumns * kBlockWidth), block_y + float(block / kColumns * kBlockHeight));
     vint last;
     __builtin_memcpy(&last, w.last + at, sizeof(last));
-    const vmask valid =
-        at_least(f.power, splat(kFaintest)) & at_least(splat(record.cap), f.power) & at_least(last, splat_int(int32_t(position)));
-    const vfloat alpha = zero_unless(valid, exp2(smaller(f.power, splat(kOpaque))));
+    const vmask valid = at_least(f.power, splat(kLog2AlphaCutoff)) & at_least(splat(record.cap), f.power) &
+                        at_least(last, splat_int(int32_t(position)));
+    const vfloat alpha = zero_unless(valid, exp2(smaller(f.power, splat(kLog2MaxAlpha))));
     const vfloat widen = reciprocal(1.0f - alpha);
     const vfloat through = load(w.through + at) * widen, weight = alpha * through;
     vfloat g = {};
@@ -49,8 +49,8 @@ GSPLAT_INLINE void splat_backward(const Compositing& in, int32_t id, int64_t pos
     const vfloat v_alpha = fma(through, g, -(behind * widen));
     store(w.through + at, through);
     store(w.behind + at, fma(weight, g, behind));
-    // A splat at the ceiling of 0.99 passes nothing on to its opacity and shape.
-    const vfloat s = zero_unless(valid & at_least(splat(kOpaque), f.power), alpha * v_alpha);
+    // Where alpha is clamped to its maximum, opacity and shape have no gradient.
+    const vfloat s = zero_unless(valid & at_least(splat(kLog2MaxAlpha), f.power), alpha * v_alpha);
     const vfloat sx = s * f.dx, sy = s * f.dy;
     sum[0] = sum[0] + s;
     sum[1] = sum[1] + sx;
@@ -72,8 +72,8 @@ GSPLAT_INLINE void put(float* to, const float* from, int count, bool add) {
 }
 
 template <int D, bool kAbs>
-void window_backward(const Compositing& in, const Tile& tile, int x0, int y0, int64_t tile_index, bool add,
-                     const CompositingGradients& out, float* scratch) {
+void window_backward(const Splats& in, const Tile& tile, int x0, int y0, int64_t tile_index, bool add,
+                     const PictureGradient& from, const GradientRows& out, float* scratch) {
   const int width = tile.right - x0 < kWindow ? tile.right - x0 : kWindow;
   const int height = tile.bottom - y0 < kWindow ? tile.bottom - y0 : kWindow;
   const int channels = D > 0 ? D : in.channels, abs_at = kMoments + channels;
@@ -94,27 +94,27 @@ void window_backward(const Compositing& in, const Tile& tile, int x0, int y0, in
     for (int x = 0; x < width; x += kBlockWidth) {
       const int at = place(x, y), count = width - x < kBlockWidth ? width - x : kBlockWidth;
       const int64_t pixel = row + x;
-      const float* const from = out.v_colors + pixel * channels;
+      const float* const source = from.v_colors + pixel * channels;
       float* const to = w.v_colors + at;
       quad left = {1, 1, 1, 1}, v_left = {};
       if (count == kBlockWidth) {
-        left = 1.0f - load_quad(out.alphas + pixel);
-        v_left = -load_quad(out.v_alphas + pixel);
-        __builtin_memcpy(last + at, out.last + pixel, kBlockWidth * sizeof(int32_t));
+        left = 1.0f - load_quad(from.alphas + pixel);
+        v_left = -load_quad(from.v_alphas + pixel);
+        __builtin_memcpy(last + at, from.last + pixel, kBlockWidth * sizeof(int32_t));
       } else {
         for (int i = 0; i < count; ++i) {
-          left[i] = 1 - out.alphas[pixel + i];
-          v_left[i] = -out.v_alphas[pixel + i];
-          last[at + i] = out.last[pixel + i];
+          left[i] = 1 - from.alphas[pixel + i];
+          v_left[i] = -from.v_alphas[pixel + i];
+          last[at + i] = from.last[pixel + i];
         }
       }
       if (D == 4 && count == kBlockWidth) {
-        quad a = load_quad(from), b = load_quad(from + 4), c = load_quad(from + 8), d = load_quad(from + 12);
+        quad a = load_quad(source), b = load_quad(source + 4), c = load_quad(source + 8), d = load_quad(source + 12);
         transpose(a, b, c, d);
         store_quad(to, a), store_quad(to + kPixels, b), store_quad(to + 2 * kPixels, c), store_quad(to + 3 * kPixels, d);
       } else {
         for (int i = 0; i < count; ++i)
-          for (int d = 0; d < channels; ++d) to[d * kPixels + i] = from[i * channels + d];
+          for (int d = 0; d < channels; ++d) to[d * kPixels + i] = source[i * channels + d];
       }
       if (background != nullptr)
         for (int d = 0; d < channels; ++d) {
@@ -141,7 +141,7 @@ void window_backward(const Compositing& in, const Tile& tile, int x0, int y0, in
     const int64_t ahead = first - 2 * kLanes > tile.begin ? first - 2 * kLanes : tile.begin;
     prefetch_records(in, ahead, kLanes);
     for (int64_t i = ahead; i < ahead + kLanes && i < tile.end; ++i)
-      __builtin_prefetch(out.rows + int64_t(out.slots[i]) * out.row_size, 1);
+      __builtin_prefetch(out.rows + int64_t(out.row_of[i]) * out.row_size, 1);
     constexpr int kHalves = (kBlocks + 31) / 32;  // a splat's set of blocks, 32 to an int
     alignas(64) uint32_t touched[kHalves][kLanes] = {};
     if (first <= furthest) {
@@ -155,7 +155,7 @@ void window_backward(const Compositing& in, const Tile& tile, int x0, int y0, in
     }
     for (int i = count - 1; i >= 0; --i) {
       const int64_t position = first + i;
-      float* const to = out.rows + int64_t(out.slots[position]) * out.row_size;
+      float* const to = out.rows + int64_t(out.row_of[position]) * out.row_size;
       uint64_t blocks = touched[0][i];
       if constexpr (kHalves > 1) blocks |= uint64_t(touched[kHalves - 1][i]) << 32;
       if (blocks == 0) {
@@ -194,33 +194,62 @@ void window_backward(const Compositing& in, const Tile& tile, int x0, int y0, in
 }
 
 template <int D, bool kAbs>
-void tile_backward(const Compositing& in, int64_t index, const CompositingGradients& out, float* scratch) {
+void tile_backward(const Splats& in, int64_t index, const PictureGradient& from, const GradientRows& out, float* scratch) {
   const Tile tile = tile_of(in, index);
   bool add = false;
   for (int y = tile.y; y < tile.bottom; y += kWindow)
     for (int x = tile.x; x < tile.right; x += kWindow, add = true)
-      window_backward<D, kAbs>(in, tile, x, y, index, add, out, scratch);
-  if (!add) {  // a tile outside of the image: its instances reach no pixel
+      window_backward<D, kAbs>(in, tile, x, y, index, add, from, out, scratch);
+  if (!add) {  // a tile outside of the image, whose instances reach no pixel
     for (int64_t position = tile.begin; position < tile.end; ++position)
-      for (int64_t r = 0; r < out.row_size; ++r) out.rows[out.slots[position] * out.row_size + r] = 0;
+      for (int64_t r = 0; r < out.row_size; ++r) out.rows[out.row_of[position] * out.row_size + r] = 0;
   }
 }
 
 template <int D>
-void tile_backward(const Compositing& in, int64_t index, const CompositingGradients& out, float* scratch) {
-  return out.absgrad ? tile_backward<D, true>(in, index, out, scratch) : tile_backward<D, false>(in, index, out, scratch);
+void tile_backward(const Splats& in, int64_t index, const PictureGradient& from, const GradientRows& out, float* scratch) {
+  return out.absgrad ? tile_backward<D, true>(in, index, from, out, scratch)
+                     : tile_backward<D, false>(in, index, from, out, scratch);
 }
 
 }  // namespace
 
-void composite_tile_backward(const Compositing& in, int64_t tile, const CompositingGradients& out, float* scratch) {
+void composite_tile_backward(const Splats& in, int64_t tile, const PictureGradient& from, const GradientRows& out,
+                             float* scratch) {
   switch (in.channels) {
-    case 1: return tile_backward<1>(in, tile, out, scratch);
-    case 3: return tile_backward<3>(in, tile, out, scratch);
-    case 4: return tile_backward<4>(in, tile, out, scratch);
-    case 5: return tile_backward<5>(in, tile, out, scratch);
-    default: return tile_backward<0>(in, tile, out, scratch);
+    case 1: return tile_backward<1>(in, tile, from, out, scratch);
+    case 3: return tile_backward<3>(in, tile, from, out, scratch);
+    case 4: return tile_backward<4>(in, tile, from, out, scratch);
+    case 5: return tile_backward<5>(in, tile, from, out, scratch);
+    default: return tile_backward<0>(in, tile, from, out, scratch);
   }
 }
 
-}  // namespace GSPLAT_ISA
+void gather(const Splats& in, const GradientRows& from, const int32_t* first, int64_t begin, int64_t end,
+            const InputGradients& out) {
+  const int channels = in.channels;
+  for (int64_t splat = begin; splat < end; ++splat) {
+    float m[kMoments] = {}, absolute[2] = {};
+    float* const v_color = out.colors + channels * splat;
+    for (int d = 0; d < channels; ++d) v_color[d] = 0;
+    const bool usable = in.records[splat].l > -__builtin_inff();
+    for (int64_t i = first[splat]; usable && i < first[splat + 1]; ++i) {
+      const float* const row = from.rows + i * from.row_size;
+      for (int r = 0; r < kMoments; ++r) m[r] += row[r];
+      for (int d = 0; d < channels; ++d) v_color[d] += row[kMoments + d];
+      if (from.absgrad)
+        for (int r = 0; r < 2; ++r) absolute[r] += row[kMoments + channels + r];
+    }
+    const float a = usable ? in.conics[3 * splat] : 0, b = usable ? in.conics[3 * splat + 1] : 0;
+    const float c = usable ? in.conics[3 * splat + 2] : 0;
+    out.means2d[2 * splat] = a * m[1] + b * m[2];
+    out.means2d[2 * splat + 1] = b * m[1] + c * m[2];
+    out.conics[3 * splat] = -0.5f * m[3];
+    out.conics[3 * splat + 1] = -m[4];
+    out.conics[3 * splat + 2] = -0.5f * m[5];
+    out.opacities[splat] = usable ? m[0] / in.opacities[splat] : 0;
+    for (int r = 0; from.absgrad && r < 2; ++r) out.absolute[2 * splat + r] = absolute[r];
+  }
+}
+
+}  // namespace GSPLAT_ISA::compositing

@@ -1,10 +1,26 @@
-// What the forward and the backward kernel share: the blocks of a window, which of them a splat touches, and its alpha there.
+// What the forward and the backward kernel of the CPU share: the blocks of a window, which of them a splat touches, its alpha
+// there.
 #pragma once
 
 #include "compositing.h"
+#include "constants.h"
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::compositing {
+
+using namespace gsplat::compositing;
+using gsplat::kLog2AlphaCutoff;
+using gsplat::kLog2MaxAlpha;
+using gsplat::kMinTransmittance;
+
+void make_records(const Inputs& in, int64_t begin, int64_t end, SplatRecord* records);
+int64_t scratch_floats(int channels);
+void composite_tile(const Splats& in, int64_t tile, const Pixels& out, float* scratch);
+void composite_tile_backward(const Splats& in, int64_t tile, const PictureGradient& from, const GradientRows& out,
+                             float* scratch);
+void gather(const Splats& in, const GradientRows& from, const int32_t* first, int64_t begin, int64_t end,
+            const InputGradients& out);
+
 namespace {
 
 constexpr int kBlockWidth = 4;
@@ -14,16 +30,12 @@ constexpr int kRows = kWindow / kBlockHeight;
 constexpr int kBlocks = kColumns * kRows;
 constexpr int kPixels = kWindow * kWindow;
 
-constexpr float kFaintest = -7.99435344f;  // log2(1/255): a splat fainter than this at a pixel is skipped there
-constexpr float kOpaque = -0.01449957f;    // log2(0.99): the most opaque that a splat can be
-constexpr float kStop = 1e-4f;             // a splat that would leave less transmittance ends the pixel, unblended
-
-// Where pixel (x, y) of a window is in its block-wise arrays.
+// The index of pixel (x, y) of a window in arrays ordered block by block.
 GSPLAT_INLINE int place(int x, int y) {
   return (y / kBlockHeight * kColumns + x / kBlockWidth) * kLanes + y % kBlockHeight * kBlockWidth + x % kBlockWidth;
 }
 
-// Four pixels next to each other, which lie next to each other in a block too.
+// Four horizontally adjacent pixels, which are contiguous in a block too.
 typedef float quad __attribute__((vector_size(16)));
 GSPLAT_INLINE quad load_quad(const float* p) {
   quad v;
@@ -32,7 +44,7 @@ GSPLAT_INLINE quad load_quad(const float* p) {
 }
 GSPLAT_INLINE void store_quad(float* p, quad v) { __builtin_memcpy(p, &v, sizeof(v)); }
 
-// The columns of four rows: 4 pixels of 4 channels from 4 channels of 4 pixels, and back.
+// Transposes 4x4: 4 pixels of 4 channels from 4 channels of 4 pixels, and back.
 GSPLAT_INLINE void transpose(quad& a, quad& b, quad& c, quad& d) {
   const quad ab_low = __builtin_shufflevector(a, b, 0, 4, 1, 5),
              ab_high = __builtin_shufflevector(a, b, 2, 6, 3, 7);
@@ -90,10 +102,10 @@ GSPLAT_INLINE void test_blocks(const SplatRecord* records, const int32_t* ids, i
   }
   const vfloat zero = {}, ux = load(fields[0]) - x, uy = load(fields[1]) - y;
   const vfloat a = -load(fields[2]), b = load(fields[3]) * -0.5f, c = -load(fields[4]);
-  const vfloat k = load(fields[5]) + (2e-3f - kFaintest);  // a little outside of the contour, against rounding
+  const vfloat k = load(fields[5]) + (2e-3f - kLog2AlphaCutoff);  // slightly outside of the contour, against rounding
   const vfloat ac = a * c, det = fma(-b, b, ac) - ac * 5e-7f;
   const vmask reaches = at_least(k, zero);
-  // What is no proper ellipse in float32 is tested pixel by pixel.
+  // A conic that is not a proper ellipse in float32 is tested pixel by pixel.
   const vfloat proper_det = det - ac * 1e-6f;
   const vmask proper = above(a, zero) & above(c, zero) & above(proper_det, zero);
   const vfloat inverse = 1.0f / a;
@@ -115,8 +127,8 @@ GSPLAT_INLINE void test_blocks(const SplatRecord* records, const int32_t* ids, i
   }
 }
 
-// Splats lie anywhere in memory: their records are on the way while others are blended.
-GSPLAT_INLINE void prefetch_records(const Compositing& in, int64_t first, int count) {
+// Records are scattered in memory: they are prefetched while others are blended.
+GSPLAT_INLINE void prefetch_records(const Splats& in, int64_t first, int count) {
   const int64_t end = first + count < in.instances ? first + count : in.instances;
   for (int64_t i = first < 0 ? 0 : first; i < end; ++i) __builtin_prefetch(in.records + in.flatten_ids[i]);
 }
@@ -127,7 +139,7 @@ struct Tile {
   int x, y, right, bottom;    // its pixels
   bool masked;
 };
-GSPLAT_INLINE Tile tile_of(const Compositing& in, int64_t tile) {
+GSPLAT_INLINE Tile tile_of(const Splats& in, int64_t tile) {
   const int64_t tiles = int64_t(in.tile_width) * in.tile_height, image = tile / tiles, inside = tile % tiles;
   Tile t;
   t.image = image;
@@ -142,4 +154,5 @@ GSPLAT_INLINE Tile tile_of(const Compositing& in, int64_t tile) {
 }
 
 }  // namespace
-}  // namespace GSPLAT_ISA
+
+}  // namespace GSPLAT_ISA::compositing

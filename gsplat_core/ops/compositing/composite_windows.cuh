@@ -1,15 +1,19 @@
-// The splats and windows of the op composite, for its forward and backward kernels.
+// Records and windows of the op composite, for its forward and backward kernels.
 #pragma once
 
 #include <type_traits>
 
-#include "blend_window.cuh"
-#include "compositing_cuda.h"
+#include "../blending/splats.cuh"
+#include "compositing.h"
+#include "cuda_scratch.h"
 
+namespace gsplat::compositing {
 namespace {
 
+using namespace blending;
+
 template <int D>
-__global__ void make_records(DeviceCompositing in, Record<D>* records) {
+__global__ void make_records(Inputs in, Record<D>* records) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.count) return;
   const float x = in.means2d[2 * i], y = in.means2d[2 * i + 1], opacity = in.opacities[i];
@@ -36,15 +40,15 @@ __global__ void make_records(DeviceCompositing in, Record<D>* records) {
 }
 
 template <int D>
-Record<D>* records_of(const DeviceCompositing& in, CudaScratch& scratch, cudaStream_t stream) {
+Record<D>* records_of(const Inputs& in, CudaScratch& scratch, cudaStream_t stream) {
   Record<D>* const records = scratch.array<Record<D>>(in.count);
   if (in.count > 0) make_records<D><<<blocks_for(in.count), kThreads, 0, stream>>>(in, records);
   return records;
 }
 
-// The lists come from the caller: an index that is no splat's is read as a splat that reaches no pixel.
+// The lists come from the caller: an index out of range is read as a splat that reaches no pixel.
 template <int D>
-__device__ inline Record<D> record_at(const DeviceCompositing& in, const Record<D>* records, int position) {
+__device__ inline Record<D> record_at(const Inputs& in, const Record<D>* records, int position) {
   const int id = in.flatten_ids[position];
   return uint32_t(id) < uint64_t(in.count) ? records[id] : faint_record<D>();
 }
@@ -54,29 +58,29 @@ struct Place {
   int64_t tile, image;
   int side, part;  // windows on a side of a tile, and which of them
 
-  __device__ explicit Place(const DeviceCompositing& in) {
-    side = (in.tile_size + kWindowSize - 1) / kWindowSize;
+  __device__ explicit Place(const Inputs& in) {
+    side = (in.tile_size + kWindow - 1) / kWindow;
     tile = blockIdx.x / (side * side);
     part = int(blockIdx.x % (side * side));
     image = tile / (int64_t(in.tile_width) * in.tile_height);
   }
-  __device__ Window window(const DeviceCompositing& in) const {
+  __device__ Window window(const Inputs& in) const {
     const int64_t tiles = int64_t(in.tile_width) * in.tile_height;
     const int64_t begin = clamp(in.offsets[tile], in.instances);
     const int64_t end = tile + 1 < tiles * in.images ? clamp(in.offsets[tile + 1], in.instances) : in.instances;
     const int within = int(tile % tiles);
     const int tile_x = within % in.tile_width * in.tile_size, tile_y = within / in.tile_width * in.tile_size;
     const int right = min(tile_x + in.tile_size, in.width), bottom = min(tile_y + in.tile_size, in.height);
-    const int left = tile_x + part % side * kWindowSize, top = tile_y + part / side * kWindowSize;
+    const int left = tile_x + part % side * kWindow, top = tile_y + part / side * kWindow;
     return Window(int(begin), int(end), left, top, right, bottom);
   }
-  __device__ int64_t pixel(const DeviceCompositing& in, const Window& w, int p) const {
+  __device__ int64_t pixel(const Inputs& in, const Window& w, int p) const {
     return (image * in.height + w.y[p]) * in.width + w.x;
   }
   __device__ static int64_t clamp(int64_t value, int64_t most) { return value < 0 ? 0 : value > most ? most : value; }
 };
 
-// run(Compiled number of channels): 0 stands for any other number.
+// run(number of channels as a constant); 0 stands for numbers that are not compiled.
 template <class Run>
 void with_channels(int channels, const Run& run) {
   switch (channels) {
@@ -89,3 +93,5 @@ void with_channels(int channels, const Run& run) {
 }
 
 }  // namespace
+
+}  // namespace gsplat::compositing

@@ -1,71 +1,107 @@
-// Alpha compositing of depth-ordered splats, tile by tile, forward and backward.
+// Alpha compositing of depth-ordered splats, tile by tile, forward and backward: what the host code and the kernels of both
+// devices share.
 //
-// Inside a tile the work goes in windows of 16x16 pixels, and a window in blocks of one vector of pixels each, 4 wide: 4x4 with
+// A tile is composited in windows of 16x16 pixels. CPU: a window in blocks of one vector of pixels each, 4 wide: 4x4 with
 // AVX-512, 4x2 with AVX2. A first pass finds for every splat the blocks that its ellipse touches; the second blends only those.
+// CUDA: a thread block of four warps has a window, each warp a quadrant of 8x8 with two pixels per thread (../blending).
 #pragma once
 
 #include <cstdint>
 
+#include "cuda_stream.h"
 #include "isa.h"
 
-// One splat, ready to blend, on one cache line. log2(alpha) = a dx^2 + b dx dy + c dy^2 + l with dx, dy from the mean to the
+class CudaScratch;
+
+namespace gsplat::compositing {
+
+constexpr int kWindow = 16;            // pixels on a side
+constexpr int kMaxRecordChannels = 8;  // channels that a CPU record has memory for
+constexpr int kMoments = 6;            // sum over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
+
+struct Inputs {
+  const float* means2d;    // [count, 2]
+  const float* conics;     // [count, 3]
+  const float* colors;     // [count, channels]
+  const float* opacities;  // [count]
+  const int32_t* offsets;  // [images, tile_height, tile_width]
+  const int32_t* flatten_ids;
+  const float* backgrounds;  // [images, channels] or null
+  const bool* masks;         // [images, tile_height, tile_width] or null
+  int64_t count, instances;
+  int32_t images, channels, width, height, tile_size, tile_width, tile_height;
+
+  constexpr int64_t tiles() const { return int64_t(images) * tile_width * tile_height; }
+  constexpr int64_t windows() const {  // of one tile
+    const int64_t side = (tile_size + kWindow - 1) / kWindow;
+    return side * side;
+  }
+};
+
+// `last` is the last blended position of flatten_ids, -1 where there is none.
+struct Pixels {
+  float* colors;  // [images, height, width, channels]
+  float* alphas;  // [images, height, width]
+  int32_t* last;  // [images, height, width]
+};
+
+// What the backward pass gets: results of the forward pass, and dL/d(colours, alphas).
+struct PictureGradient {
+  const float* alphas;
+  const int32_t* last;
+  const float* v_colors;  // [images, height, width, channels]
+  const float* v_alphas;  // [images, height, width]
+};
+
+struct InputGradients {
+  float* means2d;      // [count, 2]
+  float* conics;       // [count, 3]
+  float* colors;       // [count, channels]
+  float* opacities;    // [count]
+  float* backgrounds;  // [images, channels] or null
+  float* absolute;     // [count, 2]: sums of |dL/dmeans2d|; or null
+};
+
+// CPU: one splat, ready to blend, on one cache line. log2(alpha) = a dx^2 + b dx dy + c dy^2 + l with dx, dy from the mean to the
 // pixel. A splat with a value that is not finite has l = -infinity, so that it reaches no pixel.
 struct SplatRecord {
   float x, y, a, b, c, l;
   // log2(alpha) beyond this is skipped: l where the conic is indefinite (sigma would be negative), else infinity.
   float cap;
   float unused;
-  float colors[8];  // where there are at most 8 channels
+  float colors[kMaxRecordChannels];  // unless there are more channels
 };
 
-constexpr int kWindow = 16;       // pixels on a side
-constexpr int kMostRecorded = 8;  // channels that a record has room for
-constexpr int kMoments = 6;       // sum over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
-
-struct Compositing {
+struct Splats : Inputs {
   const SplatRecord* records;
-  const float* colors;     // [count, channels]
-  const float* means2d;    // [count, 2]
-  const float* conics;     // [count, 3]
-  const float* opacities;  // [count]
-  int32_t channels;
-  const int32_t* offsets;  // [images, tile_height, tile_width]
-  const int32_t* flatten_ids;
-  int64_t instances;
-  int32_t images, width, height, tile_size, tile_width, tile_height;
-  const float* backgrounds;  // [images, channels] or null
-  const bool* masks;         // [images, tile_height, tile_width] or null
 };
 
-// Results of the forward pass. `last` is the last blended position of flatten_ids, -1 where there is none.
-struct CompositedPixels {
-  float* colors;  // [images, height, width, channels]
-  float* alphas;  // [images, height, width]
-  int32_t* last;  // [images, height, width]
-};
-
-struct CompositingGradients {
-  const float* alphas;    // of the forward pass
-  const int32_t* last;    // of the forward pass
-  const float* v_colors;  // [images, height, width, channels]
-  const float* v_alphas;  // [images, height, width]
-  bool absgrad;
-  // Where the gradient of every instance goes: position of flatten_ids -> row of `rows`, so that a splat's rows are neighbours.
-  const int32_t* slots;
+struct GradientRows {
+  // Where the row of every instance goes: position of flatten_ids -> row of `rows`, so that a splat's rows are contiguous.
+  const int32_t* row_of;
   float* rows;  // [instances, row_size]: moments, colours, then |dL/dx|, |dL/dy| with absgrad; on cache lines
   int64_t row_size;
+  bool absgrad;
   float* v_backgrounds;  // [tiles, channels] partial sums, or null
 };
 
-struct CompositingKernels {
+struct Kernels {
   // Records of splats [begin, end).
-  void (*records)(const Compositing& in, int64_t begin, int64_t end, SplatRecord* records);
+  void (*records)(const Inputs& in, int64_t begin, int64_t end, SplatRecord* records);
   // Floats of scratch memory (64-byte aligned) that one thread needs for either pass.
   int64_t (*scratch_floats)(int channels);
-  void (*tile)(const Compositing& in, int64_t tile, const CompositedPixels& out, float* scratch);
-  void (*tile_backward)(const Compositing& in, int64_t tile, const CompositingGradients& out, float* scratch);
+  void (*tile)(const Splats& in, int64_t tile, const Pixels& out, float* scratch);
+  void (*tile_backward)(const Splats& in, int64_t tile, const PictureGradient& from, const GradientRows& out, float* scratch);
   // Sums a splat's rows [first[i], first[i + 1]) and turns them into gradients, for splats [begin, end).
-  void (*gather)(const Compositing& in, const CompositingGradients& from, const int32_t* first, int64_t begin, int64_t end,
-                 float* v_means2d, float* v_conics, float* v_colors, float* v_opacities, float* v_means2d_abs);
+  void (*gather)(const Splats& in, const GradientRows& from, const int32_t* first, int64_t begin, int64_t end,
+                 const InputGradients& out);
 };
-GSPLAT_DECLARE_KERNELS(CompositingKernels, compositing_kernels)
+
+// CUDA: all pointers are device memory.
+void composite_on_device(const Inputs& in, const Pixels& out, CudaScratch& scratch, cudaStream_t stream);
+void composite_backward_on_device(const Inputs& in, const PictureGradient& from, const InputGradients& out, CudaScratch& scratch,
+                                  cudaStream_t stream);
+
+}  // namespace gsplat::compositing
+
+GSPLAT_KERNELS(compositing, Kernels)

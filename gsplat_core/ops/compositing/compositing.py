@@ -43,10 +43,8 @@ def rasterize_to_pixels(
         backgrounds: [..., D]; masks: bool [..., tile_height, tile_width], a tile with False shows the background only.
         absgrad: the backward pass leaves the sum over pixels of |dL/dmeans2d| in `means2d.absgrad` (AbsGS, Ye et al. 2024).
 
-    Returns:
-        colors [..., image_height, image_width, D] and alphas [..., image_height, image_width, 1], float32.
-
-    Raises InvalidInput for wrong shapes or types. The result is the same for any number of threads.
+    Returns colors [..., image_height, image_width, D] and alphas [..., image_height, image_width, 1], float32. Raises InvalidInput
+    for wrong shapes or types. The result is the same for any number of threads.
     """
     channels = colors.shape[-1] if colors.ndim else 0
     image_dims = isect_offsets.shape[:-2]
@@ -141,14 +139,9 @@ def _composite_fake(
     colors: Tensor,
     opacities: Tensor,
     isect_offsets: Tensor,
-    flatten_ids: Tensor,
-    backgrounds: Tensor | None,
-    masks: Tensor | None,
-    absgrad_probe: Tensor | None,
-    width: int,
-    height: int,
-    tile_size: int,
+    *rest: Any,
 ) -> tuple[Tensor, Tensor, Tensor]:
+    *_, width, height, _tile_size = rest
     shape = (isect_offsets.shape[0], height, width)
     last = isect_offsets.new_empty(shape)
     return colors.new_empty(*shape, colors.shape[-1]), colors.new_empty(*shape, 1), last
@@ -163,16 +156,9 @@ def _composite_backward_fake(
     isect_offsets: Tensor,
     flatten_ids: Tensor,
     backgrounds: Tensor | None,
-    masks: Tensor | None,
-    width: int,
-    height: int,
-    tile_size: int,
-    alphas: Tensor,
-    last: Tensor,
-    v_colors: Tensor,
-    v_alphas: Tensor,
-    absgrad: bool,
+    *rest: Any,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    *_, absgrad = rest
     count, channels = colors.shape
     return (
         colors.new_empty(count, 2),

@@ -1,15 +1,16 @@
 // The gradient of compositing, back to front from the saved transmittance.
 //
-// Every instance (a splat in a window) has a row of its own, the sum over the window's pixels in a fixed order; the rows of a
-// splat are summed in the order of the lists. No atomics, so the same bits every time.
+// Every instance (a splat in a window) has a gradient row of its own, the sum over the window's pixels in a fixed order; the rows
+// of a splat are summed in the order of the lists. No atomics, so results are bitwise reproducible.
 #include "gather_rows.cuh"
 
+namespace gsplat::compositing {
 namespace {
 
-constexpr int kValues = 16;  // that a warp sums at once
+constexpr int kValues = 16;  // values that a warp sums at once
 
-// Sums 2 kHalf values over groups of 4 kHalf lanes with one exchange per value: a lane gives half of its values away, then half
-// of the rest. For 16 values lane i of the warp returns the sum of value i / 2.
+// Sums 2 kHalf values over groups of 4 kHalf lanes with one shuffle per value: a lane hands over half of its values, then half of
+// the rest. For 16 values lane i of the warp returns the sum of value i / 2.
 template <int kHalf>
 __device__ inline float warp_sums(float* v, int lane) {
   if constexpr (kHalf == 0) {
@@ -36,22 +37,22 @@ __device__ inline float block_sum(float value) {
   return sum;
 }
 
-// Reads the window's pixels; adds up what the background gets.
-__device__ inline void start_pixels(const DeviceCompositing& in, const DeviceGradients& out, const Place& place, const Window& w,
+// Reads the window's pixels; sums the gradient of the background.
+__device__ inline void start_pixels(const Inputs& in, const PictureGradient& from, const Place& place, const Window& w,
                                     Pixel (&pixels)[kPixelsEach], float* background_parts) {
   const float* const background = in.backgrounds != nullptr ? in.backgrounds + place.image * in.channels : nullptr;
   float left[kPixelsEach], v_left[kPixelsEach];
   for (int p = 0; p < kPixelsEach; ++p) {
     const bool inside = w.inside[p];
     const int64_t pixel = place.pixel(in, w, p);
-    left[p] = inside ? 1 - out.alphas[pixel] : 1;
-    v_left[p] = inside ? -out.v_alphas[pixel] : 0;
-    pixels[p].last = inside ? out.last[pixel] : -1;
+    left[p] = inside ? 1 - from.alphas[pixel] : 1;
+    v_left[p] = inside ? -from.v_alphas[pixel] : 0;
+    pixels[p].last = inside ? from.last[pixel] : -1;
   }
   for (int d = 0; background != nullptr && d < in.channels; ++d) {
     float shown = 0;
     for (int p = 0; p < kPixelsEach; ++p) {
-      const float v = w.inside[p] ? out.v_colors[place.pixel(in, w, p) * in.channels + d] : 0;
+      const float v = w.inside[p] ? from.v_colors[place.pixel(in, w, p) * in.channels + d] : 0;
       shown += v * left[p];
       v_left[p] = fmaf(v, background[d], v_left[p]);
     }
@@ -62,22 +63,22 @@ __device__ inline void start_pixels(const DeviceCompositing& in, const DeviceGra
 }
 
 // The row of an instance in this block's window, among those of all windows of its tile.
-__device__ inline int64_t row_of(const DeviceCompositing& in, int64_t position) {
-  const int side = (in.tile_size + kWindowSize - 1) / kWindowSize, windows = side * side;
+__device__ inline int64_t row_of(const Inputs& in, int64_t position) {
+  const int side = (in.tile_size + kWindow - 1) / kWindow, windows = side * side;
   return position * windows + blockIdx.x % windows;
 }
 
 template <int D, bool kAbs>
 __global__ void __launch_bounds__(kBlockThreads, 5)
-    backward_windows(DeviceCompositing in, const Record<D>* records, DeviceGradients out, float4* rows, float* background_parts) {
+    backward_windows(Inputs in, const Record<D>* records, PictureGradient from, float4* rows, float* background_parts) {
   __shared__ BackwardStage<D, kAbs> stage;
   const Place place(in);
   const Window w = place.window(in);
   Pixel pixels[kPixelsEach];
-  start_pixels(in, out, place, w, pixels, background_parts);
+  start_pixels(in, from, place, w, pixels, background_parts);
   float v_color[kPixelsEach][D];
   for (int p = 0; p < kPixelsEach; ++p)
-    for (int d = 0; d < D; ++d) v_color[p][d] = w.inside[p] ? out.v_colors[place.pixel(in, w, p) * D + d] : 0;
+    for (int d = 0; d < D; ++d) v_color[p][d] = w.inside[p] ? from.v_colors[place.pixel(in, w, p) * D + d] : 0;
   const auto fetch = [&](int position) { return record_at(in, records, position); };
   const auto row = [&](int position) { return rows + row_of(in, position) * stage.kQuads; };
   blend_backward<D, kAbs, true>(w, fetch, pixels, v_color, row, stage);
@@ -89,21 +90,21 @@ struct Blend {
 };
 __device__ inline Blend blend(const Pixel& pixel, float power) {
   Blend b;
-  b.alpha = exp2_fast(fminf(power, kOpaque));
+  b.alpha = exp2_fast(fminf(power, kLog2MaxAlpha));
   b.widen = reciprocal(1 - b.alpha);
   b.through = pixel.through * b.widen;
   b.weight = b.alpha * b.through;
   return b;
 }
 
-// Adds a pixel's part of the moments and moves the pixel in front of the splat.
+// Adds a pixel's part of the moments and advances the pixel to in front of the splat.
 template <bool kAbs, int D>
 __device__ inline void add_moments(const Record<D>& r, const Falloff& f, const Blend& b, float g, Pixel& pixel, float* v) {
   const float v_alpha = fmaf(b.through, g, -(pixel.behind * b.widen));
   pixel.through = b.through;
   pixel.behind = fmaf(b.weight, g, pixel.behind);
-  // A splat at the ceiling of 0.99 passes nothing on to its opacity and shape.
-  const float s = f.power <= kOpaque ? b.alpha * v_alpha : 0, sx = s * f.dx, sy = s * f.dy;
+  // Where alpha is clamped to its maximum, opacity and shape have no gradient.
+  const float s = f.power <= kLog2MaxAlpha ? b.alpha * v_alpha : 0, sx = s * f.dx, sy = s * f.dy;
   v[0] += s;
   v[1] += sx;
   v[2] += sy;
@@ -116,18 +117,17 @@ __device__ inline void add_moments(const Record<D>& r, const Falloff& f, const B
   }
 }
 
-// Any number of channels: the whole block takes one splat at a time, and 16 values of its row at a time.
+// Any number of channels: the whole block processes one splat at a time, and 16 values of its row at a time.
 template <bool kAbs>
 __global__ void __launch_bounds__(kBlockThreads)
-    backward_windows_of_any(DeviceCompositing in, const Record<0>* records, DeviceGradients out, float4* rows,
-                            float* background_parts) {
+    backward_windows_of_any(Inputs in, const Record<0>* records, PictureGradient from, float4* rows, float* background_parts) {
   constexpr int kShape = shape_size(0, kAbs);
   __shared__ float sums[kWarps][kValues];
   const Place place(in);
   const Window w = place.window(in);
   const int lane = threadIdx.x & 31, warp = threadIdx.x / 32, quads = quads_of(kShape, in.channels);
   Pixel pixels[kPixelsEach];
-  start_pixels(in, out, place, w, pixels, background_parts);
+  start_pixels(in, from, place, w, pixels, background_parts);
   const int furthest = block_furthest(__reduce_max_sync(kAll, max(pixels[0].last, pixels[1].last)));
   const int end = furthest < w.begin ? w.begin : min(furthest + 1, w.end);
   for (int64_t e = threadIdx.x; e < int64_t(w.end - end) * quads; e += kBlockThreads)
@@ -139,9 +139,9 @@ __global__ void __launch_bounds__(kBlockThreads)
     float shape[kShape] = {}, weight[kPixelsEach] = {};
     for (int p = 0; p < kPixelsEach; ++p) {
       const Falloff f = falloff(r, center_x, float(w.y[p]) + 0.5f);
-      if (!(f.power >= kFaintest && f.power <= r.cap && position <= pixels[p].last)) continue;
+      if (!(f.power >= kLog2AlphaCutoff && f.power <= r.cap && position <= pixels[p].last)) continue;
       const Blend b = blend(pixels[p], f.power);
-      const float* const v_color = out.v_colors + place.pixel(in, w, p) * in.channels;
+      const float* const v_color = from.v_colors + place.pixel(in, w, p) * in.channels;
       float g = 0;
       for (int d = 0; d < in.channels; ++d) g = fmaf(v_color[d], color[d], g);
       weight[p] = b.weight;
@@ -156,7 +156,7 @@ __global__ void __launch_bounds__(kBlockThreads)
           v[i] = shape[i < kShape ? i : 0];
         } else if (d < in.channels) {
           for (int p = 0; p < kPixelsEach; ++p)
-            if (weight[p] > 0) v[i] = fmaf(weight[p], out.v_colors[place.pixel(in, w, p) * in.channels + d], v[i]);
+            if (weight[p] > 0) v[i] = fmaf(weight[p], from.v_colors[place.pixel(in, w, p) * in.channels + d], v[i]);
         }
       }
       const float sum = warp_sums<kValues / 2>(v, lane);
@@ -164,7 +164,7 @@ __global__ void __launch_bounds__(kBlockThreads)
       __syncthreads();
       if (threadIdx.x < kValues && base + int(threadIdx.x) < 4 * quads) {
         float all = 0;
-        for (int from = 0; from < kWarps; ++from) all += sums[from][threadIdx.x];
+        for (int warp_index = 0; warp_index < kWarps; ++warp_index) all += sums[warp_index][threadIdx.x];
         reinterpret_cast<float*>(rows + row_of(in, position) * quads)[base + threadIdx.x] = all;
       }
       __syncthreads();
@@ -187,17 +187,18 @@ __global__ void sum_backgrounds(const float* parts, int64_t parts_per_image, int
 }
 
 template <int D, bool kAbs>
-void run_backward(const DeviceCompositing& in, const DeviceGradients& out, CudaScratch& scratch, cudaStream_t stream) {
+void run_backward(const Inputs& in, const PictureGradient& from, const InputGradients& out, CudaScratch& scratch,
+                  cudaStream_t stream) {
   const int64_t windows = in.windows(), blocks = in.tiles() * windows;
   const int shape = shape_size(D, kAbs), quads = quads_of(shape, in.channels);
   const Record<D>* const records = records_of<D>(in, scratch, stream);
   float4* const rows = scratch.array<float4>(in.instances * windows * quads);
-  float* const parts = out.v_backgrounds != nullptr ? scratch.array<float>(blocks * in.channels) : nullptr;
+  float* const parts = out.backgrounds != nullptr ? scratch.array<float>(blocks * in.channels) : nullptr;
   if (blocks > 0) {
     if constexpr (D > 0) {
-      backward_windows<D, kAbs><<<unsigned(blocks), kBlockThreads, 0, stream>>>(in, records, out, rows, parts);
+      backward_windows<D, kAbs><<<unsigned(blocks), kBlockThreads, 0, stream>>>(in, records, from, rows, parts);
     } else {
-      backward_windows_of_any<kAbs><<<unsigned(blocks), kBlockThreads, 0, stream>>>(in, records, out, rows, parts);
+      backward_windows_of_any<kAbs><<<unsigned(blocks), kBlockThreads, 0, stream>>>(in, records, from, rows, parts);
     }
   }
   if (in.count > 0) {
@@ -207,19 +208,21 @@ void run_backward(const DeviceCompositing& in, const DeviceGradients& out, CudaS
   }
   if (parts != nullptr && in.images > 0 && in.channels > 0)
     sum_backgrounds<<<unsigned(in.images * in.channels), kThreads, 0, stream>>>(parts, blocks / in.images, in.channels,
-                                                                                out.v_backgrounds);
+                                                                                out.backgrounds);
 }
 
 }  // namespace
 
-void composite_backward_on_device(const DeviceCompositing& in, const DeviceGradients& out, CudaScratch& scratch,
+void composite_backward_on_device(const Inputs& in, const PictureGradient& from, const InputGradients& out, CudaScratch& scratch,
                                   cudaStream_t stream) {
   with_channels(in.channels, [&](auto channels) {
     constexpr int D = decltype(channels)::value;
-    if (out.v_absolute != nullptr) {
-      run_backward<D, true>(in, out, scratch, stream);
+    if (out.absolute != nullptr) {
+      run_backward<D, true>(in, from, out, scratch, stream);
     } else {
-      run_backward<D, false>(in, out, scratch, stream);
+      run_backward<D, false>(in, from, out, scratch, stream);
     }
   });
 }
+
+}  // namespace gsplat::compositing

@@ -1,11 +1,13 @@
-#include "blend_forward.cuh"
+// Compositing front to back.
+#include "../blending/blend_forward.cuh"
 #include "composite_windows.cuh"
 
+namespace gsplat::compositing {
 namespace {
 
 template <int D>
-__device__ inline void write_pixels(const DeviceCompositing& in, const Place& place, const Window& w, BlendedPixels<D>& blended,
-                                    const DevicePixels& out) {
+__device__ inline void write_pixels(const Inputs& in, const Place& place, const Window& w, BlendedPixels<D>& blended,
+                                    const Pixels& out) {
   const float* const background = in.backgrounds != nullptr ? in.backgrounds + place.image * in.channels : nullptr;
   for (int p = 0; p < kPixelsEach; ++p) {
     if (!w.inside[p]) continue;
@@ -25,8 +27,7 @@ __device__ inline void write_pixels(const DeviceCompositing& in, const Place& pl
 }
 
 template <int D>
-__global__ void __launch_bounds__(kBlockThreads, 8)
-    composite_windows(DeviceCompositing in, const Record<D>* records, DevicePixels out) {
+__global__ void __launch_bounds__(kBlockThreads, 8) composite_windows(Inputs in, const Record<D>* records, Pixels out) {
   __shared__ ForwardStage<D> stage;
   const Place place(in);
   Window w = place.window(in);
@@ -37,8 +38,7 @@ __global__ void __launch_bounds__(kBlockThreads, 8)
 }
 
 // Any number of channels: the sums are in the image.
-__global__ void __launch_bounds__(kBlockThreads)
-    composite_windows_of_any(DeviceCompositing in, const Record<0>* records, DevicePixels out) {
+__global__ void __launch_bounds__(kBlockThreads) composite_windows_of_any(Inputs in, const Record<0>* records, Pixels out) {
   __shared__ Record<0> staged[kBlockThreads];
   __shared__ int staged_ids[kBlockThreads];
   const Place place(in);
@@ -68,9 +68,9 @@ __global__ void __launch_bounds__(kBlockThreads)
         const int i = group + __ffs(int(hits)) - 1;
         for (int p = 0; p < kPixelsEach; ++p) {
           const float power = falloff(staged[i], center_x, float(w.y[p]) + 0.5f).power;
-          if (!(open[p] && power >= kFaintest && power <= staged[i].cap)) continue;
-          const float alpha = exp2_fast(fminf(power, kOpaque)), behind = fmaf(-alpha, through[p], through[p]);
-          if (!(behind > kStop)) {
+          if (!(open[p] && power >= kLog2AlphaCutoff && power <= staged[i].cap)) continue;
+          const float alpha = exp2_fast(fminf(power, kLog2MaxAlpha)), behind = fmaf(-alpha, through[p], through[p]);
+          if (!(behind > kMinTransmittance)) {
             open[p] = false;
             continue;
           }
@@ -97,7 +97,7 @@ __global__ void __launch_bounds__(kBlockThreads)
 
 }  // namespace
 
-void composite_on_device(const DeviceCompositing& in, const DevicePixels& out, CudaScratch& scratch, cudaStream_t stream) {
+void composite_on_device(const Inputs& in, const Pixels& out, CudaScratch& scratch, cudaStream_t stream) {
   const int64_t blocks = in.tiles() * in.windows();
   if (blocks == 0) return;
   with_channels(in.channels, [&](auto channels) {
@@ -110,3 +110,5 @@ void composite_on_device(const DeviceCompositing& in, const DevicePixels& out, C
     }
   });
 }
+
+}  // namespace gsplat::compositing

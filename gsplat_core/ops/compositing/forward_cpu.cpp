@@ -1,10 +1,12 @@
+// Records of the splats, and blending front to back.
 #include "blocks.h"
-#include "passes.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::compositing {
+
 namespace {
 
-constexpr int kBatch = 64;  // splats per pass over the blocks: one bit each in a block's word
+constexpr float kLog2E = 1.44269504f;
+constexpr int kBatch = 64;  // splats per pass over the blocks: one bit each in a block's 64-bit mask
 
 // The state of a window's pixels between batches, block by block. D channels, or `channels` of them when D is 0.
 struct Window {
@@ -15,8 +17,8 @@ struct Window {
 };
 
 template <int D>
-void blend_block(const Compositing& in, const int32_t* ids, int64_t position, uint64_t splats, vfloat x, vfloat y,
-                 const Window& w, int block, uint64_t& alive) {
+void blend_block(const Splats& in, const int32_t* ids, int64_t position, uint64_t splats, vfloat x, vfloat y, const Window& w,
+                 int block, uint64_t& alive) {
   const int at = block * kLanes;
   vfloat through = load(w.through + at), kept = load(w.kept + at);
   vint last;
@@ -27,11 +29,11 @@ void blend_block(const Compositing& in, const int32_t* ids, int64_t position, ui
     const int i = __builtin_ctzll(splats);
     const SplatRecord& record = in.records[ids[i]];
     const vfloat power = falloff(record, x, y).power;
-    const vmask valid = at_least(power, splat(kFaintest)) & at_least(splat(record.cap), power);
-    const vfloat alpha = zero_unless(valid, exp2(smaller(power, splat(kOpaque))));
+    const vmask valid = at_least(power, splat(kLog2AlphaCutoff)) & at_least(splat(record.cap), power);
+    const vfloat alpha = zero_unless(valid, exp2(smaller(power, splat(kLog2MaxAlpha))));
     const vfloat next = fma(-alpha, through, through);
     // Past the stop the transmittance only falls, so this test alone ends a pixel for good.
-    const vmask open = above(next, splat(kStop));
+    const vmask open = above(next, splat(kMinTransmittance));
     const vfloat weight = zero_unless(open, alpha * through);
     if constexpr (D > 0) {
       for (int d = 0; d < D; ++d) sum[d] = fma(weight, splat(record.colors[d]), sum[d]);
@@ -56,14 +58,14 @@ void blend_block(const Compositing& in, const int32_t* ids, int64_t position, ui
   for (int d = 0; d < D; ++d) store(w.colors + d * kPixels + at, sum[d]);
 }
 
-GSPLAT_INLINE void write_pixel(const Window& w, int at, int channels, int64_t pixel, const CompositedPixels& out) {
+GSPLAT_INLINE void write_pixel(const Window& w, int at, int channels, int64_t pixel, const Pixels& out) {
   out.alphas[pixel] = 1 - w.kept[at];
   out.last[pixel] = w.last[at];
   for (int d = 0; d < channels; ++d) out.colors[pixel * channels + d] = w.colors[d * kPixels + at];
 }
 
 template <int D>
-void blend_window(const Compositing& in, const Tile& tile, int x0, int y0, const CompositedPixels& out, float* scratch) {
+void blend_window(const Splats& in, const Tile& tile, int x0, int y0, const Pixels& out, float* scratch) {
   const int width = tile.right - x0 < kWindow ? tile.right - x0 : kWindow;
   const int height = tile.bottom - y0 < kWindow ? tile.bottom - y0 : kWindow;
   alignas(64) float through[kPixels], kept[kPixels];
@@ -129,7 +131,7 @@ void blend_window(const Compositing& in, const Tile& tile, int x0, int y0, const
 }
 
 template <int D>
-void blend_tile(const Compositing& in, Tile tile, const CompositedPixels& out, float* scratch) {
+void blend_tile(const Splats& in, Tile tile, const Pixels& out, float* scratch) {
   if (tile.masked) tile.end = tile.begin;  // nothing but the background
   for (int y = tile.y; y < tile.bottom; y += kWindow)
     for (int x = tile.x; x < tile.right; x += kWindow) blend_window<D>(in, tile, x, y, out, scratch);
@@ -137,7 +139,42 @@ void blend_tile(const Compositing& in, Tile tile, const CompositedPixels& out, f
 
 }  // namespace
 
-void composite_tile(const Compositing& in, int64_t tile, const CompositedPixels& out, float* scratch) {
+void make_records(const Inputs& in, int64_t begin, int64_t end, SplatRecord* records) {
+  const int channels = in.channels;
+  for (int64_t first = begin; first < end; first += kLanes) {
+    const int n = end - first < kLanes ? int(end - first) : kLanes;
+    float logs[kLanes] = {};
+    for (int i = 0; i < n; ++i) logs[i] = in.opacities[first + i];
+    const vfloat opacity = load(logs);
+    store(logs, where(above(opacity, vfloat{}), log2(opacity), splat(-__builtin_inff())));
+    for (int i = 0; i < n; ++i) {
+      const int64_t splat = first + i;
+      const float *mean = in.means2d + 2 * splat, *conic = in.conics + 3 * splat, *color = in.colors + channels * splat;
+      SplatRecord& r = records[splat];
+      const float a = conic[0], b = conic[1], c = conic[2];
+      // Zero times a value that is not finite is NaN.
+      float check = 0 * mean[0] + 0 * mean[1] + 0 * a + 0 * b + 0 * c + 0 * in.opacities[splat];
+      for (int d = 0; d < channels; ++d) check += 0 * color[d];
+      const bool usable = check == 0;
+      const bool indefinite = !(a >= 0 && c >= 0 && a * c - b * b >= 0);
+      r.x = usable ? mean[0] : 0;
+      r.y = usable ? mean[1] : 0;
+      r.a = usable ? -0.5f * kLog2E * a : 0;
+      r.b = usable ? -kLog2E * b : 0;
+      r.c = usable ? -0.5f * kLog2E * c : 0;
+      r.l = usable ? logs[i] : -__builtin_inff();
+      r.cap = indefinite ? r.l : __builtin_inff();
+      r.unused = 0;
+      if (channels <= kMaxRecordChannels)
+        for (int d = 0; d < channels; ++d) r.colors[d] = color[d];
+    }
+  }
+}
+
+// Colours (forward) or their gradients (backward) of a window; then, in the backward pass, a splat's sums by lane and in all.
+int64_t scratch_floats(int channels) { return int64_t(channels) * (kPixels + kLanes + 1); }
+
+void composite_tile(const Splats& in, int64_t tile, const Pixels& out, float* scratch) {
   const Tile t = tile_of(in, tile);
   switch (in.channels) {
     case 1: return blend_tile<1>(in, t, out, scratch);
@@ -148,4 +185,6 @@ void composite_tile(const Compositing& in, int64_t tile, const CompositedPixels&
   }
 }
 
-}  // namespace GSPLAT_ISA
+extern const Kernels kernels = {make_records, scratch_floats, composite_tile, composite_tile_backward, gather};
+
+}  // namespace GSPLAT_ISA::compositing

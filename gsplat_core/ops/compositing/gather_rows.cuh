@@ -1,13 +1,15 @@
-// The rows of the instances, summed by splat in the order of the lists, and turned into gradients.
+// The gradient rows of the instances, summed by splat in the order of the lists, and turned into gradients.
 #pragma once
 
-#include "blend_backward.cuh"
+#include "../blending/blend_backward.cuh"
 #include "composite_windows.cuh"
 #include "cub_device.cuh"
+#include "cuda_check.h"
 
+namespace gsplat::compositing {
 namespace {
 
-__global__ void number_instances(DeviceCompositing in, uint32_t* splats, uint32_t* positions) {
+__global__ void number_instances(Inputs in, uint32_t* splats, uint32_t* positions) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.instances) return;
   const uint32_t id = uint32_t(in.flatten_ids[i]);
@@ -15,8 +17,8 @@ __global__ void number_instances(DeviceCompositing in, uint32_t* splats, uint32_
   positions[i] = uint32_t(i);
 }
 
-// Where the instances of each splat are, sorted by splat: [x, y). Splats without any keep what is there, zeros.
-__global__ void ranges_of_splats(DeviceCompositing in, const uint32_t* sorted, uint2* ranges) {
+// The range [x, y) of each splat among the instances sorted by splat; `ranges` was zeroed, for splats without any.
+__global__ void ranges_of_splats(Inputs in, const uint32_t* sorted, uint2* ranges) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.instances || sorted[i] >= in.count) return;
   if (i == 0 || sorted[i - 1] != sorted[i]) ranges[sorted[i]].x = uint32_t(i);
@@ -32,11 +34,11 @@ __device__ inline float4 from_lane_xor(const float4& v, int mask) {
 }
 
 // Sums the rows of each splat and turns the sums into gradients: four lanes per splat, each a float4 of the row at a time. A
-// splat with very many rows is left to the whole warp, in an order that depends on their number alone.
+// splat with very many rows is summed by the whole warp, in an order that depends on their number alone.
 template <int D>
-__global__ void gather_rows(DeviceCompositing in, const Record<D>* records, const uint32_t* positions, const uint2* ranges,
-                            const float4* rows, int windows, int shape, DeviceGradients out) {
-  constexpr int64_t kMany = 64;
+__global__ void gather_rows(Inputs in, const Record<D>* records, const uint32_t* positions, const uint2* ranges,
+                            const float4* rows, int windows, int shape, InputGradients out) {
+  constexpr int64_t kManyRows = 64;
   const int64_t splat = (int64_t(blockIdx.x) * kThreads + threadIdx.x) / 4;
   const int lane = threadIdx.x & 31, quads = quads_of(shape, in.channels);
   const bool usable = splat < in.count && records[splat].l > -INFINITY;
@@ -46,11 +48,11 @@ __global__ void gather_rows(DeviceCompositing in, const Record<D>* records, cons
     return windows == 1 ? rows[int64_t(positions[first + i]) * quads + q]
                         : rows[(int64_t(positions[first + i / windows]) * windows + i % windows) * quads + q];
   };
-  const unsigned large = __ballot_sync(kAll, count > kMany && lane % 4 == 0);
+  const unsigned large = __ballot_sync(kAll, count > kManyRows && lane % 4 == 0);
   for (int first_quad = 0; first_quad < quads; first_quad += 4) {
     const int q = first_quad + lane % 4;
     float4 sum = make_float4(0, 0, 0, 0);
-    if (q < quads && count <= kMany) {
+    if (q < quads && count <= kManyRows) {
 #pragma unroll 4
       for (int64_t i = 0; i < count; ++i) sum = plus(sum, row(range.x, i, q));
     }
@@ -71,19 +73,19 @@ __global__ void gather_rows(DeviceCompositing in, const Record<D>* records, cons
     if (q == 0) {
       const float a = usable ? in.conics[3 * splat] : 0, b = usable ? in.conics[3 * splat + 1] : 0;
       const float c = usable ? in.conics[3 * splat + 2] : 0;
-      out.v_means2d[2 * splat] = a * sum.y + b * sum.z;
-      out.v_means2d[2 * splat + 1] = b * sum.y + c * sum.z;
-      out.v_conics[3 * splat] = -0.5f * sum.w;
-      out.v_opacities[splat] = usable ? sum.x / in.opacities[splat] : 0;
+      out.means2d[2 * splat] = a * sum.y + b * sum.z;
+      out.means2d[2 * splat + 1] = b * sum.y + c * sum.z;
+      out.conics[3 * splat] = -0.5f * sum.w;
+      out.opacities[splat] = usable ? sum.x / in.opacities[splat] : 0;
     } else if (q == 1) {
-      out.v_conics[3 * splat + 1] = -sum.x;
-      out.v_conics[3 * splat + 2] = -0.5f * sum.y;
+      out.conics[3 * splat + 1] = -sum.x;
+      out.conics[3 * splat + 2] = -0.5f * sum.y;
     }
     for (int r = 0; r < 4; ++r) {
       const int at = 4 * q + r;
-      if (at >= shape && at < shape + in.channels) out.v_splat_colors[splat * in.channels + at - shape] = values[r];
-      if (out.v_absolute != nullptr && at >= kShapeMoments && at < kShapeMoments + 2)
-        out.v_absolute[2 * splat + at - kShapeMoments] = values[r];
+      if (at >= shape && at < shape + in.channels) out.colors[splat * in.channels + at - shape] = values[r];
+      if (out.absolute != nullptr && at >= kShapeMoments && at < kShapeMoments + 2)
+        out.absolute[2 * splat + at - kShapeMoments] = values[r];
     }
   }
 }
@@ -93,19 +95,23 @@ struct Instances {
   const uint32_t* positions;
   const uint2* ranges;
 };
-Instances by_splat(const DeviceCompositing& in, CudaScratch& scratch, cudaStream_t stream) {
+Instances by_splat(const Inputs& in, CudaScratch& scratch, cudaStream_t stream) {
   uint2* const ranges = scratch.array<uint2>(in.count);
-  cudaMemsetAsync(ranges, 0, size_t(in.count) * sizeof(uint2), stream);
+  check_cuda(cudaMemsetAsync(ranges, 0, size_t(in.count) * sizeof(uint2), stream), "clearing instance ranges");
   if (in.instances == 0) return {nullptr, ranges};
   const auto array = [&] { return scratch.array<uint32_t>(in.instances); };
   cub::DoubleBuffer<uint32_t> splats(array(), array()), positions(array(), array());
   number_instances<<<blocks_for(in.instances), kThreads, 0, stream>>>(in, splats.Current(), positions.Current());
   const int bits = bits_below(in.count + 1);
   size_t size = 0;
-  cub::DeviceRadixSort::SortPairs(nullptr, size, splats, positions, in.instances, 0, bits, stream);
-  cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, splats, positions, in.instances, 0, bits, stream);
+  check_cuda(cub::DeviceRadixSort::SortPairs(nullptr, size, splats, positions, in.instances, 0, bits, stream),
+             "sorting instances by splat");
+  check_cuda(cub::DeviceRadixSort::SortPairs(scratch.bytes(size), size, splats, positions, in.instances, 0, bits, stream),
+             "sorting instances by splat");
   ranges_of_splats<<<blocks_for(in.instances), kThreads, 0, stream>>>(in, splats.Current(), ranges);
   return {positions.Current(), ranges};
 }
 
 }  // namespace
+
+}  // namespace gsplat::compositing

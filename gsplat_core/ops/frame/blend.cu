@@ -1,14 +1,16 @@
 // One block per tile: sorts the tile's list by depth, then composites it front to back.
 #include <type_traits>
 
-#include "../compositing/blend_forward.cuh"
-#include "../compositing/blend_half.cuh"
+#include "../blending/blend_forward.cuh"
+#include "../blending/blend_half.cuh"
 #include "dependent_launch.cuh"
 #include "frame.h"
 #include "tile_sort.cuh"
 
 namespace gsplat::frame {
 namespace {
+
+using namespace blending;
 
 using Splat = Record<4>;
 

@@ -1,12 +1,14 @@
 // Splats to instances: which tiles a splat touches, how many, and the keys of its instances.
 #pragma once
 
-#include "../compositing/blend_window.cuh"
+#include "../blending/splats.cuh"
 #include "../tiles/tile_ellipse.cuh"
 #include "frame.h"
 
 namespace gsplat::frame {
 namespace {
+
+using namespace blending;
 
 using namespace gsplat::tiles;
 
@@ -54,7 +56,7 @@ struct Footprint {
 
 // The contour alpha = 1/255 in the record's units, slightly enlarged: -(a dx^2 + b dx dy + c dy^2) = l - log2(1/255).
 __device__ inline TileEllipse ellipse_of_record(const float4& xyab, float c, float l) {
-  return tile_ellipse(xyab.x, xyab.y, -xyab.z, -0.5f * xyab.w, -c, l + (7e-4f - kFaintest));
+  return tile_ellipse(xyab.x, xyab.y, -xyab.z, -0.5f * xyab.w, -c, l + (7e-4f - kLog2AlphaCutoff));
 }
 
 // The footprint of a splat with this bounding box and ellipse.

@@ -2,10 +2,12 @@
 // bitonically in registers, in shared memory, or in global memory, as the length allows.
 #pragma once
 
-#include "../compositing/blend_window.cuh"
+#include "../blending/splats.cuh"
 
 namespace gsplat::frame {
 namespace {
+
+using namespace blending;
 
 constexpr int kSortKeys = 2048;      // keys that a block sorts in shared memory
 constexpr int kMaxKeysOfThread = 8;  // keys of a thread in registers

@@ -2,12 +2,14 @@
 //
 // A row is the sum over the tile's pixels in a fixed order. Unless `atomic`, every instance has a row of its own and nothing is
 // added atomically, so results are bitwise reproducible.
-#include "../compositing/blend_backward.cuh"
+#include "../blending/blend_backward.cuh"
 #include "cuda_check.h"
 #include "frame_gradients.h"
 
 namespace gsplat::frame {
 namespace {
+
+using namespace blending;
 
 constexpr int kChannels = 4;  // red, green, blue, z
 static_assert(quads_of(shape_size(kChannels, false), kChannels) == kRowQuads);

@@ -1,5 +1,5 @@
 // The lists of the tiles, and the picture.
-#include "../compositing/blend_forward.cuh"
+#include "../blending/blend_forward.cuh"
 #include "../frame/tile_sort.cuh"
 #include "dependent_launch.cuh"
 #include "rasterization.h"
@@ -7,6 +7,7 @@
 namespace gsplat::rasterization {
 namespace {
 
+using namespace blending;
 using namespace frame;
 
 using Splat = Record<4>;

@@ -6,6 +6,7 @@
 namespace gsplat::rasterization {
 namespace {
 
+using namespace blending;
 using namespace frame;
 
 __device__ inline Projected project_one(const ProjectionInput& in, const float* mean, const Geometry& geometry, float opacity,

@@ -1,11 +1,13 @@
 // From the picture's gradient to that of the splats: per tile, from the back to the front, a row of sums for every instance; per
 // splat the sum of its rows. Every row is a sum over the tile's pixels in a fixed order, and rows are added in the order of the
 // instances: the bits are the same every time.
-#include "../compositing/blend_backward.cuh"
+#include "../blending/blend_backward.cuh"
 #include "rasterization.h"
 
 namespace gsplat::rasterization {
 namespace {
+
+using namespace blending;
 
 constexpr int kChannels = 4;  // red, green, blue, z
 constexpr int kRowFloat4s = kSplatFloats / 4;

@@ -1,20 +1,21 @@
 // Sums over the 64 pixels of a warp's quadrant for eight splats at a time, as small matrix products on the tensor cores.
 //
-// A pixel's part in a splat's gradient is s = alpha dL/dalpha for the shape and w for the colours. The moments are S Phi with
-// Phi = (1, x, y, x^2, xy, y^2) of every pixel, exact in tf32; the colours' gradients are W V with V = dL/dcolour. What is not
-// exact is split into two tf32 numbers, so that the products are as good as float32's.
+// A pixel's terms in a splat's gradient are s = alpha dL/dalpha for the shape and w for the colours. The moments are S Phi with
+// Phi = (1, x, y, x^2, xy, y^2) of every pixel, exact in tf32; the colours' gradients are W V with V = dL/dcolour. Values that
+// are not exact in tf32 are split into two tf32 numbers, which makes the products as accurate as float32's.
 #pragma once
 
-#include "blend_window.cuh"
+#include "splats.cuh"
 
+namespace gsplat::blending {
 namespace {
 
-constexpr int kSlots = 8;        // splats that are summed at once
-constexpr int kShareLanes = 36;  // the lanes' shares of one splat, and what keeps eight lanes' reads in different banks
-constexpr int kSteps = 4;        // a product runs over 8 of the 32 lanes at a time
+constexpr int kSlots = 8;       // splats that are summed at once
+constexpr int kTermLanes = 36;  // the lanes' terms of one splat, padded against bank conflicts
+constexpr int kSteps = 4;       // a product sums over 8 of the 32 lanes at a time
 
-// A lane's share of a splat: s and w of its two pixels.
-using SplatShares = float4[kSlots][kShareLanes];
+// A lane's terms of a splat: s and w of its two pixels.
+using SplatTerms = float4[kSlots][kTermLanes];
 
 __device__ inline float upper_bits(float x) { return __uint_as_float(__float_as_uint(x) & 0xffffe000u); }  // tf32, truncated
 
@@ -27,17 +28,17 @@ __device__ inline void multiply_add(float (&sums)[4], float a0, float a1, float 
         "r"(__float_as_uint(b[0])), "r"(__float_as_uint(b[1])));
 }
 
-// The right-hand matrices of a warp: what its pixels contribute per unit of s and of w.
+// The right-hand operands of a warp: what its pixels contribute per unit of s and of w.
 template <int D>
 struct PixelFactors {
   static constexpr int kColorTiles = (2 * D + 7) / 8;  // columns: the upper and the lower part of every channel
   float moments[kSteps][2];                            // of the lanes' first pixels, about their rows' middle
   float colors[kColorTiles][kSteps][kPixelsEach][2];
 
-  // The whole warp takes part, with the dL/dcolour of each lane's pixels, and writes over the shares.
-  __device__ PixelFactors(const float (&v_color)[kPixelsEach][D], SplatShares& shares) {
-    static_assert(sizeof(float[kPixelsEach][32][D]) <= sizeof(SplatShares));
-    auto& colors_of_lanes = reinterpret_cast<float (&)[kPixelsEach][32][D]>(shares);
+  // Called by the whole warp with dL/dcolour of each lane's pixels; uses `terms` as scratch.
+  __device__ PixelFactors(const float (&v_color)[kPixelsEach][D], SplatTerms& terms) {
+    static_assert(sizeof(float[kPixelsEach][32][D]) <= sizeof(SplatTerms));
+    auto& colors_of_lanes = reinterpret_cast<float (&)[kPixelsEach][32][D]>(terms);
     const int lane = threadIdx.x & 31, row = lane / 4, column = lane % 4;
 #pragma unroll
     for (int p = 0; p < kPixelsEach; ++p)
@@ -69,17 +70,18 @@ struct PixelFactors {
   }
 };
 
-// Sums the shares of eight splats. Lane 4 r + c gets of splat r: in `moments` two of the sums of s (1, x | y, x^2 | xy, y^2 for
-// c = 0, 1, 2; nothing for c = 3) about the quadrant's middle, in `colors` the sums of w dL/dcolour of channel c, then c + 4.
+// Sums the terms of eight splats over the warp. Lane 4 r + c gets of splat r: in `moments` two of the sums of s (1, x | y, x^2 |
+// xy, y^2 for c = 0, 1, 2; nothing for c = 3) about the quadrant's middle, in `colors` the sums of w dL/dcolour of channel c,
+// then c + 4.
 template <int D>
-__device__ inline void sum_shares(const SplatShares& shares, const PixelFactors<D>& factors, float (&moments)[2],
-                                  float (&colors)[PixelFactors<D>::kColorTiles]) {
+__device__ inline void sum_terms(const SplatTerms& terms, const PixelFactors<D>& factors, float (&moments)[2],
+                                 float (&colors)[PixelFactors<D>::kColorTiles]) {
   constexpr int kTiles = PixelFactors<D>::kColorTiles;
   const int row = (threadIdx.x & 31) / 4, column = threadIdx.x % 4;
   float shape[4] = {}, color[kTiles][4] = {};  // shape: of the first pixels, then of the second
 #pragma unroll
   for (int step = 0; step < kSteps; ++step) {
-    const float4 a = shares[row][8 * step + column], b = shares[row][8 * step + 4 + column];
+    const float4 a = terms[row][8 * step + column], b = terms[row][8 * step + 4 + column];
     const float4 upper_a = make_float4(upper_bits(a.x), upper_bits(a.y), upper_bits(a.z), upper_bits(a.w));
     const float4 upper_b = make_float4(upper_bits(b.x), upper_bits(b.y), upper_bits(b.z), upper_bits(b.w));
     multiply_add(shape, upper_a.x, upper_a.y, upper_b.x, upper_b.y, factors.moments[step]);
@@ -101,3 +103,5 @@ __device__ inline void sum_shares(const SplatShares& shares, const PixelFactors<
 }
 
 }  // namespace
+
+}  // namespace gsplat::blending

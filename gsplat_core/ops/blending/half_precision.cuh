@@ -1,12 +1,80 @@
-// Front-to-back blending of sixteen pixels in half precision on the tensor cores: the powers of many splats at all the pixels are
-// one matrix product, and so are the sums of the colours, as in attention (Dao et al. 2022).
+// Half precision on the tensor cores for front-to-back blending: splats staged as matrix operands, and groups of sixteen pixels.
+// The powers of many splats at all the pixels are one matrix product, and so are the sums of the colours, as in attention (Dao et
+// al. 2022).
 #pragma once
+
+#include <cuda_fp16.h>
 
 #include <cstddef>
 
-#include "half_splats.cuh"
+#include "matrix_units.cuh"
+#include "splats.cuh"
 
+namespace gsplat::blending {
 namespace {
+
+// Opacities are scaled so that half precision's smallest normal number is the cut-off: flushing denormals to zero then implements
+// it. They are in units of 1 / kHalfUnits until then.
+constexpr float kHalfUnits = 64.875f;  // 2^-14 of them are 1/255 of 1 / 0.99, to within 4e-4
+constexpr float kLog2HalfUnits = 6.0195907f;
+constexpr float kGreatestHalf = 65504;
+constexpr float kLowScale = 2048;
+
+__device__ inline uint32_t bits_of(__half2 x) { return reinterpret_cast<const uint32_t&>(x); }
+
+// The coefficients of `StagedSplat`, each as the sum of two halves, in the order of PixelBasis: 22 bits. Then the colours and
+// a 1, whose sum over the splats is that of their weights. Each of the three is a row of a matrix for `ldmatrix`.
+struct alignas(16) HalfSplat {
+  uint4 high, low, colors;
+};
+static_assert(sizeof(HalfSplat) == sizeof(Record<4>));
+
+// What the coefficients are multiplied by at (x, y), as pairs: 0 is (1, x), 1 is (y, x^2), 2 is (x y, y^2), 3 is nothing; exact
+// in half precision at pixel centres. The factors extend the range of the coefficients. A lane has one pair, of one column.
+struct PixelBasis {
+  __half2 constant, by_y, by_yy;
+
+  __device__ PixelBasis(int pair, float x) {
+    constant = __floats2half2_rn(pair == 0 ? 16 : 0, pair == 0 ? 4 * x : pair == 1 ? x * x : 0);
+    by_y = __floats2half2_rn(pair == 1 ? 4 : pair == 2 ? x : 0, 0);
+    by_yy = __floats2half2_rn(0, pair == 2 ? 1 : 0);
+  }
+  // For a pixel and the one below it; first for the coefficients' high parts, then for the low ones.
+  __device__ void fill(float y, uint32_t (&basis)[4]) const {
+#pragma unroll
+    for (int i = 0; i < 2; ++i) {
+      const __half2 both = __float2half2_rn(y + float(i)), high = __hfma2(__hfma2(by_yy, both, by_y), both, constant);
+      basis[i] = bits_of(high);
+      basis[i + 2] = bits_of(__hmul2(high, __float2half2_rn(1 / kLowScale)));
+    }
+  }
+};
+
+// Two numbers as sums of two halves each, the second of which counts in units of 1 / kLowScale, so that it does not get too
+// small.
+__device__ inline void split(float2 pair, uint32_t& high, uint32_t& low) {
+  const __half2 upper = __floats2half2_rn(pair.x, pair.y);
+  high = bits_of(upper);
+  low = pack_halves(kLowScale * (pair.x - __low2float(upper)), kLowScale * (pair.y - __high2float(upper)));
+}
+
+// `per_depth` brings the last channel into the range of half precision. Returns false, and the splat must not be drawn, where it
+// is so thin (a hundredth of a pixel) that half precision does not reach. `out` may be where `r` came from.
+__device__ inline bool stage_half_splat(const Record<4>& r, float x, float y, float per_depth, HalfSplat& out) {
+  const StagedSplat<4> s = staged(r, x, y);
+  const float2 pairs[3] = {{(s.k - kLog2HalfUnits) / 16, s.by_x / 4}, {s.by_y / 4, s.by_xx}, {s.by_xy, s.by_yy}};
+  uint4 high = {}, low = {};
+  split(pairs[0], high.x, low.x);
+  split(pairs[1], high.y, low.y);
+  split(pairs[2], high.z, low.z);
+  out.high = high;
+  out.low = low;
+  out.colors = {pack_halves(fminf(s.colors[0], kGreatestHalf), fminf(s.colors[1], kGreatestHalf)),
+                pack_halves(fminf(s.colors[2], kGreatestHalf), s.colors[3] * per_depth), pack_halves(1, 0), 0};
+  float size = 0;
+  for (const float2& pair : pairs) size += fabsf(pair.x) + fabsf(pair.y);
+  return size < kGreatestHalf;
+}
 
 // Loads 8x8 matrices of halves from shared memory: lane l gives the address of row l % 8 of matrix l / 8. Lane 4 r + c gets the
 // elements [r][2 c] and [r][2 c + 1] of each, or of each transposed.
@@ -28,7 +96,7 @@ __device__ inline void load_transposed(uint32_t (&to)[2], uint32_t address) {
                : "r"(address)
                : "memory");
 }
-// Addresses of splats in shared memory, of 16 bits, which are there in turn.
+// 16-bit shared-memory addresses of splats, which are in shared memory themselves.
 __device__ inline uint32_t load_hit(uint32_t address) {
   uint16_t hit;
   asm volatile("ld.shared.u16 %0, [%1];" : "=h"(hit) : "r"(address) : "memory");
@@ -38,14 +106,14 @@ __device__ inline void store_hit(uint32_t address, uint32_t hit) {
   asm volatile("st.shared.u16 [%0], %1;" ::"r"(address), "h"(uint16_t(hit)) : "memory");
 }
 
-// 8 kTiles splats as right-hand sides of matrix products. Lane q of a group of four gets the powers of the 2 kTiles splats from
-// 2 kTiles q on, in their order: that is how the rows are dealt out to the tiles.
+// 8 kTiles splats as right-hand operands of matrix products. Rows are assigned to tiles so that lane q of a group of four gets
+// the powers of the 2 kTiles splats from 2 kTiles q on, in their order.
 template <int kTiles>
 struct HalfSplats {
   uint32_t shapes[kTiles / 2][4];  // of two tiles: high, low, high, low
   uint32_t colors[kTiles];
 
-  // At `hits` in shared memory are the addresses of the splats.
+  // `hits`: where the addresses of the splats are in shared memory.
   __device__ explicit HalfSplats(uint32_t hits) {
     constexpr uint32_t kEachTile = 2 * sizeof(uint16_t);
     const int row = threadIdx.x % 8, matrix = threadIdx.x / 8 % 4;
@@ -57,7 +125,7 @@ struct HalfSplats {
   }
 };
 
-// Of 1 / 0.99; 0 below the cut-off.
+// Two opacities in units of 1 / kMaxAlpha; 0 below the cut-off.
 __device__ inline __half2 opacity(float power0, float power1) {
   const uint32_t units = pack_halves(exp2_fast(power0), exp2_fast(power1));
   uint32_t alpha;
@@ -68,7 +136,8 @@ __device__ inline __half2 opacity(float power0, float power1) {
 // Two rows of eight pixels. A group of four lanes has two pixels, one above the other, and a share of the splats each.
 struct HalfPixels {
   __half2 front;  // the transmittance in front of the next splat; 0 once the pixel is closed
-  float sums[4];  // of the upper pixel and of the lower: lane 0 has red and green, 1 blue and depth, 2 the weights (of 1 / 0.99)
+  float sums[4];  // of the upper pixel and of the lower: lane 0 has red and green, 1 blue and depth, 2 the weights (in units of 1
+                  // / kMaxAlpha)
 
   __device__ bool open() const { return bits_of(front) != 0; }
 };
@@ -81,7 +150,7 @@ struct HalfWeights {
 
   // The weights are as if nothing were in front of the lane's splats.
   __device__ HalfWeights(const HalfPixels& pixels, const uint32_t (&basis)[4], const HalfSplats<kTiles>& splats) {
-    const __half2 most = __float2half2_rn(0.99f);
+    const __half2 most = __float2half2_rn(kMaxAlpha);
     __half2 through;
 #pragma unroll
     for (int i = 0; i < 2 * kTiles; i += 2) {
@@ -104,11 +173,11 @@ struct HalfWeights {
 
   // Whether a pixel that was open is not open behind these splats.
   __device__ bool closes(const HalfPixels& pixels) const {
-    return !__hbge2(behind, __hmin2(pixels.front, __float2half2_rn(kStop)));
+    return !__hbge2(behind, __hmin2(pixels.front, __float2half2_rn(kMinTransmittance)));
   }
   // Takes out the splats that would close a pixel, and what is behind them.
   __device__ void cut() {
-    const __half2 most = __float2half2_rn(0.99f), stop = __float2half2_rn(kStop);
+    const __half2 most = __float2half2_rn(kMaxAlpha), stop = __float2half2_rn(kMinTransmittance);
     __half2 through = __float2half2_rn(1);
 #pragma unroll
     for (__half2& weight : weights) {
@@ -132,3 +201,5 @@ struct HalfWeights {
 };
 
 }  // namespace
+
+}  // namespace gsplat::blending

@@ -1,34 +1,35 @@
 // Front-to-back blending of one window by one block of kBlockThreads threads, in half precision on the tensor cores.
 #pragma once
 
-#include "blended_pixels.cuh"
-#include "half_pixels.cuh"
+#include "blend_forward.cuh"
+#include "half_precision.cuh"
 
+namespace gsplat::blending {
 namespace {
 
 constexpr int kHalfBatch = 3 * kBlockThreads;  // splats that are staged at once
-constexpr int kHalfTiles = 4;                  // tiles of eight splats that are blended in one go
+constexpr int kHalfTiles = 4;                  // tiles of eight splats that are blended in one step
 constexpr int kHalfStep = 8 * kHalfTiles;
 
-// A splat on its way: first what is fetched, then, in its place, what is blended.
+// A staged splat: first the record as it was fetched, then, in its place, the operands of the matrix products.
 union HalfSlot {
   Record<4> record;
   HalfSplat splat;
 };
 
-// Of one pixel: red and green, blue and depth, the weights (of 1 / 0.99) and nothing.
+// Sums of one pixel: red and green, blue and depth, the weights (in units of 1 / kMaxAlpha) and an unused value.
 struct PixelSums {
   float2 pairs[3];
 };
 
-// Shared memory that blend_half works in.
+// Shared memory of blend_half.
 struct HalfStage {
   HalfSlot slots[kHalfBatch];
   HalfSplat none;                                          // reaches no pixel
   uint4 reaching[2 * kWarps][kHalfBatch / kBlockThreads];  // by half of a quadrant: bits of the batch's splats
   union {
-    uint16_t hits[kHalfBatch + kHalfStep / 2];  // where the splats lie that reach the half: addresses in shared memory
-    PixelSums sums[kQuadrant * kQuadrant];      // in the end
+    uint16_t hits[kHalfBatch + kHalfStep / 2];  // shared-memory addresses of the splats that reach the half
+    PixelSums sums[kQuadrant * kQuadrant];      // when all splats have been blended
   } of_warp[kWarps];
 };
 
@@ -53,15 +54,15 @@ struct HalfPart {
   // pixel.
   __device__ void blend(const PixelBasis& basis, float y, uint32_t hits, int count) {
     uint32_t rows[2][4];
-    basis.put(y, rows[0]);
-    basis.put(y + 2, rows[1]);
+    basis.fill(y, rows[0]);
+    basis.fill(y + 2, rows[1]);
     for (; count >= kHalfStep && open; count -= kHalfStep, hits += kHalfStep * sizeof(uint16_t))
       blend_step<kHalfTiles>(rows, hits);
     if (count > 0 && open) blend_step<kHalfTiles / 2>(rows, hits);
   }
 
-  // Puts the sums where the threads that show the pixels find them.
-  __device__ void put_sums(PixelSums* sums) const {
+  // Stores the sums for the threads that write the pixels.
+  __device__ void store_sums(PixelSums* sums) const {
     const WarpPlace place;
     if (place.quad == 3) return;
 #pragma unroll
@@ -87,7 +88,7 @@ struct HalfPart {
   }
 };
 
-// Lists at `hits` the splats of a batch of `count` that reach a part of the window, filled up with `none` to a multiple of half a
+// Lists at `hits` the splats of a batch of `count` that reach a part of the window, padded with `none` to a multiple of half a
 // step. Returns how many. `first` is where the batch's first splat is.
 __device__ inline int list_reaching(const uint4* reaching, int count, uint32_t first, uint32_t none, uint32_t hits) {
   const int lane = threadIdx.x & 31;
@@ -112,11 +113,11 @@ __device__ inline int list_reaching(const uint4* reaching, int count, uint32_t f
   return listed + missing;
 }
 
-// Sends for the splats from `begin` on; `find(position)` says where one is, or null: there is none.
+// Starts asynchronous copies of the records of `count` splats from position `begin` on; record_of(position) is a pointer or null.
 template <class Find>
-__device__ inline void fetch_batch(const Find& find, int begin, int count, HalfSlot* slots) {
+__device__ inline void fetch_batch(const Find& record_of, int begin, int count, HalfSlot* slots) {
   for (int i = threadIdx.x; i < count; i += kBlockThreads) {
-    const Record<4>* const record = find(begin + i);
+    const Record<4>* const record = record_of(begin + i);
     if (record == nullptr)
       slots[i].record = faint_record<4>();
     else
@@ -124,7 +125,7 @@ __device__ inline void fetch_batch(const Find& find, int begin, int count, HalfS
   }
 }
 
-// Prepares the splats that this thread sent for, and notes which parts of the window they reach.
+// Waits for the records that this thread fetched, stages them, and stores the masks of splats that reach each part of the window.
 __device__ inline void stage_batch(const Window& w, int count, float per_depth, HalfStage& stage) {
   const int lane = threadIdx.x % 32;
   wait_for_copies();
@@ -134,17 +135,17 @@ __device__ inline void stage_batch(const Window& w, int count, float per_depth, 
     if (first < count) {
       HalfSlot& slot = stage.slots[first + lane];
       const Record<4> r = slot.record;
-      const bool shown = put_half_splat(r, float(w.left + kQuadrant), float(w.top + kQuadrant), per_depth, slot.splat);
-      reaching = reaching_part<kQuadrant / 2>(shown && first + lane < count, r, float(w.left) + 0.5f, float(w.top) + 0.5f);
+      const bool shown = stage_half_splat(r, float(w.left + kQuadrant), float(w.top + kQuadrant), per_depth, slot.splat);
+      reaching = reaching_parts<kQuadrant / 2>(shown && first + lane < count, r, float(w.left) + 0.5f, float(w.top) + 0.5f);
     }
     if (lane < 2 * kWarps) reinterpret_cast<unsigned*>(stage.reaching[lane])[first / 32] = reaching;
   }
 }
 
-// `find(position)` says where the splat at a position in [w.begin, w.end) is, which are in the order of depth, the last channel,
-// or null: there is none. All threads of the block take part. Without `last`.
+// `record_of(position)` points to the splat at a position in [w.begin, w.end), in the order of depth (the last channel), or is
+// null where there is none. Called by all threads of the block. Does not compute `last`.
 template <class Find>
-__device__ inline BlendedPixels<4> blend_half(const Window& w, const Find& find, HalfStage& stage) {
+__device__ inline BlendedPixels<4> blend_half(const Window& w, const Find& record_of, HalfStage& stage) {
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32, part = warp / 2 * 4 + warp % 2;
   auto& of_warp = stage.of_warp[warp];
   const uint32_t first = shared_address(stage.slots), none = shared_address(&stage.none), hits = shared_address(&of_warp);
@@ -156,9 +157,9 @@ __device__ inline BlendedPixels<4> blend_half(const Window& w, const Find& find,
   for (int begin = w.begin; begin < w.end; begin += kHalfBatch) {
     if (begin > w.begin && !__syncthreads_or(upper.open || lower.open)) break;
     const int count = min(w.end - begin, kHalfBatch);
-    fetch_batch(find, begin, count, stage.slots);
+    fetch_batch(record_of, begin, count, stage.slots);
     if (begin == w.begin) {
-      const Record<4>* const last = find(w.end - 1);
+      const Record<4>* const last = record_of(w.end - 1);
       const float deepest = last != nullptr ? last->colors[3] : 0;
       unit = deepest > 0 ? deepest * 0x1p-15f : 1;
     }
@@ -168,19 +169,21 @@ __device__ inline BlendedPixels<4> blend_half(const Window& w, const Find& find,
     if (lower.open) lower.blend(basis, y + 4, hits, list_reaching(stage.reaching[part + 2], count, first, none, hits));
   }
   __syncwarp();
-  upper.put_sums(of_warp.sums);
-  lower.put_sums(of_warp.sums + kQuadrant * kQuadrant / 2);
+  upper.store_sums(of_warp.sums);
+  lower.store_sums(of_warp.sums + kQuadrant * kQuadrant / 2);
   __syncwarp();
   BlendedPixels<4> out;
   for (int p = 0; p < kPixelsEach; ++p) {
     const PixelSums& sums = of_warp.sums[kQuadrant * row_of_lane(lane, p) + lane % kQuadrant];
-    out.through[p] = fmaxf(fmaf(-0.99f, sums.pairs[2].x, 1.0f), 0);
-    out.sum[p][0] = 0.99f * sums.pairs[0].x;
-    out.sum[p][1] = 0.99f * sums.pairs[0].y;
-    out.sum[p][2] = 0.99f * sums.pairs[1].x;
-    out.sum[p][3] = 0.99f * unit * sums.pairs[1].y;
+    out.through[p] = fmaxf(fmaf(-kMaxAlpha, sums.pairs[2].x, 1.0f), 0);
+    out.sum[p][0] = kMaxAlpha * sums.pairs[0].x;
+    out.sum[p][1] = kMaxAlpha * sums.pairs[0].y;
+    out.sum[p][2] = kMaxAlpha * sums.pairs[1].x;
+    out.sum[p][3] = kMaxAlpha * unit * sums.pairs[1].y;
   }
   return out;
 }
 
 }  // namespace
+
+}  // namespace gsplat::blending

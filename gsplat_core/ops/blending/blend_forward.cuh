@@ -1,23 +1,68 @@
 // Front-to-back blending of one window by one block of kBlockThreads threads.
 #pragma once
 
-#include "blended_pixels.cuh"
+#include "splats.cuh"
 
+namespace gsplat::blending {
 namespace {
 
-constexpr int kForwardBatch = kBlockThreads;  // splats that are staged at once, one per thread
-constexpr int kAhead = 4;                     // splats that a warp goes through between two looks at whether all is closed
+// Of a thread's two pixels: the transmittance behind the last splat, the sums of the channels, and the position of the last splat
+// that was blended, -1 where there is none.
+template <int D>
+struct BlendedPixels {
+  float through[kPixelsEach], sum[kPixelsEach][D];
+  int last[kPixelsEach];
+};
 
-// Shared memory that blend_forward works in, two batches in turn.
+// A pixel is closed once the transmittance behind all its splats, including the one that closed it, is at most kMinTransmittance.
+template <int D, bool kCapped, bool kLast>
+struct FloatPixels {
+  float front[kPixelsEach];  // the transmittance in front of the next splat
+  float through[kPixelsEach], sum[kPixelsEach][D];
+  uint32_t last[kPixelsEach];  // address of the splat that was blended last
+
+  __device__ explicit FloatPixels(const Window& w) {
+    for (int p = 0; p < kPixelsEach; ++p) {
+      front[p] = w.inside[p] ? 1 : 0;
+      through[p] = 1;
+      for (int d = 0; d < D; ++d) sum[p][d] = 0;
+    }
+  }
+  __device__ bool open() const { return front[0] > kMinTransmittance || front[1] > kMinTransmittance; }
+  __device__ void blend(const StagedSplat<D>& r, const float (&power)[kPixelsEach], uint32_t address) {
+#pragma unroll
+    for (int p = 0; p < kPixelsEach; ++p) {
+      const bool drawn = power[p] >= kStagedCutoff && (!kCapped || power[p] <= r.cap);
+      const float weight = drawn ? __saturatef(exp2_fast(power[p])) * front[p] : 0;  // in units of 1 / kMaxAlpha
+      front[p] = fmaf(weight, -kMaxAlpha, front[p]);
+      if (front[p] > kMinTransmittance) {
+        through[p] = front[p];
+        for (int d = 0; d < D; ++d) sum[p][d] = fmaf(weight, r.colors[d], sum[p][d]);
+        if (kLast && drawn) last[p] = address;
+      }
+    }
+  }
+  __device__ void finish(BlendedPixels<D>& out) const {
+    for (int p = 0; p < kPixelsEach; ++p) {
+      out.through[p] = through[p];
+      for (int d = 0; d < D; ++d) out.sum[p][d] = kMaxAlpha * sum[p][d];
+    }
+  }
+};
+
+constexpr int kForwardBatch = kBlockThreads;  // splats that are staged at once, one per thread
+constexpr int kUnrolled = 4;                  // splats that a warp blends between two checks of whether all its pixels are closed
+
+// Shared memory of blend_forward; double-buffered.
 template <int D>
 struct ForwardStage {
   StagedSplat<D> splats[2][kForwardBatch + 1];  // the last one reaches no pixel
   uint4 reached[2][2 * kWarps];                 // by half of a quadrant: bits of the batch's splats
-  uint4 hits[2 * kWarps][kForwardBatch / 4];    // where the splats lie that reach the half: addresses in shared memory
+  uint4 hits[2 * kWarps][kForwardBatch / 4];    // shared-memory addresses of the splats that reach the half
 };
 
-// Lists, for both halves of this warp's quadrant, the splats that reach it. Returns how many of the longer list, to which the
-// other is filled up, and both to a multiple of kAhead, with the splat that reaches no pixel.
+// Lists, for both halves of this warp's quadrant, the splats that reach it. Returns the length of the longer list; both are
+// padded to it, and to a multiple of kUnrolled, with a splat that reaches no pixel.
 template <int D>
 __device__ inline int list_hits(const uint4* reached, const StagedSplat<D>* splats, uint4* hits) {
   const int lane = threadIdx.x & 31;
@@ -36,7 +81,7 @@ __device__ inline int list_hits(const uint4* reached, const StagedSplat<D>* spla
       counts[half] += __popc(groups[g]);
     }
   }
-  const int most = (max(counts[0], counts[1]) + kAhead - 1) / kAhead * kAhead;
+  const int most = (max(counts[0], counts[1]) + kUnrolled - 1) / kUnrolled * kUnrolled;
 #pragma unroll
   for (int half = 0; half < 2; ++half)
     for (int i = counts[half] + lane; i < most; i += 32)
@@ -69,15 +114,15 @@ __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& f
   Record<D> next = fetch_ahead(w.end - w.begin);
   int now = 0;
   for (int left = w.end - w.begin; left > 0; left -= kBatch, now ^= 1) {
-    put_staged<kQuadrant / 2>(int(threadIdx.x), 32 * warp < left, next, w, stage.splats[now], stage.reached[now]);
+    stage_splat<kQuadrant / 2>(int(threadIdx.x), 32 * warp < left, next, w, stage.splats[now], stage.reached[now]);
     bool warp_open = __any_sync(kAll, pixels.open());
     if (!__syncthreads_or(warp_open)) break;
-    next = fetch_ahead(left - kBatch);  // on its way meanwhile
+    next = fetch_ahead(left - kBatch);  // prefetched
     const int count = warp_open ? list_hits<D>(&stage.reached[now][first_part], stage.splats[now], stage.hits[2 * warp]) : 0;
     for (uint32_t& last : pixels.last) last = kNone;
-    for (int j = 0; j < count && warp_open; j += kAhead) {
+    for (int j = 0; j < count && warp_open; j += kUnrolled) {
       const uint4 four = hits[j / 4];
-      const uint32_t addresses[kAhead] = {four.x, four.y, four.z, four.w};
+      const uint32_t addresses[kUnrolled] = {four.x, four.y, four.z, four.w};
 #pragma unroll
       for (const uint32_t address : addresses) {
         const StagedSplat<D> r = staged_at<D, kCapped>(address);
@@ -97,3 +142,5 @@ __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& f
 }
 
 }  // namespace
+
+}  // namespace gsplat::blending

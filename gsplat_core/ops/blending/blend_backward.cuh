@@ -1,9 +1,10 @@
-// Back-to-front gradient of blending one window, by one block of kBlockThreads threads, by the formulas of backward_cpu.cpp.
+// Back-to-front gradient of blending one window, by one block of kBlockThreads threads; formulas of
+// ../compositing/backward_cpu.cpp.
 #pragma once
 
-#include "quadrant_sums.cuh"
-#include "staged_splats.cuh"
+#include "pixel_sums.cuh"
 
+namespace gsplat::blending {
 namespace {
 
 constexpr int kShapeMoments = 6;    // sum over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
@@ -13,7 +14,7 @@ constexpr int kBackwardBatch = 64;  // splats that are staged at once
 constexpr int shape_size(int D, bool absgrad) { return kShapeMoments + (D == 0 || absgrad ? 2 : 0); }
 constexpr int quads_of(int shape, int channels) { return (shape + channels + 3) / 4; }
 
-// A pixel on the way from the back to the front.
+// The state of a pixel, going from the back to the front.
 struct Pixel {
   float through;  // transmittance in front of the splats seen so far; at first what the pixel lets through in the end
   float behind;   // sum of w g of what is behind, g = <dL/dcolour, colour>; at first -through dL/dalpha, and the background's
@@ -29,19 +30,19 @@ __device__ inline int block_furthest(int warp_furthest) {
   return furthest;
 }
 
-// Shared memory that blend_backward works in.
+// Shared memory of blend_backward.
 template <int D, bool kAbs>
 struct BackwardStage {
   static constexpr int kQuads = quads_of(shape_size(D, kAbs), D);
   static constexpr int kSums = (shape_size(D, kAbs) + D + 1) / 2 * 2;
   StagedSplat<D> splats[kBackwardBatch + 1];  // the last one reaches no pixel
   uint4 reached[kWarps];                      // by quadrant: bits of the batch's splats
-  SplatShares shares[kWarps];
+  SplatTerms terms[kWarps];
   float sums[kWarps][kBackwardBatch][kSums];  // of the quadrants, about their middles: the moments, |.| with absgrad, colours
-  alignas(16) uint32_t hits[kWarps][kBackwardBatch + kSlots];  // where the splats lie that reach the warp's quadrant, in bytes
+  alignas(16) uint32_t hits[kWarps][kBackwardBatch + kSlots];  // byte offsets of the splats that reach the warp's quadrant
 };
 
-// Lists the splats of the batch that reach this warp's pixels, the hindmost first; returns how many. Eight more can be read.
+// Lists the splats of the batch that reach this warp's pixels, back to front; returns how many. Eight entries beyond can be read.
 template <int D>
 __device__ inline int list_hits_backward(unsigned (&groups)[kBackwardBatch / 32], uint32_t* hits) {
   const int lane = threadIdx.x & 31;
@@ -57,25 +58,25 @@ __device__ inline int list_hits_backward(unsigned (&groups)[kBackwardBatch / 32]
   return count;
 }
 
-// A pixel's part in a splat's gradient, of which the pixel then is in front.
-struct Share {
-  float s, w;  // both of 1 / 0.99
+// A pixel's terms in a splat's gradient; advances the pixel to in front of the splat.
+struct Terms {
+  float s, w;  // both in units of 1 / kMaxAlpha
 };
 struct PixelState {
   float through;  // transmittance in front of the splats seen so far
   float behind;   // <dL/dcolour, what is seen behind the splats in front>
 };
 template <int D>
-__device__ inline Share share_of(const StagedSplat<D>& r, float power, bool drawn, const float (&v_color)[D], PixelState& pixel) {
-  const float alpha = drawn ? __saturatef(exp2_fast(power)) : 0;  // of 1 / 0.99
-  const float lets_through = fmaf(alpha, -0.99f, 1.0f);
+__device__ inline Terms terms_of(const StagedSplat<D>& r, float power, bool drawn, const float (&v_color)[D], PixelState& pixel) {
+  const float alpha = drawn ? __saturatef(exp2_fast(power)) : 0;  // in units of 1 / kMaxAlpha
+  const float lets_through = fmaf(alpha, -kMaxAlpha, 1.0f);
   float g = v_color[0] * r.colors[0];
 #pragma unroll
   for (int d = 1; d < D; ++d) g = fmaf(v_color[d], r.colors[d], g);
   pixel.through *= reciprocal(lets_through);
   const float w = alpha * pixel.through, gain = g - pixel.behind;
   pixel.behind = fmaf(-lets_through, gain, g);
-  // A splat at the ceiling of 0.99 passes nothing on to its opacity and shape.
+  // Where alpha is clamped to its maximum, opacity and shape have no gradient.
   return {power <= 0 ? w * gain : 0, w};
 }
 
@@ -102,7 +103,8 @@ __device__ inline void write_row(const BackwardStage<D, kAbs>& stage, const Wind
   }
 #pragma unroll
   for (int quad = 0; quad < kQuads; ++quad)
-    row[quad] = make_float4(0.99f * v[4 * quad], 0.99f * v[4 * quad + 1], 0.99f * v[4 * quad + 2], 0.99f * v[4 * quad + 3]);
+    row[quad] = make_float4(kMaxAlpha * v[4 * quad], kMaxAlpha * v[4 * quad + 1], kMaxAlpha * v[4 * quad + 2],
+                            kMaxAlpha * v[4 * quad + 3]);
 }
 
 // `fetch(position)` gives the splat at a position in [w.begin, w.end), `row(position)` where its row goes: the sums over the
@@ -123,15 +125,15 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
 
   const float middle_x = float(w.left + kQuadrant), middle_y = float(w.top + kQuadrant), x = float(w.x) + 0.5f - middle_x;
   const uint32_t first_address = shared_address(stage.splats);
-  const PixelFactors<D> factors(v_color, stage.shares[warp]);
+  const PixelFactors<D> factors(v_color, stage.terms[warp]);
   float y[kPixelsEach];
   PixelState states[kPixelsEach];
   for (int p = 0; p < kPixelsEach; ++p) {
     y[p] = float(w.y[p]) + 0.5f - middle_y;
     states[p] = {pixels[p].through, pixels[p].behind / pixels[p].through};
   }
-  // The splat of the batch that this thread prepares and whose row it writes. The batch has fewer splats than the block threads:
-  // other blocks use other warps for it, for every warp of a block has its scheduler.
+  // The splat of the batch that this thread stages and whose row it writes. A batch has fewer splats than the block has threads;
+  // blocks alternate which warps do it, since every warp of a block has its own scheduler.
   const int mine = int(threadIdx.x) ^ (__popc(blockIdx.x) % 2 * kBatch);
   const auto fetch_ahead = [&](int first) {
     const int position = first + mine;
@@ -141,13 +143,13 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
   int first = w.begin + (end - 1 - w.begin) / kBatch * kBatch;
   Record<D> next = fetch_ahead(first);
   for (; first >= w.begin; first -= kBatch) {
-    __syncwarp();  // the warp's lanes have read of the batch behind what they now write over
+    __syncwarp();  // the warp's lanes have finished reading what is overwritten now
     const float mean_x = next.xyab.x, mean_y = next.xyab.y;
-    if (mine < kBatch) put_staged<kQuadrant>(mine, first + mine / 32 * 32 < end, next, w, stage.splats, stage.reached);
+    if (mine < kBatch) stage_splat<kQuadrant>(mine, first + mine / 32 * 32 < end, next, w, stage.splats, stage.reached);
     __syncthreads();
-    next = fetch_ahead(first - kBatch);  // on its way meanwhile
+    next = fetch_ahead(first - kBatch);  // prefetched
     unsigned groups[kBatch / 32];
-    uint32_t limits[kPixelsEach];  // pixels blended nothing that lies at these offsets or beyond
+    uint32_t limits[kPixelsEach];  // pixels blended nothing at these offsets or beyond
 #pragma unroll
     for (int g = 0; g < kBatch / 32; ++g) {
       const int most = warp_furthest - first - 32 * g;  // the last of the group's splats that any of the warp's pixels blended
@@ -171,20 +173,20 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
         for (int n = 0; n < kUnrolled; ++n) {
           const StagedSplat<D> r = staged_at<D, kCapped>(first_address + offset[n]);
           const float constant = fmaf(fmaf(r.by_xx, x, r.by_x), x, r.k), by_y = fmaf(r.by_xy, x, r.by_y);
-          Share shares[kPixelsEach];
+          Terms terms[kPixelsEach];
           float absolute[2] = {};
 #pragma unroll
           for (int p = 0; p < kPixelsEach; ++p) {
             const float power = fmaf(fmaf(r.by_yy, y[p], by_y), y[p], constant);
-            const bool drawn = power >= kFaintestStaged && offset[n] < limits[p] && (!kCapped || power <= r.cap);
-            shares[p] = share_of<D>(r, power, drawn, v_color[p], states[p]);
+            const bool drawn = power >= kStagedCutoff && offset[n] < limits[p] && (!kCapped || power <= r.cap);
+            terms[p] = terms_of<D>(r, power, drawn, v_color[p], states[p]);
             if constexpr (kAbs) {
-              const float s = kLn2 * fabsf(shares[p].s);
+              const float s = kLn2 * fabsf(terms[p].s);
               absolute[0] = fmaf(s, fabsf(fmaf(2 * r.by_xx, x, fmaf(r.by_xy, y[p], r.by_x))), absolute[0]);
               absolute[1] = fmaf(s, fabsf(fmaf(2 * r.by_yy, y[p], by_y)), absolute[1]);
             }
           }
-          stage.shares[warp][slot + n][lane] = make_float4(shares[0].s, shares[1].s, shares[0].w, shares[1].w);
+          stage.terms[warp][slot + n][lane] = make_float4(terms[0].s, terms[1].s, terms[0].w, terms[1].w);
           if constexpr (kAbs) {
             for (int mask = 16; mask > 0; mask /= 2)
               for (float& a : absolute) a += __shfl_xor_sync(kAll, a, mask);
@@ -195,7 +197,7 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
       }
       __syncwarp();
       float moments[2], colors[PixelFactors<D>::kColorTiles];
-      sum_shares<D>(stage.shares[warp], factors, moments, colors);
+      sum_terms<D>(stage.terms[warp], factors, moments, colors);
       const int slot = lane / 4, column = lane % 4;
       if (begin + slot < count) {
         float* const sums = stage.sums[warp][stage.hits[warp][begin + slot] / sizeof(StagedSplat<D>)];
@@ -212,3 +214,5 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
 }
 
 }  // namespace
+
+}  // namespace gsplat::blending

@@ -1,0 +1,228 @@
+// composite and composite_backward: checks, memory, and how each device runs them.
+#include <algorithm>
+#include <atomic>
+#include <tuple>
+#include <vector>
+
+#include "compositing.h"
+#include "host_call.h"
+#if !defined(GSPLAT_CUDA)
+#include "counting_sort.h"
+#endif
+
+namespace gsplat::compositing {
+namespace {
+
+constexpr int64_t kMaxInts = (int64_t(1) << 31) - 1;
+
+// The inputs of either pass, checked; the tensors keep the memory alive that `in` points to.
+struct Arguments {
+  Tensor means2d, conics, colors, opacities, offsets, flatten_ids;
+  OptionalTensor backgrounds, masks;
+  Inputs in;
+
+  Arguments(const Call& call, const Tensor& means2d_, const Tensor& conics_, const Tensor& colors_, const Tensor& opacities_,
+            const Tensor& offsets_, const Tensor& flatten_ids_, const OptionalTensor& backgrounds_, const OptionalTensor& masks_,
+            int64_t width, int64_t height, int64_t tile_size)
+      : means2d(call.floats(means2d_, "means2d")),
+        conics(call.floats(conics_, "conics")),
+        colors(call.floats(colors_, "colors")),
+        opacities(call.floats(opacities_, "opacities")),
+        offsets(call.ints(offsets_, "isect_offsets")),
+        flatten_ids(call.ints(flatten_ids_, "flatten_ids")),
+        backgrounds(call.floats(backgrounds_, "backgrounds")),
+        masks(call.take_optional(masks_, ScalarType::Bool, "masks")) {
+    check(offsets.dim() == 3 && colors.dim() == 2,
+          "composite: isect_offsets must be [images, tile_height, tile_width] and colors [N, D]");
+    const int64_t channels = colors.size(1), images = offsets.size(0), count = opacities.numel();
+    const int64_t tile_height = offsets.size(1), tile_width = offsets.size(2);
+    check(means2d.numel() == 2 * count && conics.numel() == 3 * count && colors.numel() == channels * count,
+          "composite: means2d, conics, colors and opacities must be of the same splats");
+    check(tile_size > 0 && width >= 0 && height >= 0 && width < kMaxInts && height < kMaxInts && tile_size < kMaxInts &&
+              tile_width * tile_size >= width && tile_height * tile_size >= height,
+          "composite: the tiles of isect_offsets do not cover the image");
+    check(!masks || masks->numel() == offsets.numel(), "composite: masks must have one bool per tile");
+    in = {.means2d = data(means2d),
+          .conics = data(conics),
+          .colors = data(colors),
+          .opacities = data(opacities),
+          .offsets = offsets.const_data_ptr<int32_t>(),
+          .flatten_ids = flatten_ids.const_data_ptr<int32_t>(),
+          .backgrounds = data(backgrounds),
+          .masks = masks ? masks->const_data_ptr<bool>() : nullptr,
+          .count = count,
+          .instances = flatten_ids.numel(),
+          .images = int32_t(images),
+          .channels = int32_t(channels),
+          .width = int32_t(width),
+          .height = int32_t(height),
+          .tile_size = int32_t(tile_size),
+          .tile_width = int32_t(tile_width),
+          .tile_height = int32_t(tile_height)};
+  }
+};
+
+#if defined(GSPLAT_CUDA)
+
+// Unlike on the CPU the values of the lists are not checked here, for that would make the host wait: the kernels clamp positions
+// outside of flatten_ids and skip indices that are no splat's.
+void check_sizes(const Inputs& in) {
+  check(in.count < kMaxInts && in.instances <= kMaxInts && in.tiles() * in.windows() <= kMaxInts,
+        "composite: more than 2^31 - 1 splats, instances or windows of 16x16 pixels");
+}
+
+void forward(Call& call, const Inputs& in, const Pixels& out) {
+  check_sizes(in);
+  composite_on_device(in, out, call, call.stream);
+}
+
+void backward(Call& call, const Inputs& in, const PictureGradient& from, const InputGradients& out) {
+  check_sizes(in);
+  composite_backward_on_device(in, from, out, call, call.stream);
+}
+
+#else
+
+struct alignas(64) Line {
+  float floats[16];
+};
+
+// What is in front of the first tile's list is unused: lists of a fixed capacity are filled from the end.
+int64_t first_listed(const Inputs& in) { return in.tiles() > 0 ? in.offsets[0] : in.instances; }
+
+// The lists come from the caller, and a wrong index would read foreign memory.
+void check_lists(const Inputs& in) {
+  int32_t before = 0;
+  bool ordered = true;
+  for (int64_t i = 0; i < in.tiles(); ++i) ordered &= in.offsets[i] >= before, before = in.offsets[i];
+  check(ordered && before <= in.instances, "isect_offsets must rise from 0 to at most the length of flatten_ids");
+  uint32_t most = 0;
+  for (int64_t i = first_listed(in); i < in.instances; ++i) most = std::max(most, uint32_t(in.flatten_ids[i]));
+  check(first_listed(in) == in.instances || most < in.count, "flatten_ids must be in [0, ", in.count, "), found ", int32_t(most));
+}
+
+// The record of every splat, and work over all tiles.
+struct Pass {
+  std::unique_ptr<SplatRecord[]> records;
+  Splats splats;
+
+  explicit Pass(const Inputs& in) {
+    check_lists(in);
+    records = uninitialised<SplatRecord>(in.count);
+    splats = {in, records.get()};
+    torch::stable::parallel_for(0, in.count, 2048,
+                                [&](int64_t begin, int64_t end) { kernels().records(in, begin, end, records.get()); });
+  }
+
+  // run(tile, scratch) for all tiles: threads take the next free one, and no result depends on which takes which.
+  template <class Run>
+  void for_tiles(const Run& run) const {
+    constexpr int64_t kRun = 4;
+    std::atomic<int64_t> next{0};
+    const int64_t tiles = splats.tiles();
+    const int64_t workers = std::max<int64_t>(1, std::min<int64_t>(torch::stable::get_num_threads(), tiles));
+    const int64_t scratch = kernels().scratch_floats(splats.channels);
+    torch::stable::parallel_for(0, workers, 1, [&](int64_t, int64_t) {
+      const auto lines = uninitialised<Line>(scratch / 16 + 1);
+      // A few adjacent tiles at a time: they share splats, and the next tile's are being prefetched.
+      for (int64_t first; (first = next.fetch_add(kRun, std::memory_order_relaxed)) < tiles;)
+        for (int64_t tile = first; tile < std::min(first + kRun, tiles); ++tile) run(tile, lines[0].floats);
+    });
+  }
+};
+
+void forward(Call&, const Inputs& in, const Pixels& out) {
+  const Pass pass(in);
+  pass.for_tiles([&](int64_t tile, float* scratch) { kernels().tile(pass.splats, tile, out, scratch); });
+}
+
+void backward(Call&, const Inputs& in, const PictureGradient& from, const InputGradients& out) {
+  const Pass pass(in);
+  // A row for every instance; those of one splat are contiguous, in the order of the lists.
+  auto first = uninitialised<int32_t>(in.count + 1), row_of = uninitialised<int32_t>(in.instances);
+  const int64_t unused = first_listed(in), listed = in.instances - unused, channels = in.channels;
+  const int32_t* const ids = in.flatten_ids + unused;
+  const auto add = [&](int64_t begin, int64_t end, int32_t* counters) {
+    for (int64_t i = begin; i < end; ++i) ++counters[ids[i]];
+  };
+  counting_sort(listed, 1 << 15, in.count, first.get(), add, [&](int64_t begin, int64_t end, int32_t* cursors) {
+    for (int64_t i = begin; i < end; ++i) row_of[unused + i] = cursors[ids[i]]++;
+  });
+  first[in.count] = int32_t(listed);
+
+  const bool absgrad = out.absolute != nullptr;
+  const int64_t lines_per_row = (kMoments + channels + (absgrad ? 2 : 0) + 15) / 16;
+  const auto rows = uninitialised<Line>(listed * lines_per_row);
+  std::vector<float> background_parts(out.backgrounds != nullptr ? size_t(in.tiles() * channels) : 0, 0.0f);
+  const GradientRows gradients = {row_of.get(), rows[0].floats, lines_per_row * 16, absgrad,
+                                  out.backgrounds != nullptr ? background_parts.data() : nullptr};
+  pass.for_tiles([&](int64_t tile, float* scratch) { kernels().tile_backward(pass.splats, tile, from, gradients, scratch); });
+  torch::stable::parallel_for(0, in.count, 2048, [&](int64_t begin, int64_t end) {
+    kernels().gather(pass.splats, gradients, first.get(), begin, end, out);
+  });
+  for (int64_t image = 0; out.backgrounds != nullptr && image < in.images; ++image) {
+    const int64_t tiles = in.tiles() / in.images;
+    for (int64_t d = 0; d < channels; ++d) {
+      double total = 0;
+      for (int64_t tile = image * tiles; tile < (image + 1) * tiles; ++tile)
+        total += background_parts[size_t(tile * channels + d)];
+      out.backgrounds[image * channels + d] = float(total);
+    }
+  }
+}
+
+#endif
+
+std::tuple<Tensor, Tensor, Tensor> composite(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor offsets,
+                                             Tensor flatten_ids, OptionalTensor backgrounds, OptionalTensor masks,
+                                             OptionalTensor absgrad_probe, int64_t width, int64_t height, int64_t tile_size) {
+  Call call(means2d);
+  const Arguments arguments(call, means2d, conics, colors, opacities, offsets, flatten_ids, backgrounds, masks, width, height,
+                            tile_size);
+  const Inputs& in = arguments.in;
+  Tensor out_colors = call.empty({in.images, height, width, in.channels}), alphas = call.empty({in.images, height, width, 1});
+  Tensor last = call.empty({in.images, height, width}, ScalarType::Int);
+  forward(call, in, {mutable_data(out_colors), mutable_data(alphas), last.mutable_data_ptr<int32_t>()});
+  call.finish("composite");
+  return {out_colors, alphas, last};
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(Tensor means2d, Tensor conics, Tensor colors,
+                                                                              Tensor opacities, Tensor offsets,
+                                                                              Tensor flatten_ids, OptionalTensor backgrounds,
+                                                                              OptionalTensor masks, int64_t width, int64_t height,
+                                                                              int64_t tile_size, Tensor alphas, Tensor last,
+                                                                              Tensor v_colors, Tensor v_alphas, bool absgrad) {
+  Call call(means2d);
+  const Arguments arguments(call, means2d, conics, colors, opacities, offsets, flatten_ids, backgrounds, masks, width, height,
+                            tile_size);
+  const Inputs& in = arguments.in;
+  const int64_t count = in.count, channels = in.channels, pixels = in.images * height * width;
+  const Tensor alphas_ = call.floats(alphas, "alphas"), last_ = call.ints(last, "last");
+  const Tensor v_colors_ = call.floats(v_colors, "v_colors"), v_alphas_ = call.floats(v_alphas, "v_alphas");
+  check(alphas_.numel() == pixels && last_.numel() == pixels && v_alphas_.numel() == pixels &&
+            v_colors_.numel() == pixels * channels,
+        "composite_backward: alphas, last, v_colors and v_alphas must be of the image's size");
+  Tensor v_means2d = call.empty({count, 2}), v_conics = call.empty({count, 3}), v_splats = call.empty({count, channels});
+  Tensor v_opacities = call.empty({count}), v_absolute = call.empty({absgrad ? count : 0, 2});
+  Tensor v_backgrounds = call.empty({backgrounds ? in.images : 0, channels});
+  const PictureGradient from = {data(alphas_), last_.const_data_ptr<int32_t>(), data(v_colors_), data(v_alphas_)};
+  const InputGradients out = {mutable_data(v_means2d),
+                              mutable_data(v_conics),
+                              mutable_data(v_splats),
+                              mutable_data(v_opacities),
+                              backgrounds ? mutable_data(v_backgrounds) : nullptr,
+                              absgrad ? mutable_data(v_absolute) : nullptr};
+  backward(call, in, from, out);
+  call.finish("composite_backward");
+  return {v_means2d, v_conics, v_splats, v_opacities, v_backgrounds, v_absolute};
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, GSPLAT_DEVICE, m) {
+  m.impl("composite", GSPLAT_BOX(&composite));
+  m.impl("composite_backward", GSPLAT_BOX(&composite_backward));
+}
+
+}  // namespace gsplat::compositing
