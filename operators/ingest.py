@@ -43,7 +43,7 @@ class SourceOp(Operator):
 
     Params:
         source: opened by `start()` and closed by `stop()`.
-        stop_requested: asked before each frame; when it answers True the stream ends there and what is on its way is finished.
+        stop_requested: asked before each frame; when it answers True the stream ends there and the frames in flight are finished.
     """
 
     def __init__(

@@ -197,7 +197,7 @@ def replay(
 ) -> RunOutcome:
     """Run a replay; writes the video, the model and the frames' figures into the output folder.
 
-    When `stop_requested` answers True the frames on their way are finished and everything is written; the outcome says so. `report` writes
+    When `stop_requested` answers True the frames in flight are finished and everything is written; the outcome says so. `report` writes
     what it makes of the outcome beside them (see `delivered`).
 
     Raises:

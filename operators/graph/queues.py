@@ -13,7 +13,7 @@ from operators.graph.tracking import Trail
 
 
 class Message:
-    """A value on its way with its metadata (None when empty) and, when flow is tracked, where it has been."""
+    """A value in a queue, with its metadata (None when empty) and, when flow is tracked, the path it came by."""
 
     __slots__ = ("metadata", "trail", "value")
 

@@ -59,7 +59,7 @@ class VideoFile:
         try:
             self._container = av.open(self._partial.file, mode="w", format="mp4")
             self._stream = self._add_stream()
-        except (OSError, ValueError) as error:  # FFmpeg's errors are OSErrors
+        except (OSError, ValueError, av.FFmpegError) as error:
             self._partial.discard()
             self._partial = None
             raise OutputError(

@@ -103,7 +103,7 @@ class ThreadedSource:
             frames = self.frames()
             try:
                 for frame in frames:
-                    if not self._hand_over(frame, stop):
+                    if not self._put(frame, stop):
                         break
             finally:
                 # A generator holds files open until it is closed.
@@ -117,7 +117,7 @@ class ThreadedSource:
                 self._done, self._error = True, error
                 self._changed.notify_all()
 
-    def _hand_over(self, frame: Frame, stop: threading.Event) -> bool:
+    def _put(self, frame: Frame, stop: threading.Event) -> bool:
         """Wait for room and put the frame there; False when the source is being closed."""
         with self._changed:
             self._changed.wait_for(lambda: stop.is_set() or len(self._ready) < self._ahead)

@@ -9,6 +9,7 @@ import struct
 import zlib
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -180,7 +181,7 @@ def test_playlists_never_reach_the_decoder(
     def reached(*_: object) -> None:
         raise AssertionError("the decoder was given a playlist")
 
-    monkeypatch.setattr(cv2, "VideoCapture", reached)
+    monkeypatch.setattr(av, "open", reached)
     (tmp_path / f"video{suffix}").write_text(text)
     _refused(tmp_path / f"video{suffix}", "is not a video")
 

@@ -13,11 +13,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings.calibration import Calibration
 from gsplat_core.io.recordings.decoded import Picture
-from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.recordings.findings import Findings, printable
 from gsplat_core.io.recordings.frame_files import DepthFiles, MaskFiles
-from gsplat_core.io.recordings.plain_files import open_plain
+from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 
@@ -116,12 +117,17 @@ class Contents:
         return sorted({*self.other_files, *(path for part in parts if part for path in part.files)})
 
     def digest(self) -> str:
-        """sha256 over the input files: for each in order of name, its name, its length and its bytes."""
+        """sha256 over the input files: for each in order of name, its name, its length and its bytes. Raises RecordingInvalid."""
         digest = hashlib.sha256()
         for path in self.files():
             name = path.relative_to(self.root).as_posix() if path != self.root else path.name
-            with open_plain(path) as stream:
-                digest.update(os.fsencode(name) + f"\0{os.fstat(stream.fileno()).st_size}\0".encode())
-                while block := stream.read(1 << 20):
-                    digest.update(block)
+            try:
+                with open_plain(path) as stream:
+                    digest.update(os.fsencode(name) + f"\0{os.fstat(stream.fileno()).st_size}\0".encode())
+                    while block := stream.read(1 << 20):
+                        digest.update(block)
+            except (UnreadableFile, OSError) as error:
+                raise RecordingInvalid(
+                    f"{printable(path)}: {error}. Leave the recording alone while it is read."
+                ) from error
         return digest.hexdigest()

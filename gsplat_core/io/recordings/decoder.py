@@ -13,6 +13,7 @@ from fractions import Fraction
 from typing import cast
 
 import av
+import cv2
 import numpy as np
 from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
@@ -117,7 +118,9 @@ def _context(known: av.VideoCodecContext, decoder: str | None) -> av.VideoCodecC
 
 def picture(frame: av.VideoFrame, rotation: int) -> NDArray[np.uint8]:
     """RGB uint8 [H, W, 3]: the bytes that OpenCV gives for the same frame, turned upright."""
-    image = frame.to_ndarray(format="bgr24", interpolation=Interpolation.BICUBIC)[..., ::-1]
+    # By way of BGR: FFmpeg's conversions to RGB round otherwise for some formats.
+    bgr = frame.to_ndarray(format="bgr24", interpolation=Interpolation.BICUBIC)
+    image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
     if turns := _QUARTER_TURNS.get(rotation, 0):
         image = np.rot90(image, turns)
     return np.ascontiguousarray(image)

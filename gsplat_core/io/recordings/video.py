@@ -39,6 +39,14 @@ class VideoFrames:
 
     def frames(self, findings: Findings) -> Iterator[Picture | None]:
         """Frame after frame; a damaged one is marked. A video that ends early is a problem, and so is a change of size."""
+        try:
+            yield from self._frames(findings)
+        except (UnreadableFile, OSError, av.FFmpegError) as error:  # it was whole when it was opened
+            findings.problem(
+                self.path, f"the video cannot be read any more: {error}", "Leave it alone while it is read"
+            )
+
+    def _frames(self, findings: Findings) -> Iterator[Picture | None]:
         due = 0
         last: Picture | None = None
         spread = DamageSpread(self._index)
@@ -171,7 +179,7 @@ def open_video(path: Path, findings: Findings) -> VideoFrames | None:
         findings.problem(path, str(error), "Give a video file")
     except UnusableContainer as error:
         findings.problem(path, str(error), _REENCODE)
-    except OSError as error:  # FFmpeg's errors too
+    except (OSError, av.FFmpegError) as error:
         findings.problem(path, f"the video cannot be read: {error.strerror or error}", _REENCODE)
     except IndexError:
         findings.problem(path, "the file holds no video stream", _REENCODE)

@@ -183,8 +183,10 @@ def test_the_field_trains_grows_and_moves_on_as_on_the_cpu(gpu):
         for field in (here, there):
             field.adam_step(time_s, gradient.to(field.weights.device), BasisRates())
     for ours, wanted in zip(there.training_tensors(), here.training_tensors(), strict=True):
-        assert ours.device == gpu and ours.shape == wanted.shape
-        torch.testing.assert_close(ours.cpu(), wanted, rtol=1e-3, atol=1e-5)
+        assert ours.device == gpu
+        # On a GPU there is capacity behind the bumps and Gaussians that are in use.
+        in_use = ours[tuple(slice(0, size) for size in wanted.shape)]
+        torch.testing.assert_close(in_use.cpu(), wanted, rtol=1e-3, atol=1e-5)
     gaussians = Gaussians(*(torch.zeros(30, *s) for s in ((3,), (4,), (3,), (), (1, 3)))).to(gpu)
     tau = torch.full((1,), there.frame_time(1.3), device=gpu)
     torch.testing.assert_close(

@@ -19,19 +19,20 @@ from tests.gsplat_core.io.recordings import videos
 Refused = Callable[..., str]
 
 FLIPS, HOLES = 24, 12
-# The largest share of damaged files in which a changed picture may pass for whole; docs/recordings.md has what was measured.
-# VP8, MJPEG, MPEG-4 and H.265 carry no redundancy that their decoders check.
-UNSEEN_FLIPS = {"ffv1": 0.0, "ffv1_avi": 0.0, "h264_mkv": 0.0, "vp9": 0.1, "vp9_mp4": 0.1, "h264": 0.4}
-UNSEEN_HOLES = {
+# The largest share of damaged files in which a changed picture may pass for whole: what was measured (docs/recordings.md) and some room
+# for other versions of the encoders. H.265 and Motion JPEG carry no redundancy against a single bit.
+UNSEEN_FLIPS = {
     "ffv1": 0.0,
     "ffv1_avi": 0.0,
     "h264_mkv": 0.0,
-    "h264": 0.0,
-    "h265": 0.1,
-    "vp9": 0.1,
-    "vp9_mp4": 0.1,
-    "mpeg4": 0.2,
+    "vp9": 0.25,
+    "vp9_mp4": 0.25,
+    "h264": 0.6,
+    "vp8": 0.5,
+    "mpeg4": 0.6,
 }
+UNSEEN_HOLES = {"ffv1": 0.0, "ffv1_avi": 0.0, "h264_mkv": 0.0, "h264": 0.0, "h265": 0.0}
+UNSEEN_HOLES_OF_OTHERS = 0.15
 
 
 def _read(path: Path) -> tuple[list[Frame], bool]:
@@ -95,7 +96,8 @@ def test_damage_is_seen(video: SimpleNamespace, tmp_path: Path, kind: str) -> No
         if verdict is not None:
             verdicts.append(verdict)
     assert verdicts, "no damage changed a picture"
-    assert sum(verdicts) <= bounds.get(video.codec, 1.0) * len(verdicts)
+    others = 1.0 if kind == "flip" else UNSEEN_HOLES_OF_OTHERS
+    assert sum(verdicts) <= bounds.get(video.codec, others) * len(verdicts)
 
 
 @pytest.mark.parametrize("codec", ["ffv1_avi", "vp9_mp4"])
@@ -214,3 +216,19 @@ def test_image_numbers_that_repeat_are_refused(tmp_path: Path, refused: Refused)
     for name in ("f1.png", "f2.png", "f2.jpg", "f3.png"):
         assert cv2.imwrite(str(tmp_path / name), videos.pictures(1)[0])
     refused(tmp_path, RecordingInvalid, "number 2")
+
+
+@pytest.mark.parametrize("codec", ["h264", "h264_mkv", "vp9", "mjpeg", "mpeg4"])
+@pytest.mark.parametrize("part", ["beginning", "end"])
+def test_damage_to_the_container_never_ends_in_anything_but_findings(codec: str, part: str, tmp_path: Path) -> None:
+    path = videos.encode(tmp_path / videos.name_of(codec), codec, videos.pictures(6))
+    data = path.read_bytes()
+    region = (0, 1500) if part == "beginning" else (len(data) - 1500, len(data))
+    for seed in range(12):
+        choice = random.Random(seed)
+        damaged = bytearray(data)
+        for _ in range(choice.choice([1, 2, 8])):
+            damaged[choice.randrange(*region)] = choice.choice([0, 255, choice.randrange(256)])
+        path.write_bytes(damaged)
+        report = validate_recording(path)
+        assert report.ok or report.problems[0].message
