@@ -121,11 +121,16 @@ class Operations(StepOperations):
             InvalidInput: a shape, dtype, device or mode that does not fit, with what was seen.
             NotImplementedError: an argument of gsplat's that is not supported, with its value.
         """
-        refuse_unsupported(
-            sparse_grad=sparse_grad, distributed=distributed, with_ut=with_ut, with_eval3d=with_eval3d,
-            radial_coeffs=radial_coeffs, tangential_coeffs=tangential_coeffs, thin_prism_coeffs=thin_prism_coeffs,
-            ftheta_coeffs=ftheta_coeffs, rolling_shutter=rolling_shutter, viewmats_rs=viewmats_rs,
+        asked_for = (
+            sparse_grad, distributed, with_ut, with_eval3d, radial_coeffs, tangential_coeffs, thin_prism_coeffs,
+            ftheta_coeffs, rolling_shutter, viewmats_rs,
         )  # fmt: skip
+        if any(value is not None and value is not False for value in asked_for):
+            refuse_unsupported(
+                sparse_grad=sparse_grad, distributed=distributed, with_ut=with_ut, with_eval3d=with_eval3d,
+                radial_coeffs=radial_coeffs, tangential_coeffs=tangential_coeffs, thin_prism_coeffs=thin_prism_coeffs,
+                ftheta_coeffs=ftheta_coeffs, rolling_shutter=rolling_shutter, viewmats_rs=viewmats_rs,
+            )  # fmt: skip
         settings = RenderSettings(
             width=width, height=height, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
             sh_degree=sh_degree, packed=packed, tile_size=TILE_SIZE if tile_size is None else tile_size,

@@ -12,6 +12,7 @@ from gsplat_core.scene.gaussians import MAX_SH_DEGREE
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
+_RENDER_MODES, _RASTERIZE_MODES = get_args(RenderMode), get_args(RasterizeMode)
 
 NEAR_PLANE, FAR_PLANE = 0.01, 1e10
 """Default range of z that is rendered, in the scene's unit."""
@@ -55,8 +56,8 @@ class RenderSettings:
 
     def __post_init__(self) -> None:
         for name, value, known in (
-            ("render_mode", self.render_mode, get_args(RenderMode)),
-            ("rasterize_mode", self.rasterize_mode, get_args(RasterizeMode)),
+            ("render_mode", self.render_mode, _RENDER_MODES),
+            ("rasterize_mode", self.rasterize_mode, _RASTERIZE_MODES),
         ):
             if value not in known:
                 raise InvalidInput(f"unknown {name} {value!r}; the modes are {', '.join(known)}")
