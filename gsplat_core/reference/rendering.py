@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from gsplat_core.reference.compositing import rasterize_to_pixels
@@ -31,6 +32,34 @@ def bin_splats(
     images = math.prod(depths.shape[:-1]) if n_images is None else n_images
     offsets = isect_offset_encode(isect_ids, images, tile_width, tile_height)
     return tiles_per_gauss, flatten_ids, offsets
+
+
+def bin_splats_within(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    capacity: int,
+    *,
+    conics: Tensor | None = None,
+    opacities: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The compiled `bin_splats` with a capacity, of splats that are not packed: the nearest that fit, unused entries first."""
+    tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
+        means2d, radii, depths, tile_size, tile_width, tile_height, conics=conics, opacities=opacities
+    )
+    counts = tiles_per_gauss.reshape(-1)
+    nearest_first = torch.argsort(depths.detach().reshape(-1).view(torch.int32).long() & 0xFFFFFFFF, stable=True)
+    fits = torch.empty_like(counts, dtype=torch.bool)
+    fits[nearest_first] = counts[nearest_first].cumsum(0) <= capacity
+    listed = fits[flatten_ids.long()]
+    unused = flatten_ids.new_full((capacity - int(listed.sum()),), -1)
+    images = math.prod(depths.shape[:-1])
+    offsets = isect_offset_encode(isect_ids[listed], images, tile_width, tile_height) + len(unused)
+    needed = torch.tensor([len(flatten_ids)], device=depths.device)
+    return tiles_per_gauss, torch.cat([unused, flatten_ids[listed]]), offsets, needed
 
 
 rasterization = Operations(
