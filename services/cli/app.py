@@ -47,6 +47,7 @@ ModelArgument = Annotated[Path, _path_argument("MODEL", "A model folder that rep
 OutOption = Annotated[Path, _path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
 RenderOutOption = Annotated[Path, _path_option("--out", "A video (name.mp4) or a folder of images.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
+RendererOption = Annotated[str, typer.Option(help="How Gaussians become a picture: alpha.")]
 FieldOption = Annotated[str, typer.Option(help="Deformation field: auto, basis or hexplane.")]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
 ScaleOption = Annotated[float, typer.Option(help="Resize the frames by this factor.")]
@@ -171,13 +172,16 @@ def render(
     fps: Annotated[float, typer.Option(help="Frames per second of the model's time.")] = 30.0,
     scale: ScaleOption = 1.0,
     device: DeviceOption = "cpu",
+    renderer: RendererOption = "alpha",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a video that is there already.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Render a model over its time window to a video or to images."""
     from services.cli.render import render_command
 
-    return render_command(model, out, fps, scale, device, overwrite=overwrite, as_json=json)
+    return render_command(
+        model, out, fps, scale=scale, device=device, renderer=renderer, overwrite=overwrite, as_json=json
+    )
 
 
 @app.command()
