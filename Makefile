@@ -4,13 +4,14 @@ BIN := .venv/bin
 OUT ?= out/demo
 # Waiting threads sleep: tests and benchmarks share the machine.
 export OMP_WAIT_POLICY ?= PASSIVE
+MODULES := $(wildcard $(sort $(shell git ls-files --cached --others --exclude-standard 'gsplat_core/*.py' 'operators/*.py' 'services/*.py')))
 CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*.cu' 'gsplat_core/*.cuh')
 # For which GPUs `make cuda` builds: `native`, the one in this machine; `portable`, all from compute capability 8.0 on; or as CMake
 # names them, 80-real;90-real.
 CUDA_ARCHITECTURES ?= native
 CUDA_TOOLKIT := build/cuda-toolkit
 
-.PHONY: demo test lint format bench native cuda lock licences clean
+.PHONY: demo test lint format bench native cuda compilers lock licences clean always
 
 # On the NVIDIA GPU where there is one that torch can use: the CUDA kernels are built for it first. A build that fails ends it.
 demo: native
@@ -51,14 +52,26 @@ $(CUDA_TOOLKIT)/.installed: requirements-cuda.lock | .venv/.runtime
 	$(BIN)/pip install --quiet --require-hashes --no-deps --target $(CUDA_TOOLKIT) -r requirements-cuda.lock
 	touch $@
 
-# The build tools come first, so that the install builds against the torch that it will run with.
-.venv/.runtime: requirements.lock pyproject.toml
+# The host code of both libraries with every C++ compiler of this machine; warnings are errors.
+compilers: .venv/.runtime
+	@.ci/compilers
+
+.venv/.dependencies: requirements.lock
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --require-hashes -r requirements.lock
+	touch $@
+
+# The installed package holds a list of our modules. This file has it too, and changes where one was added, moved or removed.
+build/modules.txt: always
+	@mkdir -p build
+	@printf '%s\n' $(MODULES) | cmp --quiet - $@ || printf '%s\n' $(MODULES) > $@
+
+# The build tools come first, so that the install builds against the torch that it will run with.
+.venv/.runtime: .venv/.dependencies pyproject.toml build/modules.txt
 	$(BIN)/pip install --quiet --no-build-isolation --no-deps --editable .
 	touch $@
 
-.venv/.development: requirements-dev.lock .venv/.runtime
+.venv/.development: requirements-dev.lock .venv/.dependencies | .venv/.runtime
 	$(BIN)/pip install --quiet --require-hashes -r requirements-dev.lock
 	touch $@
 

@@ -37,9 +37,7 @@ find_path(CUDA_INCLUDE cuda_runtime.h PATHS ${CUDA_ROOT}/include ${CUDA_ROOT}/ta
 find_library(CUDA_RUNTIME NAMES libcudart_static.a PATHS ${CUDA_ROOT}/lib ${CUDA_ROOT}/lib64
              ${CUDA_ROOT}/targets/x86_64-linux/lib ${CUDA_ROOT}/targets/sbsa-linux/lib REQUIRED NO_DEFAULT_PATH)
 
-file(GLOB_RECURSE CUDA_SOURCES CONFIGURE_DEPENDS gsplat_core/*.cu gsplat_core/*_cuda_op.cpp)
-set(CUDA_HOST_SOURCES ${HOST_SOURCES})
-list(FILTER CUDA_HOST_SOURCES EXCLUDE REGEX "_cpu_host\\.cpp$")
+file(GLOB_RECURSE CUDA_SOURCES CONFIGURE_DEPENDS gsplat_core/*.cu)
 add_core_library(gsplat_core_cuda ${CUDA_SOURCES} ${CUDA_HOST_SOURCES})
 target_compile_definitions(gsplat_core_cuda PRIVATE ${CORE_DEFINITIONS} GSPLAT_CUDA GSPLAT_ISA=device)
 target_compile_options(gsplat_core_cuda PRIVATE

@@ -12,7 +12,7 @@ import math
 import torch
 
 from gsplat_core import Camera, Gaussians, render
-from gsplat_core.training.losses import masked_l1
+from gsplat_core.ops.image_loss.image_loss import image_loss
 from gsplat_core.training.metrics import psnr_tissue_db
 
 WIDTH_PX, HEIGHT_PX, DISTANCE_MM = 96, 80, 60.0
@@ -58,8 +58,7 @@ def main() -> None:
     before_db = psnr_tissue_db(render(start, camera).image, target)
     for _ in range(steps):
         optimiser.zero_grad()
-        loss = masked_l1(render(Gaussians(**learned), camera).image, target, tissue)
-        loss.backward()
+        image_loss(render(Gaussians(**learned), camera).image, target, tissue).loss.backward()
         optimiser.step()
     after_db = psnr_tissue_db(render(Gaussians(**learned), camera).image, target)
     print(f"{start.count} Gaussians, {steps} steps: {before_db:.1f} dB before, {after_db:.1f} dB after")

@@ -24,7 +24,8 @@ from operators.graph import (
     run,
 )
 from operators.ingest import SourceOp
-from operators.sinks.display import CallbackSinkOp
+from operators.sinks.callback import CallbackSinkOp
+from operators.sources.recording import RecordingSource
 from operators.tool_mask import RecordedToolMaskOp
 
 
@@ -65,7 +66,7 @@ class ToolShareApplication(Application):
         self.scheduler(GreedyScheduler(self, clock=ManualClock()))  # one thread: the same order each time
 
     def compose(self) -> None:
-        source = SourceOp(self, name="source", recording=self.recording)
+        source = SourceOp(self, name="source", source=RecordingSource(self.recording))
         mask = RecordedToolMaskOp(self, name="tool_mask")
         share = ToolShareOp(self, name="tool_share")
         show = CallbackSinkOp(self, name="show", callback=self.shares.append)

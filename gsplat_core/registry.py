@@ -31,12 +31,12 @@ class Registry(Generic[Kind]):
 
     def remove(self, name: str) -> None:
         """Forget `name`. Raises InvalidSetting when it is not registered."""
-        self._check(name)
+        self.check(name)
         del self._entries[name]
 
     def __getitem__(self, name: str) -> Kind:
         """What `name` stands for. Raises InvalidSetting, with the known names, when it is not registered."""
-        self._check(name)
+        self.check(name)
         entry = self._entries[name]
         if isinstance(entry, str):
             module, attribute = entry.split(":")
@@ -52,6 +52,7 @@ class Registry(Generic[Kind]):
     def __len__(self) -> int:
         return len(self._entries)
 
-    def _check(self, name: str) -> None:
+    def check(self, name: str) -> None:
+        """Raises InvalidSetting, with the known names, when `name` is not registered."""
         if name not in self._entries:
             raise InvalidSetting(f"unknown {self.what} {name!r}; known are {', '.join(self._entries) or 'none'}")

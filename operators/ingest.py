@@ -1,23 +1,42 @@
-"""The source of a replay: the frames of a recording, in order."""
+"""How frames enter the graph."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from gsplat_core.io.recordings import Recording
+from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.frames import Frame
 from operators.graph import Operator, OperatorSpec
+from operators.outcome import OutcomeBuilder
+from operators.sources.source import FrameSource, SourceDescription, SourceState
+
+LOOK_S = 0.1
+"""How often a source that waits for its next frame asks whether it is to stop."""
+PATIENCE_S = 1.0
+"""After so long without a frame, `compute` returns, so that a stop of the graph is noticed."""
+
+
+@dataclass(frozen=True)
+class SourceResult:
+    """What a run has read."""
+
+    description: SourceDescription
+    frames: int
+    """How many frames entered the graph."""
+    reached_end: bool
+    """Whether the source gave all that it had; False when the run ended before."""
 
 
 class SourceOp(Operator):
-    """Emits each frame of a recording once, then ends the stream.
+    """Emits each frame of a source once, in order, and ends when the source does.
 
     Outputs:
         frame: `Frame`; the message's metadata carries `seq` and `pts_ns`.
 
     Params:
-        recording: an open recording; it is iterated from its beginning at `start()`.
+        source: opened by `start()` and closed by `stop()`.
         stop_requested: asked before each frame; when it answers True the stream ends there and what is on its way is finished.
     """
 
@@ -25,38 +44,60 @@ class SourceOp(Operator):
         self,
         fragment: Any,
         *args: Any,
-        recording: Recording,
+        source: FrameSource,
         stop_requested: Callable[[], bool] = lambda: False,
         **kwargs: Any,
     ) -> None:
-        self.recording = recording
+        self.source = source
         self.stop_requested = stop_requested
         self.emitted = 0
-        self._frames: Iterator[Frame] = iter(())
+        self.reached_end = False
+        self._last_seq: int | None = None
         super().__init__(fragment, *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:
         spec.output("frame", type=Frame)
 
     def start(self) -> None:
-        self._frames = iter(self.recording)
-        self.emitted = 0
+        self.emitted, self.reached_end, self._last_seq = 0, False, None
+        self.source.open()
 
     def stop(self) -> None:
-        # A generator holds the video open until it is closed.
-        close = getattr(self._frames, "close", None)
-        if close is not None:
-            close()
+        self.source.close()
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        frame = None if self.stop_requested() else next(self._frames, None)
+        frame = self._next()
         if frame is None:
-            self.stop_execution()
             return
+        if self._last_seq is not None and frame.seq <= self._last_seq:
+            raise InvalidInput(f"frame {frame.seq} came after frame {self._last_seq}; a source's numbers must increase")
+        self._last_seq = frame.seq
         self.metadata["seq"] = frame.seq
         self.metadata["pts_ns"] = frame.pts_ns
         op_output.emit(frame, "frame")
         self.emitted += 1
-        if self.emitted == self.recording.frame_count:
-            # Ending here rather than on an empty tick keeps "calls" in the report equal to the number of frames.
-            self.stop_execution()
+        if self.emitted == self.source.description.frame_count:
+            # Ending here rather than on an empty compute keeps "calls" in the report equal to the number of frames.
+            self._end()
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        outcome.add(SourceResult(self.source.description, self.emitted, self.reached_end))
+
+    def _next(self) -> Frame | None:
+        """The next frame; None when there is none yet, or none any more."""
+        for _ in range(round(PATIENCE_S / LOOK_S)):
+            if self.stop_requested():
+                self.stop_execution()
+                return None
+            frame = self.source.read(LOOK_S)
+            if frame is not None:
+                return frame
+            if self.source.state is SourceState.ENDED:
+                self._end()
+                return None
+        return None
+
+    def _end(self) -> None:
+        self.reached_end = True
+        self.stop_execution()

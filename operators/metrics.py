@@ -11,8 +11,10 @@ import numpy as np
 
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import FrameQuality, QualityTracker, psnr_tissue_db
+from operators.frame_log import MAX_SERIES, Entry, FrameLog, frames_per_entry, read_frames, series
 from operators.graph import Operator, OperatorSpec
 from operators.messages import RenderedFrame
+from operators.outcome import OutcomeBuilder
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class ScoredFrame:
     previous_frame_db: float
     """Tissue PSNR of showing the raw frame before it instead: what doing nothing scores. NaN for the first frame."""
 
-    def as_json(self) -> dict[str, float | int | bool | None]:
+    def as_json(self) -> Entry:
         """One entry of the report's series; null where a measure does not exist."""
         frame = self.rendered.frame
         measures = {
@@ -42,25 +44,47 @@ class ScoredFrame:
         }
 
 
+@dataclass(frozen=True)
+class QualityResult:
+    """How good a run's frames were."""
+
+    trained: QualityTracker
+    """Frames that were trained on before they were shown."""
+    held_out: QualityTracker
+    """Frames that were shown and never trained on."""
+    series: tuple[Entry, ...]
+    """One entry per displayed frame, in order; of a long run, one per bin of frames (see `frame_log.series`)."""
+    frames_per_entry: int
+    frames_sha256: str
+
+    @property
+    def frames(self) -> int:
+        """How many frames were displayed and scored."""
+        return self.trained.count + self.held_out.count
+
+
 class MetricsOp(Operator):
     """Scores each displayed frame against its raw frame, over tissue, and takes a digest of the bytes that were displayed.
 
     The digest is SHA-256 over, for each frame in order, the line `seq width height\\n` and the RGB bytes of the reconstruction.
+    In memory only means are kept; each frame's own figures go to the log.
 
     Inputs:
         rendered: `RenderedFrame`.
 
     Outputs:
         scored: `ScoredFrame`.
+
+    Params:
+        log: where each frame's figures are written; without one there is no series.
     """
 
-    def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, fragment: Any, *args: Any, log: FrameLog | None = None, **kwargs: Any) -> None:
+        self.log = log
         self.live = QualityTracker()
         """Frames that were trained on before they were shown."""
         self.held_out = QualityTracker()
         """Frames that were shown and never trained on."""
-        self.series: list[dict[str, float | int | bool | None]] = []
-        """One entry per displayed frame, in order."""
         self._digest = hashlib.sha256()
         self._previous: Frame | None = None
         super().__init__(fragment, *args, **kwargs)
@@ -71,9 +95,15 @@ class MetricsOp(Operator):
 
     def start(self) -> None:
         self.live, self.held_out = QualityTracker(), QualityTracker()
-        self.series = []
         self._digest = hashlib.sha256()
         self._previous = None
+        if self.log is not None:
+            self.log.open()
+
+    def stop(self) -> None:
+        self._previous = None
+        if self.log is not None:
+            self.log.close()
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         rendered: RenderedFrame = op_input.receive("rendered")
@@ -85,9 +115,24 @@ class MetricsOp(Operator):
         comparable = previous is not None and previous.image.shape == frame.image.shape
         before_db = psnr_tissue_db(previous.image, frame.image, frame.mask) if comparable and previous else math.nan
         scored = ScoredFrame(rendered, quality, before_db)
-        self.series.append(scored.as_json())
+        if self.log is not None:
+            self.log.write(scored.as_json())
         self._previous = frame
         op_output.emit(scored, "scored")
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        entries: tuple[Entry, ...] = ()
+        per_entry = frames_per_entry(self.frames, MAX_SERIES)
+        if self.log is not None and self.frames:
+            entries = tuple(series(read_frames(self.log.path), per_entry))
+            outcome.output("frames", self.log.path)
+        outcome.add(QualityResult(self.live, self.held_out, entries, per_entry, self.frames_sha256))
+
+    @property
+    def frames(self) -> int:
+        """How many frames were scored so far."""
+        return self.live.count + self.held_out.count
 
     @property
     def frames_sha256(self) -> str:

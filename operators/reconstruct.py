@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from gsplat_core.scene.frames import Frame
@@ -11,6 +12,15 @@ from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.graph import Operator, OperatorSpec
 from operators.messages import Reconstruction
+from operators.outcome import OutcomeBuilder
+
+
+@dataclass(frozen=True)
+class ModelResult:
+    """The model of a run."""
+
+    model: Model
+    """The newest one, in memory of its own."""
 
 
 def never_held_out(frame: Frame) -> bool:
@@ -77,3 +87,9 @@ class ReconstructOp(Operator):
             Reconstruction(frame, self.newest, trained=train, steps=report.steps, arriving_loss=report.arriving_loss),
             "reconstruction",
         )
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        model = self.model
+        if model is not None:
+            outcome.add(ModelResult(model))

@@ -9,12 +9,13 @@ import numpy as np
 
 from gsplat_core.scene.frames import Frame
 from operators.graph import Operator, OperatorSpec
+from operators.outcome import OutcomeBuilder
 
 log = logging.getLogger(__name__)
 
 
 class RecordedToolMaskOp(Operator):
-    """Passes each frame on with its recorded mask; a frame without one counts as all tissue, which is stated once.
+    """Emits each frame with its recorded mask; a frame without one counts as all tissue, which is stated once.
 
     Inputs:
         frame: `Frame`.
@@ -43,9 +44,7 @@ class RecordedToolMaskOp(Operator):
             frame = frame.with_fields(mask=np.ones(frame.image.shape[:2], np.uint8))
         op_output.emit(frame, "frame")
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Stated fallbacks, for the report."""
-        if not self.without_mask:
-            return ()
-        return (f"{self.without_mask} frames had no tool mask; all of their pixels counted as tissue",)
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        if self.without_mask:
+            outcome.note(f"{self.without_mask} frames had no tool mask; all of their pixels counted as tissue")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -42,6 +43,18 @@ def gpu() -> torch.device:
 def device(request: pytest.FixtureRequest) -> torch.device:
     """The CPU, and again the GPU where there is one."""
     return request.getfixturevalue("gpu") if request.param == "cuda" else torch.device("cpu")
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """The random numbers of a test, the same in every run."""
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    """Torch's random numbers on the CPU for a test, the same in every run."""
+    return torch.Generator().manual_seed(0)
 
 
 @pytest.fixture

@@ -15,13 +15,15 @@ import pytest
 import torch
 import typer
 
-from gsplat_core import Frame, Gaussians
+from gsplat_core import Camera, Frame, Gaussians
 from gsplat_core.io.manifest import manifest_bytes, parse_manifest
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.scene.model import Model
 from operators.graph import Application, Operator, OperatorSpec
 from operators.ingest import SourceOp
-from operators.sinks.display import CallbackSinkOp
+from operators.sinks.callback import CallbackSinkOp
+from operators.sources.source import SourceDescription
+from operators.sources.threaded import ThreadedSource
 from services.cli.app import app
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -227,7 +229,7 @@ def test_the_operator_in_the_guide_works():
 
     class Two(Application):
         def compose(self) -> None:
-            source = SourceOp(self, name="source", recording=_Frames())
+            source = SourceOp(self, name="source", source=_Frames())
             share = names["ToolShareOp"](self, name="share", only_every=2)
             self.add_flow(source, share)
             self.add_flow(share, CallbackSinkOp(self, name="show", callback=seen.append))
@@ -236,11 +238,11 @@ def test_the_operator_in_the_guide_works():
     assert seen == [0.5, 0.5]
 
 
-class _Frames:
+class _Frames(ThreadedSource):
     """Four frames, half tool."""
 
-    frame_count = 4
+    description = SourceDescription("frames", 2, 1, 25.0, Camera.from_focal(1.0, 2, 1), frame_count=4)
 
-    def __iter__(self):
+    def frames(self):
         mask = np.array([[1, 0]], np.uint8)
         return (Frame(seq=i, pts_ns=i, image=np.zeros((1, 2, 3), np.uint8), mask=mask) for i in range(4))

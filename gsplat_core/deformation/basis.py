@@ -13,19 +13,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import torch
 from torch import Tensor
 
 from gsplat_core.deformation.basis_adam import BasisRates, Moments
-from gsplat_core.deformation.field import DeformationField, checked_window, count_of
+from gsplat_core.deformation.basis_columns import INERT, bump_capacity, columns_to_change, laid_out, with_columns
+from gsplat_core.deformation.field import DeformationField, checked_window, count_of, ops_for
 from gsplat_core.deformation.field_slots import BasisSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
-from gsplat_core.ops.basis_field.plain_torch import BUMP_REACH
-from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import BASIS_CHANNELS, BASIS_GROUPS, width_of
 
@@ -46,7 +45,7 @@ class BasisField(DeformationField):
     """
 
     kind = "basis"
-    has_frame_deltas = True
+    slot_type = BasisSlot
 
     def __init__(
         self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26, spacing_s: float | None = None
@@ -66,6 +65,8 @@ class BasisField(DeformationField):
         self.log_widths = torch.nn.Parameter(torch.zeros(count, bumps))
         self.weights = torch.nn.Parameter(torch.zeros(count, bumps, BASIS_CHANNELS))
         self._moments: Moments | None = None
+        self._spare: int = 0
+        """Inert columns at the end, which `extend` turns into bumps without moving a tensor: captured graphs stay valid."""
 
     @classmethod
     def for_gaussians(cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any) -> BasisField:
@@ -78,8 +79,8 @@ class BasisField(DeformationField):
 
     @property
     def bumps(self) -> int:
-        """Number of bumps per Gaussian B."""
-        return int(self.weights.shape[1])
+        """Number of bumps per Gaussian B; on a GPU the parameters may have spare columns beyond them."""
+        return int(self.weights.shape[1]) - self._spare
 
     @property
     def spacing_s(self) -> float:
@@ -141,17 +142,14 @@ class BasisField(DeformationField):
         """
         moments = self._moments_in_use()
         self._ops.basis_field_backward_adam_(
-            gradient,
-            tau,
-            *(p.data for p in self._parameters_in_order()),
-            moments.first,
-            moments.second,
-            moments.steps,
-            rates,
-            beta1,
-            beta2,
-            epsilon,
-        )
+            gradient, tau, *(p.data for p in self._parameters_in_order()), moments.first, moments.second, moments.steps,
+            rates, beta1, beta2, epsilon,
+        )  # fmt: skip
+
+    @property
+    def has_frame_deltas(self) -> bool:
+        """Always."""
+        return True
 
     def frame_time(self, time_s: float) -> float:
         """What `frame_deltas` takes for a time: its `tau`."""
@@ -192,10 +190,7 @@ class BasisField(DeformationField):
         if start < self._time_window_s[0] or end < self._time_window_s[1]:
             raise InvalidInput(f"the window {self._time_window_s} can only move forward, got {(start, end)}")
         spacing = self._spacing_s
-        last_s = self._origin_s + (self.bumps - 1) * spacing
-        added = max(0, math.ceil((end + spacing - last_s) / spacing - 1e-6))
-        dropped = max(0, math.floor((start - self._origin_s) / spacing - BUMP_REACH))
-        dropped = min(dropped, self.bumps + added - 4)
+        added, dropped = columns_to_change((start, end), self._origin_s, spacing, self.bumps)
         if added:
             self._append_columns(added, None if hold_at_s is None else self.deltas(hold_at_s).detach())
         if dropped:
@@ -218,28 +213,11 @@ class BasisField(DeformationField):
                 raise InvalidInput(f"parents must be [{count}], one for each new Gaussian, got {list(parents.shape)}")
             new = [p.data[parents] for p in self._parameters_in_order()]
         else:
-            columns = torch.arange(self.bumps, dtype=self.centers.dtype, device=self.centers.device)
-            new = [
-                columns.repeat(count, 1),
-                self.log_widths.new_zeros(count, self.bumps),
-                self.weights.new_zeros(count, self.bumps, BASIS_CHANNELS),
-            ]
+            columns = laid_out(self.bumps, self._spare, self.centers)
+            still = (p.data.new_zeros(count, *p.shape[1:]) for p in (self.log_widths, self.weights))
+            new = [columns.repeat(count, 1), *still]
         self._set_parameters(*(torch.cat([p.data, n]) for p, n in zip(self._parameters_in_order(), new, strict=True)))
         self._change_moments(lambda t: torch.cat([t, t.new_zeros(count, *t.shape[1:])]))
-
-    def slot(self, rows: int) -> BasisSlot:
-        """See `DeformationField.slot`; it has capacity for more bumps too."""
-        return BasisSlot(self, rows)
-
-    def adopt_layout(self, other: BasisField) -> None:
-        """Take over window, origin and spacing of the columns of `other`."""
-        self._time_window_s, self._origin_s, self._spacing_s = other._time_window_s, other._origin_s, other._spacing_s
-
-    def cropped(self, count: int, bumps: int) -> BasisField:
-        """A detached copy of the first `count` Gaussians and `bumps` columns."""
-        copied = self.detached_copy()
-        copied._set_parameters(*(p.data[:count, :bumps] for p in self._parameters_in_order()))
-        return copied
 
     def config(self) -> dict[str, Any]:
         """Kind, window and the layout of the columns."""
@@ -260,36 +238,41 @@ class BasisField(DeformationField):
         field._origin_s, field._spacing_s = float(config["origin_s"]), float(config["spacing_s"])
         return field
 
+    def detached_copy(self) -> Self:
+        """See `DeformationField.detached_copy`; without spare columns."""
+        copied = super().detached_copy()
+        copied._set_parameters(*(p.data[:, : self.bumps] for p in copied._parameters_in_order()))
+        copied._spare = 0
+        return copied
+
     def cover(self, time_s: float, newest_s: float) -> None:
         """Keep `COLUMNS_AHEAD` columns ahead of `time_s`, and one beyond; new ones continue the deformation at `newest_s`."""
-        start, end = self._time_window_s
         ahead_s = COLUMNS_AHEAD * self._spacing_s
-        if time_s + ahead_s > end:
-            self.extend((start, time_s + ahead_s + self._spacing_s), hold_at_s=newest_s)
+        if time_s + ahead_s > self._time_window_s[1]:
+            self.extend((self._time_window_s[0], time_s + ahead_s + self._spacing_s), hold_at_s=newest_s)
 
     def _training_state(self) -> Sequence[object]:
         return (self._moments,)
 
     def _append_columns(self, added: int, held: Tensor | None) -> None:
-        centers, log_widths, weights = (p.data for p in self._parameters_in_order())
-        columns = torch.arange(self.bumps, self.bumps + added, dtype=centers.dtype, device=centers.device)
-        columns = columns.repeat(self.count, 1)
-        new_weights = weights.new_zeros(self.count, added, BASIS_CHANNELS)
+        first = self.bumps
+        end = first + added
+        if added > self._spare:
+            self._add_spare((end if self.weights.is_cpu else bump_capacity(end)) - first - self._spare)
+        self._spare -= added
+        self.centers.data[:, first:end] = laid_out(end, 0, self.centers.data)[first:]
         if held is not None:
-            new_weights += held[:, None] / BUMPS_PER_SPACING
-        self._set_parameters(
-            torch.cat([centers, columns], dim=1),
-            torch.cat([log_widths, log_widths.new_zeros(self.count, added)], dim=1),
-            torch.cat([weights, new_weights], dim=1),
-        )
-        self._change_moments(lambda t: torch.cat([t, t.new_zeros(self.count, added, *t.shape[2:])], dim=1))
+            self.weights.data[:, first:end] += held[:, None] / BUMPS_PER_SPACING
+
+    def _add_spare(self, added: int) -> None:
+        widened = (with_columns(p.data, added, v) for p, v in zip(self._parameters_in_order(), INERT, strict=True))
+        self._set_parameters(*widened)
+        self._change_moments(lambda t: with_columns(t, added))
+        self._spare += added
 
     @property
     def _ops(self) -> ModuleType:
-        """The compiled ops where they exist, plain torch for other dtypes and devices."""
-        device = self.weights.device.type
-        has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
-        return compiled if has_kernels and self.weights.dtype == torch.float32 else plain_torch
+        return ops_for(self.weights, compiled, plain_torch)
 
     def _moments_in_use(self) -> Moments:
         if self._moments is None:

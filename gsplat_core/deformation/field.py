@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
 from typing import Any, ClassVar, Self, cast
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from gsplat_core.deformation.field_slots import FieldSlot
 from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.value_ranges import ListOf, NumberIn
 
@@ -32,8 +34,8 @@ class DeformationField(torch.nn.Module):
 
     kind: ClassVar[str] = ""
     """The name in the registry, in reports and in a bundle's manifest."""
-    has_frame_deltas: ClassVar[bool] = False
-    """Whether `frame_time` and `frame_deltas` are there, so that a CUDA graph can hold the field."""
+    slot_type: ClassVar[type[Any] | None] = None
+    """The `FieldSlot` for `slot`, made from a field and a number of rows. None: every snapshot of such a field gets memory of its own."""
 
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__()
@@ -88,15 +90,22 @@ class DeformationField(torch.nn.Module):
 
         return at
 
+    @property
+    def has_frame_deltas(self) -> bool:
+        """Whether `frame_time` and `frame_deltas` are there for this architecture, so that a CUDA graph can hold the field."""
+        return False
+
     def frame_time(self, time_s: float) -> float:
-        """`time_s` as `frame_deltas` counts it."""
-        raise InvalidInput(f"a {self.kind} field cannot be captured in a CUDA graph (has_frame_deltas); use cached")
+        """`time_s` as `frame_deltas` counts it. Raises InvalidInput as that does."""
+        raise InvalidInput(f"a {self.kind} field cannot be captured in a CUDA graph; use cached")
 
     def frame_deltas(self, gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Callable[[Tensor], Tensor]:
         """From a time ([1] on the field's device, see `frame_time`) to what the field adds then: [N, 16], the columns of
         `gsplat_core.ops.frame`. No autograd graph and no wait, so a CUDA graph can hold it. With `dtype` torch.float16 a field may
-        compute in half precision where that is faster; the result is float32."""
-        raise InvalidInput(f"a {self.kind} field cannot be captured in a CUDA graph (has_frame_deltas); use cached")
+        compute in half precision where that is faster; the result is float32.
+
+        Raises InvalidInput unless a kind of field overrides it."""
+        raise InvalidInput(f"a {self.kind} field cannot be captured in a CUDA graph; use cached")
 
     def config(self) -> dict[str, Any]:
         """All that `field_from_config` needs to rebuild the field without its tensors, as values of JSON."""
@@ -108,11 +117,9 @@ class DeformationField(torch.nn.Module):
         return copied.requires_grad_(False)
 
     def slot(self, rows: int) -> FieldSlot | None:
-        """A copy for `rows` Gaussians that newer states of this field can be written over, at the same addresses.
-
-        None: this kind of field has no such copy, and every snapshot of it gets memory of its own.
-        """
-        return None
+        """A copy for `rows` Gaussians that newer states of this field can be written over, at the same addresses; see `slot_type`."""
+        made: FieldSlot | None = None if self.slot_type is None else self.slot_type(self, rows)
+        return made
 
     def check_state(self) -> None:
         """InvalidInput when loaded tensors, finite and of the right shapes, still make no field."""
@@ -147,6 +154,13 @@ def checked_window(time_window_s: tuple[float, float]) -> tuple[float, float]:
     if not (math.isfinite(start) and math.isfinite(end) and start <= end):
         raise InvalidInput(f"time_window_s must be two finite times in order, got {time_window_s}")
     return start, end
+
+
+def ops_for(tensor: Tensor, compiled: ModuleType, plain: ModuleType) -> ModuleType:
+    """The compiled ops where there are kernels for such a tensor, their plain-torch versions for other dtypes and devices."""
+    device = tensor.device.type
+    has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
+    return compiled if has_kernels and tensor.dtype == torch.float32 else plain
 
 
 def count_of(added: int | Gaussians) -> int:

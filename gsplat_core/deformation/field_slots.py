@@ -5,20 +5,15 @@ A captured CUDA graph can therefore read the field of every published snapshot. 
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Protocol
 
 import torch
 
+from gsplat_core.deformation.basis_columns import INERT, INERT_CENTER, bump_capacity
+
 if TYPE_CHECKING:
     from gsplat_core.deformation.basis import BasisField
     from gsplat_core.deformation.field import DeformationField
-
-INERT_CENTER = 1e9
-"""Centre of a bump that no field has yet, in bump spacings: too far from any time to contribute."""
-BUMP_STEP = 16
-"""The capacity for bumps is a multiple of this."""
-BUMP_HEADROOM = 1.25
 
 
 class FieldSlot(Protocol):
@@ -27,6 +22,10 @@ class FieldSlot(Protocol):
     @property
     def field(self) -> DeformationField:
         """The copy, for as many Gaussians as the slot has rows; only its times and the values of its tensors change."""
+
+    @property
+    def parameter_count(self) -> int:
+        """Numbers in all tensors of the field as it was written last."""
 
     def overwrite(self, source: DeformationField) -> bool:
         """Take over the state of `source`, queued on the current stream; False, with nothing changed, where it does not fit."""
@@ -38,8 +37,9 @@ class FieldSlot(Protocol):
 class WholeFieldSlot:
     """For a field without tensors per Gaussian: its tensors never change their shapes."""
 
-    def __init__(self, source: DeformationField) -> None:
+    def __init__(self, source: DeformationField, rows: int) -> None:
         self.field = source.detached_copy()
+        self.parameter_count = sum(tensor.numel() for tensor in self.field.state_dict().values())
 
     def overwrite(self, source: DeformationField) -> bool:
         """Copy every parameter and buffer, and the time window."""
@@ -60,11 +60,17 @@ class BasisSlot:
     """A basis field with capacity for more Gaussians and more bumps than it has; those that are not in use are inert."""
 
     def __init__(self, source: BasisField, rows: int) -> None:
-        capacity = math.ceil(max(source.bumps * BUMP_HEADROOM, 1) / BUMP_STEP) * BUMP_STEP
         with torch.device(source.weights.device):
-            self.field = type(source)(rows, source.time_window_s, bumps=capacity).requires_grad_(False)
+            self.field = type(source)(rows, source.time_window_s, bumps=bump_capacity(source.bumps))
+        self.field.requires_grad_(False)
         self.field.centers.data.fill_(INERT_CENTER)
         self._used = 0, 0
+
+    @property
+    def parameter_count(self) -> int:
+        """Of the rows and bumps in use."""
+        count, bumps = self._used
+        return count * bumps * (2 + int(self.field.weights.shape[2]))
 
     def overwrite(self, source: DeformationField) -> bool:
         """Copy the bumps and the layout of the columns, and make inert what an earlier state had used beyond them."""
@@ -76,17 +82,21 @@ class BasisSlot:
         mine = (self.field.centers.data, self.field.log_widths.data, self.field.weights.data)
         theirs = (source.centers.data, source.log_widths.data, source.weights.data)
         for to, values in zip(mine, theirs, strict=True):
-            to[:count, :bumps].copy_(values)
+            to[:count, :bumps].copy_(values[:, :bumps])
         rows, columns = self._used
-        for to, inert in zip(mine, (INERT_CENTER, 0.0, 0.0), strict=True):
+        for to, inert in zip(mine, INERT, strict=True):
             if rows > count:
                 to[count:rows].fill_(inert)
             if columns > bumps:
                 to[:, bumps:columns].fill_(inert)
         self._used = count, bumps
-        self.field.adopt_layout(source)
+        for name in ("_time_window_s", "_origin_s", "_spacing_s"):
+            setattr(self.field, name, getattr(source, name))
         return True
 
     def exact_copy(self) -> DeformationField:
         """A field of as many Gaussians and bumps as are in use."""
-        return self.field.cropped(*self._used)
+        count, bumps = self._used
+        copied = self.field.detached_copy()
+        copied._set_parameters(*(p.data[:count, :bumps] for p in copied._parameters_in_order()))
+        return copied

@@ -15,15 +15,13 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation import regularisers
-from gsplat_core.deformation.field import DeformationField, checked_window
+from gsplat_core.deformation.field import DeformationField, checked_window, ops_for
 from gsplat_core.deformation.field_slots import WholeFieldSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane import hexplane as compiled
 from gsplat_core.ops.hexplane import plain_torch
 from gsplat_core.ops.hexplane.deltas import hexplane_deltas, takes_layers
 from gsplat_core.ops.hexplane.plain_torch import PLANE_AXES
-from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import HEAD_COLUMNS, HEAD_GROUPS, width_of
 
@@ -67,7 +65,7 @@ class HexPlaneField(DeformationField):
     """
 
     kind = "hexplane"
-    has_frame_deltas = True
+    slot_type = WholeFieldSlot
 
     def __init__(
         self,
@@ -111,6 +109,11 @@ class HexPlaneField(DeformationField):
         low, high = self.box.to(means.dtype)
         space = (2 * (means - low) / (high - low) - 1).clamp(-1, 1)
         return torch.cat([space, torch.full_like(space[:, :1], self.frame_time(time_s))], dim=1)
+
+    @property
+    def has_frame_deltas(self) -> bool:
+        """Whether the kernel takes the network's sizes; plain torch, which others fall back to, cannot be captured."""
+        return takes_layers(self.channels, len(self.levels), self.width, self.depth)
 
     def frame_time(self, time_s: float) -> float:
         """What `frame_deltas` takes for a time: it, clamped to the window, in [-1, 1]."""
@@ -188,18 +191,6 @@ class HexPlaneField(DeformationField):
 
         return at
 
-    def plane_smoothness(self) -> Tensor:
-        """Scalar: total variation of the space planes, mean over planes (see `regularisers`)."""
-        return regularisers.mean_over_planes(regularisers.total_variation, self._named(SPACE_PLANES))
-
-    def time_smoothness(self) -> Tensor:
-        """Scalar: squared second difference along time of the time planes, mean over planes."""
-        return regularisers.mean_over_planes(regularisers.second_difference_in_time, self._named(TIME_PLANES))
-
-    def time_sparsity(self) -> Tensor:
-        """Scalar: distance of the time planes from 1, their value without motion."""
-        return regularisers.mean_over_planes(regularisers.distance_from_one, self._named(TIME_PLANES))
-
     def extend(self, time_window_s: tuple[float, float]) -> None:
         """Cover another window with the same number of time rows: what was learned keeps its place in time.
 
@@ -226,10 +217,6 @@ class HexPlaneField(DeformationField):
         """Weights and biases of the trunk and the head, layer by layer, outside of autograd."""
         weights, biases = self._network()
         return [weight.data for weight in weights], [bias.data for bias in biases]
-
-    def slot(self, rows: int) -> WholeFieldSlot:
-        """See `DeformationField.slot`; the field has no tensors per Gaussian."""
-        return WholeFieldSlot(self)
 
     def config(self) -> dict[str, Any]:
         """Kind, window and architecture; the box is stored with the tensors."""
@@ -260,10 +247,7 @@ class HexPlaneField(DeformationField):
 
     @property
     def _ops(self) -> ModuleType:
-        """The compiled ops where they exist, plain torch for other dtypes and devices."""
-        device = self.box.device.type
-        has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
-        return compiled if has_kernels and self.box.dtype == torch.float32 else plain_torch
+        return ops_for(self.box, compiled, plain_torch)
 
     def _named(self, names: Sequence[str]) -> list[Tensor]:
         return [plane for level in self._levels(names) for plane in level]

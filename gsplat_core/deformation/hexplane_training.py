@@ -12,7 +12,6 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane.deltas import takes_layers
 from gsplat_core.ops.hexplane.training import (
     FieldGradient,
-    Penalties,
     TrainingState,
     hexplane_planes_adam_,
     hexplane_train,
@@ -30,7 +29,6 @@ class HexPlaneTraining:
 
     Args:
         field: float32 on a CUDA device. Its tensors are taken now: where they are replaced by others, another `HexPlaneTraining` is due.
-        penalties: weights in the loss of the penalties of `gsplat_core.deformation.regularisers`.
 
     Raises:
         InvalidInput: the field is elsewhere, or its sizes are not those that the kernels take; train it with autograd then.
@@ -44,7 +42,6 @@ class HexPlaneTraining:
     def __init__(
         self,
         field: HexPlaneField,
-        penalties: Penalties = Penalties(),
         betas: tuple[float, float] = (0.9, 0.999),
         epsilon: float = 1e-8,
     ) -> None:
@@ -58,7 +55,6 @@ class HexPlaneTraining:
         self._planes = field.plane_tensors()
         self._weights, self._biases = field.network_tensors()
         self._network = [t for pair in zip(self._weights, self._biases, strict=True) for t in pair]
-        self._penalties = penalties
         self._betas = betas
         self._epsilon = epsilon
         self._first, self._second = ([torch.zeros_like(p) for p in self._planes] for _ in range(2))
@@ -102,7 +98,7 @@ class HexPlaneTraining:
         betas, epsilon = self._betas, self._epsilon
         hexplane_planes_adam_(
             self._planes, self._first, self._second, time, gradient, rates[:1], step,
-            status=status, penalties=self._penalties, betas=betas, epsilon=epsilon,
+            status=status, betas=betas, epsilon=epsilon,
         )  # fmt: skip
         network_adam_(
             self._network, gradient.network, self._network_first, self._network_second, rates[1:], step,

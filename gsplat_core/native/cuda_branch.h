@@ -2,50 +2,52 @@
 // CUDA graph it becomes a second branch.
 #pragma once
 
-#include <cuda_runtime.h>
-
+#include <memory>
 #include <vector>
+
+#include "cuda_resources.h"
 
 // What is queued on `stream` comes after what the main stream had when the branch was made. The branch joins the main stream at
 // its end at the latest: make it after the memory that it uses.
 class CudaBranch {
  public:
-  explicit CudaBranch(cudaStream_t main) : stream(own().stream), main_(main) { fork(); }
-  ~CudaBranch() { join(); }
+  explicit CudaBranch(cudaStream_t main) : CudaBranch(main, of_this_thread()) {}
+  // The end may come while an exception is thrown, so it throws none: CUDA keeps the error, and the call's finish() reports it.
+  ~CudaBranch() { follow(main_, stream); }
   CudaBranch(const CudaBranch&) = delete;
   CudaBranch& operator=(const CudaBranch&) = delete;
 
   const cudaStream_t stream;
 
   // What the branch gets from now on waits for what the main stream has so far.
-  void fork() const { follow(stream, main_); }
+  void fork() const { check_cuda(follow(stream, main_), "starting work beside a stream"); }
   // What the main stream gets from now on waits for what the branch has so far.
-  void join() const { follow(main_, stream); }
+  void join() const { check_cuda(follow(main_, stream), "waiting for work beside a stream"); }
 
  private:
-  struct Own {
-    cudaStream_t stream = nullptr;
-    cudaEvent_t event = nullptr;
+  struct Resources {
+    gsplat::CudaStream stream;
+    gsplat::CudaEvent event;
   };
 
-  // Of this thread and the current device, made once: another thread may be recording a graph on its own.
-  static Own& own() {
-    thread_local std::vector<Own> all;
+  CudaBranch(cudaStream_t main, const Resources& own) : stream(own.stream.get()), event_(own.event.get()), main_(main) { fork(); }
+
+  // Of this thread and the current device, made when first used and gone when the thread ends: another thread may be capturing a
+  // graph on its own.
+  static const Resources& of_this_thread() {
+    thread_local std::vector<std::unique_ptr<Resources>> by_device;
     int device = 0;
-    cudaGetDevice(&device);
-    if (all.size() <= size_t(device)) all.resize(size_t(device) + 1);
-    Own& mine = all[size_t(device)];
-    if (mine.stream == nullptr) {
-      cudaStreamCreateWithFlags(&mine.stream, cudaStreamNonBlocking);
-      cudaEventCreateWithFlags(&mine.event, cudaEventDisableTiming);
-    }
-    return mine;
+    check_cuda(cudaGetDevice(&device), "asking for the current device");
+    if (by_device.size() <= size_t(device)) by_device.resize(size_t(device) + 1);
+    if (!by_device[size_t(device)]) by_device[size_t(device)] = std::make_unique<Resources>();
+    return *by_device[size_t(device)];
   }
 
-  static void follow(cudaStream_t later, cudaStream_t earlier) {
-    cudaEventRecord(own().event, earlier);
-    cudaStreamWaitEvent(later, own().event, 0);
+  cudaError_t follow(cudaStream_t later, cudaStream_t earlier) const {
+    const cudaError_t error = cudaEventRecord(event_, earlier);
+    return error != cudaSuccess ? error : cudaStreamWaitEvent(later, event_, 0);
   }
 
-  cudaStream_t main_;
+  const cudaEvent_t event_;
+  const cudaStream_t main_;
 };

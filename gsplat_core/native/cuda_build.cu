@@ -2,6 +2,8 @@
 // that the answer is the library's own and not that of a file beside it.
 #include <cuda_runtime.h>
 
+#include "cuda_resources.h"
+
 #define TEXT_OF(...) #__VA_ARGS__
 #define TEXT(...) TEXT_OF(__VA_ARGS__)
 #define VISIBLE extern "C" __attribute__((visibility("default")))
@@ -22,3 +24,6 @@ VISIBLE const char* gsplat_core_cuda_refusal() {
   cudaGetLastError();  // or the next call of anybody would report it
   return error == cudaSuccess ? nullptr : cudaGetErrorString(error);
 }
+
+// How many streams and events this library owns at the moment.
+VISIBLE int gsplat_core_cuda_resources() { return gsplat::cuda_resources_alive.load(); }

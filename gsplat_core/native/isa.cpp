@@ -1,8 +1,10 @@
-// Detects the processor's vector instructions once.
+// Detects the processor's vector instructions once, and tells Python which of our sets is in use.
 #include "isa.h"
 
 #include <cstdlib>
 #include <cstring>
+
+#include "torch_abi.h"
 
 static Isa widest() {
 #if defined(GSPLAT_X86)
@@ -28,3 +30,7 @@ Isa active_isa() {
   static const Isa isa = chosen();
   return isa;
 }
+
+static int64_t active_isa_op() { return int64_t(active_isa()); }
+
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, CompositeExplicitAutograd, m) { m.impl("active_isa", GSPLAT_BOX(&active_isa_op)); }

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation import DeformationField
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.rendering.frame_renderer import FrameRenderer, LaunchedFrame
@@ -105,7 +104,7 @@ class AlphaRenderer:
         gaussians, field = scene.gaussians, scene.field
         if gaussians.device.type != "cuda" or gaussians.dtype != torch.float32 or CUDA_MISSING is not None:
             return None
-        if field is not None and not _has_frame_path(field):
+        if field is not None and not field.has_frame_deltas:
             return None
         return FrameRenderer(
             gaussians,
@@ -138,7 +137,3 @@ class _FrameInFlight:
 
 def _chosen(output: RenderOutput, asked: tuple[str, ...]) -> dict[str, Tensor]:
     return {name: tensor for name, tensor in output._asdict().items() if name in asked}
-
-
-def _has_frame_path(field: DeformationField) -> bool:
-    return type(field).frame_deltas is not DeformationField.frame_deltas

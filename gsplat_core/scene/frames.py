@@ -25,7 +25,7 @@ class Frame:
     """One frame; operators add fields on its way and never change the ones it has."""
 
     seq: int
-    """Position in the stream, from 0, without gaps."""
+    """Number in the stream, from 0; it increases from frame to frame, and numbers may be missing where frames were lost."""
     pts_ns: int
     """Presentation time in nanoseconds of the recording's clock."""
     image: NDArray[np.uint8]

@@ -40,6 +40,8 @@ class SnapshotSlot:
         self._gaussians: Gaussians | None = None
         self._field: FieldSlot | None = None
         self._count = 0
+        self._in_use: list[Tensor] = []
+        """The first `_count` rows of every tensor."""
         self._holder: weakref.ref[Snapshot] | None = None
         self._order = _DeviceOrder(device)
 
@@ -53,6 +55,12 @@ class SnapshotSlot:
     def field(self) -> DeformationField | None:
         """The field for all rows."""
         return None if self._field is None else self._field.field
+
+    @property
+    def parameter_count(self) -> int:
+        """Numbers in all tensors of what was written last, without the spare capacity."""
+        own = sum(tensor[:1].numel() for tensor in self.gaussians.tensors().values()) * self._count
+        return own + (0 if self._field is None else self._field.parameter_count)
 
     @property
     def is_free(self) -> bool:
@@ -74,18 +82,20 @@ class SnapshotSlot:
             return False
         if field is not None and self._field is not None and not self._field.overwrite(field):
             return False
-        count, mine, theirs = gaussians.count, self._gaussians.tensors(), gaussians.tensors()
-        for name, tensor in mine.items():
-            tensor[:count].copy_(theirs[name])
+        count = gaussians.count
         if self._count > count:
             self._gaussians.logit_opacities[count : self._count].fill_(-math.inf)
-        self._count = count
+        if self._count != count or not self._in_use:
+            self._in_use = [tensor[:count] for tensor in self._gaussians.tensors().values()]
+            self._count = count
+        for to, tensor in zip(self._in_use, gaussians.tensors().values(), strict=True):
+            to.copy_(tensor)
         return True
 
     def _replace(self, gaussians: Gaussians, field: DeformationField | None) -> None:
         rows = math.ceil(max(gaussians.count * ROW_HEADROOM, 1) / ROW_STEP) * ROW_STEP
         self._gaussians = _inert_gaussians(gaussians, rows)
-        self._count = 0
+        self._count, self._in_use = 0, []
         self._field = None if field is None else field.slot(rows)
         self.layout += 1
         written = self._overwrite(gaussians, field)
@@ -106,7 +116,6 @@ class Snapshot:
         camera: Camera,
         time_window_s: tuple[float, float],
         training_digest: str | None = None,
-        parameter_count: int,
     ) -> None:
         self.version = version
         """Counts up with every snapshot, from 1."""
@@ -115,7 +124,7 @@ class Snapshot:
         self.time_window_s = time_window_s
         """First and last time that the model has seen; other times show the nearest of these."""
         self.training_digest = training_digest
-        self.parameter_count = parameter_count
+        self.parameter_count = slot.parameter_count
         """Numbers in all tensors, without the slot's spare capacity."""
         self.slot = slot
         self.gaussian_count = slot._count
@@ -177,7 +186,7 @@ class SnapshotSlots:
     @staticmethod
     def can_hold(field: DeformationField | None) -> bool:
         """Whether snapshots of this kind of field can lie in slots."""
-        return field is None or type(field).slot is not DeformationField.slot
+        return field is None or field.slot_type is not None
 
     def publish(
         self,
@@ -197,16 +206,12 @@ class SnapshotSlots:
             raise InvalidInput(f"a {type(field).__name__} cannot lie in a slot; publish it as a Model")
         slot = self._free_slot()
         slot.write(gaussians, field)
-        tensors: list[Tensor] = [*gaussians.tensors().values()]
-        if field is not None:
-            tensors += field.state_dict(keep_vars=True).values()
         snapshot = Snapshot(
             slot,
             version=version,
             camera=camera,
             time_window_s=time_window_s,
             training_digest=training_digest,
-            parameter_count=sum(tensor.numel() for tensor in tensors),
         )
         slot._holder = weakref.ref(snapshot)
         return snapshot

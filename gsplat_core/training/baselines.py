@@ -1,7 +1,8 @@
 """What doing nothing scores: the trivial baselines that every table of reconstruction quality needs beside it.
 
 A copy of the previous frame is a strong baseline in slow endoscopy; a reconstruction that scores below it shows nothing that a frozen
-video would not. Two passes over the recording, three frames and one sum in memory, however long the recording.
+video would not. Two passes over the recording, three frames and one sum in memory, however long the recording. Frames are held out by
+their number, `Frame.seq`; where numbers are missing, "the frame before" is the one that came before.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings.split import is_heldout
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.metrics import mean_of_scored, psnr_tissue_db
+from gsplat_core.training.metrics import ScoredMean, psnr_tissue_db
 
 
 @dataclass(frozen=True)
@@ -45,42 +46,41 @@ def measure_baselines(recording: Iterable[Frame]) -> Baselines:
         raise InvalidInput(
             "measure_baselines reads the frames twice: pass the recording itself, not an iterator over it"
         )
-    previous: list[float] = []
-    heldout_previous: list[float] = []
-    heldout_neighbours: list[float] = []
+    previous = ScoredMean()
+    heldout_previous = ScoredMean()
+    heldout_neighbours = ScoredMean()
     train_mean = _TrainMean()
     before: Frame | None = None
     pending: tuple[Frame, Frame] | None = None  # a held-out frame and the one before it, waiting for the one after
-    for index, frame in enumerate(recording):
+    for frame in recording:
         if before is not None and before.image.shape != frame.image.shape:
             raise InvalidInput(
-                f"frame {index} is {list(frame.image.shape)}, the one before it {list(before.image.shape)}; they must be equal"
+                f"frame {frame.seq} is {list(frame.image.shape)}, the one before it {list(before.image.shape)}; they must be equal"
             )
         if pending is not None:
             heldout, earlier = pending
             middle = (earlier.image.astype(np.float32) + frame.image) / np.float32(2 * 255)
-            heldout_neighbours.append(psnr_tissue_db(middle, heldout.image, heldout.mask))
+            heldout_neighbours.add(psnr_tissue_db(middle, heldout.image, heldout.mask))
             pending = None
         if before is not None:
             value = psnr_tissue_db(before.image, frame.image, frame.mask)
-            previous.append(value)
-            if is_heldout(index):
-                heldout_previous.append(value)
+            previous.add(value)
+            if is_heldout(frame.seq):
+                heldout_previous.add(value)
                 pending = frame, before
-        if not is_heldout(index):
+        if not is_heldout(frame.seq):
             train_mean.add(frame.image)
         before = frame
     mean_image = train_mean.image()
-    heldout_train_mean = [
-        psnr_tissue_db(mean_image, frame.image, frame.mask)
-        for index, frame in enumerate(recording)
-        if mean_image is not None and is_heldout(index)
-    ]
+    heldout_train_mean = ScoredMean()
+    for frame in recording:
+        if mean_image is not None and is_heldout(frame.seq):
+            heldout_train_mean.add(psnr_tissue_db(mean_image, frame.image, frame.mask))
     return Baselines(
-        previous_frame_db=mean_of_scored(previous),
-        heldout_previous_frame_db=mean_of_scored(heldout_previous),
-        heldout_neighbour_mean_db=mean_of_scored(heldout_neighbours),
-        heldout_train_mean_db=mean_of_scored(heldout_train_mean),
+        previous_frame_db=previous.mean,
+        heldout_previous_frame_db=heldout_previous.mean,
+        heldout_neighbour_mean_db=heldout_neighbours.mean,
+        heldout_train_mean_db=heldout_train_mean.mean,
     )
 
 

@@ -10,8 +10,7 @@ Three facts that a table of such figures needs:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import cv2
@@ -162,14 +161,50 @@ class FrameQuality:
 MEASURES = ("psnr_tissue_db", "psnr_frame_db", "ssim")
 
 
-@dataclass
-class QualityTracker:
-    """Collects the quality of frames as they are displayed."""
+class ScoredMean:
+    """The mean of a stream of values, leaving out those that are not finite; correctly rounded, in memory of fixed size.
 
-    frames: list[FrameQuality] = field(default_factory=list)
+    The sum is kept as a few floats that do not overlap (Shewchuk, "Adaptive Precision Floating-Point Arithmetic", 1997), so that the mean
+    does not depend on the order of the values.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        """How many finite values there were."""
+        self._parts: list[float] = []
+
+    def add(self, value: float) -> None:
+        """Take one value."""
+        if not math.isfinite(value):
+            return
+        self.count += 1
+        kept: list[float] = []
+        for part in self._parts:
+            if abs(value) < abs(part):
+                value, part = part, value
+            total = value + part
+            lost = part - (total - value)
+            if lost:
+                kept.append(lost)
+            value = total
+        self._parts = [*kept, value]
+
+    @property
+    def mean(self) -> float | None:
+        """The mean so far; None without any finite value."""
+        return math.fsum(self._parts) / self.count if self.count else None
+
+
+class QualityTracker:
+    """Means over the frames that were displayed, in memory of fixed size."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        """Frames observed, those without tissue among them."""
+        self._means = {name: ScoredMean() for name in MEASURES}
 
     def observe(self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> FrameQuality:
-        """Score one frame and keep the result; arguments as in `psnr_tissue_db`."""
+        """Score one frame and take the result into the means; arguments as in `psnr_tissue_db`."""
         pair = _masked_pair(image, target, mask)
         squared_error = pair.squared_error()
         quality = FrameQuality(
@@ -178,26 +213,11 @@ class QualityTracker:
             psnr_frame_db=_psnr_db(squared_error, pair.pixels if pair.tissue_pixels else 0),
             ssim=pair.mean_ssim() if pair.tissue_pixels else math.nan,
         )
-        self.frames.append(quality)
+        self.count += 1
+        for name, mean in self._means.items():
+            mean.add(getattr(quality, name))
         return quality
 
     def means(self) -> dict[str, float | None]:
         """Mean of each measure over the frames that have one (PSNR averaged in dB, as the field does); None without any."""
-        return {name: mean_of_scored([getattr(frame, name) for frame in self.frames]) for name in MEASURES}
-
-    def series(self) -> list[dict[str, float | int | None]]:
-        """Per-frame values ready for JSON; None where a frame has no tissue."""
-        return [
-            {"seq": frame.seq} | {name: _finite_or_none(getattr(frame, name)) for name in MEASURES}
-            for frame in self.frames
-        ]
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def mean_of_scored(values: Sequence[float]) -> float | None:
-    """Mean of the finite values; None without any."""
-    scored = [value for value in values if math.isfinite(value)]
-    return math.fsum(scored) / len(scored) if scored else None
+        return {name: mean.mean for name, mean in self._means.items()}

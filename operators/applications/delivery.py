@@ -31,7 +31,7 @@ def delivered(
 
     Raises as `OutputFolder` and as `run`; a RunFailed carries the outcome with the final paths.
     """
-    with OutputFolder(settings.out, command, [settings.recording]) as output:
+    with OutputFolder(settings.out, command, [Path(settings.recording)]) as output:
         notes = ["the output folder held an earlier run; this one replaces its files"] if output.earlier else []
 
         def deliver(outcome: RunOutcome) -> RunOutcome:

@@ -11,17 +11,20 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from gsplat_core.io.recordings import Recording, is_heldout
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.recordings import is_heldout
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
-from gsplat_core.training.reconstructor import ObserveReport, Reconstructor
+from gsplat_core.training.reconstructor import ObserveReport
 from operators.applications.delivery import Report, delivered
 from operators.applications.device import seeded
-from operators.applications.execution import Execution, Start
+from operators.applications.finishing import FirstFrames, measures_baselines, saves_model
 from operators.applications.limits import check_steps
 from operators.applications.progress import Progress, ProgressCallback
-from operators.applications.replay import ReplayApplication, ReplaySettings, prepare
+from operators.applications.replay import ReplayApplication, ReplaySettings, new_reconstructor, prepare
 from operators.applications.result import RunOutcome
+from operators.applications.session import Session, Start
+from operators.sources.source import FrameSource
 
 
 class FittedModel:
@@ -59,40 +62,46 @@ def reconstruct(
     check_steps("steps", steps)
 
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
-        recording = prepare(inside, notes)
+        source = prepare(inside, notes)
         start = Start.now()
-        model, done = _fit(recording, inside, steps, progress, stop_requested)
+        model, done = _fit(source, inside, steps, progress, stop_requested)
         if done < steps:
             notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
-        app = ReplayApplication(
-            recording,
+        graph = ReplayApplication(
+            source,
             inside,
-            video=inside.out / "reconstruction.mp4",
             progress=progress,
             stop_requested=stop_requested,
             make_reconstructor=lambda: FittedModel(model),
             stage="evaluate",
         )
-        return Execution(app, notes, stop_requested, command="reconstruct", fitted=model, start=start).execute()
+        graph.announce()
+        return Session(
+            graph,
+            inside.stated(online=False),
+            command="reconstruct",
+            engine=inside.engine,
+            finish=[saves_model(inside.out, model), measures_baselines(source)],
+            notes=notes,
+            stop_requested=stop_requested,
+            started=start,
+        ).execute()
 
     return delivered(replace(settings, heldout=True), "reconstruct", run, report)
 
 
 def _fit(
-    recording: Recording,
+    source: FrameSource,
     settings: ReplaySettings,
     steps: int,
     progress: ProgressCallback | None,
     stop_requested: Callable[[], bool],
 ) -> tuple[Model, int]:
     """Train; returns the model and how many steps were made."""
-    learning = Reconstructor(
-        settings.reconstructor_config(recording.width_px * recording.height_px),
-        recording.camera,
-        seed=settings.seed,
-        recording_digest=recording.digest,
-        device=settings.device,
-    )
+    description = source.description
+    if description.digest is None or description.frame_count is None:
+        raise InvalidSetting(f"{description.name} can be read only once; reconstruct needs a recording, or use replay")
+    learning = new_reconstructor(settings, source)
     done = 0
 
     def after_step(step: int, loss: Tensor) -> None:
@@ -103,6 +112,7 @@ def _fit(
         if stop_requested():
             raise _StopFitting
 
+    frames = FirstFrames(source, description.frame_count)
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
-        learning.fit((frame for frame in recording if not is_heldout(frame.seq)), steps, after_step)
+        learning.fit((frame for frame in frames if not is_heldout(frame.seq)), steps, after_step)
     return learning.snapshot(), done

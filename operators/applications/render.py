@@ -24,7 +24,7 @@ from operators.errors import OutputError
 from operators.output_folder import OutputFolder
 from operators.output_paths import check_file_path
 from operators.rasterize import displayed
-from operators.sinks.display import write_png
+from operators.sinks.images import write_png
 from operators.sinks.video_file import VideoFile
 from operators.storage import StorageReserve, storage_errors
 

@@ -17,31 +17,35 @@ from pathlib import Path
 from typing import Any, get_args
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.recordings import Recording, is_heldout, open_recording
+from gsplat_core.io.recordings import is_heldout
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.delivery import Report, delivered
 from operators.applications.device import check_device, scheduler_for
-from operators.applications.execution import Execution
+from operators.applications.finishing import measures_baselines, saves_model
 from operators.applications.limits import check_max_frames, check_picture, check_scale, check_seed, check_steps
 from operators.applications.progress import Progress, ProgressCallback
-from operators.applications.result import RunOutcome
+from operators.applications.result import RunOutcome, RunSettings
+from operators.applications.session import Session
 from operators.deform import DeformOp
+from operators.frame_log import FRAMES_FILE, FrameLog
 from operators.graph import Application, Engine
 from operators.ingest import SourceOp
+from operators.messages import RenderedFrame
 from operators.metrics import MetricsOp, ScoredFrame
 from operators.rasterize import RasterizeOp
 from operators.reconstruct import ReconstructOp
-from operators.sinks.display import CallbackSinkOp, VideoSinkOp
-from operators.sinks.keyframes import KeyframesOp
+from operators.sinks.callback import CallbackSinkOp
+from operators.sinks.registry import SINKS, SinkOptions, input_of
+from operators.sources.registry import SourceOptions, open_source
+from operators.sources.source import FrameSource
 from operators.storage import StorageReserve
 from operators.tool_mask import RecordedToolMaskOp
 
 REPORT_RESERVE_BYTES = 8 * 2**20
 """Room on the disk that stays free for the video's index and the report."""
-KEYFRAMES = 5
 PIXELS_PER_GAUSSIAN = 4
 
 
@@ -49,13 +53,16 @@ PIXELS_PER_GAUSSIAN = 4
 class ReplaySettings:
     """What to replay, how, and where the results go."""
 
-    recording: Path
+    recording: Path | str
+    """A recording, or a source with an end: `scheme://address` (see `open_source`)."""
     out: Path
     device: str = "cpu"
     engine: Engine = "embedded"
     field: str = "auto"
     renderer: str = "alpha"
     """A name in `gsplat_core.rendering.registry.RENDERERS`."""
+    sinks: tuple[str, ...] = ("video", "keyframes")
+    """Names in `operators.sinks.registry.SINKS`."""
     seed: int = 0
     steps_per_frame: int | None = None
     """Optimiser steps per frame; None is the reconstructor's default."""
@@ -72,6 +79,8 @@ class ReplaySettings:
         if self.steps_per_frame is not None:
             check_steps("steps_per_frame", self.steps_per_frame)
         check_max_frames(self.max_frames)
+        for name in self.sinks:
+            SINKS.check(name)
 
     def reconstructor_config(self, pixels: int | None = None) -> ReconstructorConfig:
         """The reconstructor's settings for frames of so many pixels. Raises InvalidSetting."""
@@ -84,16 +93,29 @@ class ReplaySettings:
             )
         return config if self.steps_per_frame is None else replace(config, steps_per_frame=self.steps_per_frame)
 
+    def stated(self, *, online: bool) -> RunSettings:
+        """What the report says about them. online: whether training is done frame by frame."""
+        config = self.reconstructor_config()
+        return RunSettings(
+            device=self.device,
+            engine=self.engine,
+            field=config.chosen_field,
+            renderer=self.renderer,
+            seed=self.seed,
+            scale=self.scale,
+            steps_per_frame=config.steps_per_frame if online else None,
+            heldout=self.heldout,
+        )
+
 
 class ReplayApplication(Application):
-    """Composes the graph; after a run the operators hold its results."""
+    """Composes the graph."""
 
     def __init__(
         self,
-        recording: Recording,
+        source: FrameSource,
         settings: ReplaySettings,
         *,
-        video: Path,
         reserve_bytes: int = REPORT_RESERVE_BYTES,
         progress: ProgressCallback | None = None,
         stop_requested: Callable[[], bool] = lambda: False,
@@ -102,9 +124,8 @@ class ReplayApplication(Application):
     ) -> None:
         super().__init__(name="replay", track=True)
         self.scheduler(scheduler_for(settings.device, self))
-        self.recording = recording
+        self.frame_source = source
         self.settings = settings
-        self.video_path = video
         self.stage = stage
         self._progress = progress
         self._stop_requested = stop_requested
@@ -113,26 +134,34 @@ class ReplayApplication(Application):
 
     def compose(self) -> None:
         """Wire the operators; see the module's picture."""
-        reserve = StorageReserve(self.video_path.parent, self.room_to_finish)
-        self.source = SourceOp(self, name="source", recording=self.recording, stop_requested=self._stop_requested)
-        self.tool_mask = RecordedToolMaskOp(self, name="tool_mask")
+        settings, out = self.settings, self.settings.out
+        reserve = StorageReserve(out, self.room_to_finish)
+        source = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
+        tool_mask = RecordedToolMaskOp(self, name="tool_mask")
         self.reconstruct = ReconstructOp(
             self, name="reconstruct", make_reconstructor=self._make_reconstructor, held_out=self._held_out
         )
-        self.deform = DeformOp(self, name="deform")
-        self.rasterize = RasterizeOp(self, name="rasterize", renderer=self.settings.renderer)
-        self.video = VideoSinkOp(self, name="video", path=self.video_path, fps=self.recording.fps, reserve=reserve)
-        self.metrics = MetricsOp(self, name="metrics")
-        self.keyframes = KeyframesOp(self, name="keyframes", count=KEYFRAMES)
-        report = CallbackSinkOp(self, name="progress", callback=self._report)
-        self.add_flow(self.source, self.tool_mask, {("frame", "frame")})
-        self.add_flow(self.tool_mask, self.reconstruct, {("frame", "frame")})
-        self.add_flow(self.reconstruct, self.deform, {("reconstruction", "reconstruction")})
-        self.add_flow(self.deform, self.rasterize, {("scene", "scene")})
-        self.add_flow(self.rasterize, self.video, {("rendered", "rendered")})
-        self.add_flow(self.rasterize, self.metrics, {("rendered", "rendered")})
-        self.add_flow(self.metrics, self.keyframes, {("scored", "scored")})
-        self.add_flow(self.metrics, report, {("scored", "message")})
+        deform = DeformOp(self, name="deform")
+        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
+        self.metrics = MetricsOp(self, name="metrics", log=FrameLog(out / FRAMES_FILE, reserve))
+        self.add_flow(source, tool_mask, {("frame", "frame")})
+        self.add_flow(tool_mask, self.reconstruct, {("frame", "frame")})
+        self.add_flow(self.reconstruct, deform, {("reconstruction", "reconstruction")})
+        self.add_flow(deform, rasterize, {("scene", "scene")})
+        options = SinkOptions(out, self.frame_source.description, reserve)
+        sinks = [SINKS[name](self, name, options) for name in settings.sinks]
+        # A sink takes what is rendered, or what is rendered and scored.
+        for sink in sinks:
+            port, kind = input_of(sink)
+            if kind is RenderedFrame:
+                self.add_flow(rasterize, sink, {("rendered", port)})
+        self.add_flow(rasterize, self.metrics, {("rendered", "rendered")})
+        for sink in sinks:
+            port, kind = input_of(sink)
+            if kind is ScoredFrame:
+                self.add_flow(self.metrics, sink, {("scored", port)})
+        progress = CallbackSinkOp(self, name="progress", callback=self._report)
+        self.add_flow(self.metrics, progress, {("scored", "message")})
 
     def room_to_finish(self) -> int:
         """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
@@ -140,27 +169,22 @@ class ReplayApplication(Application):
         return self._reserve_bytes + (0 if model is None else 4 * model.parameter_count)
 
     def _new_reconstructor(self) -> Reconstructor:
-        return Reconstructor(
-            self.settings.reconstructor_config(self.recording.width_px * self.recording.height_px),
-            self.recording.camera,
-            seed=self.settings.seed,
-            recording_digest=self.recording.digest,
-            device=self.settings.device,
-        )
+        return new_reconstructor(self.settings, self.frame_source)
 
     def _held_out(self, frame: Frame) -> bool:
         return self.settings.heldout and is_heldout(frame.seq)
 
     def announce(self) -> None:
         """Say how much there is to do: the first frame, which starts the model, takes long."""
-        self._tell(0, None)
+        self._show(0, None)
 
     def _report(self, scored: ScoredFrame) -> None:
-        self._tell(len(self.metrics.series), scored.quality.psnr_tissue_db)
+        self._show(self.metrics.frames, scored.quality.psnr_tissue_db)
 
-    def _tell(self, done: int, psnr_tissue_db: float | None) -> None:
+    def _show(self, done: int, psnr_tissue_db: float | None) -> None:
+        total = self.frame_source.description.frame_count
         if self._progress is not None:
-            self._progress(Progress(self.stage, done, self.recording.frame_count, psnr_tissue_db=psnr_tissue_db))
+            self._progress(Progress(self.stage, done, total or done, psnr_tissue_db=psnr_tissue_db))
 
 
 def replay(
@@ -169,7 +193,7 @@ def replay(
     stop_requested: Callable[[], bool] = lambda: False,
     report: Report | None = None,
 ) -> RunOutcome:
-    """Run a replay and write `reconstruction.mp4` and `model/` into the output folder.
+    """Run a replay; writes the video, the model and the frames' figures into the output folder.
 
     When `stop_requested` answers True the frames on their way are finished and everything is written; the outcome says so. `report` writes
     what it makes of the outcome beside them (see `delivered`).
@@ -180,30 +204,52 @@ def replay(
     """
 
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
-        recording = prepare(inside, notes)
-        app = ReplayApplication(
-            recording, inside, video=inside.out / "reconstruction.mp4", progress=progress, stop_requested=stop_requested
-        )
-        return Execution(app, notes, stop_requested).execute()
+        source = prepare(inside, notes)
+        graph = ReplayApplication(source, inside, progress=progress, stop_requested=stop_requested)
+        graph.announce()
+        return Session(
+            graph,
+            inside.stated(online=True),
+            command="replay",
+            engine=inside.engine,
+            finish=[saves_model(inside.out), measures_baselines(source)],
+            notes=notes,
+            stop_requested=stop_requested,
+        ).execute()
 
     return delivered(settings, "replay", run, report)
 
 
-def prepare(settings: ReplaySettings, notes: list[str]) -> Recording:
-    """Check everything that can be checked before the first frame; returns the recording, and adds what is to be said about it to `notes`.
+def prepare(settings: ReplaySettings, notes: list[str]) -> FrameSource:
+    """Check everything that can be checked before the first frame; returns the source, and adds what is to be said about it to `notes`.
 
     Raises as `replay` does before anything is written.
     """
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device)
     config = settings.reconstructor_config()
-    recording = open_recording(settings.recording, scale=settings.scale, max_frames=settings.max_frames)
-    check_picture(recording.camera, settings.scale)
-    notes.extend(recording.notes)
-    if "depth" not in recording.fields:
+    source = open_source(settings.recording, SourceOptions(settings.scale, settings.max_frames))
+    description = source.description
+    if description.frame_count is None:
+        raise InvalidSetting(f"{description.name} has no end; give --max-frames, or a recording")
+    check_picture(description.camera, settings.scale)
+    notes.extend(description.notes)
+    if "depth" not in description.fields:
         notes.append(
             f"the recording has no depth: the scene starts on a plane {config.default_depth_mm:g} mm away, and its"
             " depth has no measured scale"
         )
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
-    return recording
+    return source
+
+
+def new_reconstructor(settings: ReplaySettings, source: FrameSource) -> Reconstructor:
+    """A reconstructor for the frames of a source."""
+    description = source.description
+    return Reconstructor(
+        settings.reconstructor_config(description.width_px * description.height_px),
+        description.camera,
+        seed=settings.seed,
+        recording_digest=description.digest,
+        device=settings.device,
+    )

@@ -4,61 +4,61 @@ from __future__ import annotations
 
 import resource
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Literal
+from typing import TypeVar, cast
 
-from gsplat_core.io.recordings import Recording
-from gsplat_core.scene.model import Model
-from gsplat_core.training.baselines import Baselines
-from gsplat_core.training.metrics import QualityTracker
 from operators.graph import DurationSummary
-from operators.metrics import ScoredFrame
+
+Part = TypeVar("Part")
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """The settings that a report states; all of them together with the source decide what a deterministic run gives."""
+
+    device: str
+    engine: str
+    field: str
+    """The deformation field in use, never `auto`."""
+    renderer: str
+    seed: int
+    scale: float
+    steps_per_frame: int | None
+    """Optimiser steps per frame; None where training is not done frame by frame."""
+    heldout: bool
+    """Whether the protocol's held-out frames were kept from training and are scored apart."""
 
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """Everything that a report is made of."""
+    """How a run ended, what it wrote, and the parts that its operators contributed (see `operators.outcome`)."""
 
-    command: Literal["replay", "reconstruct"]
-    recording: Recording
-    device: str
-    engine: str
-    field: str
-    """`basis` or `hexplane`."""
-    seed: int
-    scale: float
-    steps_per_frame: int | None
+    command: str
+    settings: RunSettings
     started_at: datetime
     wall_s: float
-    """From the start of the graph to its end; saving and baselines are not in it."""
+    """From the start of the run to the end of its graph; saving and baselines are not in it."""
     stop_reason: str
-    """`end of recording`, `interrupted`, or what failed."""
+    """`end of recording`, `end of stream`, `interrupted`, or what failed."""
     interrupted: bool
-    ingested: int
-    displayed: int
     dropped: int
+    """Messages that edges of the graph dropped."""
     latency: dict[str, DurationSummary]
     """Per path of the graph."""
     latency_quantiles_ms: dict[str, list[float]]
     operators: dict[str, DurationSummary]
-    live: QualityTracker | None
-    """Frames right after their own training steps; None offline."""
-    held_out: QualityTracker | None
-    """Frames that were never trained on; None when none were kept back."""
-    training: QualityTracker | None
-    """Training frames after all of the training; None online."""
-    baselines: Baselines | None
-    series: tuple[dict[str, float | int | bool | None], ...]
-    keyframes: tuple[ScoredFrame, ...]
-    worst_seq: int | None
-    model: Model | None
-    frames_sha256: str
+    parts: Mapping[type, object]
     notes: tuple[str, ...]
     outputs: dict[str, Path]
     """What was written, by name."""
     peak_memory_bytes: int
+
+    def find(self, kind: type[Part]) -> Part | None:
+        """The part of this type; None where no operator contributed one."""
+        return cast("Part | None", self.parts.get(kind))
 
 
 def peak_memory_bytes() -> int:

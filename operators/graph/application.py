@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
@@ -29,6 +29,8 @@ class Fragment:
         self.name = name or type(self).__name__
         self.result: RunResult | None = None
         """How the last run ended; None before and while running."""
+        self.checks: list[Callable[[], None]] = []
+        """Called by every run once it is composed, before any operator starts; what they raise refuses the run."""
         self._tracker = FlowTracker() if track else None
         self._scheduler: Scheduler = GreedyScheduler(self)
         self._operators: dict[str, Operator] = {}
@@ -129,6 +131,11 @@ class Fragment:
         if graph is not None:
             graph.stop()
 
+    @property
+    def operators(self) -> tuple[Operator, ...]:
+        """The operators of the run under way or of the last one, in the order of composition."""
+        return tuple(self._operators.values())
+
     def edge_stats(self) -> tuple[EdgeStats, ...]:
         """Counts per edge of the run under way or of the last one; from any thread."""
         graph = self._graph
@@ -154,6 +161,8 @@ class Fragment:
         try:
             self._operators, self._flows = {}, []
             self.compose()
+            for check in self.checks:
+                check()
             if self._tracker is not None:
                 self._tracker.reset()
             graph = Graph(self._operators.values(), self._flows, scheduler, self._tracker)

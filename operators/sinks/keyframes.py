@@ -1,18 +1,31 @@
-"""A few frames kept for the report, evenly spread over a stream whose length nobody has to know."""
+"""A few frames kept for the report, evenly spread over a stream whose length is not known."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 from operators.graph import Operator, OperatorSpec
 from operators.metrics import ScoredFrame
+from operators.outcome import OutcomeBuilder
+from operators.sinks.registry import SinkOptions
+
+
+@dataclass(frozen=True)
+class KeyframesResult:
+    """A few frames of a run, for people."""
+
+    keyframes: tuple[ScoredFrame, ...]
+    """In order; `right_image` and `depth` of their raw frames are left out."""
+    worst_seq: int | None
+    """The frame with the lowest tissue PSNR."""
 
 
 class KeyframesOp(Operator):
     """Keeps at most `2 * count` frames: every k-th, with k doubled whenever they become too many; and the worst one.
 
-    So memory stays bounded on a stream without end, and a stream that is cut short still has its frames evenly spread.
+    So memory is bounded on a stream without end, and a stream that is cut short still has its frames evenly spread.
 
     Inputs:
         scored: `ScoredFrame`.
@@ -40,7 +53,7 @@ class KeyframesOp(Operator):
         self._seen, self._stride = 0, 1
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        scored: ScoredFrame = op_input.receive("scored")
+        scored = _without_inputs(op_input.receive("scored"))
         if self._seen % self._stride == 0:
             if len(self._kept) == 2 * self.count:
                 self._kept = self._kept[::2]
@@ -52,6 +65,10 @@ class KeyframesOp(Operator):
         value = scored.quality.psnr_tissue_db
         if math.isfinite(value) and (self._worst is None or value < self._worst.quality.psnr_tissue_db):
             self._worst = scored
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        outcome.add(KeyframesResult(tuple(self.keyframes), self.worst_seq))
 
     @property
     def keyframes(self) -> list[ScoredFrame]:
@@ -70,3 +87,14 @@ class KeyframesOp(Operator):
     def worst_seq(self) -> int | None:
         """The frame with the lowest tissue PSNR."""
         return None if self._worst is None else self._worst.rendered.frame.seq
+
+
+def _without_inputs(scored: ScoredFrame) -> ScoredFrame:
+    """The same without those planes of the raw frame that no picture of the report shows: they are half of its memory."""
+    frame = scored.rendered.frame.with_fields(right_image=None, depth=None)
+    return replace(scored, rendered=replace(scored.rendered, frame=frame))
+
+
+def keyframes_sink(fragment: Any, name: str, options: SinkOptions) -> KeyframesOp:
+    """The pictures of the run's report."""
+    return KeyframesOp(fragment, name=name)

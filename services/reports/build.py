@@ -6,13 +6,22 @@ from pathlib import Path
 
 import torch
 
+from gsplat_core.errors import InvalidInput
+from gsplat_core.training.baselines import Baselines
 from gsplat_core.training.metrics import QualityTracker
 from operators.applications.result import RunOutcome
+from operators.ingest import SourceResult
+from operators.metrics import QualityResult
+from operators.reconstruct import ModelResult
+from operators.sinks.keyframes import KeyframesResult
+from operators.sinks.video import DisplayResult
+from operators.sources.source import SourceDescription
 from services.reports.html import write_html
 from services.reports.machine import machine_facts
 from services.reports.pictures import keyframe_pictures
 from services.reports.schema import (
     BaselineQuality,
+    BinEntry,
     FrameCounts,
     FrameEntry,
     Latency,
@@ -28,35 +37,19 @@ from services.version import product_version
 
 
 def build_report(outcome: RunOutcome) -> RunReport:
-    """The outcome in the report's shape."""
-    recording, model, baselines = outcome.recording, outcome.model, outcome.baselines
+    """The outcome in the report's shape. Raises InvalidInput when the run had no source or measured nothing."""
+    source, quality = outcome.find(SourceResult), outcome.find(QualityResult)
+    if source is None or quality is None:
+        raise InvalidInput(f"a report needs a SourceResult and a QualityResult; the {outcome.command} has none")
+    display, model = outcome.find(DisplayResult), outcome.find(ModelResult)
     return RunReport(
-        recording=RecordingFacts(
-            name=recording.name,
-            frames=recording.frame_count,
-            width_px=recording.width_px,
-            height_px=recording.height_px,
-            fps=recording.fps,
-            digest=recording.digest,
+        recording=_recording(source.description),
+        run=_run(outcome),
+        frames=FrameCounts(
+            ingested=source.frames,
+            displayed=quality.frames if display is None else display.frames,
+            dropped=outcome.dropped,
         ),
-        run=RunFacts(
-            device=outcome.device,
-            engine=outcome.engine,
-            seed=outcome.seed,
-            version=product_version(),
-            threads=torch.get_num_threads(),
-            wall_s=round(outcome.wall_s, 3),
-            command=outcome.command,
-            field=outcome.field,
-            steps_per_frame=outcome.steps_per_frame,
-            scale=outcome.scale,
-            started_at=outcome.started_at.isoformat(timespec="seconds"),
-            stop_reason=outcome.stop_reason,
-            interrupted=outcome.interrupted,
-            peak_memory_bytes=outcome.peak_memory_bytes,
-            machine=machine_facts(),
-        ),
-        frames=FrameCounts(ingested=outcome.ingested, displayed=outcome.displayed, dropped=outcome.dropped),
         latency_ms={
             path: Latency(p50=_ms(t.p50_ms), p95=_ms(t.p95_ms), p99=_ms(t.p99_ms), max=_ms(t.max_ms))
             for path, t in outcome.latency.items()
@@ -65,30 +58,73 @@ def build_report(outcome: RunOutcome) -> RunReport:
             name: OperatorTimes(calls=t.count, p50_ms=_ms(t.p50_ms), p99_ms=_ms(t.p99_ms))
             for name, t in outcome.operators.items()
         },
-        quality=QualityReport(
-            live=_quality(outcome.live),
-            heldout=_quality(outcome.held_out),
-            training=_quality(outcome.training),
-            baselines=BaselineQuality(
-                previous_frame_db=baselines.previous_frame_db if baselines else None,
-                train_mean_db=baselines.heldout_train_mean_db if baselines else None,
-                heldout_previous_frame_db=baselines.heldout_previous_frame_db if baselines else None,
-                heldout_neighbour_mean_db=baselines.heldout_neighbour_mean_db if baselines else None,
-            ),
-        ),
+        quality=_qualities(outcome, quality),
         model=None
         if model is None
         else ModelFacts(
-            gaussians=model.gaussians.count,
-            parameters=model.parameter_count,
-            sha256=model.sha256(),
-            version=model.version,
+            gaussians=model.model.gaussians.count,
+            parameters=model.model.parameter_count,
+            sha256=model.model.sha256(),
+            version=model.model.version,
         ),
-        frames_sha256=outcome.frames_sha256,
+        frames_sha256=quality.frames_sha256,
         notes=list(outcome.notes),
         outputs={name: path.name for name, path in outcome.outputs.items()},
         latency_quantiles_ms={path: [_ms(v) for v in curve] for path, curve in outcome.latency_quantiles_ms.items()},
-        series=[FrameEntry.model_validate(entry) for entry in outcome.series],
+        series=[
+            (FrameEntry if quality.frames_per_entry == 1 else BinEntry).model_validate(entry)
+            for entry in quality.series
+        ],
+        series_frames_per_entry=quality.frames_per_entry,
+    )
+
+
+def _recording(description: SourceDescription) -> RecordingFacts:
+    return RecordingFacts(
+        name=description.name,
+        frames=description.frame_count,
+        width_px=description.width_px,
+        height_px=description.height_px,
+        fps=description.fps,
+        digest=description.digest,
+    )
+
+
+def _run(outcome: RunOutcome) -> RunFacts:
+    settings = outcome.settings
+    return RunFacts(
+        device=settings.device,
+        engine=settings.engine,
+        seed=settings.seed,
+        version=product_version(),
+        threads=torch.get_num_threads(),
+        wall_s=round(outcome.wall_s, 3),
+        command=outcome.command,
+        field=settings.field,
+        renderer=settings.renderer,
+        steps_per_frame=settings.steps_per_frame,
+        scale=settings.scale,
+        started_at=outcome.started_at.isoformat(timespec="seconds"),
+        stop_reason=outcome.stop_reason,
+        interrupted=outcome.interrupted,
+        peak_memory_bytes=outcome.peak_memory_bytes,
+        machine=machine_facts(),
+    )
+
+
+def _qualities(outcome: RunOutcome, quality: QualityResult) -> QualityReport:
+    offline = outcome.command == "reconstruct"
+    baselines = outcome.find(Baselines)
+    return QualityReport(
+        live=None if offline else _quality(quality.trained),
+        training=_quality(quality.trained) if offline else None,
+        heldout=_quality(quality.held_out) if outcome.settings.heldout else None,
+        baselines=BaselineQuality(
+            previous_frame_db=baselines.previous_frame_db if baselines else None,
+            train_mean_db=baselines.heldout_train_mean_db if baselines else None,
+            heldout_previous_frame_db=baselines.heldout_previous_frame_db if baselines else None,
+            heldout_neighbour_mean_db=baselines.heldout_neighbour_mean_db if baselines else None,
+        ),
     )
 
 
@@ -97,14 +133,13 @@ def write_reports(outcome: RunOutcome, folder: Path) -> RunReport:
     report = build_report(outcome)
     report = report.model_copy(update={"outputs": {**report.outputs, "report": "report.json", "page": "report.html"}})
     report.write(folder / "report.json")
-    write_html(
-        report, [keyframe_pictures(frame) for frame in outcome.keyframes], folder / "report.html", outcome.worst_seq
-    )
+    kept = outcome.find(KeyframesResult) or KeyframesResult((), None)
+    write_html(report, [keyframe_pictures(frame) for frame in kept.keyframes], folder / "report.html", kept.worst_seq)
     return report
 
 
-def _quality(tracker: QualityTracker | None) -> Quality | None:
-    return None if tracker is None else Quality(**tracker.means(), frames=len(tracker.frames))
+def _quality(tracker: QualityTracker) -> Quality:
+    return Quality(**tracker.means(), frames=tracker.count)
 
 
 def _ms(value: float) -> float:

@@ -26,7 +26,8 @@ class RecordingFacts(_Part):
     """The recording as it was read: after `--scale` and `--max-frames`."""
 
     name: str
-    frames: Count
+    frames: Count | None
+    """Null for a stream without an end."""
     width_px: Annotated[int, Field(ge=1)]
     height_px: Annotated[int, Field(ge=1)]
     fps: Annotated[float, Field(gt=0)]
@@ -43,9 +44,11 @@ class RunFacts(_Part):
     version: str
     threads: Annotated[int, Field(ge=1)]
     wall_s: Annotated[float, Field(ge=0)]
-    command: Literal["replay", "reconstruct"] = "replay"
+    command: str = "replay"
+    """`replay` or `reconstruct`, or another application that writes such a report."""
     field: str
     """Deformation field in use: `basis` or `hexplane`, never `auto`."""
+    renderer: str = "alpha"
     steps_per_frame: int | None = None
     scale: float = 1.0
     started_at: str
@@ -132,6 +135,15 @@ class FrameEntry(_Part):
     previous_frame_db: float | None
 
 
+class BinEntry(FrameEntry):
+    """Several displayed frames of a long run, summed up: `seq`, `time_s` and `model_version` of the first of them, means of the measures."""
+
+    frames: Count
+    """How many frames are summed up."""
+    psnr_tissue_min_db: float | None
+    """The worst of them."""
+
+
 class RunReport(_Part):
     """Everything `report.json` holds."""
 
@@ -152,7 +164,10 @@ class RunReport(_Part):
     """What was written, as paths relative to the report."""
     latency_quantiles_ms: dict[str, list[float]] = {}
     """Per path, the latency distribution at 101 equally spaced quantiles, 0 to 1."""
-    series: list[FrameEntry] = []
+    series: list[FrameEntry | BinEntry] = []
+    """One entry for each displayed frame; of a run of more than 4096 frames, one for each `series_frames_per_entry` of them. All frames are
+    in `frames.jsonl`."""
+    series_frames_per_entry: Annotated[int, Field(ge=1)] = 1
 
     def write(self, path: Path) -> None:
         """Write JSON; the file is whole or not there."""

@@ -135,9 +135,15 @@ def quality_over_time_section(report: RunReport) -> str:
                 marks=True,
             )
         )
+    summed_up = (
+        f" Each point is the mean of {report.series_frames_per_entry} frames."
+        if report.series_frames_per_entry > 1
+        else ""
+    )
     chart = Chart(
         title="Tissue PSNR over time",
-        description="Higher is better. A reconstruction under the dashed line shows less than a frozen video would.",
+        description="Higher is better. A reconstruction under the dashed line shows less than a frozen video would."
+        + summed_up,
         x_label="time in the recording, s",
         y_label="tissue PSNR, dB",
         lines=tuple(lines),
@@ -242,11 +248,11 @@ def facts_section(report: RunReport) -> str:
     """What was run, on what."""
     recording, run, model = report.recording, report.run, report.model
     facts = {
-        "Recording": f"{recording.frames} frames, {recording.width_px} x {recording.height_px} px, {recording.fps:g} fps",
+        "Recording": f"{'endless' if recording.frames is None else recording.frames} frames, {recording.width_px} x {recording.height_px} px, {recording.fps:g} fps",
         "Device, engine": f"{run.device}, {run.engine}",
         "Threads": str(run.threads),
         "Seed": str(run.seed),
-        "Field": run.field,
+        "Field, renderer": f"{run.field}, {run.renderer}",
         "Steps per frame": "default" if run.steps_per_frame is None else str(run.steps_per_frame),
         "Peak memory": "–" if run.peak_memory_bytes is None else f"{run.peak_memory_bytes / 2**30:.2f} GiB",
         "Ended by": run.stop_reason,

@@ -111,6 +111,8 @@ class FakeRecording:
     name: str = "fake"
     notes: tuple[str, ...] = ()
     digest: str = "0" * 64
+    fields: frozenset[str] = frozenset()
+    stereo_baseline_mm: float | None = None
     opened: int = 0
 
     @property

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from operators.errors import OperatorFailed
 from operators.graph import Application, Operator
-from operators.ingest import SourceOp
+from operators.ingest import SourceOp, SourceResult
+from operators.outcome import OutcomeBuilder
+from operators.sources.recording import RecordingSource
+from operators.sources.source import SourceDescription, SourceState
 
 
 class Collect(Operator):
@@ -23,59 +27,94 @@ class Collect(Operator):
 
 
 class Stream(Application):
-    def __init__(self, recording, **options):
+    def __init__(self, source, **options):
         super().__init__()
-        self.recording, self.options = recording, options
+        self.given, self.options = source, options
 
     def compose(self):
-        self.source = SourceOp(self, name="source", recording=self.recording, **self.options)
+        self.source = SourceOp(self, name="source", source=self.given, **self.options)
         self.sink = Collect(self, name="sink")
         self.add_flow(self.source, self.sink)
 
 
+class Scripted:
+    """A source whose every `read` gives what a list says: a frame, None for a time-out, an error to raise."""
+
+    def __init__(self, script, camera, frame_count=None):
+        self.script, self.opened, self.closed = list(script), 0, 0
+        self.description = SourceDescription("scripted", 24, 16, 25.0, camera, frame_count=frame_count)
+
+    @property
+    def state(self):
+        return SourceState.LIVE if self.script else SourceState.ENDED
+
+    def open(self):
+        self.opened += 1
+
+    def read(self, timeout_s):
+        step = self.script.pop(0) if self.script else None
+        if isinstance(step, Exception):
+            raise step
+        return step
+
+    def close(self):
+        self.closed += 1
+
+
+def result(app):
+    outcome = OutcomeBuilder()
+    app.source.contribute(outcome)
+    return outcome.find(SourceResult)
+
+
 def test_every_frame_arrives_once_in_order_with_its_metadata(recording):
-    app = Stream(recording)
-    result = app.run()
+    app = Stream(RecordingSource(recording))
+    run = app.run()
     assert [seq for seq, _ in app.sink.seen] == [0, 1, 2, 3, 4]
     assert app.sink.seen[3][1] == {"seq": 3, "pts_ns": 120_000_000}
-    assert app.source.emitted == 5
-    assert result.computes["source"] == 5, "the stream ends with its last frame, not with an empty compute"
+    assert run.computes["source"] == 5, "the stream ends with its last frame, not with an empty compute"
+    assert (result(app).frames, result(app).reached_end) == (5, True)
+    assert result(app).description.name == recording.name
 
 
 def test_a_stop_ends_the_stream_and_what_is_on_its_way_arrives(recording):
-    app = Stream(recording, stop_requested=lambda: app.source.emitted >= 2)
+    app = Stream(RecordingSource(recording), stop_requested=lambda: app.source.emitted >= 2)
     app.run()
     assert [seq for seq, _ in app.sink.seen] == [0, 1]
+    assert (result(app).frames, result(app).reached_end) == (2, False)
 
 
 def test_a_recording_with_fewer_frames_than_stated_ends_without_an_error(recording, monkeypatch):
     monkeypatch.setattr(type(recording), "frame_count", property(lambda self: 9))
-    app = Stream(recording)
+    app = Stream(RecordingSource(recording))
     app.run()
-    assert app.source.emitted == 5
+    assert (result(app).frames, result(app).reached_end) == (5, True)
 
 
-def test_frames_are_closed_when_the_graph_stops(recording):
-    closed = []
-
-    def frames():
-        try:
-            yield from recording.frames
-        finally:
-            closed.append(True)
-
-    recording_like = type("Generating", (), {"__iter__": lambda self: frames(), "frame_count": 5})()
-    Stream(recording_like, stop_requested=lambda: True).run()
-    app = Stream(recording_like, stop_requested=lambda: app.source.emitted == 1)
+def test_a_stall_is_waited_for_and_missing_numbers_are_no_error(camera, frame):
+    source = Scripted([frame(0), None, None, frame(3), None, frame(9)], camera)
+    app = Stream(source)
     app.run()
-    assert closed == [True], "a generator that was begun is closed; one that was not has nothing to close"
+    assert [seq for seq, _ in app.sink.seen] == [0, 3, 9]
+    assert (source.opened, source.closed) == (1, 1)
+    assert result(app).reached_end
 
 
-def test_an_error_names_the_operator(recording):
-    def broken():
-        yield recording.frames[0]
-        raise ValueError("the file ends here")
+def test_a_source_that_gives_nothing_can_be_stopped(camera):
+    source = Scripted([None] * 10_000, camera)
+    app = Stream(source, stop_requested=lambda: len(source.script) < 9_900)
+    app.run()
+    assert app.sink.seen == [] and not result(app).reached_end and source.closed == 1
 
-    bad = type("Broken", (), {"__iter__": lambda self: broken(), "frame_count": 5})()
-    with pytest.raises(Exception, match=r"operator 'source' failed in compute.*the file ends here"):
-        Stream(bad).run()
+
+@pytest.mark.parametrize("second", [0, 1])
+def test_numbers_that_do_not_increase_are_a_fault_of_the_source(camera, frame, second):
+    with pytest.raises(OperatorFailed, match=f"frame {second} came after frame 1; a source's numbers must increase"):
+        Stream(Scripted([frame(1), frame(second)], camera)).run()
+
+
+def test_an_error_names_the_operator_and_the_source_is_closed(camera, frame):
+    source = Scripted([frame(0), ValueError("the file ends here")], camera)
+    with pytest.raises(OperatorFailed, match=r"operator 'source' failed in compute.*the file ends here"):
+        Stream(source).run()
+    assert source.closed == 1

@@ -7,21 +7,35 @@ import math
 import numpy as np
 import pytest
 
-from operators.metrics import MetricsOp
+from operators import metrics
+from operators.frame_log import FrameLog
+from operators.metrics import MetricsOp, QualityResult
+from operators.outcome import OutcomeBuilder
 
 
 def score(operator, compute, frames):
     operator.start()
-    return [compute(operator, rendered=shown)[0] for shown in frames]
+    scored = [compute(operator, rendered=shown)[0] for shown in frames]
+    operator.stop()
+    return scored
 
 
-def test_live_and_held_out_frames_are_scored_apart(rendered, compute):
-    operator = MetricsOp(None)
+def result(operator):
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    return outcome.find(QualityResult), outcome.outputs
+
+
+def test_live_and_held_out_frames_are_scored_apart(rendered, compute, tmp_path):
+    operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
     score(operator, compute, [rendered(0, offset=2), rendered(1, offset=20, trained=False), rendered(2, offset=2)])
     exact = 20 * math.log10(255 / 2)
     assert operator.live.means()["psnr_tissue_db"] == pytest.approx(exact, abs=1e-3)
     assert operator.held_out.means()["psnr_tissue_db"] == pytest.approx(20 * math.log10(255 / 20), abs=1e-3)
-    assert [entry["trained"] for entry in operator.series] == [True, False, True]
+    quality, outputs = result(operator)
+    assert (quality.trained.count, quality.held_out.count, quality.frames, operator.frames) == (2, 1, 3, 3)
+    assert [entry["trained"] for entry in quality.series] == [True, False, True]
+    assert quality.frames_per_entry == 1 and outputs == {"frames": tmp_path / "frames.jsonl"}
 
 
 def test_only_tissue_counts(rendered, frame, compute):
@@ -35,14 +49,31 @@ def test_only_tissue_counts(rendered, frame, compute):
     assert scored.quality.psnr_tissue_db == pytest.approx(20 * math.log10(255 / 2), abs=1e-3)
 
 
-def test_the_baseline_is_the_previous_raw_frame(rendered, compute):
+def test_the_baseline_is_the_previous_raw_frame(rendered, compute, tmp_path):
     first, second = rendered(0), rendered(1)
-    operator = MetricsOp(None)
+    operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
     scored = score(operator, compute, [first, second])
     error = (first.frame.image.astype(float) - second.frame.image) / 255
     assert math.isnan(scored[0].previous_frame_db)
     assert scored[1].previous_frame_db == pytest.approx(-10 * math.log10((error**2).mean()), abs=1e-3)
-    assert operator.series[0]["previous_frame_db"] is None, "NaN is not JSON"
+    assert result(operator)[0].series[0]["previous_frame_db"] is None, "NaN is not JSON"
+
+
+def test_without_a_frame_there_is_a_result_and_no_file_to_show(tmp_path, compute):
+    operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    quality, outputs = result(operator)
+    assert quality.frames == 0 and quality.series == () and outputs == {}
+    score(operator, compute, [])
+    assert result(operator)[1] == {}
+
+
+def test_a_long_run_has_a_series_of_bounded_length(rendered, compute, tmp_path, monkeypatch):
+    monkeypatch.setattr(metrics, "MAX_SERIES", 4)
+    operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    score(operator, compute, [rendered(k, offset=2) for k in range(10)])
+    quality, _ = result(operator)
+    assert quality.frames_per_entry == 3
+    assert [(entry["seq"], entry["frames"]) for entry in quality.series] == [(0, 3), (3, 3), (6, 3), (9, 1)]
 
 
 def test_the_digest_depends_on_every_byte_and_on_the_order(rendered, compute):

@@ -21,6 +21,8 @@ from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 from operators.applications.replay import ReplaySettings, replay
+from operators.metrics import QualityResult
+from operators.reconstruct import ModelResult
 
 
 class DriftField(DeformationField):
@@ -142,9 +144,9 @@ def test_it_is_replayed_learns_and_is_saved_and_loaded(
 ):
     registered(kind)
     outcome = replay(ReplaySettings(recording, tmp_path / "out", field=kind.name, steps_per_frame=12))
-    assert outcome.field == kind.name
-    assert outcome.displayed == 12
-    model = outcome.model
+    assert outcome.settings.field == kind.name
+    assert outcome.find(QualityResult).frames == 12
+    model = outcome.find(ModelResult).model
     assert isinstance(model.field, kind.field)
     assert all(bool(parameter.any()) for parameter in model.field.parameters())
     assert mean_psnr_db(model, recording) > mean_psnr_db(without_motion(model), recording) + 0.3

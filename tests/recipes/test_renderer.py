@@ -24,6 +24,9 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0
 from gsplat_core.scene.model import Model
 from operators.applications.replay import ReplaySettings, replay
+from operators.metrics import QualityResult
+from operators.reconstruct import ModelResult
+from operators.sinks.keyframes import KeyframesResult
 
 
 class PointRenderer:
@@ -89,20 +92,21 @@ def tiny(tmp_path_factory):
 def test_it_runs_through_a_replay(points, tiny, tmp_path, device):
     settings = {"recording": tiny, "device": device.type, "steps_per_frame": 1}
     outcome = replay(ReplaySettings(out=tmp_path / "points", renderer="points", **settings))
-    assert outcome.displayed == 3 and points.prepared == [1, 2, 3]
+    quality = outcome.find(QualityResult)
+    assert quality.frames == 3 and points.prepared == [1, 2, 3]
     assert (tmp_path / "points" / "reconstruction.mp4").exists()
     blended = replay(ReplaySettings(out=tmp_path / "alpha", **settings))
-    assert outcome.frames_sha256 != blended.frames_sha256
-    assert outcome.model.sha256() == blended.model.sha256()
+    assert quality.frames_sha256 != blended.find(QualityResult).frames_sha256
+    assert outcome.find(ModelResult).model.sha256() == blended.find(ModelResult).model.sha256()
     # A pixel that a Gaussian covers has that Gaussian's depth.
-    shown = outcome.keyframes[0].rendered
+    shown = outcome.find(KeyframesResult).keyframes[0].rendered
     covered = shown.alpha > 0
     assert 0.05 < covered.mean() < 1 and (shown.depth[covered] > 0).all()
 
 
 def test_its_own_outputs_are_asked_for_by_name(points, tiny, tmp_path):
     outcome = replay(ReplaySettings(recording=tiny, out=tmp_path / "out", steps_per_frame=1))
-    model = outcome.model
+    model = outcome.find(ModelResult).model
     renderer = new_renderer("points", model.camera)
     renderer.prepare(model)
     frame = renderer.render(model.camera, 0.0, outputs=["gaussian_ids"])

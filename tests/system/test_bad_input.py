@@ -170,7 +170,7 @@ def test_a_disk_that_is_full_from_the_start(small_disk, tiny, refused):
 
 def test_a_disk_that_fills_up_on_the_way(small_disk, tiny, refused, monkeypatch):
     """Somebody else takes the room after three frames: video, model and report of these are still written, and whole."""
-    from operators.sinks.display import VideoSinkOp
+    from operators.sinks.video import VideoSinkOp
 
     compute = VideoSinkOp.compute
 

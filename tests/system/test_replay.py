@@ -21,6 +21,7 @@ def test_everything_is_written_and_fits_together(finished, tiny):
         "model",
         "report.json",
         "report.html",
+        "frames.jsonl",
     }
     report = RunReport.read(finished / "report.json")
     assert (report.recording.frames, report.recording.width_px, report.recording.height_px) == (6, 64, 48)

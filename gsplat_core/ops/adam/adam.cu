@@ -1,17 +1,18 @@
-#include "adam_cuda.h"
+#include "adam.h"
 #include "cuda_scratch.h"
 
+namespace gsplat::adam {
 namespace {
 
 constexpr int kMostRows = 1024;            // of a block
 constexpr int64_t kChunk = 4 * kThreads;   // values of a block, unless a row is longer
 constexpr int64_t kFew = 1024 * kThreads;  // up to so many values, a block has one for each thread: more blocks wait at once
 
-// The step as it is told by the host.
-__device__ __forceinline__ AdamStep step_of(const AdamStep& told) { return told; }
+// The step as the host computed it.
+__device__ __forceinline__ AdamStep step_of(const AdamStep& step) { return step; }
 
-// The step as the device has it. One thread of a block takes the powers, in double: -expm1 keeps 1 - beta^t accurate for a beta
-// near 1 and a small t. Ends in a barrier.
+// The step from numbers in device memory. One thread of a block takes the powers, in double: -expm1 keeps 1 - beta^t accurate for
+// a beta near 1 and a small t. Ends in a barrier.
 __device__ __forceinline__ AdamStep step_of(const AdamAt& at) {
   __shared__ float rate, inv_bias2;
   if (threadIdx.x == 0) {
@@ -27,21 +28,21 @@ __device__ __forceinline__ AdamStep step_of(const AdamAt& at) {
 template <class Step>
 __global__ void __launch_bounds__(kThreads)
     adam_rows(float* __restrict__ p, const float* __restrict__ g, float* __restrict__ m, float* __restrict__ v, int64_t rows,
-              int rows_per_block, Step told, unsigned long long* skipped) {
-  const AdamStep step = step_of(told);
-  __shared__ int poisoned[kMostRows];
+              int rows_per_block, Step source, unsigned long long* skipped) {
+  const AdamStep step = step_of(source);
+  __shared__ int unusable[kMostRows];
   const int64_t first = int64_t(blockIdx.x) * rows_per_block;
   const int count = int(rows - first < rows_per_block ? rows - first : rows_per_block);
   const int64_t at = first * step.row_size, size = count * step.row_size;
-  for (int r = threadIdx.x; r < count; r += kThreads) poisoned[r] = 0;
+  for (int r = threadIdx.x; r < count; r += kThreads) unusable[r] = 0;
   __syncthreads();
   for (int64_t i = threadIdx.x; i < size; i += kThreads) {
     const float x = g[at + i];
-    if (!isfinite(x * x)) poisoned[count == 1 ? 0 : int(i) / int(step.row_size)] = 1;  // whoever writes writes the same
+    if (!isfinite(x * x)) unusable[count == 1 ? 0 : int(i) / int(step.row_size)] = 1;  // every thread that writes writes the same
   }
   __syncthreads();
   for (int64_t i = threadIdx.x; i < size; i += kThreads) {
-    if (poisoned[count == 1 ? 0 : int(i) / int(step.row_size)]) continue;
+    if (unusable[count == 1 ? 0 : int(i) / int(step.row_size)]) continue;
     const int64_t k = at + i;
     const float x = g[k], m_old = m[k], v_old = v[k];
     const float m_new = m_old + step.fresh1 * (x - m_old), v_new = v_old + step.fresh2 * (x * x - v_old);
@@ -50,7 +51,7 @@ __global__ void __launch_bounds__(kThreads)
     p[k] -= step.rate * m_new / (sqrtf(v_new) * step.inv_bias2 + step.epsilon);
   }
   for (int r = threadIdx.x; r < count; r += kThreads)
-    if (poisoned[r]) atomicAdd(skipped, 1ULL);  // whole numbers: their sum does not depend on the order
+    if (unusable[r]) atomicAdd(skipped, 1ULL);  // whole numbers: their sum does not depend on the order
 }
 
 template <class Step>
@@ -73,3 +74,5 @@ void adam_at_on_device(float* p, const float* g, float* m, float* v, int64_t row
                        cudaStream_t stream) {
   launch(p, g, m, v, rows, at, skipped, stream);
 }
+
+}  // namespace gsplat::adam

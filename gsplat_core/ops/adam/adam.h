@@ -3,7 +3,10 @@
 
 #include <cstdint>
 
+#include "cuda_stream.h"
 #include "isa.h"
+
+namespace gsplat::adam {
 
 struct AdamStep {
   float rate;            // learning rate / (1 - beta1^t)
@@ -13,8 +16,27 @@ struct AdamStep {
   int64_t row_size;  // values that share their fate: one that is not finite keeps the whole row as it is
 };
 
-struct AdamKernels {
+// AdamStep with rate and step in device memory.
+struct AdamAt {
+  const float* rate;            // [1]: the learning rate
+  const int64_t* step;          // [1]: counts from 1
+  double log_beta1, log_beta2;  // natural logarithms
+  float fresh1, fresh2, epsilon;
+  int64_t row_size;
+};
+
+// CPU.
+struct Kernels {
   // Parameter, gradient, first and second moment of `rows` rows; returns how many rows were left alone.
   int64_t (*step)(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step);
 };
-GSPLAT_DECLARE_KERNELS(AdamKernels, adam_kernels)
+
+// CUDA: the same; the number of rows left alone is added to `skipped`. Every pointer is to device memory.
+void adam_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step, int64_t* skipped,
+                    cudaStream_t stream);
+void adam_at_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamAt& at, int64_t* skipped,
+                       cudaStream_t stream);
+
+}  // namespace gsplat::adam
+
+GSPLAT_KERNELS(adam, Kernels)

@@ -1,7 +1,9 @@
 #include "adam.h"
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::adam {
+
+using gsplat::adam::AdamStep;
 
 constexpr int64_t kBlock = 2048;  // values checked and then updated while they are in the first-level cache
 
@@ -51,6 +53,6 @@ static int64_t step(float* p, const float* g, float* m, float* v, int64_t rows, 
   return skipped;
 }
 
-extern const AdamKernels adam_kernels = {step};
+extern const gsplat::adam::Kernels kernels = {step};
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::adam

@@ -1,8 +1,7 @@
 #include "basis_field_warp.cuh"
 
+namespace gsplat::basis_field {
 namespace {
-
-using namespace basis_warp;
 
 constexpr int kFlight = 5;  // pairs of rows that a warp reads at once: bumps of width 1, one per spacing, have 8 or 9 active
 
@@ -86,3 +85,5 @@ void basis_field_backward_on_device(const DeviceBumps& field, const float* gradi
   if (field.count == 0) return;
   backward<<<unsigned((field.count + kWarps - 1) / kWarps), kBlock, 0, stream>>>(field, gradient, centers, log_widths, weights);
 }
+
+}  // namespace gsplat::basis_field

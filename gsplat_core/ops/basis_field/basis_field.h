@@ -3,8 +3,11 @@
 
 #include <cstdint>
 
+#include "cuda_stream.h"
 #include "isa.h"
 #include "raw_layout.h"
+
+namespace gsplat::basis_field {
 
 constexpr int64_t kBasisChannels = kRawBasisChannels;
 constexpr int64_t kBasisPadded =
@@ -17,7 +20,7 @@ constexpr int basis_rate_of(int64_t channel) {
   return channel < kRawRotation ? 0 : channel < kRawLogScale ? 1 : channel < kRawColor ? 2 : 3;
 }
 
-// One field at one time: centres and log-widths [N, B], weights [N, B, 13].
+// CPU: one field at one time: centres and log-widths [N, B], weights [N, B, 13].
 struct BasisBumps {
   const float *centers, *log_widths, *weights;
   int64_t bumps;
@@ -40,11 +43,41 @@ struct BasisAdam {
   int64_t table_size;
 };
 
-struct BasisFieldKernels {
+struct Kernels {
   void (*forward)(const BasisBumps& field, float* deltas, int64_t begin, int64_t end);
   // Writes every element of the three gradients, zero where a bump is inactive.
   void (*backward)(const BasisBumps& field, const float* gradient, float* centers, float* log_widths, float* weights,
                    int64_t begin, int64_t end);
   void (*adam)(const BasisAdam& field, const float* gradient, int64_t begin, int64_t end);
 };
-GSPLAT_DECLARE_KERNELS(BasisFieldKernels, basis_field_kernels)
+
+// CUDA: the same with numbers in device memory, as every pointer here.
+struct DeviceBumps {
+  const float *centers, *log_widths, *weights;
+  const float* tau;  // [1]
+  int64_t count, bumps;
+  int32_t row;  // columns of deltas and gradients: kBasisChannels or kBasisPadded
+};
+
+struct DeviceBasisAdam {
+  float *centers, *log_widths, *weights;
+  float *m_centers, *m_log_widths, *m_weights, *v_centers, *v_log_widths, *v_weights;
+  int32_t* steps;
+  const float* tau;    // [1]
+  const float* rates;  // [kBasisRates]
+  int64_t count, bumps;
+  int32_t row;
+  float fresh1, fresh2;        // 1 - beta1, 1 - beta2, subtracted in double
+  float log_beta1, log_beta2;  // natural logarithms
+  float epsilon;
+};
+
+void basis_field_on_device(const DeviceBumps& field, float* deltas, cudaStream_t stream);
+// Writes every element of the three gradients, zero where a bump is inactive.
+void basis_field_backward_on_device(const DeviceBumps& field, const float* gradient, float* centers, float* log_widths,
+                                    float* weights, cudaStream_t stream);
+void basis_field_adam_on_device(const DeviceBasisAdam& field, const float* gradient, cudaStream_t stream);
+
+}  // namespace gsplat::basis_field
+
+GSPLAT_KERNELS(basis_field, Kernels)

@@ -1,8 +1,7 @@
 #include "basis_field_warp.cuh"
 
+namespace gsplat::basis_field {
 namespace {
-
-using namespace basis_warp;
 
 constexpr int kFlight = 5;  // pairs of rows that a warp reads at once, of parameters and of both moments
 
@@ -116,3 +115,5 @@ void basis_field_adam_on_device(const DeviceBasisAdam& field, const float* gradi
   if (field.count == 0) return;
   adam<<<unsigned((field.count + kWarps - 1) / kWarps), kBlock, 0, stream>>>(field, gradient);
 }
+
+}  // namespace gsplat::basis_field

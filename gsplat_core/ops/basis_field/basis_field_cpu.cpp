@@ -2,7 +2,10 @@
 #include "basis_field.h"
 #include "simd_partial.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::basis_field {
+
+using namespace gsplat::basis_field;
+
 namespace {
 
 constexpr int kRowVectors = 16 / kLanes;
@@ -190,6 +193,6 @@ void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t 
 
 }  // namespace
 
-extern const BasisFieldKernels basis_field_kernels = {forward, backward, adam};
+extern const Kernels kernels = {forward, backward, adam};
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::basis_field

@@ -3,9 +3,9 @@
 // the last are gone through, and those between that are not active are not read.
 #pragma once
 
-#include "basis_field_cuda.h"
+#include "basis_field.h"
 
-namespace basis_warp {
+namespace gsplat::basis_field {
 
 constexpr unsigned kAll = ~0u;
 constexpr int kBlock = 256;  // threads
@@ -76,4 +76,4 @@ __device__ __forceinline__ float sum_of_half(float x) {
   return x;
 }
 
-}  // namespace basis_warp
+}  // namespace gsplat::basis_field

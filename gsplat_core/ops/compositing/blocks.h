@@ -25,7 +25,6 @@ GSPLAT_INLINE int place(int x, int y) {
 
 // Four pixels next to each other, which lie next to each other in a block too.
 typedef float quad __attribute__((vector_size(16)));
-typedef int32_t quad_index __attribute__((vector_size(16)));
 GSPLAT_INLINE quad load_quad(const float* p) {
   quad v;
   __builtin_memcpy(&v, p, sizeof(v));
@@ -35,14 +34,14 @@ GSPLAT_INLINE void store_quad(float* p, quad v) { __builtin_memcpy(p, &v, sizeof
 
 // The columns of four rows: 4 pixels of 4 channels from 4 channels of 4 pixels, and back.
 GSPLAT_INLINE void transpose(quad& a, quad& b, quad& c, quad& d) {
-  const quad ab_low = __builtin_shuffle(a, b, (quad_index){0, 4, 1, 5}),
-             ab_high = __builtin_shuffle(a, b, (quad_index){2, 6, 3, 7});
-  const quad cd_low = __builtin_shuffle(c, d, (quad_index){0, 4, 1, 5}),
-             cd_high = __builtin_shuffle(c, d, (quad_index){2, 6, 3, 7});
-  a = __builtin_shuffle(ab_low, cd_low, (quad_index){0, 1, 4, 5});
-  b = __builtin_shuffle(ab_low, cd_low, (quad_index){2, 3, 6, 7});
-  c = __builtin_shuffle(ab_high, cd_high, (quad_index){0, 1, 4, 5});
-  d = __builtin_shuffle(ab_high, cd_high, (quad_index){2, 3, 6, 7});
+  const quad ab_low = __builtin_shufflevector(a, b, 0, 4, 1, 5),
+             ab_high = __builtin_shufflevector(a, b, 2, 6, 3, 7);
+  const quad cd_low = __builtin_shufflevector(c, d, 0, 4, 1, 5),
+             cd_high = __builtin_shufflevector(c, d, 2, 6, 3, 7);
+  a = __builtin_shufflevector(ab_low, cd_low, 0, 1, 4, 5);
+  b = __builtin_shufflevector(ab_low, cd_low, 2, 3, 6, 7);
+  c = __builtin_shufflevector(ab_high, cd_high, 0, 1, 4, 5);
+  d = __builtin_shufflevector(ab_high, cd_high, 2, 3, 6, 7);
 }
 
 // Offsets of a block's pixels from its first.

@@ -5,6 +5,8 @@
 #include "../adam/adam.h"
 #include "training_cuda.h"
 
+using gsplat::adam::AdamStep;
+
 struct PlaneMoments {
   float *values, *first, *second;  // [V, U, C]
 };

@@ -62,7 +62,7 @@ class FieldGradient(NamedTuple):
 
 
 class Penalties(NamedTuple):
-    """Weights of the penalties of `gsplat_core.deformation.regularisers` in the loss."""
+    """Weights of the penalties of `gsplat_core.reference.plane_penalties` in the loss."""
 
     plane_smoothness: float = 0.0
     time_smoothness: float = 0.0

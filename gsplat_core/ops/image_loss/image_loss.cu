@@ -1,8 +1,12 @@
 // The image loss with its gradients: count the pixels that each mean is over, then one pass for L1 and inverse depth, two more
 // for the similarity where it has a weight. Sums are per block, in double, added up in the order of the blocks.
-#include "../ssim/ssim_cuda.h"
-#include "image_loss_cuda.h"
+#include "image_loss.h"
 
+#include "../ssim/ssim.h"
+#include "cuda_check.h"
+#include "cuda_scratch.h"
+
+namespace gsplat::image_loss {
 namespace {
 
 constexpr float kLeastAlpha = 1e-10f;  // what a pixel's depth is divided by at least
@@ -64,7 +68,7 @@ __device__ inline void block_totals(double (&sums)[kSums]) {
   }
 }
 
-// |x - y| and its derivative times `slope`. Zero has no slope; a NaN in tissue is passed on to both.
+// |x - y| and its derivative times `slope`. Zero has no slope; a NaN in tissue shows in both.
 struct Difference {
   float value, slope;
 };
@@ -134,16 +138,20 @@ void image_loss_on_device(const DeviceImageLoss& in, CudaScratch& scratch, cudaS
   const int64_t wanted = blocks_for(in.pixels), blocks = wanted < 1 ? 1 : wanted < kMostBlocks ? wanted : kMostBlocks;
   int64_t* const counts = scratch.array<int64_t>(kCounts);
   double* const block_sums = scratch.array<double>(blocks * kSums);
-  cudaMemsetAsync(counts, 0, kCounts * sizeof(int64_t), stream);
+  check_cuda(cudaMemsetAsync(counts, 0, kCounts * sizeof(int64_t), stream), "clearing the loss's counters");
   count_pixels<<<unsigned(blocks), kThreads, 0, stream>>>(in, counts);
   differences<<<unsigned(blocks), kThreads, 0, stream>>>(in, counts, block_sums);
-  DeviceSsim ssim = {};
+  ssim::DeviceSsim similarity = {};
   if (in.ssim_weight != 0) {
-    ssim.image = in.image, ssim.target = in.target, ssim.target_bytes = in.target_bytes, ssim.mask = in.mask;
-    ssim.tissue = counts + kTissue, ssim.scale = -in.ssim_weight;
-    ssim.height = in.height, ssim.width = in.width, ssim.channels = in.channels, ssim.stride = in.stride;
-    ssim.gradient = in.v_image, ssim.sums = scratch.array<double>(ssim.blocks());
-    ssim_on_device(ssim, scratch, stream);
+    similarity.image = in.image, similarity.target = in.target, similarity.target_bytes = in.target_bytes,
+    similarity.mask = in.mask;
+    similarity.tissue = counts + kTissue, similarity.scale = -in.ssim_weight;
+    similarity.height = in.height, similarity.width = in.width, similarity.channels = in.channels, similarity.stride = in.stride;
+    similarity.gradient = in.v_image, similarity.sums = scratch.array<double>(similarity.blocks());
+    ssim::ssim_on_device(similarity, scratch, stream);
   }
-  finish<<<1, kThreads, 0, stream>>>(in, counts, block_sums, blocks, ssim.sums, in.ssim_weight != 0 ? ssim.blocks() : 0);
+  finish<<<1, kThreads, 0, stream>>>(in, counts, block_sums, blocks, similarity.sums,
+                                     in.ssim_weight != 0 ? similarity.blocks() : 0);
 }
+
+}  // namespace gsplat::image_loss

@@ -1,10 +1,16 @@
-// The cheap terms of the image loss, row by row: masked L1 and inverse-depth L1, each with its gradient.
+// The image loss: masked L1, structural similarity (../ssim) and inverse-depth L1, with their gradients.
 #pragma once
 
 #include <cstdint>
 
+#include "cuda_stream.h"
 #include "isa.h"
 
+class CudaScratch;
+
+namespace gsplat::image_loss {
+
+// CPU: L1 and inverse depth, row by row.
 struct L1Task {
   const float* image;           // [H, W, C]
   const float* target;          // [H, W, C], or null with target_bytes
@@ -28,10 +34,37 @@ struct DepthTask {
   int64_t width;
 };
 
-struct ImageLossKernels {
+struct Kernels {
   void (*l1_rows)(const L1Task& task, int64_t row_begin, int64_t row_end);
   void (*count_depth_rows)(const DepthTask& task, int64_t row_begin, int64_t row_end);
   void (*depth_rows)(const DepthTask& task, int64_t row_begin, int64_t row_end);
   int64_t (*count_tissue)(const uint8_t* mask, int64_t pixels);
 };
-GSPLAT_DECLARE_KERNELS(ImageLossKernels, image_loss_kernels)
+
+// CUDA: all terms; every pointer is to device memory. Pixels lie one after the other; those of `image` and `v_image` are `stride`
+// floats apart, of which `channels` are compared.
+struct DeviceImageLoss {
+  const float* image;
+  const float* target;          // [H, W, channels], or null with target_bytes
+  const uint8_t* target_bytes;  // [H, W, channels], value / 255
+  const uint8_t* mask;          // [H, W], non-zero = tissue; null = all
+  // Depth: either a plane, or the channel behind the colours, not divided by alpha yet. Null: no depth.
+  const float* depth;   // [H, W]
+  const float* alphas;  // [H, W], of the frame path
+  const float* target_depth;
+  float ssim_weight, depth_weight;
+  int32_t height, width, channels, stride;
+
+  float* v_image;
+  float* v_depth;   // [H, W], with depth
+  float* v_alphas;  // [H, W], with alphas
+  float* loss;      // [1]
+  float* terms;     // [3]: L1, 1 - SSIM, inverse-depth L1
+
+  int64_t pixels;  // height times width
+};
+void image_loss_on_device(const DeviceImageLoss& loss, CudaScratch& scratch, cudaStream_t stream);
+
+}  // namespace gsplat::image_loss
+
+GSPLAT_KERNELS(image_loss, Kernels)

@@ -1,7 +1,9 @@
 #include "image_loss.h"
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::image_loss {
+
+using namespace gsplat::image_loss;
 
 constexpr int kBlock = 768;  // floats handled at a time: their tissue weights stay in the first-level cache
 
@@ -152,6 +154,6 @@ static int64_t count_tissue(const uint8_t* mask, int64_t pixels) {
   return count;
 }
 
-extern const ImageLossKernels image_loss_kernels = {l1_rows, count_depth_rows, depth_rows, count_tissue};
+extern const Kernels kernels = {l1_rows, count_depth_rows, depth_rows, count_tissue};
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::image_loss

@@ -1,13 +1,16 @@
-#include "scalars_cuda.h"
+#include "scalars.h"
 
+namespace gsplat::scalars {
 namespace {
 
-__global__ void store(float* to, DeviceScalars scalars) {
+__global__ void store(float* to, Scalars scalars) {
   if (int(threadIdx.x) < scalars.count) to[threadIdx.x] = scalars.values[threadIdx.x];
 }
 
 }  // namespace
 
-void store_on_device(float* to, const DeviceScalars& scalars, cudaStream_t stream) {
+void store_on_device(float* to, const Scalars& scalars, cudaStream_t stream) {
   store<<<1, kMostScalars, 0, stream>>>(to, scalars);
 }
+
+}  // namespace gsplat::scalars

@@ -1,8 +1,10 @@
 // Two passes over tiles of one channel. The first filters the four moments, vertically and then horizontally, and turns them into
 // the similarity and its derivatives by mean, squares and product; the second filters those, which gives the gradient: the filter
 // is symmetric.
-#include "ssim_cuda.h"
+#include "cuda_scratch.h"
+#include "ssim.h"
 
+namespace gsplat::ssim {
 namespace {
 
 constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;
@@ -164,3 +166,5 @@ void ssim_on_device(const DeviceSsim& in, CudaScratch& scratch, cudaStream_t str
   similarity<<<grid_of(in), kThreads, 0, stream>>>(in, derivatives);
   if (in.gradient != nullptr) gradient<<<grid_of(in), kThreads, 0, stream>>>(in, derivatives);
 }
+
+}  // namespace gsplat::ssim

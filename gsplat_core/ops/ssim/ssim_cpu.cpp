@@ -4,7 +4,9 @@
 #include "simd.h"
 #include "ssim.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::ssim {
+
+using namespace gsplat::ssim;
 
 constexpr float kC1 = 0.01f * 0.01f;
 constexpr float kC2 = 0.03f * 0.03f;
@@ -250,6 +252,6 @@ static void band(const SsimTask& task, int64_t strip, int64_t row_begin, int64_t
   }
 }
 
-extern const SsimKernels ssim_kernels = {band};
+extern const Kernels kernels = {band};
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::ssim

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from gsplat_core import reference
-from gsplat_core.deformation import regularisers
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane.plain_torch import PLANE_AXES
 from gsplat_core.ops.hexplane.training import (
@@ -16,6 +15,7 @@ from gsplat_core.ops.hexplane.training import (
     hexplane_train,
     hexplane_train_backward,
 )
+from gsplat_core.reference import plane_penalties
 from gsplat_core.reference.adam import adam_step
 from gsplat_core.scene.layout import HEAD_COLUMNS
 
@@ -220,9 +220,15 @@ def test_adam_over_the_planes_equals_the_reference(gpu, shape, penalties):
         gradients = case.exact()[2]
         leaves = [p.double().requires_grad_() for p in case.planes]
         space, time = ([p for i, p in enumerate(leaves) if (i % 6 < 3) == is_space] for is_space in (True, False))
-        loss = penalties.time_smoothness * regularisers.mean_over_planes(regularisers.second_difference_in_time, time)
-        loss = loss + penalties.time_sparsity * regularisers.mean_over_planes(regularisers.distance_from_one, time)
-        loss = loss + penalties.plane_smoothness * regularisers.mean_over_planes(regularisers.total_variation, space)
+        loss = penalties.time_smoothness * plane_penalties.mean_over_planes(
+            plane_penalties.second_difference_in_time, time
+        )
+        loss = loss + penalties.time_sparsity * plane_penalties.mean_over_planes(
+            plane_penalties.distance_from_one, time
+        )
+        loss = loss + penalties.plane_smoothness * plane_penalties.mean_over_planes(
+            plane_penalties.total_variation, space
+        )
         extra = torch.autograd.grad(loss, leaves, allow_unused=True)
         hexplane_planes_adam_(ours.planes, first, second, ours.time, gradient, rate, step, penalties=penalties)
         for p, m, v, g, e in zip(*wanted, gradients, extra, strict=True):

@@ -183,3 +183,32 @@ def test_nan_stays_with_its_gaussian(make_gaussians):
     moved = field(gaussians, 1.0)
     assert moved.means[2].isnan().all()
     assert moved.means[[0, 1, 3, 4, 5]].isfinite().all()
+
+
+def test_spare_columns_become_bumps_at_the_same_addresses(device):
+    def grown(spare: bool) -> BasisField:
+        torch.manual_seed(3)
+        field = BasisField(7, (0.0, 1.0), bumps=6).to(device)
+        if spare:
+            field._add_spare(9)
+        for step in range(4):
+            torch.manual_seed(step)
+            for parameter in field.parameters():
+                parameter.data[:, : field.bumps] += 0.1 * torch.randn(parameter[:, : field.bumps].shape).to(device)
+            field.adam_step(0.2 * step, torch.ones(field.count, 13, device=device), BasisRates())
+            field.extend((0.0, 1.5 + 0.5 * step), hold_at_s=0.9)
+            field.append(2)
+        return field
+
+    exact, spared = grown(False), grown(True)
+    assert spared.bumps == exact.bumps and spared.config() == exact.config()
+    for time_s in (0.0, 0.7, 2.2, 3.0):
+        assert torch.equal(spared.deltas(time_s), exact.deltas(time_s))
+    published, expected = spared.detached_copy().state_dict(), exact.detached_copy().state_dict()
+    assert {name: tensor.shape for name, tensor in published.items()} == {n: t.shape for n, t in expected.items()}
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in published.items())
+    before = spared.weights.data_ptr()
+    spared._add_spare(3)
+    at = spared.weights.data_ptr()
+    spared.extend((0.0, 3.3), hold_at_s=3.0)
+    assert at != before and spared.weights.data_ptr() == at

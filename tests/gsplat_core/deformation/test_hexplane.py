@@ -1,4 +1,4 @@
-"""The HexPlane field: its box, its axes, its network and its penalties."""
+"""The HexPlane field: its box, its axes and its network."""
 
 import pytest
 import torch
@@ -97,23 +97,6 @@ def test_an_extended_window_keeps_what_was_learned_where_it_was(make_gaussians):
         torch.testing.assert_close(field.features(gaussians.means, 2.5), before)
         torch.testing.assert_close(field.features(gaussians.means, 6.0), end)
         assert field.time_window_s == (2.0, 6.0)
-
-
-def test_penalties_are_zero_where_there_is_nothing_to_penalise(make_gaussians):
-    field = small_field(make_gaussians(3))
-    assert field.time_smoothness().item() == 0 and field.time_sparsity().item() == 0
-    assert field.plane_smoothness().item() > 0
-    with torch.no_grad():
-        field.planes[0]["xt"][4] += 1.0
-        for level in field.planes:
-            for name in ("xy", "xz", "yz"):
-                level[name].fill_(0.25)
-    assert field.plane_smoothness().item() == 0
-    # One row of nine raised by 1: second differences 1, -2, 1 in 7 rows; one of six planes.
-    assert field.time_smoothness().item() == pytest.approx((1 + 4 + 1) / 7 / 6)
-    assert field.time_sparsity().item() == pytest.approx(1 / 9 / 6)
-    (field.plane_smoothness() + field.time_smoothness() + field.time_sparsity()).backward()
-    assert field.planes[0]["xt"].grad.abs().sum() > 0
 
 
 def test_nan_positions_do_not_make_the_box(make_gaussians):

@@ -34,6 +34,17 @@ def test_by_hand():
     assert measured.heldout_train_mean_db == pytest.approx(decibels(20), abs=1e-4)
 
 
+def test_frames_are_held_out_by_their_number_where_some_are_missing():
+    # Frame 1, the held-out one, was lost: nothing is held out, and frame 2 is compared with frame 0.
+    measured = measure_baselines([frame(0, 100), frame(2, 180)])
+    assert measured.previous_frame_db == pytest.approx(decibels(80), abs=1e-4)
+    assert measured.heldout_previous_frame_db is measured.heldout_train_mean_db is None
+    # Frame 8 was lost: 9 is held out, and its neighbours are 7 and 10.
+    measured = measure_baselines([frame(7, 100), frame(9, 120), frame(10, 180)])
+    assert measured.heldout_previous_frame_db == pytest.approx(decibels(20), abs=1e-4)
+    assert measured.heldout_neighbour_mean_db == pytest.approx(decibels(20), abs=1e-4)
+
+
 def test_a_stream_too_short_for_a_baseline_says_none():
     one = measure_baselines([frame(0, 7)])
     assert one.previous_frame_db is one.heldout_train_mean_db is None

@@ -9,11 +9,37 @@ import torch
 
 from gsplat_core.errors import InvalidSetting, RecordingMissing
 from gsplat_core.io.bundle import load_bundle
+from gsplat_core.training.baselines import Baselines
 from operators.applications import replay as replay_module
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.result import RunOutcome
 from operators.errors import DeviceMissing, OutputError, RunFailed, StorageFull
 from operators.graph import MultiThreadScheduler
+from operators.ingest import SourceResult
+from operators.metrics import QualityResult
+from operators.reconstruct import ModelResult
+from operators.sinks.keyframes import KeyframesResult
+from operators.sinks.video import DisplayResult
+
+
+def ingested(outcome):
+    return outcome.find(SourceResult).frames
+
+
+def displayed(outcome):
+    return outcome.find(DisplayResult).frames
+
+
+def series(outcome):
+    return outcome.find(QualityResult).series
+
+
+def sha256(outcome):
+    return outcome.find(QualityResult).frames_sha256
+
+
+def model(outcome):
+    return outcome.find(ModelResult).model
 
 
 @pytest.fixture
@@ -26,23 +52,23 @@ def test_progress_tells_each_displayed_frame(settings):
     outcome = replay(settings, events.append)
     assert [(e.stage, e.done, e.total) for e in events] == [("replay", k, 4) for k in (0, 1, 2, 3, 4)]
     assert all(e.psnr_tissue_db > 20 for e in events[1:])
-    assert (outcome.ingested, outcome.displayed, outcome.dropped) == (4, 4, 0)
-    assert [entry["seq"] for entry in outcome.series] == [0, 1, 2, 3]
-    assert outcome.model.version == 4
+    assert (ingested(outcome), displayed(outcome), outcome.dropped) == (4, 4, 0)
+    assert [entry["seq"] for entry in series(outcome)] == [0, 1, 2, 3]
+    assert model(outcome).version == 4
 
 
 def test_each_frame_is_shown_with_the_model_that_has_just_seen_it(settings):
     outcome = replay(settings)
-    assert [entry["model_version"] for entry in outcome.series] == [1, 2, 3, 4]
+    assert [entry["model_version"] for entry in series(outcome)] == [1, 2, 3, 4]
 
 
 def test_a_stop_request_ends_cleanly_and_leaves_out_the_second_reading(settings):
     shown = []
     outcome = replay(settings, shown.append, stop_requested=lambda: len(shown) > 2)
     assert outcome.interrupted and outcome.stop_reason == "interrupted"
-    assert outcome.displayed == outcome.ingested == 2
-    assert outcome.baselines is None and any("second reading" in note for note in outcome.notes)
-    assert set(outcome.outputs) == {"video", "model"}
+    assert displayed(outcome) == ingested(outcome) == 2
+    assert outcome.find(Baselines) is None and any("second reading" in note for note in outcome.notes)
+    assert set(outcome.outputs) == {"video", "model", "frames"}
 
 
 def test_a_failure_carries_what_was_reached(settings):
@@ -54,7 +80,7 @@ def test_a_failure_carries_what_was_reached(settings):
         replay(settings, fail_on_the_third)
     outcome = caught.value.result
     assert isinstance(outcome, RunOutcome)
-    assert outcome.displayed == 3 and outcome.model.version == 3
+    assert displayed(outcome) == 3 and model(outcome).version == 3
     assert (settings.out / "reconstruction.mp4").exists() and (settings.out / "model").is_dir()
 
 
@@ -64,12 +90,13 @@ def test_threads_give_the_same_bytes_as_one(settings, monkeypatch):
     events = []
     outcome = replay(settings, events.append)
     assert [e.done for e in events] == [0, 1, 2, 3, 4]
-    assert (outcome.displayed, outcome.dropped) == (4, 0)
-    assert outcome.frames_sha256 == expected.frames_sha256
-    assert outcome.model.sha256() == expected.model.sha256()
-    assert outcome.series == expected.series
-    assert outcome.worst_seq == expected.worst_seq
-    assert [k.rendered.frame.seq for k in outcome.keyframes] == [k.rendered.frame.seq for k in expected.keyframes]
+    assert (displayed(outcome), outcome.dropped) == (4, 0)
+    assert sha256(outcome) == sha256(expected)
+    assert model(outcome).sha256() == model(expected).sha256()
+    assert series(outcome) == series(expected)
+    kept, wanted = outcome.find(KeyframesResult), expected.find(KeyframesResult)
+    assert kept.worst_seq == wanted.worst_seq
+    assert [k.rendered.frame.seq for k in kept.keyframes] == [k.rendered.frame.seq for k in wanted.keyframes]
 
 
 def test_with_threads_a_failure_still_carries_what_was_reached(settings, monkeypatch):
@@ -82,7 +109,7 @@ def test_with_threads_a_failure_still_carries_what_was_reached(settings, monkeyp
     with pytest.raises(RunFailed, match="operator 'progress' failed in compute on frame 1") as caught:
         replay(settings, fail_on_the_second)
     outcome = caught.value.result
-    assert len(outcome.series) >= 2 and outcome.displayed >= 1 and outcome.model.version >= 2
+    assert len(series(outcome)) >= 2 and displayed(outcome) >= 1 and model(outcome).version >= 2
     assert (settings.out / "reconstruction.mp4").exists() and (settings.out / "model").is_dir()
 
 
@@ -90,13 +117,13 @@ def test_with_threads_a_failure_still_carries_what_was_reached(settings, monkeyp
 def test_a_gpu_gives_the_same_bytes_twice_and_what_the_cpu_sees(gpu, settings):
     on_cpu = replay(settings)
     first, second = (replay(replace(settings, device="cuda", out=settings.out / name)) for name in "ab")
-    assert first.frames_sha256 == second.frames_sha256
-    assert first.model.sha256() == second.model.sha256()
-    assert first.model.gaussians.device.type == "cuda"
-    assert (first.displayed, first.dropped, first.model.version) == (4, 0, 4)
-    assert load_bundle(settings.out / "a" / "model").sha256() == first.model.sha256()
-    expected = on_cpu.live.means()["psnr_tissue_db"]
-    assert first.live.means()["psnr_tissue_db"] == pytest.approx(expected, abs=0.3)
+    assert sha256(first) == sha256(second)
+    assert model(first).sha256() == model(second).sha256()
+    assert model(first).gaussians.device.type == "cuda"
+    assert (displayed(first), first.dropped, model(first).version) == (4, 0, 4)
+    assert load_bundle(settings.out / "a" / "model").sha256() == model(first).sha256()
+    expected = on_cpu.find(QualityResult).trained.means()["psnr_tissue_db"]
+    assert first.find(QualityResult).trained.means()["psnr_tissue_db"] == pytest.approx(expected, abs=0.3)
 
 
 def test_the_callers_random_numbers_are_untouched(settings):

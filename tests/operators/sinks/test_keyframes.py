@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import pytest
 
 from operators.metrics import MetricsOp
-from operators.sinks.keyframes import KeyframesOp
+from operators.outcome import OutcomeBuilder
+from operators.sinks.keyframes import KeyframesOp, KeyframesResult
 
 
 def keep(count, length, rendered, compute, worst=None):
@@ -43,3 +45,20 @@ def test_without_a_frame_there_are_none():
     operator = KeyframesOp(None)
     operator.start()
     assert operator.keyframes == [] and operator.worst_seq is None
+
+
+def test_planes_that_no_picture_shows_are_not_kept(rendered, frame, compute):
+    image = frame(0).image
+    full = frame(
+        0, right_image=image, depth=np.ones(image.shape[:2], np.float32), mask=np.ones(image.shape[:2], np.uint8)
+    )
+    metrics, operator, outcome = MetricsOp(None), KeyframesOp(None), OutcomeBuilder()
+    metrics.start()
+    operator.start()
+    (scored,) = compute(metrics, rendered=rendered(frame=full))
+    compute(operator, scored=scored)
+    operator.contribute(outcome)
+    (kept,) = outcome.find(KeyframesResult).keyframes
+    assert kept.rendered.frame.right_image is None and kept.rendered.frame.depth is None
+    assert kept.rendered.frame.mask is full.mask and kept.rendered.depth is scored.rendered.depth
+    assert scored.rendered.frame.depth is full.depth, "the message that others see is not changed"

@@ -1,0 +1,102 @@
+#include "ssim.h"
+
+#include <cmath>
+#include <vector>
+
+#include "host_call.h"
+
+namespace gsplat::ssim {
+
+#if !defined(GSPLAT_CUDA)
+
+static void fill_taps(float* taps) {
+  double weights[kSsimTaps], total = 0;
+  for (int k = 0; k < kSsimTaps; ++k) {
+    const double offset = (k - kSsimRadius) / 1.5;  // sigma 1.5 px
+    total += weights[k] = std::exp(-0.5 * offset * offset);
+  }
+  for (int k = 0; k < kSsimTaps; ++k) taps[k] = float(weights[k] / total);
+}
+
+void run_ssim(SsimTask& task) {
+  fill_taps(task.taps);
+  // A band recomputes two radii of rows, so it should be several times as high.
+  constexpr int64_t kBandRows = 48;
+  torch::stable::parallel_for(0, task.height, kBandRows, [&](int64_t begin, int64_t end) {
+    thread_local std::vector<float> scratch(kSsimScratchFloats);
+    for (int64_t strip = 0; strip < ssim_strips(task.width, task.channels); ++strip)
+      kernels().band(task, strip, begin, end, scratch.data());
+  });
+}
+
+#endif
+
+namespace {
+
+// Two images of one size, checked.
+struct Images {
+  Tensor image, target;
+  int64_t height, width, channels;
+
+  Images(const Call& call, const Tensor& image_, const Tensor& target_)
+      : image(call.floats(image_, "image")), target(call.floats(target_, "target")) {
+    check(image.dim() == 3 && target.dim() == 3, "image and target must be [H, W, C]");
+    for (int d = 0; d < 3; ++d)
+      check(image.size(d) == target.size(d), "image and target must have one shape, got ", image.size(d), " and ", target.size(d),
+            " along dimension ", d);
+    height = image.size(0), width = image.size(1), channels = image.size(2);
+    check(channels >= 1 && channels <= kSsimMaxChannels, "image must have 1 to ", kSsimMaxChannels, " channels, got ", channels);
+  }
+};
+
+// Writes the map, or adds the gradient of `upstream` times the map; the other is null.
+void run(Call& call, const Images& images, const float* upstream, float* map, float* gradient) {
+#if defined(GSPLAT_CUDA)
+  check(images.height <= kSsimMostRows && images.width <= kSsimMostRows, "image must have at most ", kSsimMostRows,
+        " pixels on a side, got ", images.width, " x ", images.height);
+  DeviceSsim task = {};
+  task.stride = int32_t(images.channels);
+#else
+  (void)call;
+  SsimTask task = {};
+#endif
+  task.image = data(images.image), task.target = data(images.target), task.upstream = upstream, task.scale = 1;
+  task.map = map, task.gradient = gradient;
+  task.height = decltype(task.height)(images.height), task.width = decltype(task.width)(images.width);
+  task.channels = int(images.channels);
+#if defined(GSPLAT_CUDA)
+  ssim_on_device(task, call, call.stream);
+#else
+  run_ssim(task);
+#endif
+}
+
+Tensor ssim_map(Tensor image, Tensor target) {
+  Call call(image);
+  const Images images(call, image, target);
+  Tensor map = call.empty({images.height, images.width, images.channels});
+  run(call, images, nullptr, mutable_data(map), nullptr);
+  call.finish("ssim_map");
+  return map;
+}
+
+Tensor ssim_map_backward(Tensor gradient, Tensor image, Tensor target) {
+  Call call(image);
+  const Images images(call, image, target);
+  const Tensor upstream = call.floats(gradient, "gradient");
+  check(upstream.numel() == images.image.numel(), "the gradient must have the map's ", images.image.numel(), " values, got ",
+        upstream.numel());
+  Tensor result = call.zeros({images.height, images.width, images.channels});
+  run(call, images, data(upstream), nullptr, mutable_data(result));
+  call.finish("ssim_map_backward");
+  return result;
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(gsplat_core, GSPLAT_DEVICE, m) {
+  m.impl("ssim_map", GSPLAT_BOX(&ssim_map));
+  m.impl("ssim_map_backward", GSPLAT_BOX(&ssim_map_backward));
+}
+
+}  // namespace gsplat::ssim

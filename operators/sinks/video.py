@@ -1,0 +1,80 @@
+"""The video of a run: every frame beside its reconstruction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from operators.graph import Operator, OperatorSpec
+from operators.messages import RenderedFrame
+from operators.outcome import OutcomeBuilder
+from operators.sinks.pictures import side_by_side
+from operators.sinks.registry import SinkOptions
+from operators.sinks.video_file import VideoFile
+from operators.storage import StorageReserve
+
+VIDEO_FILE = "reconstruction.mp4"
+
+
+@dataclass(frozen=True)
+class DisplayResult:
+    """What a run has shown."""
+
+    frames: int
+    """How many frames were displayed."""
+
+
+class VideoSinkOp(Operator):
+    """Writes raw | reconstruction side by side, with frame number and model version, to an MP4.
+
+    Inputs:
+        rendered: `RenderedFrame`.
+
+    Params:
+        path: the file; it is finished when the graph stops, for whatever reason.
+        fps: frames per second of the video.
+        reserve: room that must stay free on the disk.
+    """
+
+    def __init__(
+        self, fragment: Any, *args: Any, path: Path, fps: float, reserve: StorageReserve | None = None, **kwargs: Any
+    ) -> None:
+        self.path = path
+        self.fps = fps
+        self.reserve = reserve
+        self.displayed = 0
+        self._video: VideoFile | None = None
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("rendered", type=RenderedFrame)
+
+    def start(self) -> None:
+        self.displayed = 0
+
+    def stop(self) -> None:
+        if self._video is not None:
+            self._video.close()
+            self._video = None
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        picture = side_by_side(op_input.receive("rendered"))
+        if self._video is None:
+            # The size is known with the first frame only.
+            self._video = VideoFile(self.path, picture.shape[1], picture.shape[0], self.fps, self.reserve)
+        self._video.write(picture)
+        self.displayed += 1
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        outcome.add(DisplayResult(self.displayed))
+        if self.displayed and self.path.exists():
+            outcome.output("video", self.path)
+
+
+def video_sink(fragment: Any, name: str, options: SinkOptions) -> VideoSinkOp:
+    """The run's video, at the source's rate."""
+    return VideoSinkOp(
+        fragment, name=name, path=options.out / VIDEO_FILE, fps=options.source.fps, reserve=options.reserve
+    )

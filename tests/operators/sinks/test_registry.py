@@ -1,0 +1,35 @@
+"""Sinks chosen by name."""
+
+from __future__ import annotations
+
+import pytest
+
+from gsplat_core.errors import InvalidInput, InvalidSetting
+from operators.applications.replay import ReplaySettings
+from operators.messages import RenderedFrame
+from operators.metrics import ScoredFrame
+from operators.sinks.callback import CallbackSinkOp
+from operators.sinks.registry import SINKS, SinkOptions, input_of
+from operators.sources.recording import RecordingSource
+from operators.storage import StorageReserve
+
+
+def test_each_sink_takes_rendered_or_scored_frames(tmp_path, recording):
+    options = SinkOptions(tmp_path, RecordingSource(recording).description, StorageReserve(tmp_path, lambda: 0))
+    made = {name: SINKS[name](None, name, options) for name in SINKS}
+    assert {name: input_of(sink) for name, sink in made.items()} == {
+        "video": ("rendered", RenderedFrame),
+        "keyframes": ("scored", ScoredFrame),
+    }
+    assert [sink.name for sink in made.values()] == ["video", "keyframes"]
+    assert made["video"].path.parent == tmp_path and made["video"].fps == recording.fps
+
+
+def test_an_operator_whose_input_takes_anything_is_no_sink():
+    with pytest.raises(InvalidInput, match="it must have one, declared with type=RenderedFrame or type=ScoredFrame"):
+        input_of(CallbackSinkOp(None, name="any", callback=print))
+
+
+def test_an_unknown_sink_is_refused_by_its_name(tmp_path):
+    with pytest.raises(InvalidSetting, match="unknown sink 'hologram'; known are video, keyframes"):
+        ReplaySettings(tmp_path, tmp_path / "out", sinks=("hologram",))

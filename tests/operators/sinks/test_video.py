@@ -1,0 +1,100 @@
+"""The video of a run: playable or not there."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from operators.errors import OutputError, StorageFull
+from operators.outcome import OutcomeBuilder
+from operators.sinks.video import DisplayResult, VideoSinkOp
+from operators.storage import StorageReserve
+
+
+def frames_of(path):
+    capture = cv2.VideoCapture(str(path))
+    frames = []
+    while (read := capture.read())[0]:
+        frames.append(read[1][..., ::-1])
+    return frames
+
+
+def test_the_video_shows_raw_and_reconstruction_side_by_side(tmp_path, rendered, compute):
+    operator = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0)
+    operator.start()
+    for k in range(4):
+        compute(operator, rendered=rendered(k, offset=30))
+    assert not (tmp_path / "out.mp4").exists(), "the name appears with the finished file"
+    operator.stop()
+    frames = frames_of(tmp_path / "out.mp4")
+    assert len(frames) == 4 == operator.displayed
+    _height, width = frames[0].shape[:2]
+    assert width == 2 * 14 * 24, "small frames are enlarged by a whole factor"
+    raw, reconstruction = frames[0][40:, : width // 2 - 8], frames[0][40:, width // 2 + 8 :]
+    assert 20 < float(reconstruction.mean()) - float(raw.mean()) < 40
+
+
+def test_the_caption_tells_frame_and_model(tmp_path, rendered, compute):
+    """Without reading letters: the caption changes with the frame's number, and never covers the picture."""
+    from operators.sinks.pictures import CAPTION_HEIGHT_PX, side_by_side
+
+    one, other = side_by_side(rendered(1)), side_by_side(rendered(1, model_version=77))
+    differs = np.abs(one.astype(int) - other).sum(axis=2) > 0
+    assert differs[:CAPTION_HEIGHT_PX].any() and not differs[CAPTION_HEIGHT_PX:].any()
+    held_out = side_by_side(rendered(1, trained=False))
+    assert (np.abs(one.astype(int) - held_out).sum(axis=2) > 0)[:CAPTION_HEIGHT_PX].any()
+
+
+def test_stopping_without_a_frame_leaves_no_file(tmp_path):
+    operator = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0)
+    operator.start()
+    operator.stop()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_run_keeps_the_video_of_the_run_before(tmp_path, rendered, compute):
+    path = tmp_path / "out.mp4"
+    path.write_bytes(b"earlier")
+    operator = VideoSinkOp(None, path=path, fps=25.0, reserve=StorageReserve(tmp_path, lambda: 1 << 60))
+    operator.start()
+    with pytest.raises(StorageFull, match=r"the disk of .* is full"):
+        compute(operator, rendered=rendered())
+    operator.stop()
+    assert path.read_bytes() == b"earlier" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_full_disk_stops_the_video_while_it_can_still_be_finished(tmp_path, rendered, compute):
+    reserve_bytes = 0
+    operator = VideoSinkOp(
+        None, path=tmp_path / "out.mp4", fps=25.0, reserve=StorageReserve(tmp_path, lambda: reserve_bytes)
+    )
+    operator.start()
+    compute(operator, rendered=rendered(0))
+    compute(operator, rendered=rendered(1))
+    reserve_bytes = 1 << 60
+    with pytest.raises(StorageFull, match="free some space on that disk or choose another --out"):
+        compute(operator, rendered=rendered(2))
+    operator.stop()
+    assert len(frames_of(tmp_path / "out.mp4")) == 2
+
+
+def test_a_frame_of_another_size_is_refused(tmp_path, rendered, frame, compute):
+    operator = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0)
+    operator.start()
+    compute(operator, rendered=rendered(0))
+    with pytest.raises(OutputError, match="they must be equal"):
+        compute(operator, rendered=rendered(frame=frame(1, image=np.zeros((400, 500, 3), np.uint8))))
+    operator.stop()
+
+
+def test_what_it_contributes(tmp_path, rendered, compute):
+    operator, outcome = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0), OutcomeBuilder()
+    operator.contribute(outcome)
+    assert outcome.find(DisplayResult) == DisplayResult(0) and outcome.outputs == {}
+    operator.start()
+    compute(operator, rendered=rendered(0))
+    operator.stop()
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    assert outcome.find(DisplayResult) == DisplayResult(1) and outcome.outputs == {"video": tmp_path / "out.mp4"}

@@ -1,0 +1,75 @@
+"""Which source an address stands for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidSetting, RecordingMissing
+from gsplat_core.io.recordings import open_recording, synthesize
+from operators.applications.finishing import FirstFrames
+from operators.sources.recording import RecordingSource
+from operators.sources.registry import SOURCES, SourceOptions, open_source
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return synthesize(tmp_path_factory.mktemp("recordings") / "tiny", frames=4, width_px=64, height_px=48, stereo=False)
+
+
+def test_a_path_is_a_recording_with_the_same_frames(folder):
+    source = open_source(folder, SourceOptions(scale=0.5, max_frames=3))
+    recording = open_recording(folder, scale=0.5, max_frames=3)
+    assert isinstance(source, RecordingSource)
+    described = source.description
+    assert (described.name, described.frame_count, described.fps) == (folder.name, 3, recording.fps)
+    assert (described.width_px, described.height_px) == (32, 24) == (described.camera.width_px, 24)
+    assert described.fields == recording.fields and described.digest == recording.digest
+    for _ in range(2):  # it can be read again
+        for played, expected in zip(FirstFrames(source, 9), recording, strict=True):
+            assert (played.seq, played.pts_ns) == (expected.seq, expected.pts_ns)
+            np.testing.assert_array_equal(played.image, expected.image)
+            np.testing.assert_array_equal(played.mask, expected.mask)
+            np.testing.assert_array_equal(played.depth, expected.depth)
+
+
+def test_the_first_frames_are_no_more_than_asked_for(folder):
+    source = open_source(folder)
+    assert [frame.seq for frame in FirstFrames(source, 2)] == [0, 1]
+    assert list(FirstFrames(source, 0)) == []
+
+
+@pytest.mark.parametrize("address", ["tape://studio/7?take=2", Path("tape://studio/7?take=2")])
+def test_a_scheme_chooses_the_source(monkeypatch, address):
+    asked = []
+    SOURCES.add("tape", lambda rest, options: asked.append((rest, options)))
+    try:
+        open_source(address, SourceOptions(0.5, 7))
+    finally:
+        SOURCES.remove("tape")
+    assert asked == [("studio/7?take=2", SourceOptions(0.5, 7))]
+
+
+def test_a_recording_may_be_named_by_its_scheme(folder):
+    assert open_source(f"recording://{folder}").description.name == folder.name
+
+
+def test_an_unknown_scheme_is_refused_by_its_name():
+    with pytest.raises(InvalidSetting, match="unknown source 'rtsp'; known are recording"):
+        open_source("rtsp://camera/1")
+
+
+def test_a_path_that_exists_is_a_path_whatever_it_looks_like(folder, tmp_path, monkeypatch):
+    (tmp_path / "tape:").mkdir()
+    (tmp_path / "tape:" / "take").symlink_to(folder)
+    monkeypatch.chdir(tmp_path)
+    assert open_source("tape://take").description.frame_count == 4
+
+
+@pytest.mark.parametrize("address", ["nowhere", "/nowhere/at/all", "C:/recordings", "a:b", ""])
+def test_what_is_no_address_and_not_there_is_a_missing_recording(address, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(RecordingMissing):
+        open_source(address or tmp_path / "empty")

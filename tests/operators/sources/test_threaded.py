@@ -1,0 +1,126 @@
+"""A source in a thread of its own: order, errors, waiting, closing, states."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from gsplat_core.errors import InvalidInput
+from operators.sources.source import FrameSource, SourceDescription, SourceState
+from operators.sources.threaded import ThreadedSource
+
+SOON_S = 10.0
+"""Longer than anything here takes."""
+
+
+class Listed(ThreadedSource):
+    """Gives what a list says: frames, errors to raise, events to wait for."""
+
+    def __init__(self, script, camera, **options):
+        super().__init__(**options)
+        self.script, self.given, self.closed_in = script, 0, []
+        self.description = SourceDescription("listed", camera.width_px, camera.height_px, 25.0, camera)
+
+    def frames(self):
+        try:
+            for step in self.script:
+                if isinstance(step, BaseException):
+                    raise step
+                if isinstance(step, threading.Event):
+                    assert step.wait(SOON_S)
+                else:
+                    self.given += 1
+                    yield step
+        finally:
+            self.closed_in.append(threading.current_thread())
+
+
+def all_of(source):
+    seqs = []
+    while (frame := source.read(SOON_S)) is not None:
+        seqs.append(frame.seq)
+    return seqs
+
+
+def test_it_keeps_the_protocol_and_gives_every_frame_once_in_order(camera, frame):
+    source = Listed([frame(k) for k in range(50)], camera)
+    assert isinstance(source, FrameSource)
+    assert source.state is SourceState.ENDED and source.read(0) is None, "not open"
+    source.open()
+    assert all_of(source) == list(range(50))
+    assert source.state is SourceState.ENDED and source.read(0) is None
+    source.close()
+
+
+def test_opening_and_closing_twice_has_no_effect_and_opening_again_begins_again(camera, frame):
+    source = Listed([frame(k) for k in range(4)], camera)
+    source.close()
+    source.open()
+    assert source.read(SOON_S).seq == 0
+    source.open()
+    assert source.read(SOON_S).seq == 1, "still the same reading"
+    source.close()
+    source.close()
+    assert source.read(0) is None and source.state is SourceState.ENDED
+    source.open()
+    assert all_of(source) == [0, 1, 2, 3]
+    source.close()
+
+
+def test_it_is_never_more_than_so_many_frames_ahead(camera, frame):
+    source = Listed([frame(k) for k in range(100)], camera, ahead=3)
+    source.open()
+    for taken in range(1, 20):
+        source.read(SOON_S)
+        # One more may be in the reader's hands, waiting for room.
+        assert source.given <= taken + 3 + 1
+    source.close()
+    assert source.given < 100
+
+
+def test_an_error_comes_after_the_frames_before_it_and_only_once(camera, frame):
+    source = Listed([frame(0), frame(1), ValueError("broken here"), frame(2)], camera, ahead=5)
+    source.open()
+    assert [source.read(SOON_S).seq for _ in range(2)] == [0, 1]
+    with pytest.raises(ValueError, match="broken here"):
+        source.read(SOON_S)
+    assert source.read(0) is None and source.state is SourceState.ENDED
+    source.close()
+
+
+def test_a_time_out_is_none_and_the_source_goes_on(camera, frame):
+    go_on = threading.Event()
+    source = Listed([frame(0), go_on, frame(1)], camera)
+    source.open()
+    assert source.read(SOON_S).seq == 0
+    assert source.read(0.01) is None and source.state is SourceState.LIVE
+    go_on.set()
+    assert source.read(SOON_S).seq == 1
+    source.close()
+
+
+def test_it_says_when_it_is_stalled(camera, frame):
+    go_on = threading.Event()
+    source = Listed([frame(0), go_on, frame(1)], camera, stalled_after_s=0.0)
+    source.open()
+    assert source.read(SOON_S).seq == 0
+    assert source.read(0.01) is None and source.state is SourceState.STALLED
+    go_on.set()
+    assert source.read(SOON_S).seq == 1
+    source.close()
+    assert source.state is SourceState.ENDED
+
+
+def test_the_iterator_is_closed_in_the_thread_that_runs_it(camera, frame):
+    source = Listed([frame(k) for k in range(100)], camera)
+    source.open()
+    source.read(SOON_S)
+    source.close()
+    (thread,) = source.closed_in
+    assert thread is not threading.current_thread() and not thread.is_alive()
+
+
+def test_one_frame_ahead_is_the_least(camera):
+    with pytest.raises(InvalidInput, match="ahead is 0; it must be at least 1"):
+        Listed([], camera, ahead=0)
