@@ -19,6 +19,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.model import Model
 from operators.applications.device import check_device
 from operators.applications.limits import check_picture, check_scale, frames_to_render
+from operators.applications.memory import render_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.errors import OutputError
 from operators.output_folder import OutputFolder
@@ -61,6 +62,9 @@ def render_model(
     model = load_bundle(bundle).to(device)
     camera = model.camera.scaled(scale)
     check_picture(camera, scale)
+    if device == "cpu":
+        needed = render_bytes(camera.width_px, camera.height_px, model.parameter_count)
+        require_memory(needed, f"a picture of {camera.width_px}x{camera.height_px} px", "give a smaller --scale")
     images = _images(model, new_renderer(renderer, camera, device), camera, fps, progress, stop_requested)
     if not to_video:
         return _write_images(images, bundle, out)

@@ -104,6 +104,7 @@ def replay(
     device: DeviceOption = "cpu",
     engine: Annotated[str, typer.Option(help="Graph engine: embedded or holoscan.")] = "embedded",
     field: FieldOption = "auto",
+    renderer: RendererOption = "alpha",
     seed: SeedOption = 0,
     steps_per_frame: Annotated[
         int | None, typer.Option(help="Optimiser steps per frame.", show_default="the field's")
@@ -128,6 +129,7 @@ def replay(
         device=device,
         engine=engine,  # type: ignore[arg-type]
         field=field,
+        renderer=renderer,
         seed=seed,
         steps_per_frame=steps_per_frame,
         max_frames=max_frames,
@@ -143,6 +145,7 @@ def reconstruct(
     out: OutOption,
     device: DeviceOption = "cpu",
     field: FieldOption = "auto",
+    renderer: RendererOption = "alpha",
     seed: SeedOption = 0,
     steps: Annotated[int, typer.Option(help="Optimiser steps over all training frames.")] = 2000,
     max_frames: MaxFramesOption = None,
@@ -158,6 +161,7 @@ def reconstruct(
         out=out,
         device=device,
         field=field,
+        renderer=renderer,
         seed=seed,
         max_frames=max_frames,
         scale=scale,
