@@ -22,7 +22,7 @@ mkdir -p "$out"
 nvidia-smi --query-gpu=name,driver_version,clocks.sm,clocks.mem --format=csv | tee "$out/machine.csv"
 [ -n "$built" ] || benchmarks/gpu_check.sh
 if [ -n "$sanitize" ]; then benchmarks/gpu_sanitize.sh 2>&1 | tee "$out/sanitizer.log"; fi
-for name in gpu_splat gpu_deformation gpu_training; do
+for name in gpu_splat gpu_eager gpu_deformation gpu_training; do
   echo "$name"
   "$python" "benchmarks/$name.py" | tee "$out/$name.jsonl"
 done

@@ -24,8 +24,13 @@ HEADER = """# Third-party licences
 The packages that `requirements.lock` installs on Linux with Python {python}, and the licence that each states. Written by
 `deploy/third_party_licences.py`. None of them is part of this repository.
 
-OpenCV's wheel carries FFmpeg's libraries, which are under the LGPL 2.1. NVIDIA's packages come with torch. `make cuda` also installs
-NVIDIA's compiler (`requirements-cuda.lock`), under NVIDIA's own licence; the kernels that it builds contain CUDA's static runtime.
+OpenCV's wheel carries FFmpeg's libraries, which are under the LGPL 2.1. PyAV (`av`) is under the BSD licence; its wheel carries
+FFmpeg's libraries, which state LGPL 3 or later, and beside them x264 and x265, which are under the GPL 2 or later. IntraSplat uses
+of them FFmpeg's demuxers, muxer and decoders, libvpx and dav1d (both BSD). It does not use x264 and x265 (its tests do), but whoever
+passes the wheel on, in a container image for example, passes them on too. Without them: build PyAV against an FFmpeg of your own.
+
+NVIDIA's packages come with torch. `make cuda` also installs NVIDIA's compiler (`requirements-cuda.lock`), under NVIDIA's own licence;
+the kernels that it builds contain CUDA's static runtime.
 
 | package | version | licence |
 |---|---|---|

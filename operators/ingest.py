@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.scene.frames import Frame
+from gsplat_core.io.recordings.decoded import DamagedFrames
+from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
 from operators.sources.source import FrameSource, SourceDescription, SourceState
+
+log = logging.getLogger(__name__)
 
 LOOK_S = 0.1
 """How often a source that waits for its next frame asks whether it is to stop."""
@@ -27,6 +31,8 @@ class SourceResult:
     """How many frames entered the graph."""
     reached_end: bool
     """Whether the source gave all that it had; False when the run ended before."""
+    damaged: int = 0
+    """How many of the frames were damaged: shown, but neither trained on nor scored."""
 
 
 class SourceOp(Operator):
@@ -52,6 +58,8 @@ class SourceOp(Operator):
         self.stop_requested = stop_requested
         self.emitted = 0
         self.reached_end = False
+        self.damaged = DamagedFrames()
+        """Those of the emitted frames that are damaged."""
         self._last_seq: int | None = None
         super().__init__(fragment, *args, **kwargs)
 
@@ -60,10 +68,13 @@ class SourceOp(Operator):
 
     def start(self) -> None:
         self.emitted, self.reached_end, self._last_seq = 0, False, None
+        self.damaged = DamagedFrames()
         self.source.open()
 
     def stop(self) -> None:
         self.source.close()
+        if self.damaged.count:
+            log.warning("%s", self.damaged.sentence(self.emitted))
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         frame = self._next()
@@ -72,6 +83,8 @@ class SourceOp(Operator):
         if self._last_seq is not None and frame.seq <= self._last_seq:
             raise InvalidInput(f"frame {frame.seq} came after frame {self._last_seq}; a source's numbers must increase")
         self._last_seq = frame.seq
+        if frame.status is FrameStatus.DAMAGED:
+            self.damaged.add(frame.seq)
         self.metadata["seq"] = frame.seq
         self.metadata["pts_ns"] = frame.pts_ns
         op_output.emit(frame, "frame")
@@ -82,7 +95,9 @@ class SourceOp(Operator):
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
-        outcome.add(SourceResult(self.source.description, self.emitted, self.reached_end))
+        outcome.add(SourceResult(self.source.description, self.emitted, self.reached_end, self.damaged.count))
+        if self.damaged.count:
+            outcome.note(self.damaged.sentence(self.emitted))
 
     def _next(self) -> Frame | None:
         """The next frame; None when there is none yet, or none any more."""

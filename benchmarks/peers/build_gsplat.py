@@ -1,8 +1,11 @@
-"""Compiles gsplat out of its PyPI wheel for the GPU at hand, to be timed beside this project (`benchmarks/gpu_*.py`).
+"""Compiles gsplat out of its PyPI wheel, or out of a source archive, for the GPU at hand, to be timed beside this project.
 
     python -m pip download gsplat==1.5.3 --no-deps --only-binary :all: --dest build/peers
     python benchmarks/peers/build_gsplat.py build/peers/gsplat-1.5.3-py3-none-any.whl build/peers
-    PYTHONPATH=build/peers python benchmarks/gpu_splat.py
+    PYTHONPATH=build/peers python benchmarks/gpu_eager.py
+
+1.5.3 is the newest version on PyPI (November 2026); a later one is taken as gsplat-VERSION.tar.gz in the wheel's place. For a GPU machine
+without a network, put the archive into build/peers, which git ignores, and carry that folder there.
 
 Needs nvcc, ninja, a torch with CUDA, and jaxtyping and rich, which gsplat imports. The sources and the flags (-O3 -use_fast_math)
 are the wheel's; only where the result lies differs from gsplat's own compilation when it is first used: beside its Python files,
@@ -14,8 +17,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import subprocess
 import sys
+import tarfile
+import tempfile
 import time
 import zipfile
 from pathlib import Path
@@ -23,7 +29,7 @@ from pathlib import Path
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("wheel", type=Path, help="gsplat-1.5.3-py3-none-any.whl")
+    parser.add_argument("wheel", type=Path, help="gsplat-1.5.3-py3-none-any.whl, or gsplat-VERSION.tar.gz")
     parser.add_argument("folder", type=Path, help="where the package is unpacked and built")
     options = parser.parse_args()
     start = time.perf_counter()
@@ -36,12 +42,23 @@ def main() -> None:
     print(f"built in {time.perf_counter() - start:.0f} s")
 
 
+def unpack(archive: Path, folder: Path) -> None:
+    """Put the package `gsplat` of a wheel or a source archive into `folder`."""
+    if archive.suffix == ".whl":
+        zipfile.ZipFile(archive).extractall(folder)
+        return
+    with tarfile.open(archive) as files, tempfile.TemporaryDirectory(dir=folder) as unpacked:
+        files.extractall(unpacked, filter="data")
+        (package,) = Path(unpacked).glob("*/gsplat")
+        shutil.move(package, folder / "gsplat")
+
+
 def build(wheel: Path, folder: Path) -> None:
     """Unpack the wheel into `folder` and compile its extension to `gsplat/csrc.so` there."""
     from torch.utils.cpp_extension import load
 
     if not (folder / "gsplat").exists():
-        zipfile.ZipFile(wheel).extractall(folder)
+        unpack(wheel, folder)
     os.environ.setdefault("MAX_JOBS", str(os.cpu_count() or 1))
     cuda, objects = folder / "gsplat" / "cuda", folder / "objects"
     objects.mkdir(exist_ok=True)

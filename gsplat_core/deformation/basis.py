@@ -99,8 +99,8 @@ class BasisField(DeformationField):
         """The Gaussians with `deltas` [N, 13] added; differentiable in both."""
         if gaussians.count != deltas.shape[0]:
             raise InvalidInput(
-                f"the field holds bumps for {deltas.shape[0]} Gaussians, got {gaussians.count}; keep them in step with"
-                " select and append"
+                f"the field holds bumps for {deltas.shape[0]} Gaussians, got {gaussians.count}; call"
+                " select or append when Gaussians are removed or added"
             )
         position, rotation, log_scale, colour = torch.split(deltas, [width_of(group) for group in BASIS_GROUPS], dim=1)
         sh = gaussians.sh
@@ -173,7 +173,7 @@ class BasisField(DeformationField):
     def training_tensors(self) -> tuple[Tensor, ...]:
         """Everything that `adam_step_at` changes: parameters, both moments of each, updates per bump. Made where they are not yet.
 
-        A recorded CUDA graph is good as long as these are the same tensors.
+        A captured CUDA graph is valid as long as these are the same tensors.
         """
         moments = self._moments_in_use()
         return *(p.data for p in self._parameters_in_order()), *moments.first, *moments.second, moments.steps

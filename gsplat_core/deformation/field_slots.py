@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 import torch
+from torch import Tensor
 
 from gsplat_core.deformation.basis_columns import INERT, INERT_CENTER, bump_capacity
 
@@ -34,6 +35,11 @@ class FieldSlot(Protocol):
         """The field as it was written last, of its own size and in memory of its own."""
 
 
+def copy_each(to: list[Tensor], values: list[Tensor]) -> None:
+    """Copy every tensor into the one at its place: one call, and as few launches as torch can make of it."""
+    torch._foreach_copy_(to, values, non_blocking=True)
+
+
 class WholeFieldSlot:
     """For a field without tensors per Gaussian: its tensors never change their shapes."""
 
@@ -46,8 +52,7 @@ class WholeFieldSlot:
         mine, theirs = self.field.state_dict(keep_vars=True), source.state_dict(keep_vars=True)
         if {name: t.shape for name, t in mine.items()} != {name: t.shape for name, t in theirs.items()}:
             return False
-        for name, tensor in mine.items():
-            tensor.data.copy_(theirs[name].data)
+        copy_each([tensor.data for tensor in mine.values()], [theirs[name].data for name in mine])
         self.field._time_window_s = source.time_window_s
         return True
 
@@ -65,6 +70,7 @@ class BasisSlot:
         self.field.requires_grad_(False)
         self.field.centers.data.fill_(INERT_CENTER)
         self._used = 0, 0
+        self._in_use: list[Tensor] = [tensor.data[:0, :0] for tensor in self.field.parameters()]
 
     @property
     def parameter_count(self) -> int:
@@ -79,10 +85,17 @@ class BasisSlot:
         count, bumps = source.count, source.bumps
         if count > self.field.count or bumps > self.field.bumps:
             return False
-        mine = (self.field.centers.data, self.field.log_widths.data, self.field.weights.data)
+        if self._used != (count, bumps):
+            self._use(count, bumps)
         theirs = (source.centers.data, source.log_widths.data, source.weights.data)
-        for to, values in zip(mine, theirs, strict=True):
-            to[:count, :bumps].copy_(values[:, :bumps])
+        copy_each(self._in_use, [values[:, :bumps] for values in theirs])
+        for name in ("_time_window_s", "_origin_s", "_spacing_s"):
+            setattr(self.field, name, getattr(source, name))
+        return True
+
+    def _use(self, count: int, bumps: int) -> None:
+        """Choose the part of every tensor that is written, and make inert what an earlier state had used beyond it."""
+        mine = (self.field.centers.data, self.field.log_widths.data, self.field.weights.data)
         rows, columns = self._used
         for to, inert in zip(mine, INERT, strict=True):
             if rows > count:
@@ -90,9 +103,7 @@ class BasisSlot:
             if columns > bumps:
                 to[:, bumps:columns].fill_(inert)
         self._used = count, bumps
-        for name in ("_time_window_s", "_origin_s", "_spacing_s"):
-            setattr(self.field, name, getattr(source, name))
-        return True
+        self._in_use = [to[:count, :bumps] for to in mine]
 
     def exact_copy(self) -> DeformationField:
         """A field of as many Gaussians and bumps as are in use."""

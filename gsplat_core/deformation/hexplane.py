@@ -20,8 +20,8 @@ from gsplat_core.deformation.field_slots import WholeFieldSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane import hexplane as compiled
 from gsplat_core.ops.hexplane import plain_torch
-from gsplat_core.ops.hexplane.deltas import hexplane_deltas, takes_layers
 from gsplat_core.ops.hexplane.plain_torch import PLANE_AXES
+from gsplat_core.ops.hexplane_deltas.hexplane_deltas import hexplane_deltas, takes_layers
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import HEAD_COLUMNS, HEAD_GROUPS, width_of
 

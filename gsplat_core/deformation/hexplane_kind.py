@@ -8,7 +8,7 @@ from gsplat_core.deformation.hexplane import HexPlaneField
 from gsplat_core.deformation.hexplane_training import HexPlaneTraining
 from gsplat_core.deformation.kind import FieldKind
 from gsplat_core.deformation.rates import FieldRates
-from gsplat_core.ops.hexplane.deltas import takes_layers
+from gsplat_core.ops.hexplane_deltas.hexplane_deltas import takes_layers
 from gsplat_core.value_ranges import IntegerIn, ListOf
 
 

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from gsplat_core.deformation.hexplane import HexPlaneField
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.hexplane.deltas import takes_layers
-from gsplat_core.ops.hexplane.training import (
+from gsplat_core.ops.hexplane_deltas.hexplane_deltas import takes_layers
+from gsplat_core.ops.hexplane_training.hexplane_training import (
+    AdamOnDevice,
     FieldGradient,
     TrainingState,
     hexplane_planes_adam_,
@@ -92,16 +93,12 @@ class HexPlaneTraining:
             time: as for `deltas`.
             rates: float32 [2], of the planes and of the network.
             step: int64 [1], counts from 1.
-            status: int32 [4] of the frame; where status[2] is not 0 its lists were cut, and nothing but `v_raw` is changed.
+            status: int32 [4] of the frame; if its lists overflowed, nothing but `v_raw` is changed.
         """
         gradient = self.gradient(v_raw)
-        betas, epsilon = self._betas, self._epsilon
-        hexplane_planes_adam_(
-            self._planes, self._first, self._second, time, gradient, rates[:1], step,
-            status=status, betas=betas, epsilon=epsilon,
-        )  # fmt: skip
-        network_adam_(
-            self._network, gradient.network, self._network_first, self._network_second, rates[1:], step,
-            status=status, betas=betas, epsilon=epsilon,
-        )  # fmt: skip
+        of_planes, of_network = (
+            AdamOnDevice(rate, step, status, self._betas, self._epsilon) for rate in (rates[:1], rates[1:])
+        )
+        hexplane_planes_adam_(self._planes, self._first, self._second, time, gradient, of_planes)
+        network_adam_(self._network, gradient.network, self._network_first, self._network_second, of_network)
         self._state = None

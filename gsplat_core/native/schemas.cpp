@@ -71,6 +71,15 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
       "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 
+  // The whole of `rasterization()`, CUDA only: gsplat_core/ops/rasterization/rasterization.py names what is in the lists.
+  m.def("rasterize(Tensor?[] inputs, int[] image_dims, int[] options, float[] ranges, bool training) -> Tensor[]");
+  m.def(
+      "rasterize_splats_backward(Tensor?[] saved, Tensor? v_image, Tensor? v_alphas, int[] image_dims, int[] options, "
+      "float[] ranges) -> (Tensor v_records, Tensor v_means2d, Tensor v_absolute)");
+  m.def(
+      "rasterize_inputs_backward(Tensor?[] inputs, Tensor radii, Tensor? row_of, Tensor?[] gradients, int[] image_dims, "
+      "int[] options, float[] ranges, bool[] needs) -> Tensor[]");
+
   // One frame from raw Gaussians (CUDA only): image [H, W, 4] with depth, and what its gradient needs. gaussians: means, quats,
   // log_scales, logit_opacities, sh. mode: 0 tile lists in one buffer, 1 the same for training, 2 a segment per tile.
   m.def(
@@ -87,7 +96,8 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // The same and one Adam step of the Gaussians, in place; rates [5] and step [1] are read on the device, rows that were left
   // unchanged are added to skipped [5]. v_raw is empty if not asked for.
   m.def(
-      "render_frame_backward_adam_(Tensor(a!)[] gaussians, Tensor(b!)[] first_moments, Tensor(c!)[] second_moments, Tensor rates, "
+      "render_frame_backward_adam_(Tensor(a!)[] gaussians, Tensor(b!)[] first_moments, Tensor(c!)[] second_moments, Tensor "
+      "rates, "
       "Tensor step, Tensor(d!) skipped, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, Tensor[] forward, "
       "Tensor v_image, Tensor? v_alphas, float eps2d, int camera_model, float beta1, float beta2, float epsilon, bool needs_raw, "
       "bool deterministic) -> Tensor v_raw");
@@ -139,21 +149,20 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "hexplane_deltas(Tensor[] spaces, Tensor coordinates, Tensor? order, Tensor time, Tensor[] time_planes, Tensor[] weights, "
       "Tensor[] biases) -> Tensor");
-  // Training of the whole field without autograd, CUDA only: gsplat_core/ops/hexplane/training.py says what passes between them.
+  // Training of the whole field without autograd, CUDA only; ops/hexplane_training/hexplane_training.py describes what is passed
+  // between them: state is what hexplane_train returns after the deltas, gradient what its backward pass returns after the
+  // network's, and starts.
   m.def(
       "hexplane_train(Tensor means, Tensor box, Tensor time, Tensor[] planes, Tensor[] weights, Tensor[] biases) -> "
       "(Tensor deltas, Tensor coordinates, Tensor lines, Tensor features, Tensor hidden, Tensor order, Tensor starts)");
   m.def(
-      "hexplane_train_backward(Tensor(a!) v_raw, Tensor box, Tensor coordinates, Tensor lines, Tensor features, Tensor hidden, "
-      "Tensor order, Tensor starts, Tensor[] planes, Tensor[] weights, Tensor[] biases) -> "
-      "(Tensor network, Tensor rows, Tensor shares, Tensor crowds, Tensor v_lines)");
+      "hexplane_train_backward(Tensor(a!) v_raw, Tensor box, Tensor[] state, Tensor[] planes, Tensor[] weights, "
+      "Tensor[] biases) -> (Tensor network, Tensor rows, Tensor fractions, Tensor dense_sums, Tensor v_lines)");
+  m.def("hexplane_planes_gradient(Tensor time, Tensor[] gradient, Tensor[] planes) -> Tensor[]");
   m.def(
-      "hexplane_planes_gradient(Tensor time, Tensor rows, Tensor shares, Tensor crowds, Tensor starts, "
-      "Tensor v_lines, Tensor[] planes) -> Tensor[]");
-  m.def(
-      "hexplane_planes_adam_(Tensor(a!)[] planes, Tensor(b!)[] first, Tensor(c!)[] second, Tensor time, Tensor rows, Tensor "
-      "shares, Tensor crowds, Tensor starts, Tensor v_lines, Tensor rate, Tensor step, Tensor? status, "
-      "float beta1, float beta2, float epsilon, float smoothness, float time_smoothness, float sparsity) -> ()");
+      "hexplane_planes_adam_(Tensor(a!)[] planes, Tensor(b!)[] first, Tensor(c!)[] second, Tensor time, Tensor[] gradient, "
+      "Tensor rate, Tensor step, Tensor? status, float beta1, float beta2, float epsilon, float smoothness, "
+      "float time_smoothness, float sparsity) -> ()");
   m.def(
       "network_adam_(Tensor(a!)[] parameters, Tensor gradient, Tensor(b!) first, Tensor(c!) second, Tensor rate, Tensor step, "
       "Tensor? status, float beta1, float beta2, float epsilon) -> ()");

@@ -20,7 +20,7 @@
 
 namespace gsplat {
 
-// What torch says about a call of its C interface that has failed, without its own backtrace; torch tells it from 2.13 on.
+// What torch says about a call of its C interface that has failed, without a backtrace; torch has a message from 2.13 on.
 [[noreturn]] __attribute__((noinline, cold)) inline void torch_call_failed(const char* call) {
   using What = const char* (*)();
   const auto what = reinterpret_cast<What>(dlsym(RTLD_DEFAULT, "torch_exception_get_what_without_backtrace"));

@@ -69,7 +69,6 @@ def bin_splats_within(
 rasterization = Operations(
     fully_fused_projection=fully_fused_projection,
     spherical_harmonics=spherical_harmonics,
-    isect_tiles=isect_tiles,
     bin_splats=bin_splats,
     rasterize_to_pixels=rasterize_to_pixels,
 ).rasterization

@@ -1,24 +1,25 @@
-"""The way from Gaussians to images, for any implementation of the operations it is built from."""
+"""`rasterization` with gsplat's arguments and results, for any implementation of the operations it is built from."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, pack
-from gsplat_core.rendering.meta import Deferred, Meta
+from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection
+from gsplat_core.rendering.chain import Geometry, RenderedSplats, StepOperations, isect_ids_of, render_splats
 from gsplat_core.rendering.settings import (
     EPS2D,
     FAR_PLANE,
     NEAR_PLANE,
     TILE_SIZE,
+    Arguments,
     RasterizeMode,
     RenderMode,
     RenderSettings,
@@ -26,21 +27,19 @@ from gsplat_core.rendering.settings import (
 )
 from gsplat_core.rendering.view_colors import view_colors
 
-Rasterized = tuple[Tensor, Tensor, Meta]
-"""Colours [..., C, H, W, X], alphas [..., C, H, W, 1] and what was computed on the way."""
+if TYPE_CHECKING:
+    from gsplat_core.ops.rasterization.rasterization import Rasterized
+
+Meta = dict[str, Any]
+"""What was computed on the way, under gsplat's names."""
 
 
 @dataclass(frozen=True)
-class Operations:
-    """One implementation of the operations, under gsplat's names and signatures, and `rasterization` built from them."""
+class Operations(StepOperations):
+    """`rasterization` built from one implementation of the steps."""
 
-    fully_fused_projection: Callable[..., Any]
-    spherical_harmonics: Callable[..., Tensor]
-    isect_tiles: Callable[..., tuple[Tensor, Tensor, Tensor]]
-    bin_splats: Callable[..., tuple[Tensor, Tensor, Tensor]]
-    rasterize_to_pixels: Callable[..., tuple[Tensor, Tensor]]
-    passes_no_zeros_on: bool = False
-    """On CUDA a gradient of zero stays zero in the backward operations, whatever it would be multiplied with."""
+    in_one_call: Callable[[Arguments, RenderSettings], Rasterized | None] | None = None
+    """Renders in one native call, or returns None for arguments that it does not take."""
 
     def rasterization(
         self,
@@ -58,7 +57,6 @@ class Operations:
         radius_clip: float = 0.0,
         eps2d: float = EPS2D,
         sh_degree: int | None = None,
-        *,
         packed: bool = True,
         tile_size: int | None = TILE_SIZE,
         backgrounds: Tensor | None = None,
@@ -79,8 +77,11 @@ class Operations:
         ftheta_coeffs: Any = None,
         rolling_shutter: Any = None,
         viewmats_rs: Tensor | None = None,
-    ) -> Rasterized:
-        """Render 3D Gaussians (Kerbl et al. 2023) with gsplat 1.5.3's arguments and results.
+    ) -> tuple[Tensor, Tensor, Meta]:
+        """Render 3D Gaussians (Kerbl et al. 2023) with gsplat 1.5.3's arguments, in its order, and its results.
+
+        Constants are those of gsplat 1.6, here and in all operations: alpha is at most 0.99, and the compensation for
+        antialiasing at least 0.005. gsplat 1.5.3 has 0.999 and 0; that is not offered.
 
         Shapes; `...` are any batch dimensions, the same everywhere:
             means [..., N, 3]; quats [..., N, 4] wxyz, of any length but zero; scales [..., N, 3]; opacities [..., N];
@@ -104,8 +105,11 @@ class Operations:
             covars: [..., N, 3, 3] in place of quats and scales.
             channel_chunk, segmented: accepted and without effect; neither changes the result.
 
+        On CUDA one native call per pass renders tiles of 16 px and spherical harmonics or up to 3 plain colours; the rest goes
+        through the chain of operations. Either way the host waits once, for the length of the tiles' lists.
+
         Returns:
-            render_colors [..., C, H, W, X], render_alphas [..., C, H, W, 1] and `meta` with batch_ids, camera_ids and
+            render_colors [..., C, H, W, X], render_alphas [..., C, H, W, 1] and `meta`, a dict with batch_ids, camera_ids and
             gaussian_ids (None unless packed), radii, means2d (call retain_grad() on it to see its gradient), depths,
             conics, opacities, tile_width, tile_height, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets, width,
             height, tile_size, n_batches and n_cameras.
@@ -127,97 +131,87 @@ class Operations:
             sh_degree=sh_degree, packed=packed, tile_size=TILE_SIZE if tile_size is None else tile_size,
             render_mode=render_mode, absgrad=absgrad, rasterize_mode=rasterize_mode, camera_model=camera_model,
         )  # fmt: skip
-        return _rasterize(self, means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, settings)
+        arguments = Arguments(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
+        rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
+        if rendered is not None:
+            return _named_as_in_gsplat(rendered, arguments, settings)
+        image, splats = _step_by_step(self, arguments, settings)
+        ids = splats.rows[:3] if isinstance(splats.rows, PackedProjection) else (None, None, None)
+        keys = isect_ids_of(splats.flatten_ids, splats.isect_offsets, splats.rows.depths, math.prod(settings.tile_grid))
+        meta = _meta(splats, splats.rows, ids, splats.opacities, keys, settings, viewmats.shape[:-2])
+        return image, splats.alphas, meta
+
+    def pictures(self, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor]:
+        """The colours and alphas of `rasterization`, without what it computes for `meta` alone."""
+        rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
+        if rendered is not None:
+            return rendered.image, rendered.alphas
+        image, splats = _step_by_step(self, arguments, settings)
+        return image, splats.alphas
 
 
-def _rasterize(
-    ops: Operations,
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    backgrounds: Tensor | None,
-    covars: Tensor | None,
-    settings: RenderSettings,
-) -> Rasterized:
-    """Project, colour, sort and blend; shapes and errors as in `Operations.rasterization`."""
-    width, height = settings.width, settings.height
-    batch_dims, n_cameras, n_gaussians = _check_shapes(means, opacities, colors, viewmats, backgrounds, settings)
+def _named_as_in_gsplat(out: Rasterized, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor, Meta]:
+    opacities, dims = out.opacities, arguments.viewmats.shape[:-2]
+    if not settings.packed and settings.rasterize_mode == "classic":
+        opacities = arguments.opacities[..., None, :]
+        if dims[-1] != 1:
+            opacities = opacities.expand(*dims, -1)
+    meta = _meta(out, out, (out.batch_ids, out.camera_ids, out.gaussian_ids), opacities, out.isect_ids, settings, dims)
+    return out.image, out.alphas, meta
+
+
+def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, RenderedSplats]:
+    """Colours and depth [..., C, H, W, X], and what was computed on the way."""
+    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars = arguments
+    batch_dims, n_gaussians = _check_shapes(means, opacities, colors, viewmats, backgrounds, settings)
     if covars is not None:
         require_shape("covars", covars, (*batch_dims, n_gaussians, 3, 3), "[..., N, 3, 3]")
         # Not by an index of lists: on CUDA the host would wait until they are on the device.
         covars = torch.stack([covars[..., i, j] for i in range(3) for j in range(i, 3)], -1)
         quats = scales = None
-    dense: DenseProjection = ops.fully_fused_projection(
-        means, covars, quats, scales, viewmats, Ks, width, height,
-        eps2d=settings.eps2d, near_plane=settings.near_plane, far_plane=settings.far_plane,
-        radius_clip=settings.radius_clip, calc_compensations=settings.rasterize_mode == "antialiased",
-        camera_model=settings.camera_model, opacities=opacities,
-    )  # fmt: skip
-    channels = None
+    coloring = None
     if settings.has_colors:
-        channels, dense = view_colors(ops, means, colors, viewmats, dense, settings)
-    opacities = opacities[..., None, :].expand(*batch_dims, n_cameras, n_gaussians)
-
-    rows: DenseProjection | PackedProjection = dense
-    ids: dict[str, Tensor | None] = dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
-    tiling: dict[str, Any] = {}
-    if settings.packed:
-        rows = pack(dense)
-        ids = {name: getattr(rows, name) for name in ids}
-        image_ids = rows.batch_ids * n_cameras + rows.camera_ids
-        n_images = math.prod(batch_dims) * n_cameras
-        tiling = {"packed": True, "n_images": n_images, "image_ids": image_ids}
-        picked = image_ids * n_gaussians + rows.gaussian_ids
-        opacities = opacities.reshape(-1)[picked]
-        channels = None if channels is None else channels.reshape(-1, channels.shape[-1])[picked]
-    if rows.compensations is not None:
-        opacities = opacities * rows.compensations
-    if settings.has_depth:
-        depth = rows.depths[..., None]
-        channels = depth if channels is None else torch.cat([channels, depth], -1)
-        if backgrounds is not None:
-            zeros = backgrounds.new_zeros(*backgrounds.shape[:-1], 1)
-            backgrounds = torch.cat([backgrounds, zeros], -1) if settings.has_colors else zeros
-    assert channels is not None
-
-    tile_size = settings.tile_size
-    tile_width, tile_height = -(-width // tile_size), -(-height // tile_size)
-    grid = (tile_size, tile_width, tile_height)
-    splats = (rows.means2d, rows.radii, rows.depths)
-    exact = {"conics": rows.conics, "opacities": opacities}
-    tiles_per_gauss, flatten_ids, isect_offsets = ops.bin_splats(*splats, *grid, **exact, **tiling)
-    isect_offsets = isect_offsets.reshape(*batch_dims, n_cameras, tile_height, tile_width)
-    render_colors, render_alphas = ops.rasterize_to_pixels(
-        rows.means2d, rows.conics, channels, opacities, width, height, tile_size, isect_offsets, flatten_ids,
-        backgrounds=backgrounds, packed=settings.packed, absgrad=settings.absgrad,
-    )  # fmt: skip
+        coloring = lambda dense: view_colors(ops, means, colors, viewmats, dense, settings)
+    geometry = Geometry(means, covars, quats, scales, opacities, viewmats, Ks)
+    splats = render_splats(ops, geometry, coloring, backgrounds, settings)
+    image = splats.image
     if settings.render_mode.endswith("ED"):
-        expected = render_colors[..., -1:] / render_alphas.clamp(min=1e-10)
-        render_colors = torch.cat([render_colors[..., :-1], expected], -1) if settings.has_colors else expected
-    meta = Meta(
-        **ids,
-        radii=rows.radii,
-        means2d=rows.means2d,
-        depths=rows.depths,
-        conics=rows.conics,
-        opacities=opacities,
-        tile_width=tile_width,
-        tile_height=tile_height,
-        tiles_per_gauss=tiles_per_gauss,
-        isect_ids=Deferred(lambda: ops.isect_tiles(*splats, *grid, **exact, **tiling)[1]),
-        flatten_ids=flatten_ids,
-        isect_offsets=isect_offsets,
-        width=width,
-        height=height,
-        tile_size=tile_size,
-        n_batches=math.prod(batch_dims),
-        n_cameras=n_cameras,
-    )
-    return render_colors, render_alphas, meta
+        expected = image[..., -1:] / splats.alphas.clamp(min=1e-10)
+        image = torch.cat([image[..., :-1], expected], -1) if settings.has_colors else expected
+    return image, splats
+
+
+def _meta(
+    splats: RenderedSplats | Rasterized,
+    rows: DenseProjection | PackedProjection | Rasterized,
+    ids: tuple[Tensor | None, ...],
+    opacities: Tensor,
+    isect_ids: Tensor,
+    settings: RenderSettings,
+    image_dims: torch.Size,
+) -> Meta:
+    tile_width, tile_height = settings.tile_grid
+    return {
+        "batch_ids": ids[0],
+        "camera_ids": ids[1],
+        "gaussian_ids": ids[2],
+        "radii": rows.radii,
+        "means2d": rows.means2d,
+        "depths": rows.depths,
+        "conics": rows.conics,
+        "opacities": opacities,
+        "tile_width": tile_width,
+        "tile_height": tile_height,
+        "tiles_per_gauss": splats.tiles_per_gauss,
+        "isect_ids": isect_ids,
+        "flatten_ids": splats.flatten_ids,
+        "isect_offsets": splats.isect_offsets,
+        "width": settings.width,
+        "height": settings.height,
+        "tile_size": settings.tile_size,
+        "n_batches": math.prod(image_dims[:-1]),
+        "n_cameras": image_dims[-1],
+    }
 
 
 def _check_shapes(
@@ -227,8 +221,8 @@ def _check_shapes(
     viewmats: Tensor,
     backgrounds: Tensor | None,
     settings: RenderSettings,
-) -> tuple[tuple[int, ...], int, int]:
-    """Batch dimensions, cameras and Gaussians; what the projection checks is left to it."""
+) -> tuple[tuple[int, ...], int]:
+    """Batch dimensions and number of Gaussians; what the projection checks is left to it."""
     if means.dim() < 2 or means.shape[-1] != 3:
         raise InvalidInput(f"means must be [..., N, 3], got {list(means.shape)}")
     if viewmats.dim() < 3:
@@ -247,4 +241,4 @@ def _check_shapes(
         depth_only = not settings.has_colors
         d = backgrounds.shape[-1] if depth_only else 3 if settings.sh_degree is not None else colors.shape[-1]
         require_shape("backgrounds", backgrounds, (*batch_dims, c, d), "[..., C, D]")
-    return batch_dims, c, n
+    return batch_dims, n

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -12,22 +13,26 @@ from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
 from gsplat_core.ops.frame.frame import STATUS_NEEDED, STATUS_OVERFLOW, View, render_frame
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
-from gsplat_core.ops.tiles.tiles import bin_splats, isect_tiles
+from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.rendering.pipeline import Operations
+from gsplat_core.rendering.settings import Arguments, RenderSettings
+from gsplat_core.rendering.single_call import rasterize_in_one_call
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.transfers import HostCopy
 
 __all__ = ["RenderOutput", "rasterization", "render"]
 
-rasterization = Operations(
+step_by_step = Operations(
     fully_fused_projection=fully_fused_projection,
     spherical_harmonics=spherical_harmonics,
-    isect_tiles=isect_tiles,
     bin_splats=bin_splats,
     rasterize_to_pixels=rasterize_to_pixels,
-    passes_no_zeros_on=True,
-).rasterization
+    zero_gradients_stay_zero=True,
+)
+"""The chain of compiled operations, on any device they run on."""
+_operations = replace(step_by_step, in_one_call=rasterize_in_one_call)
+rasterization = _operations.rasterization
 
 
 INSTANCES_PER_GAUSSIAN = 8
@@ -62,22 +67,18 @@ def render(gaussians: Gaussians, camera: Camera, background: Tensor | None = Non
     )
     if gaussians.device.type == "cuda" and gaussians.dtype == torch.float32 and not followed:
         return _render_frame(gaussians, camera, viewmat, intrinsics, background, depth)
-    colors, alphas, _ = rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        viewmat[None],
-        intrinsics[None],
-        camera.width_px,
-        camera.height_px,
-        sh_degree=gaussians.sh_degree,
-        packed=False,
-        backgrounds=None if background is None else background[None],
-        render_mode="RGB+ED" if depth else "RGB",
-        camera_model=camera.model,
-    )
+    settings = RenderSettings(
+        width=camera.width_px, height=camera.height_px, sh_degree=gaussians.sh_degree,
+        render_mode="RGB+ED" if depth else "RGB", camera_model=camera.model,
+    )  # fmt: skip
+    behind = None if background is None else background[None]
+    colors, alphas = _operations.pictures(
+        Arguments(
+            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, viewmat[None],
+            intrinsics[None], behind, None,
+        ),
+        settings,
+    )  # fmt: skip
     alpha = alphas[0, ..., 0]
     z = colors[0, ..., 3] if depth else alpha.new_zeros(alpha.shape)
     return RenderOutput(colors[0, ..., :3], alpha, z)

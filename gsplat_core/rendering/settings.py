@@ -1,9 +1,11 @@
-"""The options of `rasterization` that are no tensors, and which of gsplat's are refused."""
+"""The arguments of `rasterization`: its tensors, its options, and which of gsplat's are refused."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
+
+from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE
@@ -19,23 +21,37 @@ TILE_SIZE = 16
 """Default side of a tile in pixels."""
 
 
+class Arguments(NamedTuple):
+    """The tensors that `rasterization` was given, unchecked."""
+
+    means: Tensor
+    quats: Tensor | None
+    scales: Tensor | None
+    opacities: Tensor
+    colors: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    backgrounds: Tensor | None
+    covars: Tensor | None
+
+
 @dataclass(frozen=True)
 class RenderSettings:
     """What `rasterization` was asked for, beyond tensors; the checks that need no tensor are made here."""
 
     width: int
     height: int
-    near_plane: float
-    far_plane: float
-    radius_clip: float
-    eps2d: float
-    sh_degree: int | None
-    packed: bool
-    tile_size: int
-    render_mode: RenderMode
-    absgrad: bool
-    rasterize_mode: RasterizeMode
-    camera_model: str
+    near_plane: float = NEAR_PLANE
+    far_plane: float = FAR_PLANE
+    radius_clip: float = 0.0
+    eps2d: float = EPS2D
+    sh_degree: int | None = None
+    packed: bool = False
+    tile_size: int = TILE_SIZE
+    render_mode: RenderMode = "RGB"
+    absgrad: bool = False
+    rasterize_mode: RasterizeMode = "classic"
+    camera_model: str = "pinhole"
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -53,6 +69,11 @@ class RenderSettings:
     def has_colors(self) -> bool:
         """Whether colours are among the channels."""
         return self.render_mode.startswith("RGB")
+
+    @property
+    def tile_grid(self) -> tuple[int, int]:
+        """Tiles across and down."""
+        return -(-self.width // self.tile_size), -(-self.height // self.tile_size)
 
     @property
     def has_depth(self) -> bool:

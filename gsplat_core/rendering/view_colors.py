@@ -11,11 +11,11 @@ from gsplat_core.ops.projection.arguments import DenseProjection
 from gsplat_core.rendering.settings import RenderSettings
 
 if TYPE_CHECKING:
-    from gsplat_core.rendering.pipeline import Operations
+    from gsplat_core.rendering.chain import StepOperations
 
 
 def view_colors(
-    ops: Operations,
+    ops: StepOperations,
     means: Tensor,
     colors: Tensor,
     viewmats: Tensor,
@@ -44,7 +44,7 @@ def view_colors(
         return values if settings.sh_degree is None else (values + 0.5).clamp_min(0)
 
     values = evaluate(visible)  # looked at before they are clamped: minus infinity would be black
-    if values.is_cuda and ops.passes_no_zeros_on:
+    if values.is_cuda and ops.zero_gradients_stay_zero:
         finite = (values.detach() * 0).sum(-1) == 0  # 0 times a number is 0, unless it is a NaN or an infinity
         return shown(values), dense._replace(radii=dense.radii * finite.to(dense.radii.dtype)[..., None])
     # One cheap sum in the common case; it can only miss nothing, as a sum with a NaN or an infinity is not finite. A compiled

@@ -18,6 +18,8 @@ class FrameStatus(Enum):
     LIVE = "live"
     REPLAY = "replay"
     STALE = "stale"
+    DAMAGED = "damaged"
+    """Some of it may be the decoder's guess: it is shown, and neither trained on nor scored."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,8 @@ class Frame:
     pose: NDArray[np.float64] | None = None
     """World-to-camera [4, 4], OpenCV axes."""
     status: FrameStatus = FrameStatus.REPLAY
+    damage: str | None = None
+    """What is wrong with a damaged frame."""
 
     def __post_init__(self) -> None:
         image = self.image

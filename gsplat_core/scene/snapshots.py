@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField
-from gsplat_core.deformation.field_slots import FieldSlot
+from gsplat_core.deformation.field_slots import FieldSlot, copy_each
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
@@ -88,8 +88,7 @@ class SnapshotSlot:
         if self._count != count or not self._in_use:
             self._in_use = [tensor[:count] for tensor in self._gaussians.tensors().values()]
             self._count = count
-        for to, tensor in zip(self._in_use, gaussians.tensors().values(), strict=True):
-            to.copy_(tensor)
+        copy_each(self._in_use, [*gaussians.tensors().values()])
         return True
 
     def _replace(self, gaussians: Gaussians, field: DeformationField | None) -> None:

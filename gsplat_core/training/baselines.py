@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings.split import is_heldout
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.training.metrics import ScoredMean, psnr_tissue_db
 
 
@@ -68,7 +68,7 @@ def measure_baselines(recording: Iterable[Frame]) -> Baselines:
             if is_heldout(frame.seq):
                 heldout_previous.add(value)
                 pending = frame, before
-        if not is_heldout(frame.seq):
+        if not is_heldout(frame.seq) and frame.status is not FrameStatus.DAMAGED:
             train_mean.add(frame.image)
         before = frame
     mean_image = train_mean.image()

@@ -101,7 +101,7 @@ class Spending:
         self._in_flight = 0
 
     def planned(self) -> int:
-        """How many steps are still to come, at least 1: exactly, or as the time that is left lets expect."""
+        """How many steps are still to come, at least 1: exactly, or estimated from the time that is left."""
         budget = self._budget
         if budget.steps is not None:
             return max(1, budget.steps - self.made)
@@ -129,7 +129,7 @@ class Spending:
 
 
 class StepsInFlight:
-    """Counts the steps that are queued on a device and not finished, and lets no more than a few be."""
+    """Counts the steps that are queued on a device and not finished, and waits where there are more than a few."""
 
     def __init__(self, device: torch.device, most: int = MAX_IN_FLIGHT) -> None:
         self._device = device

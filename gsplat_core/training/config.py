@@ -51,7 +51,7 @@ class ReconstructorConfig:
     window_frames: int = 30
     """Recent frames that are trained on again, so that the model does not forget them."""
     jump_ratio: float = 1.8
-    """A new frame whose loss is this many times the usual one shows a jump (a cut, a pull) and gets extra steps."""
+    """A new frame whose loss is this many times the usual one shows a jump (a cut between shots, a sudden motion) and gets extra steps."""
     jump_extra: int = 4
     """Extra steps for a jump, in multiples of the frame's own."""
     bump_spacing_s: float = 0.2

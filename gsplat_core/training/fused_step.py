@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation.field_slots import copy_each
 from gsplat_core.deformation.kind import CapturedTraining
 from gsplat_core.ops.adam.adam import adam_step_at_
 from gsplat_core.ops.frame.frame import GAUSSIAN_TENSORS, FrameMode, View, accumulate_status_, render_frame
@@ -29,7 +30,7 @@ class FusedStep:
     field's window moved), the next step captures a new graph.
 
     A frame whose splats do not fit its lists changes nothing: the device sees it and leaves every parameter and moment alone. `settle`
-    notices, makes room and says how many steps were lost, which the owner then takes again.
+    notices, raises the capacity and returns how many steps had no effect, which the caller then takes again.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class FusedStep:
         self._mask = torch.ones(shape, dtype=torch.uint8, device=device)
         self._depth = torch.zeros(shape, device=device) if weights.depth > 0 else None
         self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + 1 + field.rates)
-        """With the rates of the Gaussians in the frame's pass, of the positions behind it, of the field."""
+        """Among them the learning rates: of the Gaussians in the frame's backward pass, of the positions after it, of the field."""
         self._step = torch.full((1,), adam.steps, dtype=torch.int64, device=device)
         self._skipped = torch.zeros(len(GAUSSIAN_TENSORS), dtype=torch.int64, device=device)
         self._totals = torch.zeros(4, dtype=torch.int32, device=device)
@@ -96,8 +97,7 @@ class FusedStep:
         if observation is self._taken:
             return
         self._taken = observation
-        self._image.copy_(observation.image, non_blocking=True)
-        self._mask.copy_(observation.mask, non_blocking=True)
+        copy_each([self._image, self._mask], [observation.image, observation.mask])
         if self._depth is not None:
             if observation.depth is None:
                 self._depth.zero_()  # unknown everywhere: the term is 0
@@ -165,7 +165,7 @@ class FusedStep:
 
     def _move(self, means: Tensor, gradient: Tensor, rate: Tensor, fits: Tensor) -> None:
         """Adam over the positions, whose gradient the field has completed."""
-        # Not a number where the frame was cut: Adam leaves such rows alone, moments and all.
+        # NaN where the frame did not fit its tile lists: Adam leaves such rows and their moments alone.
         complete = gradient[:, :3] / fits
         first, second = self._adam.first_moments["means"], self._adam.second_moments["means"]
         adam_step_at_(

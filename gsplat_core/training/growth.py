@@ -19,11 +19,11 @@ from gsplat_core.transfers import HostCopy
 
 
 def gaussians_for_uncovered_tissue(
-    frame: Frame, observation: Observation, current: Gaussians, config: ReconstructorConfig, room: int
+    frame: Frame, observation: Observation, current: Gaussians, config: ReconstructorConfig, most: int
 ) -> Gaussians | None:
     """Gaussians for the tissue pixels of `frame` that `current` (the model at the frame's time) leaves uncovered.
 
-    At most `room`, as dense as the first frame's. Their depth is measured where the frame has depth, else that of the nearest covered
+    At most `most`, as dense as the first frame's. Their depth is measured where the frame has depth, else that of the nearest covered
     pixel. None when there is nothing worth adding.
 
     They are on the device of `current`, which also looks for uncovered pixels; a frame that has few costs the host one number.
@@ -35,15 +35,15 @@ def gaussians_for_uncovered_tissue(
     height, width = frame.image.shape[:2]
     if not are_worth_filling(uncovered):
         return None
-    bare = HostCopy(uncovered).numpy()
+    is_uncovered = HostCopy(uncovered).numpy()
     spacing = math.sqrt(height * width / config.gaussians)
     columns = np.arange(spacing / 2, width, spacing)
     rows = np.arange(spacing / 2, height, spacing)
     grid = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
-    wanted = grid[bare[grid[:, 1].astype(np.int64), grid[:, 0].astype(np.int64)]]
+    wanted = grid[is_uncovered[grid[:, 1].astype(np.int64), grid[:, 0].astype(np.int64)]]
     if len(wanted) == 0:
         return None
-    wanted = wanted[:: math.ceil(len(wanted) / room)]
+    wanted = wanted[:: math.ceil(len(wanted) / most)]
     if frame.depth is None:
         covered = torch.where(output.alpha >= UNCOVERED_ALPHA, output.depth, 0)
         covered_mm = cv2.medianBlur(HostCopy(covered).numpy(), 5)

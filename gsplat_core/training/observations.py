@@ -18,7 +18,7 @@ from gsplat_core.transfers import tensor_of
 
 @dataclass(frozen=True)
 class Observation:
-    """One frame as the training step wants it, on the device that trains."""
+    """One frame in the types of the training step, on the device that trains."""
 
     seq: int
     time_s: float

@@ -15,7 +15,7 @@ class FusedAdam:
     """Adam (Kingma and Ba 2015) over named tensors, with a learning rate each, as torch.optim.Adam computes it.
 
     It holds the moments and not the parameters: those are passed to every step, so they may be replaced between steps as long as
-    their rows keep step with the moments (`select`, `append`).
+    their rows are those of the moments (`select`, `append`).
 
     A NaN or infinite gradient never reaches a parameter or a moment. With `rows=True` (Gaussians: dimension 0 counts them) it
     leaves its whole row of that tensor as it was, with `rows=False` (planes, weights) just its element; `skipped` counts them.
@@ -158,7 +158,7 @@ class FusedAdam:
                 moments[name] = fresh
 
     def reset(self, name: str, index: Tensor | None = None) -> None:
-        """Forget the moments of one tensor, or of some of its rows: after its values were set by hand (opacity reset, relocation)."""
+        """Forget the moments of one tensor, or of some of its rows: after its values were set otherwise (opacity reset, relocation)."""
         for moments in (self.first_moments, self.second_moments):
             if index is None:
                 moments[name].zero_()

@@ -8,7 +8,11 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.image_loss.image_loss import image_loss
-from gsplat_core.rendering.settings import EPS2D, FAR_PLANE, NEAR_PLANE, TILE_SIZE
+from gsplat_core.ops.projection.projection import fully_fused_projection
+from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
+from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.rendering.chain import Geometry, RenderedSplats, StepOperations, render_splats
+from gsplat_core.rendering.settings import EPS2D, RenderSettings
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.observations import Observation
@@ -22,70 +26,95 @@ class LossWeights:
     depth: float = 0.0
 
 
+@torch.no_grad()
 def loss_and_gradients(
     gaussians: Gaussians, observation: Observation, weights: LossWeights
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Loss [] against `observation`, and its gradient for each of the Gaussians' five raw tensors, by name.
 
-    The loss stays on the device: whoever wants the number waits for it. The same as `render`, `image_loss` and `backward()`, without building a graph: this is the inner loop of training.
+    The loss stays on the device: whoever wants the number waits for it. The same as `render`, `image_loss` and `backward()`,
+    without an autograd graph: this is the inner loop of training.
     """
-    ops = torch.ops.gsplat_core
     camera = observation.camera
-    width, height = camera.width_px, camera.height_px
-    model = CAMERA_MODELS.index(camera.model)
-    viewmat, intrinsics = (matrix[None, None] for matrix in camera.matrices(gaussians.device))
-    means, quats = gaussians.means[None], gaussians.quats[None]
+    viewmat, intrinsics = (matrix[None] for matrix in camera.matrices(gaussians.device))
     scales, opacities = gaussians.scales, gaussians.opacities
     use_depth = weights.depth > 0 and observation.depth is not None
-
-    means2d, depths, conics, _, radii = ops.project_gaussians(
-        means, None, quats, scales[None], opacities[None], viewmat, intrinsics,
-        width, height, EPS2D, NEAR_PLANE, FAR_PLANE, 0.0, False, model,
+    settings = RenderSettings(
+        width=camera.width_px, height=camera.height_px, sh_degree=gaussians.sh_degree,
+        render_mode="RGB+D" if use_depth else "RGB", camera_model=camera.model,
     )  # fmt: skip
-    radii, means2d, depths, conics = radii[0], means2d[0, 0], depths[0, 0], conics[0, 0]
+    geometry = Geometry(gaussians.means, None, gaussians.quats, scales, opacities, viewmat, intrinsics)
     unclamped, directions = _colours(gaussians, camera.position)
-    colours = unclamped.clamp(min=0)
-    channels = torch.cat([colours, depths[:, None]], 1) if use_depth else colours
-    columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
-    _, flatten_ids, offsets = ops.bin_splats(
-        means2d[None], radii, depths[None], conics[None], opacities[None], None, 1, TILE_SIZE, columns, rows
-    )
-    splats = (means2d, conics, channels, opacities, offsets, flatten_ids, None, None)
-    picture, alphas, last = ops.composite(*splats, None, width, height, TILE_SIZE)
+    splats = render_splats(_STEPS, geometry, lambda dense: (unclamped.clamp(min=0)[None], dense), None, settings)
 
-    image, alpha = picture[0, ..., :3].contiguous(), alphas[0].reshape(height, width)
-    expected = picture[0, ..., 3] / alpha.clamp(min=1e-10) if use_depth else None
-    result = image_loss(
-        image, observation.image, observation.mask, expected, observation.depth if use_depth else None,
-        weights.ssim, weights.depth,
-    )  # fmt: skip
-    v_picture, v_alphas = result.grad_image, torch.zeros_like(alphas)
-    if expected is not None:
-        v_depth = result.grad_depth / alpha.clamp(min=1e-10)
-        v_picture = torch.cat([v_picture, v_depth[..., None]], -1)
-        v_alphas = (-expected * v_depth).reshape(alphas.shape)
-    v_means2d, v_conics, v_channels, v_opacities, _, _ = ops.composite_backward(
-        *splats, width, height, TILE_SIZE, alphas, last, v_picture.reshape(picture.shape), v_alphas, False
-    )
+    loss, v_picture, v_alphas = _loss_of_picture(splats, observation, weights, use_depth)
+    v_means2d, v_conics, v_channels, v_opacities = _composite_backward(splats, v_picture, v_alphas, settings)
     v_depths = v_channels[:, 3].contiguous()[None, None] if use_depth else None
-    v_means, _, v_quats, v_scales, _ = ops.project_gaussians_backward(
-        means, None, quats, scales[None], viewmat, intrinsics, radii[None], v_means2d[None, None], v_depths,
-        v_conics[None, None], None, width, height, EPS2D, model, False,
+    v_means, _, v_quats, v_scales, _ = torch.ops.gsplat_core.project_gaussians_backward(
+        gaussians.means[None], None, gaussians.quats[None], scales[None], viewmat[None], intrinsics[None],
+        splats.rows.radii[None], v_means2d[None, None], v_depths, v_conics[None, None], None, settings.width,
+        settings.height, EPS2D, CAMERA_MODELS.index(camera.model), False,
     )  # fmt: skip
     v_colours = v_channels[:, :3] * (unclamped > 0)
     v_means, v_sh = v_means[0], v_colours[:, None] * SH_C0
     if directions is not None:
-        v_directions, v_sh = ops.spherical_harmonics_backward(
+        v_directions, v_sh = torch.ops.gsplat_core.spherical_harmonics_backward(
             gaussians.sh_degree, directions[None], gaussians.sh, None, v_colours.contiguous()[None], True
         )
         v_means = v_means + v_directions[0]
-    return result.loss, {
+    return loss, {
         "means": v_means,
         "quats": v_quats[0],
         "log_scales": v_scales[0] * scales,
         "logit_opacities": v_opacities * opacities * (1 - opacities),
         "sh": v_sh,
     }
+
+
+def _loss_of_picture(
+    splats: RenderedSplats, observation: Observation, weights: LossWeights, use_depth: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The loss, and its gradients for the blended channels [1, H, W, D] and alphas [1, H, W, 1]."""
+    picture, alphas = splats.image, splats.alphas
+    image, alpha = picture[0, ..., :3].contiguous(), alphas[0, ..., 0]
+    expected = picture[0, ..., 3] / alpha.clamp(min=1e-10) if use_depth else None
+    result = image_loss(
+        image, observation.image, observation.mask, expected, observation.depth if use_depth else None,
+        weights.ssim, weights.depth,
+    )  # fmt: skip
+    v_picture, v_alphas = result.grad_image, torch.zeros_like(alphas)
+    if expected is not None and result.grad_depth is not None:
+        v_depth = result.grad_depth / alpha.clamp(min=1e-10)
+        v_picture = torch.cat([v_picture, v_depth[..., None]], -1)
+        v_alphas = (-expected * v_depth).reshape(alphas.shape)
+    return result.loss, v_picture.reshape(picture.shape), v_alphas
+
+
+def _composite(
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int, tile_size: int,
+    isect_offsets: Tensor, flatten_ids: Tensor, **_: object,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """`rasterize_to_pixels` of one image, and what its gradient needs: the last splat of every pixel."""
+    splats = (means2d[0], conics[0], colors[0], opacities[0])
+    return torch.ops.gsplat_core.composite(
+        *splats, isect_offsets, flatten_ids, None, None, None, width, height, tile_size
+    )
+
+
+def _composite_backward(
+    splats: RenderedSplats, v_picture: Tensor, v_alphas: Tensor, settings: RenderSettings
+) -> tuple[Tensor, ...]:
+    """Gradients of the splats' means2d [N, 2], conics [N, 3], channels [N, D] and opacities [N]."""
+    blended = (splats.rows.means2d[0], splats.rows.conics[0], splats.channels[0], splats.opacities[0])
+    lists = (splats.isect_offsets, splats.flatten_ids)
+    size = (settings.width, settings.height, settings.tile_size)
+    (last,) = splats.rest
+    return torch.ops.gsplat_core.composite_backward(
+        *blended, *lists, None, None, *size, splats.alphas, last, v_picture, v_alphas, False
+    )[:4]
+
+
+_STEPS = StepOperations(fully_fused_projection, spherical_harmonics, bin_splats, _composite)
 
 
 def _colours(gaussians: Gaussians, position: object) -> tuple[Tensor, Tensor | None]:

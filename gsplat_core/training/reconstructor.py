@@ -80,13 +80,13 @@ class Reconstructor:
         self._step: TrainingStep | None = None
         self._coverage: CapturedCoverage | None = None
         self._unsettled: Observation | None = None
-        """The frame whose steps are queued and not yet known to have had room in the tile lists."""
+        """The frame whose steps are queued; whether their splats fitted the tile lists is not known yet."""
         self._in_flight = StepsInFlight(self.device)
         self._step_s: float | None = None
         """How long a step took lately, where budgets are timed."""
         self._version = 0
         self._slots = SnapshotSlots(self.device)
-        self._usual_surprise = math.inf
+        self._usual_first_loss = math.inf
         self._first_time_s = 0.0
         self._last_time_s = 0.0
 
@@ -140,22 +140,22 @@ class Reconstructor:
         assert self._step is not None
         spending = Spending(budget, self._step_s)
         plan: list[Observation] = [observation]
-        arriving: HostCopy | None = None
+        first_loss: HostCopy | None = None
         jump = False
         while spending.allows_step():
             if not plan:
                 if budget.is_timed and not jump:
-                    jump = self._is_jump(arriving, first)
+                    jump = self._is_jump(first_loss, first)
                 count = spending.planned()
                 plan = [observation] * count if jump else self._window.schedule(count)[::-1]
             loss = self._step(plan.pop())
-            arriving = arriving or HostCopy(loss)
+            first_loss = first_loss or HostCopy(loss)
             spending.step_made(self._in_flight.queued() if budget.is_timed else 0)
-        if arriving is None:
+        if first_loss is None:
             return ObserveReport(observation.seq, 0, None, self.gaussians, spending.ending)
         extra = 0
         # Asked for only now, so that a GPU need not be waited for before its queue is filled.
-        if not budget.is_timed and self._is_jump(arriving, first):
+        if not budget.is_timed and self._is_jump(first_loss, first):
             extra = spending.made * self.config.jump_extra
         for _ in range(extra):
             loss = self._step(observation)
@@ -165,11 +165,11 @@ class Reconstructor:
         if budget.is_timed:
             self._learn_step_time(spending)
         if not first:
-            self._learn_surprise(arriving.item())
+            self._learn_first_loss(first_loss.item())
         return ObserveReport(observation.seq, spending.made + extra, HostCopy(loss), self.gaussians, spending.ending)
 
     def _settle(self) -> None:
-        """Wait for the queued steps, and take again those that found no room in the tile lists.
+        """Wait for the queued steps, and take again those whose splats did not fit the tile lists.
 
         With a number of steps this is done when the next frame comes: until then the host prepares it while a GPU trains.
         """
@@ -177,13 +177,15 @@ class Reconstructor:
             self._step.settle(self._unsettled)
         self._unsettled = None
 
-    def _is_jump(self, arriving: HostCopy | None, first: bool) -> bool:
-        """Whether the loss with which a frame arrived shows a cut or a pull. Waits for it."""
-        return not first and arriving is not None and arriving.item() > self.config.jump_ratio * self._usual_surprise
+    def _is_jump(self, first_loss: HostCopy | None, first: bool) -> bool:
+        """Whether a frame's first loss shows a cut between shots or a sudden motion. Waits for it."""
+        return (
+            not first and first_loss is not None and first_loss.item() > self.config.jump_ratio * self._usual_first_loss
+        )
 
-    def _learn_surprise(self, surprise: float) -> None:
-        known = self._usual_surprise if self._usual_surprise < math.inf else surprise
-        self._usual_surprise = known + USUAL_DECAY * (min(surprise, self.config.jump_ratio * known) - known)
+    def _learn_first_loss(self, first_loss: float) -> None:
+        known = self._usual_first_loss if self._usual_first_loss < math.inf else first_loss
+        self._usual_first_loss = known + USUAL_DECAY * (min(first_loss, self.config.jump_ratio * known) - known)
 
     def _learn_step_time(self, spending: Spending) -> None:
         spending.all_finished()
@@ -283,13 +285,13 @@ class Reconstructor:
         """Add Gaussians where the frame shows tissue that the model does not cover."""
         assert self._step is not None
         step = self._step
-        room = self.config.max_gaussians - step.gaussians.count
-        if room <= 0:
+        most = self.config.max_gaussians - step.gaussians.count
+        if most <= 0:
             return
         if self._coverage is not None and not self._coverage.leaves_much_uncovered(
             step.gaussians, step.field, observation
         ):
             return
-        added = gaussians_for_uncovered_tissue(frame, observation, step.at(observation.time_s), self.config, room)
+        added = gaussians_for_uncovered_tissue(frame, observation, step.at(observation.time_s), self.config, most)
         if added is not None:
             step.append(added)

@@ -37,7 +37,7 @@ def check_device(device: str) -> None:
 def scheduler_for(device: str, app: Application) -> GreedyScheduler | MultiThreadScheduler:
     """How an application that keeps every frame runs beside `device`; the frames' bytes do not depend on it.
 
-    On the CPU the training keeps every core busy, and one thread goes round the operators. While a GPU trains, the host is free: decoding,
+    On the CPU the training keeps every core busy, and one thread runs all operators in turn. While a GPU trains, the host is free: decoding,
     scoring and video each have a thread of their own, and what they do for one frame overlaps with the training on the next ones.
     """
     return GreedyScheduler(app, clock=ManualClock()) if device == "cpu" else MultiThreadScheduler(app)

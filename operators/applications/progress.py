@@ -1,4 +1,4 @@
-"""What an application tells about its progress while it runs."""
+"""What an application reports about its progress while it runs."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import is_heldout
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.training.reconstructor import ObserveReport
 from operators.applications.delivery import Report, delivered
@@ -90,6 +90,10 @@ def reconstruct(
     return delivered(replace(settings, heldout=True), "reconstruct", run, report)
 
 
+def _trains(frame: Frame) -> bool:
+    return not is_heldout(frame.seq) and frame.status is not FrameStatus.DAMAGED
+
+
 def _fit(
     source: FrameSource,
     settings: ReplaySettings,
@@ -114,5 +118,5 @@ def _fit(
 
     frames = FirstFrames(source, description.frame_count)
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
-        learning.fit((frame for frame in frames if not is_heldout(frame.seq)), steps, after_step)
+        learning.fit((frame for frame in frames if _trains(frame)), steps, after_step)
     return learning.snapshot(), done

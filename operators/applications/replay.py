@@ -1,8 +1,10 @@
-"""Replay: a recording goes through the graph and comes out reconstructed, measured and viewable.
+"""Replay: a recording, or another source with an end, is reconstructed, shown and measured frame by frame.
 
     source → tool_mask → reconstruct → deform → rasterize → video
                                                           → metrics → keyframes
                                                                     → progress
+
+`video` and `keyframes` are the sinks that `ReplaySettings.sinks` names.
 
 Deterministic: each operator takes its frames in order and shares nothing with the others but messages, time comes from the recording, work
 per frame is a count, every edge blocks. The same recording, settings and device give the same `frames_sha256`, on either engine and with

@@ -39,7 +39,7 @@ class RealtimeClock:
 
 
 class ManualClock:
-    """Time that stands still while anything can compute and then jumps to the next appointment.
+    """Time that stands still while any operator can compute and then jumps to when the next one is due.
 
     An hour of a 30 Hz stream replays as fast as its operators compute, with the same result each time.
     """

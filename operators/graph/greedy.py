@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class GreedyScheduler:
-    """Goes round the operators in topological order; each computes once per round if it may.
+    """Runs in rounds: each operator, in topological order, computes once per round if it may.
 
     Everything happens in the thread that calls run(). The order of computes depends only on the graph and on what
     the operators do, so with a ManualClock a replay has the same result each time.

@@ -8,11 +8,11 @@ Hazards of the SDK (4.6) and what is done about them:
 - Its MultiThreadScheduler stops early at random: our threads map to its EventBasedScheduler, and a run that ends
   while an operator could go on raises EngineError.
 - `stop_execution` does not wake a graph that waits for an event: stopping goes through the gates.
-- The greedy scheduler sleeps through events until the next appointed time: appointments are kept short.
+- Its greedy scheduler sleeps through events until the next time at which an operator is due: no due time is more than 10 ms away.
 - Its schedulers give up before they have seen what a check or a thread just changed: they wait half a second first.
 - An exception in compute can end a run silently: none ever reaches the SDK.
 - It takes over SIGINT and SIGTERM, for good: the handlers are put back once it runs.
-- Its EventBasedScheduler starts an operator anew that it has just stopped, when it was looking at it in another thread, and fails:
+- Its EventBasedScheduler may check an operator in one thread while it stops it in another, starts it again, and fails:
   there a finished operator waits for ever, which does not keep the run from ending.
 - It checks an operator that computes: such a check decides nothing.
 - It drops without counting: edges keep the policy themselves, and the SDK's queues never overflow.
@@ -42,7 +42,7 @@ _Application: Any = _sdk.core.Application
 _PortCondition = _sdk.core.ConditionType
 _QUEUE = _sdk.core.IOSpec.ConnectorType.DOUBLE_BUFFER
 _STATUS = {status: getattr(_sdk.core.SchedulingStatusType, status.name) for status in SchedulingStatus}
-_APPOINTMENT_NS = 10_000_000
+_LONGEST_SLEEP_NS = 10_000_000
 _GIVE_UP_MS = 500
 
 
@@ -71,7 +71,7 @@ class Gate(_Condition):
             status = SchedulingStatus.WAIT
         elif status is SchedulingStatus.WAIT_TIME:
             manual = isinstance(self.scheduler.clock, ManualClock)
-            return _STATUS[status], timestamp + (due_ns - now_ns if manual else min(due_ns - now_ns, _APPOINTMENT_NS))
+            return _STATUS[status], timestamp + (due_ns - now_ns if manual else min(due_ns - now_ns, _LONGEST_SLEEP_NS))
         self.ready_at_ns = now_ns
         return _STATUS[status], None
 
@@ -94,7 +94,7 @@ class Gate(_Condition):
         if self.task.has_room():
             return True
         self.waits_for_room = True
-        return self.task.has_room()  # again: what was taken before this was noted is told to nobody
+        return self.task.has_room()  # again: a message taken before `waits_for_room` was set wakes no one
 
     def room_made(self) -> None:
         """Have the SDK check the operator again if it waits for room. The SDK does so by itself when it hands out a message, but

@@ -115,7 +115,7 @@ class MultiThreadScheduler:
 
     def _rouse(self, task: OperatorTask) -> None:
         """Wake one operator if it sleeps; under the lock."""
-        # Taken off the list here and not by its thread, so that nobody takes it for asleep before the thread runs.
+        # Removed here and not by its own thread: until that runs, `_check_deadlock` would count it as asleep.
         if self._asleep.pop(task, None) is not None:
             self._wakers[task].notify()
 

@@ -217,7 +217,7 @@ class OperatorTask:
         return status, due_ns
 
     def exhausted(self) -> bool:
-        """Whether the operator can do nothing more: told to stop, starved for good, or with nobody listening."""
+        """Whether the operator has nothing more to do: it was stopped, its inputs have ended, or all consumers of its outputs have."""
         if self.operator._finish:
             return True
         for queue, edge, need in self._needs:
@@ -236,7 +236,7 @@ class OperatorTask:
         return bool(self.out_edges)
 
     def finish(self) -> None:
-        """Be done: tell the neighbours through the edges."""
+        """Be done: mark the edges as ended, so that the operators at their other ends see it."""
         self.finished = True
         for edge in self.out_edges:
             edge.ended = True
@@ -244,7 +244,7 @@ class OperatorTask:
             edge.close()
 
     def waits_for(self, now_ns: int) -> str:
-        """In words, what keeps the operator from computing."""
+        """What keeps the operator from computing, for a message."""
         reasons = [
             f"condition {condition.name} ({status.name})"
             for condition in self.conditions

@@ -57,9 +57,14 @@ class Histogram:
         reached = 0
         for bucket, count in enumerate(counts):
             reached += count
-            while count and len(values) < len(fractions) and reached >= math.ceil(fractions[len(values)] * total):
+            while count and len(values) < len(fractions) and reached >= _rank(fractions[len(values)], total):
                 values.append(min(_bucket_end(bucket), max_ns) * 1e-6)
         return values + [0.0] * (len(fractions) - len(values))
+
+
+def _rank(fraction: float, total: int) -> int:
+    """How many of `total` values a share of them is, rounded up; 0.07 of 100 is 7, though its product in floats is a little more."""
+    return math.ceil(fraction * total - 1e-9 * total)
 
 
 def _bucket(value: int) -> int:
@@ -73,7 +78,7 @@ def _bucket_end(bucket: int) -> int:
 
 
 class PathNode:
-    """One operator on a path from a root; the nodes of all paths form a tree, so a path is one reference."""
+    """One operator on a path from a root; the nodes of all paths form a tree, so that a path is one reference."""
 
     __slots__ = ("_children", "latency", "names")
 

@@ -59,11 +59,12 @@ class VideoSinkOp(Operator):
             self._video = None
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        picture = side_by_side(op_input.receive("rendered"))
+        rendered: RenderedFrame = op_input.receive("rendered")
+        picture = side_by_side(rendered)
         if self._video is None:
             # The size is known with the first frame only.
             self._video = VideoFile(self.path, picture.shape[1], picture.shape[0], self.fps, self.reserve)
-        self._video.write(picture)
+        self._video.write(picture, rendered.frame.time_s)
         self.displayed += 1
 
     def contribute(self, outcome: OutcomeBuilder) -> None:

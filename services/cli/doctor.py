@@ -148,7 +148,7 @@ def _video() -> list[Check]:
     import tempfile
     from pathlib import Path
 
-    import cv2
+    import av
     import numpy as np
 
     from operators.errors import OutputError
@@ -159,7 +159,7 @@ def _video() -> list[Check]:
             video.write(np.zeros((48, 64, 3), np.uint8))
     except OutputError as error:
         return [Check("video", "cannot be written", False, str(error))]
-    return [Check("video", f"OpenCV {cv2.__version__} writes {CODEC}")]
+    return [Check("video", f"PyAV {av.__version__} writes {CODEC}")]
 
 
 def _holoscan() -> list[Check]:

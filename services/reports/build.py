@@ -143,5 +143,5 @@ def _quality(tracker: QualityTracker) -> Quality:
 
 
 def _ms(value: float) -> float:
-    """Milliseconds to the microsecond; the clock knows no more."""
+    """Milliseconds, rounded to microseconds: the resolution of the clock."""
     return round(value, 3)

@@ -1,4 +1,4 @@
-"""`report.html`: one page that needs nothing but itself."""
+"""`report.html`: one page that needs nothing but itself, and the video beside it for those who want to see it move."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from services.reports.sections import (
     quality_over_time_section,
     tiles_section,
 )
+from services.reports.video import video_section
 
-# Nothing may be fetched, whatever a later edit writes into the page.
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+# Nothing may be fetched but the video beside the page, whatever a later edit writes into it.
+_POLICY = "default-src 'none'; img-src data:; media-src 'self'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
 def write_html(
@@ -38,6 +39,7 @@ def render_html(report: RunReport, keyframes: Sequence[KeyframePictures], worst_
     recording, run = report.recording, report.run
     sections = [
         tiles_section(report),
+        video_section(report),
         pictures_section(keyframes, worst_seq, report),
         quality_over_time_section(report),
         f'<div class="two">{baselines_section(report)}{latency_section(report)}</div>',

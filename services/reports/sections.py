@@ -247,8 +247,9 @@ def operators_section(report: RunReport) -> str:
 def facts_section(report: RunReport) -> str:
     """What was run, on what."""
     recording, run, model = report.recording, report.run, report.model
+    length = "a stream without an end" if recording.frames is None else f"{recording.frames} frames"
     facts = {
-        "Recording": f"{'endless' if recording.frames is None else recording.frames} frames, {recording.width_px} x {recording.height_px} px, {recording.fps:g} fps",
+        "Recording": f"{length}, {recording.width_px} x {recording.height_px} px, {recording.fps:g} fps",
         "Device, engine": f"{run.device}, {run.engine}",
         "Threads": str(run.threads),
         "Seed": str(run.seed),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
+import pickle
 
 import pytest
 import torch
@@ -114,7 +115,33 @@ def test_meta_dense(scene):
     again = gsplat.isect_offset_encode(meta["isect_ids"], 2, 4, 3)
     torch.testing.assert_close(again, meta["isect_offsets"])
     assert len(meta["isect_ids"]) == len(meta["flatten_ids"]) == meta["tiles_per_gauss"].sum()
-    assert dict(meta)["isect_ids"] is meta["isect_ids"]
+    # image | tile | depth: as gsplat's own key, entry by entry.
+    tiles = torch.repeat_interleave(
+        torch.arange(24), torch.diff(meta["isect_offsets"].flatten(), append=torch.tensor([len(meta["isect_ids"])]))
+    )
+    bits = meta["depths"].flatten()[meta["flatten_ids"]].view(torch.int32).long()
+    assert torch.equal(meta["isect_ids"], (tiles // 12) << 36 | (tiles % 12) << 32 | bits)
+    assert torch.equal(meta["isect_ids"], meta["isect_ids"].sort().values)
+
+
+def test_meta_is_a_dict_a_pytree_and_picklable(scene):
+    with torch.no_grad():
+        _, _, meta = rasterize(scene, packed=False)
+    assert type(meta) is dict
+    leaves, spec = torch.utils._pytree.tree_flatten(meta)
+    assert torch.utils._pytree.tree_unflatten(leaves, spec)["means2d"] is meta["means2d"]
+    again = pickle.loads(pickle.dumps(meta))
+    assert list(again) == META
+    assert torch.equal(again["isect_ids"], meta["isect_ids"])
+
+
+def test_all_arguments_can_be_given_by_position(scene):
+    given = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh, scene.viewmats, scene.Ks, 52, 37)
+    given += (0.01, 1e10, 0.0, 0.3, 3, False, 16, None, "RGB+ED", False, False, "antialiased", 32, False, "pinhole")
+    image, alpha, _ = gsplat.rasterization(*given)
+    wanted = rasterize(scene, packed=False, render_mode="RGB+ED", rasterize_mode="antialiased")
+    assert torch.equal(image, wanted[0])
+    assert torch.equal(alpha, wanted[1])
 
 
 def test_meta_packed_has_the_visible_rows(scene):
@@ -262,5 +289,3 @@ def test_wrong_arguments_are_refused(scene):
             rasterize(scene, **changes)
     with pytest.raises(InvalidInput, match=r"float32, got torch.float64.*gsplat_core\.reference"):
         rasterize(scene.to(torch.float64))
-    with pytest.raises(TypeError, match="positional"):
-        gsplat.rasterization(*[scene.means] * 15)

@@ -6,6 +6,8 @@ from types import SimpleNamespace
 
 import torch
 
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.transfers import HostCopy
 from operators.reconstruct import ReconstructOp
 
@@ -79,3 +81,22 @@ def test_the_heavy_work_begins_at_start_and_the_last_model_survives_stop(frame, 
     compute(operator, frame=frame())
     operator.stop()
     assert len(made) == 1 and operator.model.version == 1
+
+
+def test_a_snapshot_becomes_a_model_when_it_is_asked_for(frame, model, camera, compute):
+    slots = SnapshotSlots("cpu")
+
+    def publish(version):
+        gaussians = model(version, index=version).gaussians
+        return slots.publish(gaussians, None, version=version, camera=camera, time_window_s=(0.0, 1.0))
+
+    operator = ReconstructOp(None, make_reconstructor=lambda: FakeReconstructor(publish))
+    operator.start()
+    messages = [compute(operator, frame=frame(k))[0] for k in range(2)]
+    assert [type(message.model) for message in messages] == [Snapshot, Snapshot]
+    assert operator.newest is messages[-1].model
+    del messages
+    operator.stop()
+    assert isinstance(operator.model, Model) and operator.model.version == 2
+    assert torch.equal(operator.model.gaussians.means, model(2, index=2).gaussians.means)
+    assert all(slot.is_free for slot in slots._slots), "the last slot is given up when the graph stops"

@@ -140,13 +140,14 @@ def without_motion(model: Model) -> Model:
 
 @EACH_KIND
 def test_it_is_replayed_learns_and_is_saved_and_loaded(
-    registered: Callable[[FieldKind[Any]], None], recording, tmp_path, kind
+    registered: Callable[[FieldKind[Any]], None], recording, tmp_path, kind, device
 ):
     registered(kind)
-    outcome = replay(ReplaySettings(recording, tmp_path / "out", field=kind.name, steps_per_frame=12))
+    settings = ReplaySettings(recording, tmp_path / "out", device=device.type, field=kind.name, steps_per_frame=12)
+    outcome = replay(settings)
     assert outcome.settings.field == kind.name
     assert outcome.find(QualityResult).frames == 12
-    model = outcome.find(ModelResult).model
+    model = outcome.find(ModelResult).model.to("cpu")
     assert isinstance(model.field, kind.field)
     assert all(bool(parameter.any()) for parameter in model.field.parameters())
     assert mean_psnr_db(model, recording) > mean_psnr_db(without_motion(model), recording) + 0.3

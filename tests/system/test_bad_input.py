@@ -143,7 +143,9 @@ def test_no_model_at_all(tmp_path, refused):
 def small_disk(tmp_path):
     """A file system of 12 MiB: a tmpfs where this process may mount one."""
     if os.geteuid() != 0:
-        pytest.skip("only root may mount a small tmpfs; tests/operators/test_display.py shows the same with a reserve")
+        pytest.skip(
+            "only root may mount a small tmpfs; tests/operators/sinks/test_video.py shows the same with a reserve"
+        )
     folder = tmp_path / "disk"
     folder.mkdir()
     mounted = subprocess.run(

@@ -11,13 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.io.recordings.arrays import ArrayHeader, read_array
 from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
 from gsplat_core.scene.cameras import CAMERA_MODELS, Camera
 
 DEFAULT_FOCAL_FACTOR = 0.9
 """Focal length in units of the longer image side where nothing is known: 58° across, as common endoscopes have."""
-MAX_JSON_BYTES = 64 * 1024 * 1024
-MAX_POSES = 10_000_000
+MAX_JSON_BYTES = 32 * 1024 * 1024
+MAX_LENGTH = 1e9
+"""Largest coordinate of a camera, in the recording's unit, and largest focal length in pixels: float32 keeps room to calculate."""
+MIN_FOCAL_PX = 1e-3
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -50,22 +55,19 @@ def read_poses_bounds(
     The poses are camera-to-world in OpenCV axes, as the endoscopic data sets store them; LLFF's permutation of axes is
     not applied (gsplat's and Deform3DGS's loaders apply one to EndoNeRF's identity poses).
     """
-    advice = "Save N x 17 float64 numbers: 3x5 [R | t | (H, W, f)], near, far for each frame"
-    try:
-        # A map, so that the shape is known before anything is read.
-        table = np.load(path, mmap_mode="r", allow_pickle=False)
-        shape = table.shape
-        if len(shape) != 2 or shape[1] != 17 or table.dtype.kind not in "fiu" or shape[0] > MAX_POSES:
-            findings.problem(path, f"it holds {table.dtype} {list(shape)} in place of [N, 17] numbers", advice)
-            return None
-        table = np.array(table, dtype=np.float64)
-    except (OSError, ValueError, EOFError, SyntaxError) as error:
-        findings.problem(path, f"it is not a plain NumPy array: {str(error).splitlines()[0]}", advice)
+    advice = "Save N x 17 float64 numbers: 3x5 [R | t | (H, W, f)], near, far for each frame, in frame order"
+
+    def wrong(header: ArrayHeader) -> str | None:
+        if len(header.shape) != 2 or header.shape[1] != 17:
+            return f"it holds {header.dtype} {list(header.shape)!s:.80} in place of [N, 17] numbers"
+        if header.shape[0] != frame_count:
+            return f"it has {header.shape[0]} poses for {frame_count} frames"
         return None
-    if len(table) != frame_count:
-        findings.problem(
-            path, f"it has {len(table)} poses for {frame_count} frames", "Give one row for each frame, in frame order"
-        )
+
+    try:
+        table = read_array(path, wrong).astype(np.float64)
+    except UnreadableFile as error:
+        findings.problem(path, str(error), advice)
         return None
     bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
     if bad.size:
@@ -83,8 +85,10 @@ def read_poses_bounds(
     if np.any(poses[:, :, 4] != poses[0, :, 4]):
         findings.problem(path, "H, W or f differ between rows", "Give one size and focal length for all frames")
         return None
-    if focal_px <= 0:
-        findings.problem(path, f"the focal length is {focal_px:g} px", advice)
+    if not MIN_FOCAL_PX <= focal_px <= MAX_LENGTH:
+        findings.problem(
+            path, f"the focal length is {focal_px:g} px", f"Give one from {MIN_FOCAL_PX:g} to {MAX_LENGTH:g} px"
+        )
         return None
     world_to_camera = invert_poses(poses[:, :, :4], path, findings)
     if world_to_camera is None:
@@ -94,21 +98,37 @@ def read_poses_bounds(
 
 
 def read_json(path: Path, findings: Findings) -> dict[str, Any] | None:
-    """A JSON object from a file of bounded size."""
-    if not path.is_file():
-        findings.problem(path, "it is not a plain file", "Give a JSON file")
-        return None
+    """A JSON object from a file of bounded size, each key once."""
     try:
-        if path.stat().st_size > MAX_JSON_BYTES:
-            findings.problem(path, f"{path.stat().st_size} bytes, more than the bound of {MAX_JSON_BYTES}", "Split it")
+        with open_plain(path) as stream:
+            data = stream.read(MAX_JSON_BYTES + 1)
+        if len(data) > MAX_JSON_BYTES:
+            findings.problem(path, f"it has more bytes than the bound of {MAX_JSON_BYTES}", "Split it")
             return None
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(data.decode("utf-8"), object_pairs_hook=_each_key_once)
+    except UnreadableFile as error:
+        findings.problem(path, str(error), "Give a JSON file")
+        return None
     except (OSError, ValueError, RecursionError) as error:
-        findings.problem(path, f"it is not JSON: {error}", "Write it again; the README of the recording format helps")
+        findings.problem(
+            path, f"it is not JSON: {error!s:.200}", "Write it again; docs/recordings.md describes the format"
+        )
         return None
     if not isinstance(content, dict):
         findings.problem(path, f"it holds a {type(content).__name__} in place of an object", "Write {…} with keys")
         return None
+    return content
+
+
+def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        seen: set[str] = set()
+        for twice, _ in pairs:
+            if twice in seen:
+                break
+            seen.add(twice)
+        raise ValueError(f"the key {twice!r:.60} is there twice")
     return content
 
 
@@ -122,11 +142,14 @@ def read_pinhole(path: Path, content: dict[str, Any], findings: Findings) -> Cam
         return None
     width, height, fx, fy, cx, cy = (float(value) for value in values.values() if value is not None)
     model = content.get("model", "pinhole")
-    if fx <= 0 or fy <= 0 or width < 1 or height < 1 or width % 1 or height % 1 or model not in CAMERA_MODELS:
+    whole = all(side >= 1 and not side % 1 and side <= MAX_PIXELS for side in (width, height))
+    bounded = all(MIN_FOCAL_PX <= value <= MAX_LENGTH for value in (fx, fy)) and max(abs(cx), abs(cy)) <= MAX_LENGTH
+    if not whole or not bounded or model not in CAMERA_MODELS:
         findings.problem(
             path,
-            f"this cannot be a camera: {model!r:.40}, {width:g}x{height:g} px, fx = {fx:g}, fy = {fy:g}",
-            f"Sizes are whole pixels, focal lengths are positive, the model is one of {', '.join(CAMERA_MODELS)}",
+            f"this cannot be a camera: {model!r:.40}, {width:g}x{height:g} px, fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}",
+            f"Sizes are whole pixels, focal lengths {MIN_FOCAL_PX:g} to {MAX_LENGTH:g} px, the model is one of "
+            f"{', '.join(CAMERA_MODELS)}",
         )
         return None
     return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), int(width), int(height), model=model)
@@ -135,6 +158,12 @@ def read_pinhole(path: Path, content: dict[str, Any], findings: Findings) -> Cam
 def invert_poses(camera_to_world: NDArray[np.float64], path: Path, findings: Findings) -> NDArray[np.float64] | None:
     """World-to-camera [N, 4, 4] from camera-to-world [N, 3, 4]; each must be a rotation and a translation."""
     rotation, translation = camera_to_world[:, :, :3], camera_to_world[:, :, 3]
+    if np.abs(translation).max() > MAX_LENGTH:
+        index = int(np.argmax((np.abs(translation) > MAX_LENGTH).any(axis=1)))
+        findings.problem(
+            path, f"the camera of frame {index} is at {translation[index].tolist()}", f"Lengths go up to {MAX_LENGTH:g}"
+        )
+        return None
     bounded = np.clip(rotation, -2, 2)  # keeps the products finite, and what it changes is no rotation either way
     skew = np.abs(bounded @ bounded.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     skew = np.maximum(skew, np.abs(np.linalg.det(bounded) - 1))

@@ -14,6 +14,10 @@ import numpy as np
 from gsplat_core.io.recordings.calibration import Calibration, invert_poses, number, read_json, read_pinhole
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.frame_files import ImageFiles, check_sizes
+from gsplat_core.io.recordings.plain_files import UnreadableFile, check_plain, stays_inside
+
+MAX_NAME = 512
+"""Longest file name, folders included."""
 
 
 def read_cameras_json(root: Path, findings: Findings) -> tuple[ImageFiles, Calibration] | None:
@@ -70,7 +74,7 @@ def _pose(value: object, path: Path, index: int, findings: Findings) -> np.ndarr
 
 def _inside(root: Path, name: object, path: Path, index: int, findings: Findings) -> Path | None:
     """The file that a document names, held inside the folder: no absolute path, no `..`, no link that leads out."""
-    relative = isinstance(name, str) and name != "" and "\0" not in name
+    relative = isinstance(name, str) and 0 < len(name) <= MAX_NAME and "\0" not in name
     if relative:
         posix, windows = PurePosixPath(str(name)), PureWindowsPath(str(name))
         relative = not posix.is_absolute() and not windows.anchor and ".." not in (*posix.parts, *windows.parts)
@@ -81,23 +85,14 @@ def _inside(root: Path, name: object, path: Path, index: int, findings: Findings
         return None
     file = root / str(name)
     try:
-        real = Path(os.path.realpath(file, strict=True))
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        missing = isinstance(error, FileNotFoundError)
+        missing = not os.path.lexists(file)
+        check_plain(file)
+    except (UnreadableFile, ValueError) as error:
         findings.problem(
             file,
-            f"frame {index} cannot be read: {reason}",
+            f"frame {index} cannot be read: {error}",
             "Export it again, or drop it from cameras.json",
             missing=missing,
         )
         return None
-    if not real.is_relative_to(os.path.realpath(root)):
-        findings.problem(
-            file, f"frame {index} leads out of the recording's folder", "Copy the file in place of linking it"
-        )
-        return None
-    if not real.is_file():
-        findings.problem(file, f"frame {index} is not a plain file", "Give an image file")
-        return None
-    return file
+    return file if stays_inside(root, file, findings) else None

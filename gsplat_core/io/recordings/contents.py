@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -13,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.io.recordings.calibration import Calibration
+from gsplat_core.io.recordings.decoded import Picture
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.frame_files import DepthFiles, MaskFiles
-from gsplat_core.scene.frames import Frame
+from gsplat_core.io.recordings.plain_files import open_plain
+from gsplat_core.scene.frames import Frame, FrameStatus
 
 
 class FrameImages(Protocol):
@@ -26,11 +29,13 @@ class FrameImages(Protocol):
     frame_count: int
     width_px: int
     height_px: int
+    times: Sequence[float] | None
+    """When each frame was taken, in frame durations from the first one on; None: one after the other."""
     fps: float | None
     """None where the files do not say."""
 
-    def frames(self, findings: Findings) -> Iterator[NDArray[np.uint8] | None]:
-        """RGB uint8 [H, W, 3]; None where a frame cannot be read."""
+    def frames(self, findings: Findings) -> Iterator[Picture | None]:
+        """Frame after frame; None where one cannot be read at all."""
         ...
 
 
@@ -66,28 +71,44 @@ class Contents:
 
     def frames(self, findings: Findings, limit: int | None = None) -> Iterator[Frame | None]:
         """Frame after frame at full size, decoded when asked for; None where one has a problem."""
-        images = islice(self.images.frames(findings), limit)
+        pictures = islice(self.images.frames(findings), limit)
         rights = self.right.frames(findings) if self.right else None
-        for index, image in enumerate(images):
+        for index, picture in enumerate(pictures):
             known = len(findings.problems)
-            right_image = next(rights, None) if rights else None
+            right = next(rights, None) if rights else None
             depth = self.depth.read(index, findings) if self.depth else None
             mask = self.masks.read(index, findings) if self.masks else None
-            if image is None or len(findings.problems) > known:
+            if picture is None or len(findings.problems) > known:
                 yield None
                 continue
-            if self.valid_mask is not None:
-                mask = self.valid_mask if mask is None else mask & self.valid_mask
-            poses = self.calibration.poses
-            yield Frame(
-                seq=index,
-                pts_ns=round(index * 1e9 / self.fps),
-                image=image,
-                right_image=right_image,
-                depth=depth,
-                mask=mask,
-                pose=None if poses is None else poses[index],
-            )
+            yield self._frame(index, picture, right, depth, mask)
+
+    def _frame(
+        self,
+        index: int,
+        picture: Picture,
+        right: Picture | None,
+        depth: NDArray[np.float32] | None,
+        mask: NDArray[np.uint8] | None,
+    ) -> Frame:
+        damage = picture.damage or (right.damage if right else None)
+        if damage is not None:
+            # No pixel of it is known to be tissue: whoever trains or scores by the mask leaves the frame out.
+            mask = np.zeros(picture.image.shape[:2], np.uint8)
+        elif self.valid_mask is not None:
+            mask = self.valid_mask if mask is None else mask & self.valid_mask
+        poses, times = self.calibration.poses, self.images.times
+        return Frame(
+            seq=index,
+            pts_ns=round((index if times is None else times[index]) * 1e9 / self.fps),
+            image=picture.image,
+            right_image=None if right is None else right.image,
+            depth=depth,
+            mask=mask,
+            pose=None if poses is None else poses[index],
+            status=FrameStatus.REPLAY if damage is None else FrameStatus.DAMAGED,
+            damage=damage,
+        )
 
     def files(self) -> list[Path]:
         """Every file that is read, sorted."""
@@ -99,8 +120,8 @@ class Contents:
         digest = hashlib.sha256()
         for path in self.files():
             name = path.relative_to(self.root).as_posix() if path != self.root else path.name
-            digest.update(f"{name}\0{path.stat().st_size}\0".encode())
-            with path.open("rb") as stream:
+            with open_plain(path) as stream:
+                digest.update(os.fsencode(name) + f"\0{os.fstat(stream.fileno()).st_size}\0".encode())
                 while block := stream.read(1 << 20):
                     digest.update(block)
         return digest.hexdigest()

@@ -8,6 +8,11 @@ from pathlib import Path
 from gsplat_core.errors import RecordingInvalid, RecordingMissing
 
 
+def printable(name: Path | str) -> str:
+    """A name that can be written as UTF-8 whatever its bytes are: those that are no UTF-8 become question marks."""
+    return str(name).encode("utf-8", "replace").decode("utf-8")
+
+
 @dataclass(frozen=True)
 class Finding:
     """One thing wrong with one file."""
@@ -34,14 +39,14 @@ class Findings:
 
     def problem(self, file: Path | str, message: str, advice: str, *, missing: bool = False) -> None:
         """Note a fault that makes the recording unusable."""
-        finding = Finding(str(file), message, advice, missing)
+        finding = Finding(printable(file), printable(message), advice, missing)
         self.problems.append(finding)
         if self.strict:
             raise (RecordingMissing if missing else RecordingInvalid)(str(finding))
 
     def warn(self, file: Path | str, message: str, advice: str) -> None:
         """Note a stated fallback, or something odd that does not stop the recording from being read."""
-        self.warnings.append(Finding(str(file), message, advice))
+        self.warnings.append(Finding(printable(file), printable(message), advice))
 
 
 @dataclass(frozen=True)

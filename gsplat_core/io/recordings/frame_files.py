@@ -10,15 +10,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.io.recordings.arrays import ArrayHeader, read_array, read_header
+from gsplat_core.io.recordings.decoded import Picture
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.image_files import (
     MAX_PIXELS,
     UnreadableImage,
-    check_plain,
-    decode_image,
+    decode_picture,
+    decode_plane,
     frame_number,
     image_size,
 )
+from gsplat_core.io.recordings.plain_files import UnreadableFile
 
 POLARITY_SAMPLES = 16
 MAX_TOOL_SHARE = 0.5
@@ -28,20 +31,28 @@ MAX_TOOL_SHARE = 0.5
 class ImageFiles:
     """One image file for each frame."""
 
-    def __init__(self, files: Sequence[Path], width_px: int, height_px: int, fps: float | None = None) -> None:
+    def __init__(
+        self,
+        files: Sequence[Path],
+        width_px: int,
+        height_px: int,
+        fps: float | None = None,
+        times: Sequence[float] | None = None,
+    ) -> None:
         self.files = tuple(files)
+        self.times = times
         self.numbers = [frame_number(path) for path in self.files]
         self.frame_count = len(self.files)
         self.width_px = width_px
         self.height_px = height_px
         self.fps = fps
 
-    def frames(self, findings: Findings) -> Iterator[NDArray[np.uint8] | None]:
-        """RGB uint8 [H, W, 3], frame after frame; None where one cannot be decoded."""
+    def frames(self, findings: Findings) -> Iterator[Picture | None]:
+        """Frame after frame; None where one cannot be decoded."""
         for path in self.files:
             try:
-                yield decode_image(path, colour=True).astype(np.uint8, copy=False)
-            except UnreadableImage as error:
+                yield decode_picture(path)
+            except UnreadableFile as error:
                 findings.problem(path, str(error), "Export this frame again, or remove it with its sidecars")
                 yield None
 
@@ -56,8 +67,8 @@ class MaskFiles:
         """[H, W]; 1 = tissue, 0 = tool."""
         path = self.files[index]
         try:
-            mask = decode_image(path, colour=False)
-        except UnreadableImage as error:
+            mask = decode_plane(path)
+        except UnreadableFile as error:
             findings.problem(path, str(error), "Export this mask again")
             return None
         if mask.ndim == 3:
@@ -107,30 +118,11 @@ class DepthFiles:
     def read(self, index: int, findings: Findings) -> NDArray[np.float32] | None:
         """z in millimetres, float32 [H, W]."""
         path = self.files[index]
-        if path.suffix.lower() == ".npy":
-            try:
-                depth = np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float32)
-            except (OSError, ValueError, EOFError, SyntaxError) as error:
-                findings.problem(path, f"it is not a plain NumPy array: {str(error).splitlines()[0]}", _DEPTH_ADVICE)
-                return None
-        else:
-            try:
-                stored = decode_image(path, colour=False)
-            except UnreadableImage as error:
-                findings.problem(path, str(error), "Export this depth map again")
-                return None
-            if stored.ndim == 3:
-                if np.ptp(stored[..., :3], axis=2).any():
-                    findings.problem(path, "the depth map is a colour picture", _DEPTH_ADVICE)
-                    return None
-                stored = stored[..., 0]
-            depth = stored.astype(np.float32) * np.float32(self.unit_mm)
+        depth = self._array(path, findings) if path.suffix.lower() == ".npy" else self._image(path, findings)
+        if depth is None:
+            return None
         if depth.shape != self._shape:
-            findings.problem(
-                path,
-                f"the depth map is {list(depth.shape)}, the images are {list(self._shape)} (rows, columns)",
-                _DEPTH_ADVICE,
-            )
+            findings.problem(path, self._other_shape(depth.shape), _DEPTH_ADVICE)
             return None
         wrong = ~np.isfinite(depth) | (depth < 0)
         if wrong.any():
@@ -144,6 +136,33 @@ class DepthFiles:
             return None
         return depth
 
+    def _array(self, path: Path, findings: Findings) -> NDArray[np.float32] | None:
+        def wrong(header: ArrayHeader) -> str | None:
+            return None if header.shape == self._shape else self._other_shape(header.shape)
+
+        try:
+            with np.errstate(over="ignore"):  # what does not fit is infinite then, and refused as that
+                return read_array(path, wrong).astype(np.float32)
+        except UnreadableFile as error:
+            findings.problem(path, str(error), _DEPTH_ADVICE)
+            return None
+
+    def _image(self, path: Path, findings: Findings) -> NDArray[np.float32] | None:
+        try:
+            stored = decode_plane(path)
+        except UnreadableFile as error:
+            findings.problem(path, str(error), "Export this depth map again")
+            return None
+        if stored.ndim == 3:
+            if np.ptp(stored[..., :3], axis=2).any():
+                findings.problem(path, "the depth map is a colour picture", _DEPTH_ADVICE)
+                return None
+            stored = stored[..., 0]
+        return stored.astype(np.float32) * np.float32(self.unit_mm)
+
+    def _other_shape(self, shape: tuple[int, ...]) -> str:
+        return f"the depth map is {list(shape)!s:.80}, the images are {list(self._shape)} (rows, columns)"
+
 
 _DEPTH_ADVICE = "Give one grey 8- or 16-bit PNG, or float .npy [H, W] in millimetres, of the images' size per frame"
 
@@ -156,7 +175,7 @@ def check_sizes(
     for path in files:
         try:
             sizes[path] = _npy_size(path) if path.suffix.lower() == ".npy" else image_size(path)
-        except UnreadableImage as error:
+        except UnreadableFile as error:
             findings.problem(path, str(error), f"Export this {what} again", missing=not path.exists())
             return None
     expected = size or Counter(sizes.values()).most_common(1)[0][0]
@@ -175,14 +194,13 @@ def check_sizes(
 
 
 def _npy_size(path: Path) -> tuple[int, int]:
-    check_plain(path)
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, SyntaxError) as error:
-        raise UnreadableImage(f"it is not a plain NumPy array: {str(error).splitlines()[0]}") from error
-    if array.ndim != 2 or array.dtype.kind not in "fiu" or array.size > MAX_PIXELS:
-        raise UnreadableImage(f"it holds {array.dtype} {list(array.shape)} in place of [H, W] numbers")
-    return array.shape[1], array.shape[0]
+    header = read_header(path)
+    if len(header.shape) != 2:
+        raise UnreadableImage(f"it holds {header.dtype} {list(header.shape)!s:.80} in place of [H, W] numbers")
+    height, width = header.shape
+    if height * width > MAX_PIXELS:
+        raise UnreadableImage(f"the header announces {width}x{height} numbers, more than the bound of {MAX_PIXELS}")
+    return width, height
 
 
 def check_pairing(

@@ -6,16 +6,21 @@ more pixels than MAX_PIXELS is refused before a decoder allocates anything.
 
 from __future__ import annotations
 
-import os
 import re
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from gsplat_core.io.recordings.decoded import Picture
+from gsplat_core.io.recordings.jpeg import decode_jpeg, jpeg_damage
+from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
 
 MAX_PIXELS = 64 * 1024 * 1024
 """Largest image that is decoded (8192 x 8192); surgical video is 8 Mpx at most."""
@@ -26,7 +31,7 @@ _JPEG_SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_WITHOUT_LENGTH = frozenset(range(0xD0, 0xD8)) | {0x01}
 
 
-class UnreadableImage(Exception):
+class UnreadableImage(UnreadableFile):
     """Why an image cannot be decoded; the checks turn it into a finding."""
 
 
@@ -39,12 +44,6 @@ def quiet_decoder() -> Iterator[None]:
         yield
     finally:
         cv2.utils.logging.setLogLevel(level)
-
-
-def check_plain(path: Path) -> None:
-    """Raise UnreadableImage for what is no file: opening a pipe would wait for ever."""
-    if not path.is_file():
-        raise UnreadableImage("it is not a plain file" if os.path.lexists(path) else "the file is not there")
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
@@ -61,21 +60,9 @@ def frame_number(path: Path) -> int | None:
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) in pixels as the PNG or JPEG header announces it. Raises UnreadableImage."""
-    check_plain(path)
     try:
-        with path.open("rb") as stream:
-            head = stream.read(24)
-            if head.startswith(PNG_SIGNATURE):
-                if len(head) < 24 or head[12:16] != b"IHDR":
-                    raise UnreadableImage("the PNG header is damaged")
-                width, height = struct.unpack(">II", head[16:24])
-            elif head.startswith(b"\xff\xd8"):
-                stream.seek(2)
-                width, height = _jpeg_size(stream.read(1 << 20))
-            elif not head:
-                raise UnreadableImage("the file is empty (0 bytes)")
-            else:
-                raise UnreadableImage(f"this is neither PNG nor JPEG data (it begins with {head[:8]!r})")
+        with open_plain(path) as stream:
+            width, height = _announced_size(stream)
     except OSError as error:
         raise UnreadableImage(f"the file cannot be read: {error.strerror or error}") from error
     if width < 1 or height < 1:
@@ -83,6 +70,21 @@ def image_size(path: Path) -> tuple[int, int]:
     if width * height > MAX_PIXELS:
         raise UnreadableImage(f"the header announces {width}x{height} pixels, more than the bound of {MAX_PIXELS}")
     return width, height
+
+
+def _announced_size(stream: BinaryIO) -> tuple[int, int]:
+    head = stream.read(24)
+    if head.startswith(PNG_SIGNATURE):
+        if len(head) < 24 or head[12:16] != b"IHDR":
+            raise UnreadableImage("the PNG header is damaged")
+        width, height = struct.unpack(">II", head[16:24])
+        return width, height
+    if head.startswith(b"\xff\xd8"):
+        stream.seek(2)
+        return _jpeg_size(stream.read(1 << 20))
+    if not head:
+        raise UnreadableImage("the file is empty (0 bytes)")
+    raise UnreadableImage(f"this is neither PNG nor JPEG data (it begins with {head[:8]!r})")
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
@@ -103,21 +105,67 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
     raise UnreadableImage("the JPEG header holds no frame size")
 
 
-def decode_image(path: Path, *, colour: bool) -> NDArray[np.generic]:
-    """The pixels of a PNG or JPEG. Raises UnreadableImage.
+def decode_picture(path: Path) -> Picture:
+    """A frame: RGB uint8 [H, W, 3], grey repeated, alpha dropped. Raises UnreadableFile.
 
-    colour=True: RGB uint8 [H, W, 3] (grey is repeated, alpha dropped). colour=False: as stored, 8 or 16 bit, [H, W] or
-    [H, W, C]. EXIF rotation is not applied: the header's size is the image's size.
+    A JPEG that libjpeg had to repair is handed out as a damaged picture. EXIF rotation is not applied: the header's size is
+    the image's size.
     """
-    width, height = image_size(path)
-    if path.stat().st_size > MAX_FILE_BYTES:
-        raise UnreadableImage(f"the file has {path.stat().st_size} bytes, more than the bound of {MAX_FILE_BYTES}")
-    data = path.read_bytes()
-    # Decoders fill the missing part of a cut-off file with grey and call it a success.
-    end = b"IEND" if data.startswith(PNG_SIGNATURE) else b"\xff\xd9"
-    if end not in data[-4096:]:
+    data, size = _read(path)
+    decoded = None if data.startswith(PNG_SIGNATURE) else decode_jpeg(data)
+    if decoded is None:
+        pixels = _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        decoded = np.ascontiguousarray(pixels[..., ::-1], dtype=np.uint8), None
+    image, damage = decoded
+    _check_size(image, size)
+    return Picture(image, damage)
+
+
+def decode_plane(path: Path) -> NDArray[np.generic]:
+    """The pixels of a PNG or JPEG as stored, 8 or 16 bit, [H, W] or [H, W, C]. Raises UnreadableFile for a damaged one too."""
+    data, size = _read(path)
+    if not data.startswith(PNG_SIGNATURE) and (damage := jpeg_damage(data)):
+        raise UnreadableImage(f"the image data is damaged: {damage}")
+    pixels = _decode(data, cv2.IMREAD_UNCHANGED)
+    _check_size(pixels, size)
+    return pixels
+
+
+def _read(path: Path) -> tuple[bytes, tuple[int, int]]:
+    """The file's bytes, complete to its end mark, and the (width, height) that its header announces."""
+    size = image_size(path)
+    with open_plain(path) as stream:
+        data = stream.read(MAX_FILE_BYTES + 1)
+    if len(data) > MAX_FILE_BYTES:
+        raise UnreadableImage(f"the file has more bytes than the bound of {MAX_FILE_BYTES}")
+    if data.startswith(PNG_SIGNATURE):
+        _check_png(data)
+    elif b"\xff\xd9" not in data[-4096:]:
+        # Decoders fill the missing part of a cut-off file with grey and call it a success.
         raise UnreadableImage(f"the file ends too early ({len(data)} bytes, without the end mark)")
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if colour else cv2.IMREAD_UNCHANGED
+    return data, size
+
+
+def _check_png(data: bytes) -> None:
+    """Every chunk complete and with a right CRC-32 (PNG 5.3), up to the end mark: all damage to a PNG shows here."""
+    at = len(PNG_SIGNATURE)
+    while at + 12 <= len(data):
+        length, kind = struct.unpack(">I4s", data[at : at + 8])
+        end = at + 12 + length
+        if end > len(data):
+            break
+        (stated,) = struct.unpack(">I", data[end - 4 : end])
+        if zlib.crc32(memoryview(data)[at + 4 : end - 4]) != stated:
+            raise UnreadableImage(
+                f"the image data is damaged: the checksum of part {kind.decode('latin-1')!a} is wrong"
+            )
+        if kind == b"IEND":
+            return
+        at = end
+    raise UnreadableImage(f"the file ends too early ({len(data)} bytes, without the end mark)")
+
+
+def _decode(data: bytes, flags: int) -> NDArray[np.generic]:
     try:
         with quiet_decoder():
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -125,9 +173,13 @@ def decode_image(path: Path, *, colour: bool) -> NDArray[np.generic]:
         raise UnreadableImage(f"the decoder refuses it: {error.err}") from error
     if pixels is None:
         raise UnreadableImage("the image data is damaged")
-    if pixels.shape[:2] != (height, width):
-        raise UnreadableImage(f"it decodes to {pixels.shape[1]}x{pixels.shape[0]}, its header says {width}x{height}")
-    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB) if colour else pixels
+    return pixels
+
+
+def _check_size(pixels: NDArray[np.generic], size: tuple[int, int]) -> None:
+    height, width = pixels.shape[:2]
+    if (width, height) != size:
+        raise UnreadableImage(f"it decodes to {width}x{height}, its header says {size[0]}x{size[1]}")
 
 
 def list_images(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list[Path]:

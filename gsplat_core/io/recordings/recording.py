@@ -10,15 +10,20 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from gsplat_core.errors import InvalidInput
+from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings.contents import Contents
-from gsplat_core.io.recordings.findings import Findings, ValidationReport
+from gsplat_core.io.recordings.decoded import DEPENDS, DamagedFrames
+from gsplat_core.io.recordings.findings import Findings, ValidationReport, printable
 from gsplat_core.io.recordings.frame_files import resize_area, resize_nearest
+from gsplat_core.io.recordings.image_files import MAX_PIXELS
 from gsplat_core.io.recordings.layouts import inspect
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, FrameStatus
 
 MAX_REPORTED_PROBLEMS = 100
+_DAMAGE_ADVICE = "Damaged frames are shown, but neither trained on nor scored; copy the file again from its source"
+MIN_SCALED_SIDE_PX = 8
+"""Shortest side that `scale` may lead to."""
 
 
 @runtime_checkable
@@ -59,7 +64,7 @@ class FileRecording:
     def __init__(self, contents: Contents, scale: float, max_frames: int | None, notes: tuple[str, ...]) -> None:
         self._contents = contents
         # A relative path such as `.` has no name of its own.
-        self.name = contents.root.name or contents.root.resolve().name
+        self.name = printable(contents.root.name or contents.root.resolve().name)
         self.camera = contents.calibration.camera.scaled(scale)
         self.width_px, self.height_px = self.camera.width_px, self.camera.height_px
         self.frame_count = min(contents.images.frame_count, max_frames or contents.images.frame_count)
@@ -108,17 +113,32 @@ def open_recording(path: str | os.PathLike[str], *, scale: float = 1.0, max_fram
     along with them. max_frames: read only the beginning.
 
     Counts, header sizes, calibration and mask polarity are checked here, each frame's data while iterating.
-    Raises RecordingMissing or RecordingInvalid, naming the file, the value that is wrong, and what to do; InvalidInput
-    for a scale that is not positive and finite, or max_frames below 1.
+    Raises RecordingMissing or RecordingInvalid, naming the file, the value that is wrong, and what to do; InvalidSetting
+    for a scale that is not positive or leads to too large or too small frames, or max_frames below 1.
     """
     if not 0 < scale < float("inf"):
-        raise InvalidInput(f"scale must be a positive number, got {scale}")
+        raise InvalidSetting(f"scale must be a positive number, got {scale}")
     if max_frames is not None and max_frames < 1:
-        raise InvalidInput(f"max_frames must be at least 1, got {max_frames}")
+        raise InvalidSetting(f"max_frames must be at least 1, got {max_frames}")
     findings = Findings(strict=True)
     contents = inspect(Path(path), findings)
     assert contents is not None  # a strict collector has raised
+    _check_scaled_size(contents.images.width_px, contents.images.height_px, scale)
     return FileRecording(contents, scale, max_frames, tuple(str(finding) for finding in findings.warnings))
+
+
+def _check_scaled_size(width_px: int, height_px: int, scale: float) -> None:
+    if scale == 1:
+        return
+    # In Python's numbers, which overflow to infinity and not to something small.
+    width, height = width_px * scale, height_px * scale
+    if width * height > MAX_PIXELS or min(width, height) < MIN_SCALED_SIDE_PX:
+        least = MIN_SCALED_SIDE_PX / min(width_px, height_px)
+        most = (MAX_PIXELS / (width_px * height_px)) ** 0.5
+        raise InvalidSetting(
+            f"scale {scale:g} makes frames of {width:.4g}x{height:.4g} px from {width_px}x{height_px}; "
+            f"choose one from {least:.3g} to {most:.3g}: both sides at least {MIN_SCALED_SIDE_PX} px, and at most {MAX_PIXELS} pixels"
+        )
 
 
 def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
@@ -126,22 +146,36 @@ def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
     findings = Findings()
     contents = inspect(Path(path), findings)
     if contents is None:
-        return ValidationReport({"path": str(path)}, findings.problems, findings.warnings)
-    decoded = 0
+        return ValidationReport({"path": printable(os.fspath(path))}, findings.problems, findings.warnings)
+    decoded = intact = causes = 0
     tissue = 0.0
+    damaged = DamagedFrames()
     for frame in contents.frames(findings):
         if len(findings.problems) >= MAX_REPORTED_PROBLEMS:
             findings.warn(contents.root, f"more than {MAX_REPORTED_PROBLEMS} problems", "The rest was not looked at")
             break
-        if frame is not None:
-            decoded += 1
+        if frame is None:
+            continue
+        decoded += 1
+        if frame.status is FrameStatus.DAMAGED:
+            damaged.add(frame.seq)
+            causes += not str(frame.damage).startswith(DEPENDS)
+            if causes <= MAX_REPORTED_PROBLEMS and not str(frame.damage).startswith(DEPENDS):
+                findings.warn(f"{contents.root}, frame {frame.seq}", f"it is damaged: {frame.damage}", _DAMAGE_ADVICE)
+        else:
+            intact += 1
             tissue += 1.0 if frame.mask is None else float(frame.mask.mean())
+    if damaged.count:
+        what = f"{damaged.count} frames are damaged, or may depend on damaged ones: {damaged.numbers()}"
+        findings.warn(contents.root, what, _DAMAGE_ADVICE)
     images, calibration = contents.images, contents.calibration
     facts: dict[str, object] = {
-        "path": str(path),
+        "path": printable(os.fspath(path)),
         "layout": contents.layout,
         "frames": images.frame_count,
         "frames_decoded": decoded,
+        "frames_damaged": damaged.count,
+        "damaged_frames": damaged.numbers(),
         "width_px": images.width_px,
         "height_px": images.height_px,
         "fps": contents.fps,
@@ -150,7 +184,7 @@ def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
         "calibration": calibration.source,
         "focal_px": [float(calibration.camera.K[0, 0]), float(calibration.camera.K[1, 1])],
         "camera_moves": calibration.poses is not None and bool(np.ptp(calibration.poses, axis=0).max() > 1e-9),
-        "tissue_share": tissue / decoded if decoded else None,
+        "tissue_share": tissue / intact if intact else None,
         "tool_share": contents.tool_share,
         "stereo_baseline_mm": contents.stereo_baseline_mm,
     }

@@ -1,167 +1,250 @@
-"""Reading video: what the container says first, then frames in order, never by seeking.
-
-Only containers that are known by their first bytes reach the decoder. FFmpeg guesses formats from content, and a text
-file in a playlist format could make it open other files or network addresses.
-"""
+"""Reading video: the container first, then its packets, then frames in order, never by seeking."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
+import av
 
+from gsplat_core.io.recordings.containers import Container, UnusableContainer, recognise
+from gsplat_core.io.recordings.decoded import DEPENDS, Picture
+from gsplat_core.io.recordings.decoder import NO_PICTURE, PictureDecoder, captured_log, frame_rate, picture
 from gsplat_core.io.recordings.findings import Findings
-from gsplat_core.io.recordings.image_files import MAX_PIXELS, quiet_decoder
+from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
+from gsplat_core.io.recordings.video_index import VideoIndex, is_picture, open_container, read_index
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
-_ISO_FIRST_BOXES = frozenset({b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide"})
 _REENCODE = "Copy the file again from its source, or re-encode it (ffmpeg -i IN -c:v libx264 OUT.mp4)"
-
-
-@contextmanager
-def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
-    # Read by OpenCV when FFmpeg is first used in the process; -8 is AV_LOG_QUIET. An operator's own setting wins.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    with quiet_decoder():
-        # An absolute path, so that no name (`concat:…`) is taken for a protocol.
-        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
-    try:
-        yield capture
-    finally:
-        capture.release()
+_MOST_LATE = 64
+"""Packets: no decoder holds a frame longer."""
 
 
 class VideoFrames:
     """The frames of a video file, in order, decoded one at a time."""
 
-    def __init__(self, path: Path, frame_count: int, width_px: int, height_px: int, fps: float) -> None:
+    def __init__(self, path: Path, container: Container, index: VideoIndex, fps: float, rotation: int) -> None:
         self.path = path
         self.files: tuple[Path, ...] = (path,)
-        self.numbers: list[int | None] = list(range(frame_count))
-        self.frame_count = frame_count
-        self.width_px = width_px
-        self.height_px = height_px
+        self.frame_count = index.frame_count
+        self.numbers: list[int | None] = list(range(index.frame_count))
+        self.width_px = self.height_px = 0
+        self.times: Sequence[float] | None = None
         self.fps: float | None = fps
+        self._container = container
+        self._index = index
+        self._rotation = rotation
 
-    def frames(self, findings: Findings) -> Iterator[NDArray[np.uint8] | None]:
-        """RGB uint8 [H, W, 3], frame after frame. A video that ends early is a problem."""
-        with _capture(self.path) as capture:
-            for index in range(self.frame_count):
-                decoded, image = capture.read()
-                if not decoded:
+    def frames(self, findings: Findings) -> Iterator[Picture | None]:
+        """Frame after frame; a damaged one is marked. A video that ends early is a problem, and so is a change of size."""
+        due = 0
+        last: Picture | None = None
+        spread = DamageSpread(self._index)
+        for position, decoded in self._decoded(spread):
+            if self._index.ordered and position < due:
+                continue  # given twice, or after its time
+            while self._index.ordered and due < position and last is not None:
+                yield Picture(last.image, spread.damage(due) or NO_PICTURE)
+                due += 1
+            image, damage = decoded.image, decoded.damage
+            if image.shape != (self.height_px, self.width_px, 3):
+                if damage is None or last is None:
                     findings.problem(
                         self.path,
-                        f"the video ends early: {index} of {self.frame_count} announced frames could be decoded",
-                        f"{_REENCODE}, or replay only its beginning (--max-frames {index})",
-                    )
-                    return
-                if image.shape != (self.height_px, self.width_px, 3):
-                    findings.problem(
-                        self.path,
-                        f"frame {index} is {image.shape[1]}x{image.shape[0]}, the first one is "
-                        f"{self.width_px}x{self.height_px}",
+                        f"frame {due} is {image.shape[1]}x{image.shape[0]}, the first one is {self.width_px}x{self.height_px}",
                         _REENCODE,
                     )
                     yield None
+                    due += 1
                     continue
-                yield np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+                image = last.image  # what a damaged header says of the size counts for nothing
+            last = Picture(image, damage)
+            yield last
+            due += 1
+        if due < self.frame_count:
+            findings.problem(
+                self.path,
+                f"the video ends early: {due} of {self.frame_count} announced frames could be decoded",
+                f"{_REENCODE}, or replay only its beginning (--max-frames {due})",
+            )
+
+    def look_at_first(self) -> Picture | None:
+        """The first frame, whose size is that of all; None where there is none."""
+        decoded = self._decoded(DamageSpread(self._index))
+        position, first = next(decoded, (0, None))
+        decoded.close()
+        if first is not None:
+            self.height_px, self.width_px = first.image.shape[:2]
+            if self._index.ordered and position > 0:
+                return Picture(first.image, NO_PICTURE)
+        return first
+
+    def _decoded(self, spread: DamageSpread) -> Generator[tuple[int, Picture], None, None]:
+        """The pictures as the decoder gives them, each with its position."""
+        with _opened(self.path, self._container) as (container, stream):
+            decoder = PictureDecoder(stream)
+            for number, packet in _numbered(container, stream):
+                shown = number < len(self._index.positions) and self._index.positions[number] >= 0
+                frames = decoder.decode(packet, number, shown)
+                spread.follow(decoder.doubts, number)
+                for own, frame in frames:
+                    position = self._index.positions[own]
+                    if position >= 0:
+                        yield position, Picture(picture(frame, self._rotation), spread.damage(position))
+
+
+class DamageSpread:
+    """Which pictures are damaged: those that something speaks against, and all that may have been predicted from them, which is
+    every later one up to the next key frame, and those behind it in the file that are shown before it."""
+
+    def __init__(self, index: VideoIndex) -> None:
+        self._index = index
+        self._own: dict[int, str] = {}
+        self._damage: dict[int, str] = {}
+        self._cause: str | None = None
+        self._before_position = -1
+        self._next = 0
+
+    def follow(self, doubts: dict[int, str], last: int) -> None:
+        """Take in what the decoder doubts, up to packet `last`."""
+        self._own = doubts | self._own  # what was said first explains most
+        begin = min([self._next, *doubts])  # what is found out late is judged again from there on
+        doubts.clear()
+        self._next = min(last + 1, len(self._index.positions))
+        for number in range(begin, self._next):
+            self._judge(number)
+        for number in [number for number in self._own if number < self._next - _MOST_LATE]:
+            del self._own[number]
+
+    def _judge(self, number: int) -> None:
+        own = self._own.get(number) or self._index.damaged.get(number)
+        position = self._index.positions[number]
+        if self._index.key_packets[number] and own is None and self._cause is not None:
+            self._cause, self._before_position = None, position
+        if own is not None:
+            self._cause = self._cause or f"frame {position}: {own}"
+            self._damage[position] = own
+        elif self._cause is not None:
+            self._damage.setdefault(position, f"{DEPENDS} ({self._cause})")
+        elif 0 <= position < self._before_position:
+            self._damage.setdefault(position, f"{DEPENDS} before the key frame that follows it")
+
+    def damage(self, position: int) -> str | None:
+        """What is known against the picture at a position in the order of showing; asked once."""
+        return self._damage.pop(position, None)
+
+
+@contextmanager
+def _opened(path: Path, container: Container) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+    with open_plain(path) as file, open_container(file, container) as opened:
+        yield opened, opened.streams.video[0]
+
+
+def _numbered(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[tuple[int, av.Packet | None]]:
+    """The packets that hold data, numbered as in the index, and None at the end."""
+    number = 0
+    packets = iter(container.demux(stream))
+    while True:
+        with captured_log():  # the index has noted what the container complains of
+            try:
+                packet = next(packets, None)
+            except av.FFmpegError:
+                packet = None
+        if packet is None:
+            break
+        if is_picture(packet):
+            yield number, packet
+            number += 1
+    yield max(number - 1, 0), None
 
 
 def open_video(path: Path, findings: Findings) -> VideoFrames | None:
     """Check the container and the first frame; None where there is a problem."""
-    exact_count = _check_container(path, findings)
-    if exact_count is None:
-        return None
-    with _capture(path) as capture:
-        width_px = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
-        height_px = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        if width_px * height_px > MAX_PIXELS:
-            findings.problem(
-                path, f"frames of {width_px}x{height_px} exceed the bound of {MAX_PIXELS} pixels", "Scale it down"
-            )
-            return None
-        announced = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        fps = capture.get(cv2.CAP_PROP_FPS)
-        decoded, image = capture.read()
-        if not decoded:
-            findings.problem(path, "no frame of the video can be decoded", _REENCODE)
-            return None
-        height_px, width_px = image.shape[:2]
-        frame_count = int(announced)
-        if not exact_count or frame_count < 1:
-            # These containers only estimate their length.
-            frame_count = 1
-            while capture.grab():
-                frame_count += 1
-            if frame_count < 0.98 * announced - 2:
-                findings.problem(
-                    path, f"the video ends early: {frame_count} of about {announced:.0f} frames are there", _REENCODE
-                )
-    if not 0.1 <= fps <= 1000:
-        findings.warn(path, f"the container announces {fps} frames/s", "30 frames/s are assumed")
-        fps = 30.0
-    return VideoFrames(path, frame_count, width_px, height_px, float(fps))
-
-
-def _check_container(path: Path, findings: Findings) -> bool | None:
-    """None: a problem. True: the announced frame count is exact. False: it is an estimate."""
-    if not path.is_file():  # opening a pipe would wait for ever
-        findings.problem(path, "it is not a plain file", "Give a video file")
-        return None
     try:
-        size = path.stat().st_size
-        with path.open("rb") as stream:
-            head = stream.read(16)
-            if head[4:8] in _ISO_FIRST_BOXES:
-                return _check_iso_boxes(path, size, findings)
-    except OSError as error:
-        findings.problem(path, f"the file cannot be read: {error.strerror or error}", "Check the file")
-        return None
-    if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
-        riff_end = 8 + int.from_bytes(head[4:8], "little")
-        if riff_end > size:
-            findings.problem(path, f"the video is cut off: {size} of {riff_end} bytes are there", _REENCODE)
-            return None
-        return False
-    if head.startswith(b"\x1a\x45\xdf\xa3"):
-        return False
-    what = "is empty (0 bytes)" if not head else f"is not a video (it begins with {head[:12]!r})"
-    findings.problem(path, f"the file {what}", "Give an MP4/MOV, AVI or Matroska/WebM file")
+        with open_plain(path) as file:
+            container = recognise(file)
+        with _opened(path, container) as (opened, stream):
+            return _inspect(path, container, opened, stream, findings)
+    except UnreadableFile as error:
+        findings.problem(path, str(error), "Give a video file")
+    except UnusableContainer as error:
+        findings.problem(path, str(error), _REENCODE)
+    except OSError as error:  # FFmpeg's errors too
+        findings.problem(path, f"the video cannot be read: {error.strerror or error}", _REENCODE)
+    except IndexError:
+        findings.problem(path, "the file holds no video stream", _REENCODE)
     return None
 
 
-def _check_iso_boxes(path: Path, size: int, findings: Findings) -> bool | None:
-    """Walk the top-level boxes of an MP4 (ISO/IEC 14496-12, 4.2): all of them complete, and the index among them."""
-    seen: set[bytes] = set()
-    at = 0
-    with path.open("rb") as stream:
-        while at + 8 <= size:
-            stream.seek(at)
-            header = stream.read(16)
-            kind, length = header[4:8], int.from_bytes(header[:4], "big")
-            if length == 1:
-                length = int.from_bytes(header[8:16], "big")
-            elif length == 0:
-                length = size - at
-            if length < 8:
-                findings.problem(path, f"the box at byte {at} announces {length} bytes", _REENCODE)
-                return None
-            if at + length > size:
-                findings.problem(
-                    path,
-                    f"the video is cut off: part {kind.decode('latin-1')!a} goes to byte {at + length}, "
-                    f"the file ends at byte {size}",
-                    _REENCODE,
-                )
-                return None
-            seen.add(kind)
-            at += length
-    if b"moov" not in seen:
-        findings.problem(path, "the video is cut off: its index (part 'moov') is missing", _REENCODE)
+def _inspect(
+    path: Path,
+    container: Container,
+    opened: av.container.InputContainer,
+    stream: av.VideoStream,
+    findings: Findings,
+) -> VideoFrames | None:
+    context = stream.codec_context
+    if context is None:
+        findings.problem(path, "no decoder is known for the video in it", _REENCODE)
         return None
-    return b"moof" not in seen
+    if context.width * context.height > MAX_PIXELS:
+        findings.problem(
+            path,
+            f"frames of {context.width}x{context.height} exceed the bound of {MAX_PIXELS} pixels",
+            "Scale it down",
+        )
+        return None
+    fps = frame_rate(stream)
+    announced = stream.frames or int(fps * _duration_s(opened, stream))
+    index = read_index(opened, stream, container)
+    if index.frame_count < 0.98 * announced - 2 and not _is_edited(index):
+        findings.problem(
+            path, f"the video ends early: {index.frame_count} of about {announced} frames are there", _REENCODE
+        )
+        return None
+    if not 0.1 <= fps <= 1000:
+        findings.warn(path, f"the container announces {fps} frames/s", "30 frames/s are assumed")
+        fps = 30.0
+    return _with_first_frame(path, container, index, fps, findings)
+
+
+def _duration_s(opened: av.container.InputContainer, stream: av.VideoStream) -> float:
+    if stream.duration and stream.time_base:
+        return float(stream.duration * stream.time_base)
+    return (opened.duration or 0) / av.time_base
+
+
+def _is_edited(index: VideoIndex) -> bool:
+    """Whether some packets are there only to be decoded: an edit list shows less than what is stored."""
+    return any(position < 0 for position in index.positions)
+
+
+def _rotation(path: Path, container: Container) -> int:
+    """By how many degrees, counter-clockwise, the container says that pictures are to be turned."""
+    with _opened(path, container) as (opened, stream), captured_log():
+        try:
+            frame = next(opened.decode(stream), None)
+        except av.FFmpegError:
+            frame = None
+        return 0 if frame is None else frame.rotation
+
+
+def _with_first_frame(
+    path: Path, container: Container, index: VideoIndex, fps: float, findings: Findings
+) -> VideoFrames | None:
+    """The video, where its first frame is whole: everything begins with it."""
+    video = VideoFrames(path, container, index, fps, _rotation(path, container))
+    first = video.look_at_first()
+    if first is None:
+        findings.problem(path, "no frame of the video can be decoded", _REENCODE)
+        return None
+    if first.damage is not None:
+        findings.problem(
+            path,
+            f"the first frame is damaged: {first.damage}",
+            f"{_REENCODE}, or cut off its beginning (ffmpeg -ss SECONDS -i IN -c:v libx264 OUT.mp4)",
+        )
+        return None
+    return video

@@ -13,7 +13,7 @@ struct AdamStep {
   float inv_bias2;       // 1 / sqrt(1 - beta2^t)
   float fresh1, fresh2;  // 1 - beta1, 1 - beta2, subtracted in double: 1 - 0.999f is off by 5e-5
   float epsilon;
-  int64_t row_size;  // values that share their fate: one that is not finite keeps the whole row as it is
+  int64_t row_size;  // values of a row: one gradient that is not finite leaves the whole row as it is
 };
 
 // AdamStep with rate and step in device memory.

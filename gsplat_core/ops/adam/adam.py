@@ -44,14 +44,14 @@ def adam_step_queued(
 ) -> Tensor:
     """Update `parameter` and its moments in place as torch.optim.Adam does; on CUDA the host does not wait.
 
-    A gradient that is NaN or infinite (or so large that its square is) would poison the moments for good, so it leaves its row of
-    `row_size` consecutive values, parameter and moments, as it was.
+    A gradient that is NaN or infinite (or so large that its square is) would stay in the moments for good, so its row of
+    `row_size` consecutive values, parameter and moments, is left as it was.
 
     Args:
         parameter, first_moment, second_moment: float32, contiguous, of the gradient's shape.
         gradient: float32.
         step: counts from 1.
-        row_size: values that share their fate; 1 = each for itself. It divides the number of values.
+        row_size: values that are updated together or not at all; 1 = each for itself. It divides the number of values.
 
     Returns:
         How many rows were left alone, int64 [] on the device.

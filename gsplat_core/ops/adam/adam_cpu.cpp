@@ -9,15 +9,15 @@ constexpr int64_t kBlock = 2048;  // values checked and then updated while they 
 
 // Whether every gradient, squared, is finite: an infinite second moment would stop its parameter for good.
 static bool usable(const float* g, int64_t n) {
-  vfloat poison{};
+  vfloat nan_if_unusable{};
   int64_t i = 0;
   for (; i + kLanes <= n; i += kLanes) {
     const vfloat x = load(g + i);
-    poison += x * x * 0.0f;
+    nan_if_unusable += x * x * 0.0f;
   }
   float rest = 0;
   for (; i < n; ++i) rest += g[i] * g[i] * 0.0f;
-  return bits(poison == 0) == bits(vfloat{} == 0) && rest == 0;
+  return bits(nan_if_unusable == 0) == bits(vfloat{} == 0) && rest == 0;
 }
 
 static void update(float* __restrict__ p, const float* __restrict__ g, float* __restrict__ m, float* __restrict__ v, int64_t n,

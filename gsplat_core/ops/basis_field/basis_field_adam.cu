@@ -48,7 +48,7 @@ __global__ void __launch_bounds__(kBlock, 4) adam(DeviceBasisAdam field, const f
   const int64_t first = at.gaussian * field.bumps;
   Timing next = timing_at(field.centers, field.log_widths, first, at.lane, field.bumps);
   const float tau = *field.tau, channel_rate = field.rates[basis_rate_of(at.channel)];
-  // The frame does not show this Gaussian, or says nothing of use about it.
+  // The frame does not show this Gaussian, or its gradient is not finite.
   if (!__any_sync(kAll, g != 0.0f) || __any_sync(kAll, !isfinite(g * g))) return;
   for (int from = 0; from < field.bumps; from += 32) {
     const bool exists = from + at.lane < field.bumps;

@@ -45,9 +45,9 @@ GSPLAT_INLINE bool is_zero(const Row& r) {
 
 // Whether every square is finite: an infinite second moment would stop its parameter for good.
 GSPLAT_INLINE bool is_usable(const Row& r) {
-  vfloat poison = r.v[0] * r.v[0] * 0.0f;
-  for (int i = 1; i < kRowVectors; ++i) poison += r.v[i] * r.v[i] * 0.0f;
-  return sum(poison) == 0.0f;
+  vfloat nan_if_unusable = r.v[0] * r.v[0] * 0.0f;
+  for (int i = 1; i < kRowVectors; ++i) nan_if_unusable += r.v[i] * r.v[i] * 0.0f;
+  return sum(nan_if_unusable) == 0.0f;
 }
 
 // A vector of neighbouring bumps of one Gaussian at one time.
@@ -156,7 +156,7 @@ void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t 
   for (int i = 0; i < kRowVectors; ++i) rates.v[i] = load(field.channel_rates + i * kLanes);
   for (int64_t n = begin; n < end; ++n) {
     const Row g = load_row(gradient + n * field.row);
-    if (is_zero(g) || !is_usable(g)) continue;  // the frame does not show this Gaussian, or says nothing of use about it
+    if (is_zero(g) || !is_usable(g)) continue;  // not shown in this frame, or not finite
     const int64_t first = n * field.bumps;
     for (int64_t from = 0; from < field.bumps; from += kLanes) {
       const int64_t at = first + from, count = lanes_left(from, field.bumps);

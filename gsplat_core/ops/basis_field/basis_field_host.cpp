@@ -116,7 +116,7 @@ void backward(const Call&, const Field& f, const Tensor& gradient, float* center
   });
 }
 
-// Adam's bias corrections by number of updates, up to where float32 no longer tells them from 1.
+// Adam's bias corrections by number of updates, up to where they are 1 in float32.
 struct BiasTable {
   double beta1, beta2;
   std::vector<float> inverse_bias1, inverse_root_bias2;

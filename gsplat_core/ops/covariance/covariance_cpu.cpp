@@ -1,6 +1,6 @@
 #include "covariance.h"
 #include "covariance_math.h"
-#include "rows.h"
+#include "transposed_rows.h"
 #include "simd.h"
 
 namespace GSPLAT_ISA::covariance {

@@ -12,62 +12,6 @@ namespace {
 
 using Splat = Record<4>;
 
-// A block's shared memory: the keys while they are sorted, then the sorted ids and the staged splats.
-template <class Stage>
-union BlendShared {
-  uint64_t keys[kSortKeys];
-  struct {
-    uint32_t ids[kBlockThreads * kMaxKeysOfThread];
-    union {
-      BucketShared buckets;
-      Stage stage;
-    };
-  };
-};
-
-// The low words of a tile's keys in depth order: splats, or instances when training; in shared memory if they fit.
-struct SortedIds {
-  const uint32_t* first;
-  int stride;
-  __device__ uint32_t operator[](int i) const { return first[i * stride]; }
-};
-
-template <int kEach, class Stage>
-__device__ inline void sort_short(const uint64_t* keys, int length, BlendShared<Stage>& shared) {
-  uint64_t mine[kEach];
-#pragma unroll
-  for (int i = 0; i < kEach; ++i) {
-    const int at = i * kBlockThreads + int(threadIdx.x);
-    mine[i] = at < length ? keys[at] : ~0ull;
-  }
-  if (sort_by_buckets(mine, length, shared.buckets, shared.ids)) return;
-  __syncthreads();
-  sort_in_registers<kEach>(mine, length, shared.keys);
-  __syncthreads();
-#pragma unroll
-  for (int i = 0; i < kEach; ++i) shared.ids[int(threadIdx.x) * kEach + i] = uint32_t(mine[i]);
-}
-
-// Sorts a tile's keys by depth; ends with a barrier.
-template <class Stage>
-__device__ inline SortedIds sort_tile(uint64_t* keys, int length, BlendShared<Stage>& shared) {
-  SortedIds sorted = {shared.ids, 1};
-  if (length <= kBlockThreads) {
-    sort_short<1>(keys, length, shared);
-  } else if (length <= 2 * kBlockThreads) {
-    sort_short<2>(keys, length, shared);
-  } else if (length <= 4 * kBlockThreads) {
-    sort_short<4>(keys, length, shared);
-  } else if (length <= kMaxKeysOfThread * kBlockThreads) {
-    sort_short<kMaxKeysOfThread>(keys, length, shared);
-  } else {
-    sort_long(keys, length, shared.keys);
-    sorted = {reinterpret_cast<const uint32_t*>(keys), 2};  // little-endian
-  }
-  __syncthreads();
-  return sorted;
-}
-
 // The sorted splats of a tile. A list that overflowed may contain "no instance", which is read as a splat that reaches no pixel.
 template <Mode mode>
 struct TileSplats {

@@ -1,16 +1,19 @@
-// HexPlane features: bilinear samples of six planes multiplied, for one level. Planes are channels-last [V, U, C].
+// HexPlane features of one level, bilinear samples of six planes multiplied, and factorised inference: what the host code and the
+// kernels of both devices share. Planes are channels-last [V, U, C].
 #pragma once
 
 #include <cstdint>
 
+#include "cuda_stream.h"
 #include "isa.h"
+
+class CudaScratch;
+
+namespace gsplat::hexplane {
 
 // Planes in the order xy, xz, yz, xt, yt, zt; u and v are the axes (0 x, 1 y, 2 z, 3 t) along U and V.
 constexpr int kPlanes = 6;
 constexpr int kPlaneAxes[kPlanes][2] = {{0, 1}, {0, 2}, {1, 2}, {0, 3}, {1, 3}, {2, 3}};
-
-// Points whose sample gradients are held at once: small enough to stay in the cache until they are added up.
-constexpr int64_t kBackwardBlock = 2048;
 
 struct FeaturePlane {
   const float* values;
@@ -23,7 +26,39 @@ struct HexPlanes {
   int64_t channels;
 };
 
-struct HexPlaneKernels {
+// Inference at one time: cached space features times three lines per level, then an MLP with ReLU between its layers.
+constexpr int kMaxLevels = 16;
+constexpr int kMaxLayers = 66;
+
+struct DecodeLevel {
+  const float* space;     // [N, C]
+  const float* lines[3];  // [U, C], the time planes interpolated at the time; null if `space` already holds the features
+  int32_t widths[3];      // U
+  int64_t channels;
+};
+
+struct DecodeLayer {
+  const float* weights;  // transposed and padded with zeros: [inputs, padded outputs]
+  const float* bias;     // [padded outputs]
+  int64_t inputs, padded_outputs;
+};
+
+struct Decode {
+  DecodeLevel levels[kMaxLevels];
+  DecodeLayer layers[kMaxLayers];
+  int level_count, layer_count;
+  const float* coordinates;  // [N, 4] in [-1, 1]
+  float* outputs;            // [N, output_count]
+  int64_t output_count;
+  int64_t stride;  // floats per row of a buffer: at least the features and every layer's padded outputs
+};
+
+// CPU: points whose sample gradients are held at once; few enough to stay in the cache until they are added up.
+constexpr int64_t kBackwardBlock = 2048;
+// CPU: Gaussians that go through all layers while they are in the first-level cache; a multiple of every micro-kernel's rows.
+constexpr int64_t kBlockRows = 48;
+
+struct Kernels {
   // Product of the planes first..last-1 at each point: [N, C].
   void (*product)(const HexPlanes& level, int first, int last, float* features, int64_t begin, int64_t end);
   // Per point of a block the gradient of each plane's sample, [6, kBackwardBlock, C] counted from `block`, and of the
@@ -35,5 +70,22 @@ struct HexPlaneKernels {
                   int64_t last, int64_t block, int64_t end);
   // features[n, c] = space[n, c] * product over the axes of line[axis] (given [U, C]) at x, y, z of the point.
   void (*modulate)(const HexPlanes& level, const float* space, float* features, int64_t begin, int64_t end);
+  int lanes;  // outputs of a decoded layer are padded to a multiple of this
+  // `buffer` holds 2 * kBlockRows * stride floats.
+  void (*decode)(const Decode& d, float* buffer, int64_t begin, int64_t end);
 };
-GSPLAT_DECLARE_KERNELS(HexPlaneKernels, hexplane_kernels)
+
+// CUDA: all pointers are device memory. Product of the planes first..last-1 at each point: [N, C].
+void plane_product(const HexPlanes& level, int first, int last, float* features, int64_t count, cudaStream_t stream);
+// features = space times the three lines (given as planes of height 1) at x, y, z.
+void modulate_lines(const HexPlanes& level, const float* space, float* features, int64_t count, cudaStream_t stream);
+// Gradients of all six planes' product: of the coordinates [N, 4] and of each plane.
+void plane_gradients(const HexPlanes& level, const float* gradient, float* v_coordinates, float* const* v_planes, int64_t count,
+                     CudaScratch& scratch, cudaStream_t stream);
+// out [N, outputs] = in [N, inputs] weight^T + bias; weight [outputs, inputs]. Rows of `in` and `out` may be longer than that.
+void linear_layer(const float* in, int64_t in_stride, const float* weight, const float* bias, float* out, int64_t out_stride,
+                  int64_t count, int inputs, int outputs, bool rectify, cudaStream_t stream);
+
+}  // namespace gsplat::hexplane
+
+GSPLAT_KERNELS(hexplane, Kernels)

@@ -3,7 +3,7 @@
 
 #include "simd.h"
 
-namespace GSPLAT_ISA {
+namespace GSPLAT_ISA::hexplane {
 
 struct LinePosition {
   int64_t cell;    // the left one of two neighbours
@@ -11,7 +11,7 @@ struct LinePosition {
   float slope;     // cells per unit of the coordinate, zero at the border and beyond
 };
 
-// NaN lands in the first cell with a NaN fraction, so that it shows in the result and nothing outside is read.
+// NaN gives the first cell with a NaN fraction, so that it propagates into the result and nothing outside is read.
 GSPLAT_INLINE LinePosition position_on(float coordinate, int32_t size) {
   const float scale = 0.5f * float(size - 1);
   const float unclamped = (coordinate + 1.0f) * scale;
@@ -23,4 +23,4 @@ GSPLAT_INLINE LinePosition position_on(float coordinate, int32_t size) {
   return {cell, at - float(cell), unclamped > 0.0f && unclamped < float(size - 1) ? scale : 0.0f};
 }
 
-}  // namespace GSPLAT_ISA
+}  // namespace GSPLAT_ISA::hexplane

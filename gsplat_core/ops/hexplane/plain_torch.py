@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.scene.layout import HEAD_COLUMNS, RAW_COLUMNS
+from gsplat_core.scene.layout import COLOUR, HEAD_GROUPS, OPACITY, RAW_COLUMNS, width_of
 
 
 def sample_plane(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:
@@ -95,12 +95,25 @@ def hexplane_deltas(
     The time planes [V, U, C], three per level, are interpolated into lines, then `hexplane_decode` (or another `decode`). With `order`,
     row i of the inputs is Gaussian order[i].
     """
+    # Nothing here makes the host wait or copies from it, so that a CUDA graph can hold the call.
     lines = []
     for plane in time_planes:
-        at = ((time.reshape(()) + 1) / 2 * (plane.shape[0] - 1)).clamp(0, plane.shape[0] - 1)
+        at = ((time.reshape(1) + 1) / 2 * (plane.shape[0] - 1)).clamp(0, plane.shape[0] - 1)
         row = at.detach().nan_to_num().long().clamp(max=max(plane.shape[0] - 2, 0))
-        lines.append(torch.lerp(plane[row], plane[(row + 1).clamp(max=plane.shape[0] - 1)], at - row))
+        next_row = (row + 1).clamp(max=plane.shape[0] - 1)
+        lines.append(torch.lerp(plane.index_select(0, row)[0], plane.index_select(0, next_row)[0], at - row))
     outputs = (decode or hexplane_decode)(spaces, coordinates, lines, weights, biases)
-    deltas = outputs.new_zeros(outputs.shape[0], RAW_COLUMNS)
-    rows = torch.arange(outputs.shape[0], device=outputs.device) if order is None else order.long()
-    return deltas.index_put((rows[:, None], torch.tensor(HEAD_COLUMNS, device=outputs.device)), outputs)
+    position, log_scale, rotation, opacity = outputs.split([width_of(group) for group in HEAD_GROUPS], dim=1)
+    n, no_colour = len(outputs), width_of(COLOUR)
+    deltas = torch.cat(
+        [
+            position,
+            rotation,
+            log_scale,
+            outputs.new_zeros(n, no_colour),
+            opacity,
+            outputs.new_zeros(n, RAW_COLUMNS - OPACITY.stop),
+        ],
+        dim=1,
+    )
+    return deltas if order is None else torch.zeros_like(deltas).index_copy(0, order.long(), deltas)

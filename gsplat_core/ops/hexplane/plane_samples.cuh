@@ -1,19 +1,22 @@
-// Bilinear samples of channels-last planes: a team of lanes has a point, and each lane some of its channels.
+// Bilinear samples of channels-last planes by a team of lanes per point, each with some of the channels; and the gradient of one
+// node of a plane, which adds the gradient rows of the Gaussians in the four cells around it in their sorted order.
 #pragma once
+
+#include <type_traits>
 
 #include "hexplane.h"
 #include "line_position.h"
 
-namespace hexplane {
+namespace gsplat::hexplane {
 
-using GSPLAT_ISA::LinePosition;
-using GSPLAT_ISA::position_on;
+using GSPLAT_ISA::hexplane::LinePosition;
+using GSPLAT_ISA::hexplane::position_on;
 
 // kPlaneAxes for device code, which cannot index it.
 constexpr int u_axis(int plane) { return plane == 2 || plane == 4 ? 1 : plane == 5 ? 2 : 0; }
 constexpr int v_axis(int plane) { return plane == 0 ? 1 : plane < 3 ? 2 : 3; }
 
-// Neighbouring channels of a lane: 4 where the channels are a multiple of 4 and memory is aligned, otherwise 1.
+// Consecutive channels of a lane: 4 if the number of channels is a multiple of 4 and memory is aligned, otherwise 1.
 template <int kLane>
 struct Channels {
   float v[kLane];
@@ -80,7 +83,7 @@ __device__ __forceinline__ Channels<kLane> between(const Channels<kLane>& a, con
 // The cells around a point: of a plane four, of a line two. Offsets are in floats, from the start of the plane.
 struct Corners {
   int64_t start;
-  int32_t right, below;  // to the neighbours; 0 where there is one cell only
+  int32_t right, below;  // to the neighbours; 0 if there is only one cell
   LinePosition u, v;
 
   __device__ Corners(const FeaturePlane& plane, const LinePosition& along_u, const LinePosition& along_v, int channels)
@@ -105,7 +108,7 @@ struct Sample {
   }
   __device__ Channels<kLane> along_u(const Corners& at) const { return between(p10 - p00, p11 - p01, at.v.fraction); }
   __device__ Channels<kLane> along_v(const Corners& at) const { return between(p01 - p00, p11 - p10, at.u.fraction); }
-  // All three, which share most of their work: the value, and its derivatives per cell.
+  // The value and its derivatives per cell, which share most of their computation.
   __device__ void value_and_slopes(const Corners& at, Channels<kLane>& value, Channels<kLane>& along_u,
                                    Channels<kLane>& along_v) const {
     const Channels<kLane> upper = p10 - p00, lower = p11 - p01, top = plus(p00, at.u.fraction, upper);
@@ -123,4 +126,94 @@ __device__ __forceinline__ float team_sum(float x) {
   return x;
 }
 
-}  // namespace hexplane
+// Calls `run` with the channels of a lane and the lanes of a team as constants. Every row of channels must be aligned to 16
+// bytes.
+template <class Run>
+void with_wide_team(int64_t channels, const Run& run) {
+  const auto four = std::integral_constant<int, 4>();
+  if (channels <= 32) return run(four, std::integral_constant<int, 8>());
+  run(four, std::integral_constant<int, 16>());
+}
+
+// The same without that condition: 4 channels a lane only if `wide`.
+template <class Run>
+void with_team(bool wide, int64_t channels, const Run& run) {
+  if (wide) return with_wide_team(channels, run);
+  run(std::integral_constant<int, 1>(), std::integral_constant<int, 16>());
+}
+
+constexpr int kDenseCell = 8;  // a cell with at least so many Gaussians is dense: its rows are summed in a pass of their own
+constexpr int kDenseRun = 32;  // sorted rows that one team sums in that pass
+constexpr int kNodeBatch = 2;  // rows of a node in flight: few, since many nodes are
+
+// One plane's Gaussians, sorted by cell = along the major axis * minor size + along the minor axis.
+struct SortedCells {
+  const int32_t* starts;    // of the plane's first cell
+  const float* rows;        // [all planes' items, C], sorted: gradient of the plane's sample
+  const float* fractions;   // [items, 2]: fraction of the way to the right node along the major and the minor axis
+  const float* dense_sums;  // sums of dense cells for their corners (../hexplane_training/training.h); null: none
+  int32_t minor_size;
+};
+
+// The weight of node `node` in a sample at `at`.
+__device__ __forceinline__ float weight_of(const LinePosition& at, int node) {
+  return int(at.cell) == node ? 1.0f - at.fraction : int(at.cell) == node - 1 ? at.fraction : 0.0f;
+}
+
+// Calls use(i, fraction along major, along minor, row) for the sorted items [begin, end) in order; kBatch of them are loaded at
+// once.
+template <int kLane, int kBatch, class Use>
+__device__ __forceinline__ void for_rows(const SortedCells& cells, int32_t begin, int32_t end, int channel, int channels,
+                                         const Use& use) {
+  for (int32_t i = begin; i < end; i += kBatch) {
+    Channels<kLane> row[kBatch];
+    float2 share[kBatch];
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k) {
+      const int64_t at = min(i + k, end - 1);
+      row[k] = Channels<kLane>::load(cells.rows + at * channels + channel);
+      share[k] = *reinterpret_cast<const float2*>(cells.fractions + 2 * at);
+    }
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k)
+      if (i + k < end) use(i + k, share[k].x, share[k].y, row[k]);
+  }
+}
+
+// The index in [runs, 5, 4, C] of the sums of a dense cell's rows in run `run`: the first of five places is for the cell that
+// begins in an earlier run, the others are for those that begin in one of the run's quarters, where no two do.
+__device__ __forceinline__ int64_t dense_place(int run, bool begins, int32_t begin, int corner) {
+  return (int64_t(run) * 5 + (begins ? 1 + begin % kDenseRun / kDenseCell : 0)) * 4 + corner;
+}
+
+template <int kLane>
+__device__ Channels<kLane> node_gradient(const SortedCells& cells, int major, int minor, int channel, int channels) {
+  Channels<kLane> sum = Channels<kLane>::all(0.0f);
+#pragma unroll 1
+  for (int left = 0; left < 2; ++left) {  // along the major axis, the cell on the node's right comes last
+    const int cell_major = major - 1 + left;
+    if (cell_major < 0) continue;
+    const int32_t* starts = cells.starts + int64_t(cell_major) * cells.minor_size + minor;
+    const int32_t bounds[3] = {starts[minor > 0 ? -1 : 0], starts[0], starts[1]};
+    if (bounds[0] == bounds[2]) continue;
+#pragma unroll
+    for (int low = 0; low < 2; ++low) {
+      const int32_t begin = bounds[low], end = bounds[low + 1];
+      if (cells.dense_sums != nullptr && end - begin >= kDenseCell) {
+        const int first = begin / kDenseRun, corner = 2 * (1 - left) + (1 - low);
+        for (int run = first; run <= (end - 1) / kDenseRun; ++run)
+          sum =
+              plus(sum, 1.0f,
+                   Channels<kLane>::load(cells.dense_sums + dense_place(run, run == first, begin, corner) * channels + channel));
+        continue;
+      }
+      for_rows<kLane, kNodeBatch>(cells, begin, end, channel, channels,
+                                  [&](int32_t, float along, float across, const Channels<kLane>& row) {
+                                    sum = plus(sum, (left ? 1.0f - along : along) * (low ? 1.0f - across : across), row);
+                                  });
+    }
+  }
+  return sum;
+}
+
+}  // namespace gsplat::hexplane

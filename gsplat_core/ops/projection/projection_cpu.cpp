@@ -1,6 +1,6 @@
 #include "projection.h"
 #include "projection_math.h"
-#include "rows.h"
+#include "transposed_rows.h"
 #include "simd.h"
 
 namespace GSPLAT_ISA::projection {

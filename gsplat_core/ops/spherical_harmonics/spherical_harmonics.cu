@@ -28,7 +28,7 @@ __device__ UnitDirection unit_direction(const float* dirs, int64_t i) {
   return {{x * inverse, y * inverse, z * inverse}, inverse};
 }
 
-// A set's coefficients are 3 K floats behind one another, so a lane alone would touch as many sectors of memory as it reads
+// A set's coefficients are 3 K consecutive floats, so a lane alone would touch as many sectors of memory as it reads
 // numbers. The warp's sets together are one run: it is copied through shared memory, neighbouring lanes at neighbouring places,
 // without the sets that `wanted` (a bit per lane) leaves out.
 template <int degree>
@@ -44,7 +44,7 @@ __device__ void fetch_sets(float* shared, const float* coeffs, int64_t row, unsi
   __syncwarp();
 }
 
-// The way back: the used coefficients of the warp's `sets` sets, and zeros for those that the degree does not use.
+// Copies back: the used coefficients of the warp's `sets` sets, and zeros for those that the degree does not use.
 template <int degree>
 __device__ void put_sets(float* coeffs, const float* shared, int64_t row, int sets, int lane) {
   constexpr int width = width_of(degree), pitch = pitch_of(degree);

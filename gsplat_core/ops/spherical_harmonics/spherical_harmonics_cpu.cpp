@@ -1,7 +1,7 @@
-#include "rows.h"
 #include "simd.h"
 #include "spherical_harmonics.h"
 #include "spherical_harmonics_bases.h"
+#include "transposed_rows.h"
 
 namespace GSPLAT_ISA::spherical_harmonics {
 

@@ -206,7 +206,7 @@ static void load_upstream(const Strip& s, int64_t row) {
   for (int64_t i = 0; i < (to - from) * c; ++i) out[i] = source[i];
 }
 
-// What a row that the band owns gives away: its sum and its map.
+// The outputs of a row that the band owns: its sum and its map.
 static void emit_row(const Strip& s, int64_t strip, int64_t row) {
   const SsimTask& task = s.task;
   const int first = s.begin(0), last = s.end(0);

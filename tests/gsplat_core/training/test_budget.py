@@ -198,6 +198,21 @@ def test_no_more_than_a_few_steps_are_in_flight(monkeypatch):
     assert steps.queued() == 1
 
 
+@pytest.mark.cuda
+def test_on_a_gpu_a_deadline_of_so_many_steps_gives_the_model_of_that_number(
+    gpu, tissue_video, camera, clock, step_takes
+):
+    counted, timed = (Reconstructor(CONFIG, camera, device=gpu) for _ in range(2))
+    step_takes(1.0)
+    for frame, steps in zip(tissue_video(6), (6, 5, 8, 1, 12, 7), strict=True):
+        expected = counted.observe(frame, steps=steps)
+        # Steps in flight count as if they were still to be made: at_most alone ends the frame.
+        budget = Budget.until(clock() + 100, at_most=steps, clock=clock)
+        report = timed.observe(frame, budget=budget)
+        assert (report.steps, report.ending, report.loss) == (steps, "at_most", expected.loss)
+    assert timed.snapshot().sha256() == counted.snapshot().sha256()
+
+
 def test_on_the_cpu_nothing_is_in_flight():
     assert StepsInFlight(torch.device("cpu")).queued() == 0
 

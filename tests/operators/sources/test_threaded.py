@@ -7,6 +7,7 @@ import threading
 import pytest
 
 from gsplat_core.errors import InvalidInput
+from operators.sources import threaded
 from operators.sources.source import FrameSource, SourceDescription, SourceState
 from operators.sources.threaded import ThreadedSource
 
@@ -119,6 +120,26 @@ def test_the_iterator_is_closed_in_the_thread_that_runs_it(camera, frame):
     source.close()
     (thread,) = source.closed_in
     assert thread is not threading.current_thread() and not thread.is_alive()
+
+
+def test_a_reader_that_does_not_end_is_left_behind_and_never_gives_frames_to_a_later_reading(
+    camera, frame, monkeypatch, caplog
+):
+    monkeypatch.setattr(threaded, "CLOSE_TIMEOUT_S", 0.01)
+    stuck = threading.Event()
+    source = Listed([frame(0), stuck, frame(1)], camera)
+    source.open()
+    assert source.read(SOON_S).seq == 0
+    source.close()
+    assert "read listed does not end; it is left behind" in caplog.text
+    source.script = [frame(7)]
+    source.open()
+    stuck.set()
+    for thread in threading.enumerate():
+        if thread.name == "read listed":
+            thread.join(SOON_S) if thread is not source._thread else None
+    assert all_of(source) == [7]
+    source.close()
 
 
 def test_one_frame_ahead_is_the_least(camera):

@@ -74,6 +74,19 @@ def test_it_says_what_it_must(text):
     assert "prefers-color-scheme: dark" in text
 
 
+def test_a_series_that_is_summed_up_says_so(report, text):
+    binned = report.model_copy(update={"series_frames_per_entry": 12})
+    assert "Each point is the mean of 12 frames." in render_html(binned, [])
+    assert "Each point is the mean" not in text
+
+
+def test_a_stream_without_an_end_has_a_page(report):
+    recording = report.recording.model_copy(update={"frames": None})
+    run = report.run.model_copy(update={"stop_reason": "end of stream"})
+    text = render_html(report.model_copy(update={"recording": recording, "run": run}), [])
+    assert "a stream without an end, 24 x 16 px" in text and 'role="alert"' not in text
+
+
 def test_names_and_notes_are_escaped(text):
     assert "take &lt;7&gt;" in text and "take <7>" not in text
     assert "no &lt;mask&gt;" in text

@@ -7,7 +7,7 @@ import json
 import pytest
 from pydantic import ValidationError
 
-from services.reports.schema import RunReport
+from services.reports.schema import BinEntry, FrameEntry, RunReport
 
 PROMISED = {
     "recording": {"frames", "width_px", "height_px", "fps"},
@@ -22,6 +22,25 @@ def test_what_is_written_reads_back_equal(tmp_path, report):
     report.write(tmp_path / "report.json")
     assert RunReport.read(tmp_path / "report.json") == report
     assert [p.name for p in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_a_long_runs_series_of_bins_reads_back_equal(tmp_path, report):
+    content = report.model_dump()
+    bins = [{**entry, "frames": 3, "psnr_tissue_min_db": 21.5} for entry in content["series"]]
+    binned = RunReport.model_validate({**content, "series": bins, "series_frames_per_entry": 3})
+    assert {type(entry) for entry in binned.series} == {BinEntry} and {type(entry) for entry in report.series} == {
+        FrameEntry
+    }
+    binned.write(tmp_path / "report.json")
+    assert RunReport.read(tmp_path / "report.json") == binned
+    with pytest.raises(ValidationError, match="psnr_tissue_min_db"):
+        RunReport.model_validate({**content, "series": [{**bins[0], "psnr_tissue_min_db": "low"}]})
+
+
+def test_what_earlier_reports_did_not_have_is_not_asked_for(report):
+    content = report.model_dump()
+    del content["series_frames_per_entry"], content["run"]["renderer"]
+    assert RunReport.model_validate(content) == report
 
 
 def test_every_promised_field_is_there(tmp_path, report):

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.atomic_files import PartialFolder
 from gsplat_core.io.recordings.calibration import DEFAULT_FOCAL_FACTOR
-from gsplat_core.io.recordings.layouts import RECORDING_FORMAT, RECORDING_VERSION
+from gsplat_core.io.recordings.sidecars import RECORDING_FORMAT, RECORDING_VERSION
 from gsplat_core.io.recordings.synthetic.renderer import Eye, render_eye
 from gsplat_core.io.recordings.synthetic.target import GENERATOR, check_target
 from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM, Tissue

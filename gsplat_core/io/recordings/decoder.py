@@ -1,0 +1,129 @@
+"""Decoding packet by packet, with everything that the decoder lets on about damage.
+
+One thread, so that results repeat and each complaint of the decoder belongs to the packet it was given. Where there is a choice of
+decoders, the one that checks most: FFmpeg's own decoder for VP9 hides nearly all damage, libvpx reports nearly all of it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from typing import cast
+
+import av
+import numpy as np
+from av.video.reformatter import Interpolation
+from numpy.typing import NDArray
+
+from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.io.recordings.overrun import PROBED, OverrunProbe, Ticket
+from gsplat_core.io.recordings.packet_checks import length_bytes, packet_check
+
+_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9", "av1": "libdav1d"}
+_OPTIONS = {
+    # Every check that the decoders have; what they find is reported, and they go on with the next picture.
+    "err_detect": "crccheck+bitstream+buffer+careful+compliant+aggressive",
+    "max_pixels": str(MAX_PIXELS),
+}
+_STRICT = {"libdav1d": {"strict": "1"}}
+_WITHOUT_DELAY = frozenset({"vp8", "vp9", "av1", "mjpeg", "ffv1", "png", "huffyuv", "prores", "dnxhd"})
+"""A packet's picture comes out as the packet goes in."""
+NO_PICTURE = "the decoder gave no picture for it"
+_QUARTER_TURNS = {90: 1, 180: 2, -180: 2, -90: 3, 270: 3}
+
+
+@contextmanager
+def captured_log() -> Iterator[list[tuple[int, str, str]]]:
+    """FFmpeg's error messages (level, who, text) of this thread, kept off the terminal."""
+    if av.logging.get_level() != av.logging.ERROR:
+        logger = logging.getLogger("libav")
+        logger.addHandler(logging.NullHandler())
+        logger.propagate = False
+        av.logging.set_level(av.logging.ERROR)
+    av.logging.set_skip_repeated(False)  # the same complaint about two packets counts twice
+    with av.logging.Capture() as messages:
+        yield messages
+
+
+class PictureDecoder:
+    """Decodes one stream, and says which packets are damaged."""
+
+    def __init__(self, stream: av.VideoStream) -> None:
+        known = stream.codec_context
+        name = known.codec.canonical_name
+        self.doubts: dict[int, str] = {}
+        """What spoke against a packet, by its number; whoever has dealt with a packet takes its entry out."""
+        self._check = packet_check(name, known.extradata)
+        self._at_once = name in _WITHOUT_DELAY
+        self._context = _context(known, _DECODERS.get(name))
+        self._probe: OverrunProbe | None = None
+        if name in PROBED:
+            self._probe = OverrunProbe(_context(known, _DECODERS.get(name, name)), length_bytes(name, known.extradata))
+
+    def decode(self, packet: av.Packet | None, number: int, shown: bool) -> list[tuple[int, av.VideoFrame]]:
+        """The frames that come out when a packet goes in, each with the number of its own packet; None at the end, for those that
+        are still inside. `shown`: the packet has a picture to show."""
+        if packet is not None:
+            packet.opaque = Ticket(number)
+            if packet.is_corrupt:
+                self._doubt(number, "its packet is not complete")
+            elif self._check is not None and (wrong := self._check(bytes(packet))):
+                self._doubt(number, wrong)
+        if self._probe is not None:
+            with captured_log():
+                self._probe.decode(packet, number)
+        with captured_log() as messages:
+            try:
+                frames = self._context.decode(packet)
+            except av.FFmpegError as error:
+                self._doubt(number, messages[0][2] if messages else error.strerror or str(error))
+                frames = []
+        if messages:
+            self._doubt(number, messages[0][2])
+        numbered = [(frame.opaque.number, frame) for frame in frames if isinstance(frame.opaque, Ticket)]
+        if packet is not None and self._at_once and shown and number not in (own for own, _ in numbered):
+            self._doubt(number, NO_PICTURE)
+        for own, frame in numbered:
+            if frame.is_corrupt:
+                self._doubt(own, "the decoder marked it as damaged")
+            if self._probe is not None and self._probe.differs(own, frame):
+                self._doubt(own, "the decoder read past its end")
+        return numbered
+
+    def _doubt(self, number: int, what: str) -> None:
+        text = " ".join(what.split())
+        self.doubts.setdefault(number, text if text.isprintable() else ascii(text))
+
+
+def _context(known: av.VideoCodecContext, decoder: str | None) -> av.VideoCodecContext:
+    """A decoder for a stream: the stream's own, or one of another name."""
+    context = known
+    if decoder is not None:
+        context = cast(av.VideoCodecContext, av.CodecContext.create(decoder, "r"))
+        context.width, context.height = known.width, known.height
+        context.colorspace, context.color_range = known.colorspace, known.color_range
+        if known.extradata:
+            context.extradata = known.extradata
+    context.thread_type = "NONE"
+    context.thread_count = 1
+    context.options = _OPTIONS | _STRICT.get(context.name, {})
+    flags = av.codec.context.Flags
+    # A damaged picture is handed out too: something must be shown in its place.
+    context.flags |= flags.copy_opaque | flags.output_corrupt
+    return context
+
+
+def picture(frame: av.VideoFrame, rotation: int) -> NDArray[np.uint8]:
+    """RGB uint8 [H, W, 3]: the bytes that OpenCV gives for the same frame, turned upright."""
+    image = frame.to_ndarray(format="bgr24", interpolation=Interpolation.BICUBIC)[..., ::-1]
+    if turns := _QUARTER_TURNS.get(rotation, 0):
+        image = np.rot90(image, turns)
+    return np.ascontiguousarray(image)
+
+
+def frame_rate(stream: av.VideoStream) -> float:
+    """Frames per second as the container tells it; 0 where it does not."""
+    rate = stream.guessed_rate or stream.average_rate or Fraction(0)
+    return float(rate)

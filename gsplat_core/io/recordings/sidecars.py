@@ -1,0 +1,161 @@
+"""What lies beside the images of a recording, each of it optional: masks, depth, the right eye, poses, a description.
+
+Absent means that nothing has that name. Whatever has it and cannot be used (a file in place of a folder, a link that leads to
+nothing or out of the recording, an empty folder) is a problem: a mask that is overlooked lets tools be learned as tissue.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.io.recordings.calibration import Calibration, number, read_json, read_pinhole, read_poses_bounds
+from gsplat_core.io.recordings.contents import FrameImages
+from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.recordings.frame_files import DepthFiles, ImageFiles, MaskFiles, check_pairing, check_sizes
+from gsplat_core.io.recordings.image_files import decode_plane, list_images
+from gsplat_core.io.recordings.plain_files import UnreadableFile, all_stay_inside, stays_inside
+
+RECORDING_FORMAT = "intrasplat-recording"
+RECORDING_VERSION = 1
+_FILES = ("recording.json", "poses_bounds.npy", "cameras.json", "valid_mask.png")
+
+
+class Beside:
+    """The sidecars in a recording's folder; None in place of the folder: there are none."""
+
+    def __init__(self, folder: Path | None, images: FrameImages, findings: Findings) -> None:
+        self._folder = folder
+        self._images = images
+        self._size = (images.width_px, images.height_px)
+        self._findings = findings
+
+    def files(self) -> tuple[Path, ...]:
+        """The single files that are there."""
+        found = (self._file(name) for name in _FILES)
+        return tuple(path for path in found if path is not None)
+
+    def description(self) -> dict[str, Any]:
+        """fps, camera, depth_unit_mm and stereo_baseline_mm of `recording.json`, each optional."""
+        path = self._file("recording.json")
+        return (_read_description(path, self._size, self._findings) if path else None) or {}
+
+    def poses(self) -> Calibration | None:
+        """The cameras of `poses_bounds.npy`."""
+        path = self._file("poses_bounds.npy")
+        return read_poses_bounds(path, self._images.frame_count, *self._size, self._findings) if path else None
+
+    def right(self) -> ImageFiles | None:
+        """The right eye."""
+        files = self._sequence("images_right", "right image")
+        return ImageFiles(files, *self._size) if files else None
+
+    def masks(self) -> MaskFiles | None:
+        """Tool masks."""
+        files = self._sequence("masks", "mask")
+        return MaskFiles(files) if files else None
+
+    def depth(self, unit_mm: float | None) -> DepthFiles | None:
+        """Depth maps; `unit_mm` is the length of one grey value, None where it is not stated."""
+        files = self._sequence("depth", "depth map")
+        if not files:
+            return None
+        if unit_mm is None:
+            unit_mm = 1.0
+            if any(path.suffix.lower() != ".npy" for path in files):
+                self._findings.warn(
+                    files[0].parent, "the unit of depth is not stated", "1 mm for each grey value is assumed"
+                )
+        return DepthFiles(files, *self._size, unit_mm)
+
+    def valid_mask(self) -> NDArray[np.uint8] | None:
+        """[H, W]; 1 inside the scope's circle."""
+        path = self._file("valid_mask.png")
+        return _read_valid_mask(path, self._size, self._findings) if path else None
+
+    def _file(self, name: str) -> Path | None:
+        """A file that is there. One that leads nowhere or outside is a problem."""
+        path = self._there(name)
+        return path if path is not None and stays_inside(path.parent, path, self._findings) else None
+
+    def _there(self, name: str) -> Path | None:
+        if self._folder is None or not os.path.lexists(self._folder / name):
+            return None
+        return self._folder / name
+
+    def _sequence(self, name: str, what: str) -> Sequence[Path] | None:
+        """The files of a folder that has one for each frame."""
+        folder = self._there(name)
+        if folder is None or not stays_inside(folder.parent, folder, self._findings):
+            return None
+        if not folder.is_dir():
+            self._findings.problem(
+                folder, "it is not a folder", f"Give a folder with one {what} for each frame, or remove it"
+            )
+            return None
+        files = list_images(folder)
+        if what == "depth map" and not files:
+            files = list_images(folder, frozenset({".npy"}))
+        if not check_pairing(self._images.numbers, files, folder, what, self._findings):
+            return None
+        if not all_stay_inside(folder.parent, files, self._findings):
+            return None
+        return files if check_sizes(files, self._size, what, self._findings) else None
+
+
+def _read_valid_mask(path: Path, size: tuple[int, int], findings: Findings) -> np.ndarray | None:
+    try:
+        mask = decode_plane(path)
+    except UnreadableFile as error:
+        findings.problem(path, str(error), "Export this mask again")
+        return None
+    if mask.shape != (size[1], size[0]):
+        findings.problem(
+            path,
+            f"the mask is {list(mask.shape)}, the images are {[size[1], size[0]]}",
+            "Give a grey PNG of their size",
+        )
+        return None
+    if not mask.any():
+        findings.problem(path, "it marks no pixel as valid", "255 means inside the scope's circle")
+        return None
+    return (mask != 0).astype(np.uint8)
+
+
+def _read_description(path: Path, size: tuple[int, int], findings: Findings) -> dict[str, Any] | None:
+    """fps, camera, depth_unit_mm and stereo_baseline_mm of `recording.json`, each optional."""
+    if (content := read_json(path, findings)) is None:
+        return None
+    if content.get("format") != RECORDING_FORMAT or content.get("version") != RECORDING_VERSION:
+        findings.problem(
+            path,
+            f"format {content.get('format')!r:.60} version {content.get('version')!r:.20} is not known",
+            f"This version reads {RECORDING_FORMAT} {RECORDING_VERSION}",
+        )
+        return None
+    read: dict[str, Any] = {}
+    for key, low, high in (("fps", 0.1, 1000), ("depth_unit_mm", 1e-6, 1e3), ("stereo_baseline_mm", 1e-3, 1e4)):
+        if content.get(key) is not None:
+            value = number(content[key])
+            if value is None or not low <= value <= high:
+                findings.problem(path, f"{key} is {content[key]!r:.40}", f"Give a number from {low:g} to {high:g}")
+                return None
+            read[key] = value
+    if (described := content.get("camera")) is not None:
+        if not isinstance(described, dict):
+            findings.problem(path, f"camera is {described!r:.40}", "Give width, height, fx, fy, cx and cy in pixels")
+            return None
+        camera = read_pinhole(path, described, findings)
+        if camera is not None and (camera.width_px, camera.height_px) != size:
+            findings.problem(
+                path,
+                f"its camera is {camera.width_px}x{camera.height_px}, the images are {size[0]}x{size[1]}",
+                "Give the camera of these images",
+            )
+        read["camera"] = camera
+    return read

@@ -1,0 +1,242 @@
+"""Training of the HexPlane field on CUDA without autograd: forward, backward, and Adam over the planes.
+
+    state = hexplane_train(means, box, time, planes, weights, biases)           # state.deltas into the frame
+    gradient = hexplane_train_backward(v_raw, box, state, planes, weights, biases)
+    hexplane_planes_adam_(planes, first, second, time, gradient, adam)
+
+Nothing waits for the host and every call can be captured in a CUDA graph; time, rate and step are read from device memory. The same
+inputs give the same bits: no sum is made by atomic additions. The gradient of the planes stays factored, one gradient row per Gaussian,
+level and plane, until the pass that updates the planes adds up each node's rows; `hexplane_planes_gradient` gives it as tensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.hexplane_deltas.hexplane_deltas import padded_width
+from gsplat_core.scene.layout import RAW_COLUMNS
+
+
+class TrainingState(NamedTuple):
+    """What the forward pass leaves for the backward pass."""
+
+    deltas: Tensor
+    """[N, 16] in the layout of `scene.layout`."""
+    coordinates: Tensor
+    """[N, 4]: x, y, z in [-1, 1], and 1; a Gaussian whose position is not finite has zeros and is left out."""
+    lines: Tensor
+    """The time planes interpolated at the time, [U, C] each, concatenated."""
+    features: Tensor
+    """[N, levels * C]."""
+    hidden: Tensor
+    """[depth, N, padded width]: the outputs of each layer of the trunk, padded with zeros."""
+    order: Tensor
+    """int32 [3, 3 * levels * N]: items (plane after plane, Gaussian after Gaussian) sorted by the cell of the plane; the index of each
+    item among the sorted ones; and the cells of the sorted items, with their highest bit set if they have 8 items or more (dense)."""
+    starts: Tensor
+    """int32 [cells + 1]: where each cell's items start."""
+
+
+class FieldGradient(NamedTuple):
+    """The gradient of a field, that of its planes factored."""
+
+    network: Tensor
+    """Weight and bias of every layer, concatenated."""
+    rows: Tensor
+    """[2, 3 * levels * N, C]: gradients of the samples of the space planes (xy, xz, yz of every level) and of the lines of their major
+    axes (y, x, z), sorted by the cell of the plane."""
+    fractions: Tensor
+    """[3 * levels * N, 2]: of the way to the next node along the major and the minor axis, in the same order."""
+    dense_sums: Tensor
+    """[3 * levels * N / 32, 5, 4, C]: of each run of 32 sorted rows, sums of the dense cells' rows for the four corners of the cell."""
+    v_lines: Tensor
+    """The gradient of the lines."""
+    starts: Tensor
+    """int32 [cells + 1]: where each cell's rows start."""
+
+    @property
+    def of_planes(self) -> list[Tensor]:
+        """All but the network's, as the ops over the planes take it."""
+        return list(self[1:])
+
+
+class AdamOnDevice(NamedTuple):
+    """Adam's settings of one step, read from device memory (Kingma and Ba 2015, algorithm 1)."""
+
+    rate: Tensor
+    """float32 [1], the learning rate."""
+    step: Tensor
+    """int64 [1], counted from 1."""
+    status: Tensor | None = None
+    """int32 [4] of a frame; if its lists overflowed nothing is changed."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    epsilon: float = 1e-8
+
+    @property
+    def arguments(self) -> tuple[Tensor | float | None, ...]:
+        """In the order in which the ops take them."""
+        return self.rate, self.step, self.status, *self.betas, self.epsilon
+
+
+class Penalties(NamedTuple):
+    """Weights of the penalties of `gsplat_core.reference.plane_penalties` in the loss."""
+
+    plane_smoothness: float = 0.0
+    time_smoothness: float = 0.0
+    time_sparsity: float = 0.0
+
+
+def hexplane_train(
+    means: Tensor,
+    box: Tensor,
+    time: Tensor,
+    planes: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+) -> TrainingState:
+    """The field's deltas at `time`, with what the backward pass needs.
+
+    Args:
+        means: canonical positions [N, 3]; outside the box they are clamped to it.
+        box: [2, 3], the range of the positions.
+        time: one number in [-1, 1].
+        planes: xy, xz, yz, xt, yt, zt of every level, [V, U, C], C a multiple of 16.
+        weights, biases: the trunk's layers and the head's (`takes_layers` says which sizes fit).
+
+    Raises:
+        InvalidInput: a tensor is not float32 on one CUDA device. RuntimeError: sizes do not fit.
+    """
+    _check(means, box, time, *planes, *weights, *biases)
+    state = torch.ops.gsplat_core.hexplane_train(means, box, time, list(planes), list(weights), list(biases))
+    return TrainingState(*state)
+
+
+def hexplane_train_backward(
+    v_raw: Tensor,
+    box: Tensor,
+    state: TrainingState,
+    planes: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+) -> FieldGradient:
+    """Gradients for dL/d(deltas) `v_raw` [N, 16], to whose first 3 columns the gradient of the positions through the field is added.
+
+    A row of `v_raw` that is not finite counts as zero.
+    """
+    _check(v_raw, box, *planes, *weights, *biases)
+    network, rows, fractions, dense_sums, v_lines = torch.ops.gsplat_core.hexplane_train_backward(
+        v_raw, box, list(state[1:]), list(planes), list(weights), list(biases)
+    )
+    return FieldGradient(network, rows, fractions, dense_sums, v_lines, state.starts)
+
+
+def hexplane_planes_gradient(time: Tensor, gradient: FieldGradient, planes: Sequence[Tensor]) -> list[Tensor]:
+    """The gradient of every plane as a tensor of its size."""
+    return torch.ops.gsplat_core.hexplane_planes_gradient(time, gradient.of_planes, list(planes))
+
+
+def hexplane_planes_adam_(
+    planes: Sequence[Tensor],
+    first: Sequence[Tensor],
+    second: Sequence[Tensor],
+    time: Tensor,
+    gradient: FieldGradient,
+    adam: AdamOnDevice,
+    penalties: Penalties = Penalties(),
+) -> None:
+    """One step of Adam over all planes in place, gradients and penalties computed in the same pass.
+
+    A value whose gradient is not finite, and its moments, stay unchanged.
+
+    Args:
+        first, second: moments of the planes' shapes.
+    """
+    _check(*planes, *first, *second, adam.rate)
+    torch.ops.gsplat_core.hexplane_planes_adam_(
+        list(planes), list(first), list(second), time, gradient.of_planes, *adam.arguments, *penalties
+    )
+
+
+def network_adam_(
+    parameters: Sequence[Tensor], gradient: Tensor, first: Tensor, second: Tensor, adam: AdamOnDevice
+) -> None:
+    """One step of Adam over a network's small tensors in one launch, in place; as `hexplane_planes_adam_` otherwise.
+
+    Args:
+        parameters: weight and bias of every layer; `gradient`, `first` and `second` have their values concatenated.
+    """
+    _check(*parameters, gradient, first, second, adam.rate)
+    torch.ops.gsplat_core.network_adam_(list(parameters), gradient, first, second, *adam.arguments)
+
+
+def _check(*tensors: Tensor) -> None:
+    for tensor in tensors:
+        if tensor.dtype != torch.float32 or tensor.device.type != "cuda":
+            raise InvalidInput(
+                f"the HexPlane training ops take float32 on CUDA, got {tensor.dtype} on {tensor.device};"
+                " train with autograd, or move it"
+            )
+
+
+def _lines_size(planes: list[Tensor]) -> int:
+    return sum(int(plane.shape[1] * plane.shape[2]) for index, plane in enumerate(planes) if index % 6 >= 3)
+
+
+def _cells(planes: list[Tensor]) -> int:
+    return sum(int(plane.shape[0] * plane.shape[1]) for index, plane in enumerate(planes) if index % 6 < 3)
+
+
+@torch.library.register_fake("gsplat_core::hexplane_train")
+def _(
+    means: Tensor, box: Tensor, time: Tensor, planes: list[Tensor], weights: list[Tensor], biases: list[Tensor]
+) -> tuple[Tensor, ...]:
+    n, width = means.shape[0], weights[0].shape[0]
+    return (
+        means.new_empty(n, RAW_COLUMNS),
+        means.new_empty(n, 4),
+        means.new_empty(_lines_size(planes)),
+        means.new_empty(n, weights[0].shape[1]),
+        means.new_empty(len(weights) - 1, n, padded_width(width)),
+        means.new_empty(3, len(planes) // 2 * n, dtype=torch.int32),
+        means.new_empty(_cells(planes) + 1, dtype=torch.int32),
+    )
+
+
+@torch.library.register_fake("gsplat_core::hexplane_train_backward")
+def _(
+    v_raw: Tensor,
+    box: Tensor,
+    state: list[Tensor],
+    planes: list[Tensor],
+    weights: list[Tensor],
+    biases: list[Tensor],
+) -> tuple[Tensor, ...]:
+    n, slots = v_raw.shape[0], len(planes) // 2
+    return (
+        v_raw.new_empty(sum(t.numel() for t in (*weights, *biases))),
+        v_raw.new_empty(2, slots * n, planes[0].shape[2]),
+        v_raw.new_empty(slots * n, 2),
+        v_raw.new_empty((slots * n + 31) // 32, 5, 4, planes[0].shape[2]),
+        v_raw.new_empty(_lines_size(planes)),
+    )
+
+
+@torch.library.register_fake("gsplat_core::hexplane_planes_gradient")
+def _(time: Tensor, gradient: list[Tensor], planes: list[Tensor]) -> list[Tensor]:
+    return [plane.new_empty(plane.shape) for plane in planes]
+
+
+@torch.library.register_fake("gsplat_core::hexplane_planes_adam_")
+def _(planes: list[Tensor], *rest: object) -> None:
+    return None
+
+
+@torch.library.register_fake("gsplat_core::network_adam_")
+def _(parameters: list[Tensor], *rest: object) -> None:
+    return None

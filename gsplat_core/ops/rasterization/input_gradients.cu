@@ -1,0 +1,295 @@
+// Per Gaussian: from the gradients of its splats, in the order of the cameras, to those of its parameters.
+#include "gaussians.cuh"
+
+namespace gsplat::rasterization {
+namespace {
+
+constexpr int kWarps = frame::kGaussianThreads / 32;
+constexpr int kMoments = 6;
+
+// a b - c d without the loss of digits where they are nearly the same (Kahan; Jeannerod et al. 2013).
+__device__ inline float difference_of_products(float a, float b, float c, float d) {
+  const float cd = __fmul_rn(c, d);
+  return fmaf(a, b, -cd) + fmaf(-c, d, cd);
+}
+
+// Gradient of the blurred covariance S (a, b; b, c), as a symmetric matrix: 1/2 S^-1 M S^-1 with M the moments of second order.
+// Taken along the axes u and w of the ellipse: in x and y a thin splat's share along its length, smaller by the square of the
+// ratio of its axes, would be lost in rounding.
+__device__ inline void covariance_gradient(float a, float b, float c, const float* m, float (&g)[3]) {
+  const float half = 0.5f * (a - c), radius = ::sqrtf(half * half + b * b);
+  const float longer = 0.5f * (a + c) + radius, shorter = difference_of_products(a, c, b, b) / longer;
+  float x = half < 0 ? b : half + radius, y = half < 0 ? radius - half : b;  // u; w is (-y, x)
+  const float norm = ::sqrtf(x * x + y * y);
+  x = norm > 0 ? x / norm : 1;
+  y = norm > 0 ? y / norm : 0;
+  const float wx = difference_of_products(x, m[4], y, m[3]), wy = difference_of_products(x, m[5], y, m[4]);  // M w
+  const float uu = (x * (x * m[3] + y * m[4]) + y * (x * m[4] + y * m[5])) / (longer * longer);
+  const float uw = (x * wx + y * wy) / (longer * shorter), ww = difference_of_products(x, wy, y, wx) / (shorter * shorter);
+  g[0] = 0.5f * (x * x * uu - 2 * x * y * uw + y * y * ww);
+  g[1] = 0.5f * (x * y * (uu - ww) + (x * x - y * y) * uw);
+  g[2] = 0.5f * (y * y * uu + 2 * x * y * uw + x * x * ww);
+}
+
+// What came back for one splat.
+struct SplatGradient {
+  float moments[kMoments], color[3], means2d[2], depth, conic[3], opacity;
+};
+
+__device__ inline SplatGradient load_gradient(const Scene& scene, const ProjectedGradients& from, int64_t at) {
+  SplatGradient v = {};
+  if (from.v_splats != nullptr) {
+    const float4* const row = reinterpret_cast<const float4*>(from.v_splats + at * kSplatFloats);
+    const float4 a = row[0], b = row[1], c = row[2];
+    v.moments[0] = a.x, v.moments[1] = a.y, v.moments[2] = a.z, v.moments[3] = a.w, v.moments[4] = b.x, v.moments[5] = b.y;
+    v.color[0] = b.z, v.color[1] = b.w, v.color[2] = c.x;
+    if (scene.depth) v.depth = c.y;
+  }
+  const int64_t row = from.row_of != nullptr ? from.row_of[at] : at;
+  if (row < 0) return v;
+  if (from.v_means2d != nullptr)
+    for (int k = 0; k < 2; ++k) v.means2d[k] = from.v_means2d[2 * row + k];
+  if (from.v_depths != nullptr) v.depth += from.v_depths[row];
+  if (from.v_conics != nullptr)
+    for (int k = 0; k < 3; ++k) v.conic[k] = from.v_conics[3 * row + k];
+  if (from.v_opacities != nullptr) v.opacity = from.v_opacities[row];
+  return v;
+}
+
+template <CameraModel model, bool kViews>
+__device__ inline BackProjected project_back(const Scene& scene, const ProjectionInput& in, const float* mean, int64_t n,
+                                             const SplatGradient& v, bool conics, float& v_opacity) {
+  const View<model> view(in);
+  const Geometry geometry = load_geometry(in, n);
+  const Point3 p = view.to_camera(mean);
+  const ImagePoint image = Projector<model>::forward(view.k, p);
+  const Ellipse e = ellipse_of(view, image, geometry.sigma);
+  float g[3];
+  covariance_gradient(e.a0 + in.eps2d, e.b, e.c0 + in.eps2d, v.moments, g);
+  const float opacity = in.opacities[n];
+  v_opacity += v.moments[0] / opacity;
+  if (scene.antialiased || conics) {
+    // The opacity blended is the product with the compensation, and the first moment its dL/d log.
+    float more[3], v_compensation = 0;
+    if (scene.antialiased) {
+      const float a = e.a0 + in.eps2d, c = e.c0 + in.eps2d, compensation = compensation_of(e, a * c - e.b * e.b);
+      v_compensation = fmaf(v.opacity, opacity, v.moments[0] / compensation);
+      v_opacity += v.opacity * compensation;
+    }
+    covariance2d_gradient(e, in.eps2d, v.conic, scene.antialiased, v_compensation, more);
+    for (int k = 0; k < 3; ++k) g[k] += more[k];
+  }
+  if (!scene.antialiased) v_opacity += v.opacity;
+  return project_backward(in, view, mean, geometry, p, image, e, g, v.means2d, v.depth, kViews);
+}
+
+template <bool kViews>
+__device__ inline BackProjected project_back(const Scene& scene, const ProjectionInput& in, const float* mean, int64_t n,
+                                             const SplatGradient& v, bool conics, float& v_opacity) {
+  switch (in.model) {
+    case kOrtho: return project_back<kOrtho, kViews>(scene, in, mean, n, v, conics, v_opacity);
+    case kFisheye: return project_back<kFisheye, kViews>(scene, in, mean, n, v, conics, v_opacity);
+    default: return project_back<kPinhole, kViews>(scene, in, mean, n, v, conics, v_opacity);
+  }
+}
+
+// The colour's way back to the coefficients, whose gradient is added to v_c, and to the direction: v_mean gets what it means for
+// the Gaussian's place, and the negative is the camera centre's. A channel that was raised to zero has no gradient.
+template <int degree>
+__device__ inline void harmonics_back(const float* center, const float* mean, const float* c, const float* v_color, float* v_c,
+                                      float* v_mean) {
+  constexpr int kBases = kBasesOf<degree>;
+  float direction[3], b[kBases], v[3];
+  const float inverse = unit_direction(center, mean, direction);
+  bases_at<degree>(direction[0], direction[1], direction[2], b);
+  for (int j = 0; j < 3; ++j) {
+    float color = 0;
+#pragma unroll
+    for (int k = 0; k < kBases; ++k) color = fmaf(b[k], c[3 * k + j], color);
+    v[j] = color + 0.5f >= 0 ? v_color[j] : 0;
+  }
+#pragma unroll
+  for (int k = 0; k < kBases; ++k)
+    for (int j = 0; j < 3; ++j) v_c[3 * k + j] = fmaf(b[k], v[j], v_c[3 * k + j]);
+  if constexpr (degree > 0) {  // a constant has no direction
+    float v_b[kBases] = {}, g[3];
+#pragma unroll
+    for (int k = 1; k < kBases; ++k) v_b[k] = v[0] * c[3 * k] + v[1] * c[3 * k + 1] + v[2] * c[3 * k + 2];
+    bases_backward<degree>(direction[0], direction[1], direction[2], v_b, g, g + 1, g + 2);
+    const float along = g[0] * direction[0] + g[1] * direction[1] + g[2] * direction[2];
+    for (int k = 0; k < 3; ++k) v_mean[k] = (g[k] - along * direction[k]) * inverse;
+  }
+}
+
+// The block's sums of kViewSums values per thread, in a fixed order: halves of a warp, then warp after warp.
+__device__ inline void sum_views(const float* v, float* to) {
+  __shared__ float warps[kWarps][kViewSums];
+  for (int i = 0; i < kViewSums; ++i) {
+    float x = v[i];
+    for (int half = 16; half > 0; half /= 2) x += __shfl_down_sync(kWholeWarp, x, half);
+    if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32][i] = x;
+  }
+  __syncthreads();
+  if (threadIdx.x < kViewSums) {
+    float total = 0;
+    for (int w = 0; w < kWarps; ++w) total += warps[w][threadIdx.x];
+    to[threadIdx.x] = total;
+  }
+  __syncthreads();
+}
+
+template <int degree>
+struct ColorSums {
+  static constexpr int kFloats = degree == kPlainColors ? kMostPlainColors : 3 * kBasesOf<degree>;
+  float v[kFloats] = {};
+};
+
+template <int columns>
+__device__ inline void store_row(float* to, int64_t row, const float* v) {
+  if (to == nullptr) return;
+  for (int k = 0; k < columns; ++k) to[columns * row + k] = v[k];
+}
+
+// The coefficients of a warp while the gradients need them, then their gradients.
+template <int degree>
+struct WarpColors {
+  Coefficients<degree> coefficients;
+
+  __device__ void load(const Scene& scene, int64_t first, unsigned wanted, int lane) {
+    coefficients.load(scene.colors + first * scene.color_row, scene.color_row, wanted, lane);
+    coefficients.wait();
+  }
+  // By the whole warp: the gradients of `count` Gaussians from `first` on.
+  __device__ void store(const Scene& scene, const ColorSums<degree>& sums, float* to, int64_t first, int count, int lane) {
+    __syncwarp();
+    float* const row = coefficients.row(lane);
+#pragma unroll
+    for (int k = 0; k < ColorSums<degree>::kFloats; ++k) row[k] = sums.v[k];
+    __syncwarp();
+    coefficients.store(to + first * scene.color_row, scene.color_row, count, lane);
+    __syncwarp();
+  }
+};
+template <>
+struct WarpColors<kPlainColors> {
+  __device__ void load(const Scene&, int64_t, unsigned, int) {}
+  __device__ void store(const Scene& scene, const ColorSums<kPlainColors>& sums, float* to, int64_t first, int count, int lane) {
+    if (lane < count)
+      for (int k = 0; k < scene.channels; ++k) to[(first + lane) * scene.color_row + k] = sums.v[k];
+  }
+};
+
+// A block is of one batch: a thread has one Gaussian and goes through the cameras in their order. Of one camera (kOne) the
+// colours' gradient is written before the geometry's is computed, which needs fewer registers.
+template <int degree, bool kViews, bool kOne>
+__global__ void __launch_bounds__(frame::kGaussianThreads, kViews       ? 1
+                                                           : degree < 4 ? 4
+                                                                        : 2)
+    gradients_of_inputs(Scene scene, ProjectedGradients from, InputGradients to) {
+  __shared__ float center[3];
+  __shared__ WarpColors<degree> warps[kWarps];
+  const int64_t blocks = scene.blocks(), batch = blockIdx.x / blocks, block = blockIdx.x % blocks;
+  const int64_t n = block * frame::kGaussianThreads + threadIdx.x, N = scene.gaussians;
+  const int lane = threadIdx.x % 32;
+  const int64_t first = n - lane;
+  const int count = int(N - first < 0 ? 0 : N - first < 32 ? N - first : 32);
+  WarpColors<degree>& warp = warps[threadIdx.x / 32];
+  const bool geometry = to.means != nullptr || to.covars != nullptr || to.quats != nullptr || to.scales != nullptr ||
+                        to.opacities != nullptr || kViews;
+  const bool colors = scene.colors != nullptr && from.v_splats != nullptr && (to.colors != nullptr || (degree > 0 && geometry));
+  BackProjected total = {};
+  ColorSums<degree> v_colors;
+  float v_opacity = 0, mean[3] = {};
+  if (n < N)
+    for (int k = 0; k < 3; ++k) mean[k] = scene.projection.means[3 * (batch * N + n) + k];
+  const int cameras = kOne ? 1 : scene.cameras;
+  for (int camera = 0; camera < cameras; ++camera) {
+    const int64_t image = batch * cameras + camera, at = image * N + n;
+    const bool seen = n < N && from.radii[2 * at] > 0;
+    SplatGradient v = {};
+    if (seen) v = load_gradient(scene, from, at);
+    const bool has_color = seen && !(v.color[0] == 0 && v.color[1] == 0 && v.color[2] == 0);
+    float v_center[3] = {};
+    BackProjected g = {};
+    if (degree > 0) {
+      __syncthreads();  // the centre before has been read
+      load_center(scene, image, center);
+    }
+    if (colors) {
+      if constexpr (degree == kPlainColors) {
+        if (has_color)
+          for (int k = 0; k < kMostPlainColors; ++k) v_colors.v[k] += v.color[k];
+      } else {
+        const unsigned wanted = __ballot_sync(kWholeWarp, has_color);
+        const int64_t set = (scene.colors_per_camera ? image : batch) * N + first;
+        if (wanted != 0) warp.load(scene, set, wanted, lane);
+        if (has_color) {
+          float v_mean[3] = {};
+          harmonics_back<degree>(center, mean, warp.coefficients.row(lane), v.color, v_colors.v, v_mean);
+          for (int k = 0; k < 3; ++k) total.mean[k] += v_mean[k], v_center[k] = -v_mean[k];
+        }
+      }
+    }
+    if (to.colors != nullptr && (kOne || scene.colors_per_camera)) {
+      warp.store(scene, v_colors, to.colors, image * N + first, count, lane);
+      v_colors = {};
+    }
+    if (seen && geometry) {
+      const bool conics = from.v_conics != nullptr;
+      g = project_back<kViews>(scene, seen_by(scene, batch, image), mean, n, v, conics, v_opacity);
+      for (int k = 0; k < 3; ++k) total.mean[k] += g.mean[k], total.scales[k] += g.scales[k];
+      for (int k = 0; k < 4; ++k) total.quat[k] += g.quat[k];
+      for (int k = 0; k < 6; ++k) total.sigma.v[k] += g.sigma.v[k];
+    }
+    if constexpr (kViews) {
+      float sums[kViewSums];
+      for (int k = 0; k < 12; ++k) sums[k] = g.viewmat[k];
+      for (int k = 0; k < 3; ++k) sums[12 + k] = v_center[k];
+      sum_views(sums, to.view_sums + (image * blocks + block) * kViewSums);
+    }
+  }
+  if (to.colors != nullptr && !kOne && !scene.colors_per_camera)
+    warp.store(scene, v_colors, to.colors, batch * N + first, count, lane);
+  if (n >= N) return;
+  const int64_t row = batch * N + n;
+  store_row<3>(to.means, row, total.mean);
+  store_row<6>(to.covars, row, total.sigma.v);
+  store_row<4>(to.quats, row, total.quat);
+  store_row<3>(to.scales, row, total.scales);
+  store_row<1>(to.opacities, row, &v_opacity);
+}
+
+// A warp per image and sum; each lane adds up every 32nd block, and the lanes are added in a fixed order.
+__global__ void sum_over_blocks(const float* sums, int64_t blocks, float* viewmats, float* centers) {
+  const int64_t image = blockIdx.x;
+  const int i = threadIdx.x / 32, lane = threadIdx.x % 32;
+  double total = 0;
+  for (int64_t block = lane; block < blocks; block += 32) total += sums[(image * blocks + block) * kViewSums + i];
+  for (int half = 16; half > 0; half /= 2) total += __shfl_down_sync(kWholeWarp, total, half);
+  if (lane > 0) return;
+  if (i < 12) {
+    viewmats[image * 16 + (i < 9 ? i / 3 * 4 + i % 3 : (i - 9) * 4 + 3)] = float(total);
+  } else if (centers != nullptr) {
+    centers[image * 3 + i - 12] = float(total);
+  }
+}
+
+}  // namespace
+
+void input_gradients(const Scene& scene, const ProjectedGradients& from, const InputGradients& to, cudaStream_t stream) {
+  const int64_t blocks = scene.batches * scene.blocks();
+  const bool views = to.view_sums != nullptr;
+  if (blocks > 0)
+    with_degree(scene.degree, [&](auto degree) {
+      constexpr int kDegree = decltype(degree)::value;
+      const auto kernel = views                ? gradients_of_inputs<kDegree, true, false>
+                          : scene.cameras == 1 ? gradients_of_inputs<kDegree, false, true>
+                                               : gradients_of_inputs<kDegree, false, false>;
+      kernel<<<unsigned(blocks), frame::kGaussianThreads, 0, stream>>>(scene, from, to);
+    });
+  if (views && scene.images() > 0)
+    sum_over_blocks<<<unsigned(scene.images()), 32 * kViewSums, 0, stream>>>(to.view_sums, scene.blocks(), to.viewmats,
+                                                                             to.centers);
+}
+
+}  // namespace gsplat::rasterization

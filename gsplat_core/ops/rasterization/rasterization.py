@@ -1,0 +1,269 @@
+"""All of `rasterization()` on CUDA in one native call per pass: project, colour, sort and blend (Kerbl et al. 2023).
+
+Two autograd nodes, so that programs can look between them: `_Project` (Gaussians to splats) and `_Blend` (splats to the picture),
+with `means2d` on the way from one to the other. The forward pass of both is the one call that `_Project` makes.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+
+PLAIN_COLORS = -1
+"""In place of a degree: colours are taken as they are, at most `MOST_PLAIN_COLORS` of them."""
+MOST_PLAIN_COLORS = 3
+NO_DEPTH, DEPTH_SUM, EXPECTED_DEPTH = range(3)
+TILE_SIZE = 16
+MOST_PIXELS = 16 << 13
+"""Largest width and height of a picture."""
+
+_FORWARD = torch.ops.gsplat_core.rasterize.default
+_SPLATS_BACKWARD = torch.ops.gsplat_core.rasterize_splats_backward.default
+_INPUTS_BACKWARD = torch.ops.gsplat_core.rasterize_inputs_backward.default
+
+
+class Options(NamedTuple):
+    """The op's list of integers."""
+
+    width: int
+    height: int
+    camera_model: int
+    """Index into CAMERA_MODELS."""
+    degree: int
+    """0 to 4, or PLAIN_COLORS."""
+    channels: int
+    """Colours in the picture, 0 to 3."""
+    depth_mode: int
+    antialiased: int
+    """1 or 0, like the next two."""
+    packed: int
+    absgrad: int
+
+
+class Ranges(NamedTuple):
+    """The op's list of numbers: blur in pixels², planes in the scene's unit, smallest radius in pixels."""
+
+    eps2d: float
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+
+
+class View(NamedTuple):
+    """What is to be rendered, but for the tensors."""
+
+    image_dims: tuple[int, ...]
+    """Batch dimensions and number of cameras."""
+    options: Options
+    ranges: Ranges
+
+
+class Inputs(NamedTuple):
+    """Tensors, float32 on one CUDA device; batch dimensions as in `rasterization()`."""
+
+    means: Tensor
+    covars: Tensor | None
+    """Upper triangles [..., N, 6], or None with the next two given."""
+    quats: Tensor | None
+    scales: Tensor | None
+    opacities: Tensor
+    colors: Tensor | None
+    """[..., (C,) N, K, 3] or [..., (C,) N, D]; None where no colour is rendered."""
+    viewmats: Tensor
+    Ks: Tensor
+    centers: Tensor | None
+    """[..., C, 3]: the cameras' centres, where their gradient is wanted; else they are computed from the matrices."""
+    backgrounds: Tensor | None
+    """[..., C, channels]."""
+
+
+class Saved(NamedTuple):
+    """What the forward pass leaves for the gradient of the picture."""
+
+    records: Tensor
+    """[images * N, 12]: the splats as the kernels keep them."""
+    conics: Tensor
+    isect_offsets: Tensor
+    splat_ids: Tensor
+    """int32 [M]: the tiles' lists; a splat is image * N + Gaussian."""
+    sorted: Tensor
+    """int32 [M]: for every entry of the lists which pair of splat and tile it is, counted in the order of the splats."""
+    splat_starts: Tensor
+    """int32 [images * N + 1]: where the pairs of each splat start."""
+    row_of: Tensor | None
+    """int32 [images * N]: the packed row of a splat or -1; None unless packed."""
+    backgrounds: Tensor | None
+    alphas: Tensor
+    expected: Tensor
+    """[..., C, H, W]: expected depth, where it is in the picture."""
+    last: Tensor
+    """int32 [..., C, H, W]: the last entry of the lists that a pixel blended, or -1."""
+
+
+class Rasterized(NamedTuple):
+    """What the forward pass returns; `opacities` is empty unless antialiased or packed, the ids are None unless packed."""
+
+    image: Tensor
+    alphas: Tensor
+    means2d: Tensor
+    depths: Tensor
+    conics: Tensor
+    opacities: Tensor
+    radii: Tensor
+    tiles_per_gauss: Tensor
+    isect_offsets: Tensor
+    flatten_ids: Tensor
+    isect_ids: Tensor
+    batch_ids: Tensor | None = None
+    camera_ids: Tensor | None = None
+    gaussian_ids: Tensor | None = None
+
+
+class _Call:
+    """One forward pass on its way through the two nodes."""
+
+    __slots__ = ("outputs", "view")
+
+    def __init__(self, view: View) -> None:
+        self.view = view
+        self.outputs: list[Tensor] = []
+
+    def left_for_gradients(self) -> list[Tensor]:
+        """records, splat_starts, sorted, last and expected; packed also row_of, the radii of all splats and splat_ids."""
+        return self.outputs[14 if self.view.options.packed else 11 :]
+
+
+def rasterize(inputs: Inputs, view: View, differentiable: bool) -> Rasterized:
+    """Render; the caller has checked shapes, types and devices.
+
+    The host waits once, for the length of the tiles' lists. The same inputs give the same bits, forward and backward.
+    """
+    if not differentiable:
+        return _named(_FORWARD(inputs, *view, False), view)
+    call = _Call(view)
+    means2d, depths, conics, opacities, records = _Project.apply(call, *inputs)
+    image, alphas = _Blend.apply(call, means2d, records, inputs.backgrounds)
+    out = _named(call.outputs, view)
+    return out._replace(image=image, alphas=alphas, means2d=means2d, depths=depths, conics=conics, opacities=opacities)
+
+
+def _named(outputs: list[Tensor], view: View) -> Rasterized:
+    return Rasterized(*outputs[: 14 if view.options.packed else 11])
+
+
+class _Project(Function):
+    @staticmethod
+    def forward(ctx: Any, call: _Call, *inputs: Any) -> tuple[Tensor, ...]:
+        call.outputs = out = _FORWARD(inputs, *call.view, True)
+        ctx.view = call.view
+        ctx.set_materialize_grads(False)
+        own = call.left_for_gradients()
+        row_of, radii = (own[5], own[6]) if call.view.options.packed else (None, out[6])
+        ctx.save_for_backward(*inputs, radii, row_of)
+        return out[2], out[3], out[4], out[5], own[0]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
+        v_means2d, v_depths, v_conics, v_opacities, v_records = v
+        *inputs, radii, row_of = ctx.saved_tensors
+        wanted = list(ctx.needs_input_grad[1:])
+        wanted[-1] = False  # the backgrounds' is the other node's
+        if v_opacities is not None and not v_opacities.numel():
+            v_opacities = None
+        gradients = [v_records, v_means2d, v_depths, v_conics, v_opacities]
+        out = _INPUTS_BACKWARD(inputs, radii, row_of, gradients, *ctx.view, wanted)
+        return None, *(gradient if want else None for gradient, want in zip(out, wanted, strict=True))
+
+
+class _Blend(Function):
+    @staticmethod
+    def forward(
+        ctx: Any, call: _Call, means2d: Tensor, records: Tensor, backgrounds: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        out, own, options = call.outputs, call.left_for_gradients(), call.view.options
+        ctx.view = call.view
+        ctx.set_materialize_grads(False)
+        row_of, splat_ids = (own[5], own[7]) if options.packed else (None, out[9])
+        saved = Saved(
+            records, conics=out[4], isect_offsets=out[8], splat_ids=splat_ids, sorted=own[2], splat_starts=own[1],
+            row_of=row_of, backgrounds=backgrounds, alphas=out[1], expected=own[4], last=own[3],
+        )  # fmt: skip
+        ctx.save_for_backward(*saved, means2d if options.absgrad else None)
+        return out[0], out[1]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None) -> tuple[Tensor | None, ...]:
+        *tensors, means2d = ctx.saved_tensors
+        saved = Saved(*tensors)
+        _, needs_means2d, needs_records, needs_backgrounds = ctx.needs_input_grad
+        v_means2d = v_records = v_backgrounds = None
+        if needs_backgrounds and v_image is not None:
+            colors = v_image[..., : ctx.view.options.channels]
+            v_backgrounds = (colors * (1 - saved.alphas)).sum((-3, -2))
+        if needs_means2d or needs_records:
+            v_records, v_means2d, absolute = _SPLATS_BACKWARD(saved, v_image, v_alphas, *ctx.view)
+            if means2d is not None:
+                means2d.absgrad = absolute
+        return None, v_means2d, v_records, v_backgrounds
+
+
+@torch.library.register_fake("gsplat_core::rasterize")
+def _fake(
+    inputs: list[Tensor | None], image_dims: list[int], options: list[int], ranges: list[float], training: bool
+) -> list[Tensor]:
+    means, option = inputs[0], Options(*options)
+    assert means is not None
+    n, size = means.shape[-2], torch.library.get_ctx().new_dynamic_size
+    images, length = torch.Size(image_dims).numel(), size()
+    floats = lambda *shape: means.new_empty(shape)
+    ints = lambda *shape: means.new_empty(shape, dtype=torch.int32)
+    longs = lambda *shape: means.new_empty(shape, dtype=torch.int64)
+    pixels = (*image_dims, option.height, option.width)
+    rows = (size(),) if option.packed else (*image_dims, n)
+    own_opacities = option.packed or option.antialiased
+    tiles = (-(-option.height // TILE_SIZE), -(-option.width // TILE_SIZE))
+    out = [
+        floats(*pixels, option.channels + (option.depth_mode != NO_DEPTH)), floats(*pixels, 1), floats(*rows, 2),
+        floats(*rows), floats(*rows, 3), floats(*rows) if own_opacities else floats(0), ints(*rows, 2), ints(*rows),
+        ints(*image_dims, *tiles), ints(length), longs(length),
+    ]  # fmt: skip
+    if option.packed:
+        out += [longs(*rows) for _ in range(3)]
+    if training:
+        expected = floats(*pixels) if option.depth_mode == EXPECTED_DEPTH else floats(0)
+        out += [floats(images * n, 12), ints(images * n + 1), ints(length), ints(*pixels), expected]
+    if training and option.packed:
+        out += [ints(images * n), ints(*image_dims, n, 2), ints(length)]
+    return out
+
+
+@torch.library.register_fake("gsplat_core::rasterize_splats_backward")
+def _fake_splats_backward(
+    saved: list[Tensor | None], v_image: Tensor | None, v_alphas: Tensor | None, image_dims: list[int],
+    options: list[int], ranges: list[float],
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    records, conics = saved[:2]
+    assert records is not None and conics is not None
+    rows = (*conics.shape[:-1], 2)
+    absolute = rows if Options(*options).absgrad else (0,)
+    return records.new_empty(records.shape), conics.new_empty(rows), conics.new_empty(absolute)
+
+
+@torch.library.register_fake("gsplat_core::rasterize_inputs_backward")
+def _fake_inputs_backward(
+    inputs: list[Tensor | None], radii: Tensor, row_of: Tensor | None, gradients: list[Tensor | None],
+    image_dims: list[int], options: list[int], ranges: list[float], needs: list[bool],
+) -> list[Tensor]:  # fmt: skip
+    wanted = dict(zip(Inputs._fields, needs, strict=True))
+    views = wanted["viewmats"] or wanted["centers"]
+    wanted |= {"viewmats": views, "centers": views, "Ks": False, "backgrounds": False}
+    empty = lambda t, want: radii.new_empty(t.shape if want and t is not None else (0,), dtype=torch.float32)
+    return [empty(t, want) for t, want in zip(inputs, wanted.values(), strict=True)]

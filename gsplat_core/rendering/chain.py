@@ -1,0 +1,128 @@
+"""From Gaussians to images in four steps, written once: project, colour, list by tile, blend.
+
+`rasterization()` and training go this way with the compiled operations, the tests' oracle with those in plain torch. On CUDA
+`single_call.py` does the same in one native call.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, pack
+from gsplat_core.rendering.settings import RenderSettings
+
+
+@dataclass(frozen=True)
+class StepOperations:
+    """One implementation of the steps, under gsplat's names and signatures."""
+
+    fully_fused_projection: Callable[..., Any]
+    spherical_harmonics: Callable[..., Tensor]
+    bin_splats: Callable[..., tuple[Tensor, Tensor, Tensor]]
+    rasterize_to_pixels: Callable[..., tuple[Tensor, ...]]
+    """Colours, alphas, and whatever else the caller of `render_splats` wants to have of it."""
+    zero_gradients_stay_zero: bool = False
+    """On CUDA a gradient of zero stays zero in the backward operations, whatever it would be multiplied with."""
+
+
+class Geometry(NamedTuple):
+    """Gaussians without their colours, and the cameras; shapes as in `rasterization`."""
+
+    means: Tensor
+    covars: Tensor | None
+    """Upper triangles [..., N, 6], or None with the next two given."""
+    quats: Tensor | None
+    scales: Tensor | None
+    opacities: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+
+
+class RenderedSplats(NamedTuple):
+    """The images and what was computed on the way. A row is a Gaussian in a camera, or a visible one where packed."""
+
+    image: Tensor
+    """[..., C, H, W, channels]: colours, then the sum of weight and z where depth is rendered."""
+    alphas: Tensor
+    rows: DenseProjection | PackedProjection
+    channels: Tensor
+    """What was blended, [rows, channels]."""
+    opacities: Tensor
+    """[rows], with the compensation for antialiasing."""
+    tiles_per_gauss: Tensor
+    flatten_ids: Tensor
+    isect_offsets: Tensor
+    rest: tuple[Tensor, ...]
+    """What `rasterize_to_pixels` returned beyond image and alphas."""
+
+
+Coloring = Callable[[DenseProjection], tuple[Tensor, DenseProjection]]
+"""Colours [..., C, N, D] of projected Gaussians, and the projection without those that are culled for their colour."""
+
+
+def render_splats(
+    ops: StepOperations,
+    geometry: Geometry,
+    coloring: Coloring | None,
+    backgrounds: Tensor | None,
+    settings: RenderSettings,
+) -> RenderedSplats:
+    """Project, colour, list by tile and blend; without `coloring` the depth is rendered alone. Shapes have been checked."""
+    means, covars, quats, scales, opacities, viewmats, Ks = geometry
+    batch_dims, n_gaussians, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
+    dense: DenseProjection = ops.fully_fused_projection(
+        means, covars, quats, scales, viewmats, Ks, settings.width, settings.height,
+        eps2d=settings.eps2d, near_plane=settings.near_plane, far_plane=settings.far_plane,
+        radius_clip=settings.radius_clip, calc_compensations=settings.rasterize_mode == "antialiased",
+        camera_model=settings.camera_model, opacities=opacities,
+    )  # fmt: skip
+    channels = None
+    if coloring is not None:
+        channels, dense = coloring(dense)
+    opacities = opacities[..., None, :].expand(*batch_dims, n_cameras, n_gaussians)
+    rows: DenseProjection | PackedProjection = dense
+    packing: dict[str, Any] = {}
+    if settings.packed:
+        rows = pack(dense)
+        image_ids = rows.batch_ids * n_cameras + rows.camera_ids
+        packing = {"packed": True, "n_images": math.prod(batch_dims) * n_cameras, "image_ids": image_ids}
+        picked = image_ids * n_gaussians + rows.gaussian_ids
+        opacities = opacities.reshape(-1)[picked]
+        channels = None if channels is None else channels.reshape(-1, channels.shape[-1])[picked]
+    if rows.compensations is not None:
+        opacities = opacities * rows.compensations
+    if settings.has_depth:
+        depth = rows.depths[..., None]
+        channels = depth if channels is None else torch.cat([channels, depth], -1)
+        if backgrounds is not None:
+            zeros = backgrounds.new_zeros(*backgrounds.shape[:-1], 1)
+            backgrounds = torch.cat([backgrounds, zeros], -1) if settings.has_colors else zeros
+    assert channels is not None
+    grid = (settings.tile_size, *settings.tile_grid)
+    tiles_per_gauss, flatten_ids, isect_offsets = ops.bin_splats(
+        rows.means2d, rows.radii, rows.depths, *grid, conics=rows.conics, opacities=opacities, **packing
+    )
+    isect_offsets = isect_offsets.reshape(*batch_dims, n_cameras, *reversed(settings.tile_grid))
+    image, alphas, *rest = ops.rasterize_to_pixels(
+        rows.means2d, rows.conics, channels, opacities, settings.width, settings.height, settings.tile_size, isect_offsets,
+        flatten_ids, backgrounds=backgrounds, packed=settings.packed, absgrad=settings.absgrad,
+    )  # fmt: skip
+    return RenderedSplats(
+        image, alphas, rows, channels, opacities, tiles_per_gauss, flatten_ids, isect_offsets, tuple(rest)
+    )
+
+
+def isect_ids_of(flatten_ids: Tensor, isect_offsets: Tensor, depths: Tensor, tiles_of_image: int) -> Tensor:
+    """gsplat's key of every entry of the tiles' lists, int64: image | tile | the 32 bits of the depth as float32."""
+    positions = torch.arange(len(flatten_ids), dtype=torch.int32, device=flatten_ids.device)
+    tiles = torch.searchsorted(isect_offsets.reshape(-1), positions, right=True) - 1
+    tile_bits = tiles_of_image.bit_length()
+    images = torch.div(tiles, tiles_of_image, rounding_mode="floor")
+    bits = depths.detach().float().reshape(-1).view(torch.int32)[flatten_ids].long() & 0xFFFFFFFF
+    return (images << (32 + tile_bits)) | ((tiles - images * tiles_of_image) << 32) | bits

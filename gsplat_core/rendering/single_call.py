@@ -1,0 +1,116 @@
+"""`rasterization()` in one native call per pass, for the inputs that it takes on CUDA."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from gsplat_core.ops.native import CUDA_MISSING
+from gsplat_core.ops.rasterization.rasterization import (
+    DEPTH_SUM,
+    EXPECTED_DEPTH,
+    MOST_PIXELS,
+    MOST_PLAIN_COLORS,
+    NO_DEPTH,
+    PLAIN_COLORS,
+    Inputs,
+    Options,
+    Ranges,
+    Rasterized,
+    View,
+    rasterize,
+)
+from gsplat_core.ops.rasterization.rasterization import TILE_SIZE as NATIVE_TILE_SIZE
+from gsplat_core.rendering.settings import Arguments, RenderSettings
+from gsplat_core.rendering.view_colors import camera_centers
+from gsplat_core.scene.cameras import CAMERA_MODELS
+
+_PLAIN_TENSORS = (Tensor, Parameter)
+_DEPTH_MODES = {"RGB": NO_DEPTH, "D": DEPTH_SUM, "ED": EXPECTED_DEPTH, "RGB+D": DEPTH_SUM, "RGB+ED": EXPECTED_DEPTH}
+
+
+def rasterize_in_one_call(arguments: Arguments, settings: RenderSettings) -> Rasterized | None:
+    """What the chain of operations renders; the host waits once, for the lists' length. None for what the native call does not take,
+    wrong arguments among it: the chain renders it, or says what is wrong."""
+    return _rasterize(arguments, settings) if _takes(arguments, settings) else None
+
+
+def _takes(arguments: Arguments, settings: RenderSettings) -> bool:
+    if CUDA_MISSING is not None or settings.tile_size != NATIVE_TILE_SIZE or torch.compiler.is_compiling():
+        return False
+    if not _are_plain_cuda_floats(arguments):
+        return False
+    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars = arguments
+    if means.dim() < 2 or viewmats.dim() < 3 or settings.camera_model not in CAMERA_MODELS:
+        return False
+    batch, n, c = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
+    images = c * batch.numel()
+    if images < 1 or not (0 < settings.width <= MOST_PIXELS and 0 < settings.height <= MOST_PIXELS):
+        return False
+    tiles = settings.tile_grid[0] * settings.tile_grid[1]
+    if images * n >= 2**31 - 1 or images * tiles >= 2**26:
+        return False
+    if covars is None:
+        if quats is None or scales is None or quats.shape != (*batch, n, 4) or scales.shape != (*batch, n, 3):
+            return False
+    elif covars.shape != (*batch, n, 3, 3):
+        return False
+    if means.shape[-1] != 3 or opacities.shape != (*batch, n) or viewmats.shape != (*batch, c, 4, 4):
+        return False
+    if Ks.shape != (*batch, c, 3, 3) or not _has_fitting_colors(colors, (*batch, n), (*batch, c, n), settings):
+        return False
+    channels = 3 if settings.sh_degree is not None else colors.shape[-1]
+    return backgrounds is None or not settings.has_colors or backgrounds.shape == (*batch, c, channels)
+
+
+def _are_plain_cuda_floats(arguments: Arguments) -> bool:
+    """Whether all are float32 on one CUDA device, and neither a subclass of Tensor nor under a transform or mode of torch's."""
+    device = arguments.means.device
+    if device.type != "cuda":
+        return False
+    for tensor in arguments:
+        if tensor is None:
+            continue
+        if type(tensor) not in _PLAIN_TENSORS or tensor.dtype is not torch.float32 or tensor.device != device:
+            return False
+    return not torch._C._are_functorch_transforms_active() and not torch._C._len_torch_dispatch_stack()
+
+
+def _has_fitting_colors(
+    colors: Tensor, shared: tuple[int, ...], per_camera: tuple[int, ...], settings: RenderSettings
+) -> bool:
+    if settings.sh_degree is None:
+        return colors.shape[:-1] in (shared, per_camera) and 1 <= colors.shape[-1] <= MOST_PLAIN_COLORS
+    if colors.dim() < 3 or colors.shape[-1] != 3 or colors.shape[-2] < (settings.sh_degree + 1) ** 2:
+        return False
+    return colors.shape[:-2] in (shared, per_camera)
+
+
+def _rasterize(arguments: Arguments, settings: RenderSettings) -> Rasterized:
+    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars = arguments
+    differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in arguments)
+    triangles = centers = None
+    if covars is not None:
+        triangles = torch.stack([covars[..., i, j] for i in range(3) for j in range(i, 3)], -1)
+        quats = scales = None
+    if not settings.has_colors:
+        backgrounds = None
+    harmonics = settings.has_colors and settings.sh_degree is not None
+    if harmonics and differentiable and viewmats.requires_grad:
+        centers = camera_centers(viewmats)
+    options = Options(
+        width=settings.width,
+        height=settings.height,
+        camera_model=CAMERA_MODELS.index(settings.camera_model),
+        degree=settings.sh_degree if harmonics and settings.sh_degree is not None else PLAIN_COLORS,
+        channels=colors.shape[-1] if settings.has_colors else 0,
+        depth_mode=_DEPTH_MODES[settings.render_mode],
+        antialiased=settings.rasterize_mode == "antialiased",
+        packed=settings.packed,
+        absgrad=settings.absgrad,
+    )
+    ranges = Ranges(settings.eps2d, settings.near_plane, settings.far_plane, settings.radius_clip)
+    shown = colors if settings.has_colors else None
+    inputs = Inputs(means, triangles, quats, scales, opacities, shown, viewmats, Ks, centers, backgrounds)
+    return rasterize(inputs, View(tuple(viewmats.shape[:-2]), options, ranges), differentiable)

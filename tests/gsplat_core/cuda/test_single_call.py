@@ -1,0 +1,196 @@
+"""`rasterization` in one native call per pass beside the chain of operations: the same pictures, gradients and meta."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsplat_core import quat_scale_to_covar_preci, rasterization, reference
+from gsplat_core.rendering import single_call
+from gsplat_core.rendering.rasterization import step_by_step
+from tests.gsplat_core.cuda.single_call_checks import assert_same, check_lists, inputs, run
+
+pytestmark = pytest.mark.cuda
+
+
+@pytest.fixture(autouse=True)
+def calls(monkeypatch) -> list[bool]:
+    """Whether each call of `rasterization` was taken by the native one."""
+    found: list[bool] = []
+    take = single_call._takes
+
+    def taken(*arguments):
+        found.append(take(*arguments))
+        return found[-1]
+
+    monkeypatch.setattr(single_call, "_takes", taken)
+    return found
+
+
+VARIANTS = [
+    {},
+    {"render_mode": "RGB+ED"},
+    {"render_mode": "RGB+D", "rasterize_mode": "antialiased"},
+    {"render_mode": "D"},
+    {"render_mode": "ED", "rasterize_mode": "antialiased"},
+    {"near_plane": 4.0, "far_plane": 7.0, "radius_clip": 3.0, "eps2d": 0.1},
+]
+
+
+@pytest.mark.parametrize("options", VARIANTS)
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize(("batch", "cameras"), [((), 1), ((), 3), ((2, 1), 2)])
+def test_every_variant_equals_the_chain(make_scene, calls, options, packed, batch, cameras):
+    scene = make_scene(150, batch, cameras, width=90, height=70)
+    leaves = inputs(scene)
+    seen, meta = run(rasterization, scene, leaves, packed=packed, **options)
+    assert calls == [True]
+    wanted, wanted_meta = run(step_by_step.rasterization, scene, leaves, packed=packed, **options)
+    assert wanted["alphas"].max() > 0.3
+    assert_same(seen, wanted)
+    assert list(meta) == list(wanted_meta)
+    same_rows = bool((meta["radii"] == wanted_meta["radii"]).all()) if not packed else False
+    for name in (
+        "batch_ids",
+        "camera_ids",
+        "gaussian_ids",
+        "radii",
+        "tile_width",
+        "tile_height",
+        "n_batches",
+        "n_cameras",
+    ):
+        a, b = meta[name], wanted_meta[name]
+        assert torch.equal(a, b) if isinstance(b, Tensor) else a == b, name
+    for name in ("means2d", "depths", "conics", "opacities"):
+        shown = meta["radii"][..., 0] > 0
+        torch.testing.assert_close(meta[name][shown], wanted_meta[name][shown], rtol=1e-4, atol=1e-4)
+    assert packed or same_rows
+    check_lists(meta)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_degrees_and_camera_models_equal_the_reference(make_scene, model, degree):
+    scene = make_scene(80, cameras=2, model=model, degree=4)
+    leaves = inputs(scene)
+    seen, _ = run(rasterization, scene, leaves, sh_degree=degree, packed=False)
+    exact = {name: t.detach().double().requires_grad_() for name, t in leaves.items()}
+    image, alphas, _ = reference.rasterization(
+        **exact, Ks=scene.Ks.cuda(), width=scene.width, height=scene.height, sh_degree=degree, packed=False
+    )
+    random = torch.Generator().manual_seed(3)
+    weights = [torch.rand(t.shape, generator=random).cuda() for t in (image, alphas)]
+    gradients = torch.autograd.grad((image * weights[0]).sum() + (alphas * weights[1]).sum(), list(exact.values()))
+    wanted = {"image": image, "alphas": alphas} | dict(zip(exact, gradients, strict=True))
+    assert_same(seen, {name: t.detach().float() for name, t in wanted.items()})
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+@pytest.mark.parametrize("per_camera", [False, True])
+def test_plain_colours(make_scene, calls, count, per_camera):
+    scene = make_scene(120, cameras=2)
+    random = torch.Generator().manual_seed(8)
+    colors = torch.rand(*((2,) if per_camera else ()), 120, count, generator=random)
+    background = torch.rand(2, count, generator=random).cuda()
+    leaves = inputs(scene, colors=colors)
+    options = {"sh_degree": None, "backgrounds": background, "render_mode": "RGB+ED", "packed": False}
+    seen, _ = run(rasterization, scene, leaves, **options)
+    assert calls == [count <= 3]
+    assert_same(seen, run(step_by_step.rasterization, scene, leaves, **options)[0])
+
+
+def test_coefficients_per_camera(make_scene):
+    scene = make_scene(90, cameras=2)
+    leaves = inputs(scene, colors=scene.sh * torch.tensor([1.0, -0.5])[:, None, None, None])
+    assert_same(*(run(f, scene, leaves, packed=False)[0] for f in (rasterization, step_by_step.rasterization)))
+
+
+def test_covariances_in_place_of_quaternions(make_scene):
+    scene = make_scene(100)
+    covars, _ = quat_scale_to_covar_preci(scene.quats.float(), scene.scales.float(), compute_preci=False)
+    leaves = inputs(scene, covars=covars)
+    del leaves["quats"], leaves["scales"]
+    options = {"quats": None, "scales": None}
+    assert_same(*(run(f, scene, leaves, **options)[0] for f in (rasterization, step_by_step.rasterization)))
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 31, 33, 129])
+def test_few_gaussians_and_none_that_is_seen(make_scene, count, packed):
+    scene = make_scene(count)
+    behind = replace(scene, means=-scene.means)
+    for each in (scene, behind):
+        leaves = inputs(each)
+        options = {"packed": packed, "render_mode": "RGB+ED"}
+        seen, meta = run(rasterization, each, leaves, **options)
+        assert_same(seen, run(step_by_step.rasterization, each, leaves, **options)[0])
+        check_lists(meta)
+
+
+def test_large_and_many_in_one_tile(make_scene):
+    scene = make_scene(6000, width=200, height=40)
+    scene.scales[:40] = 5.0
+    scene.opacities[:] *= 0.1
+    leaves = inputs(scene)
+    seen, meta = run(rasterization, scene, leaves, packed=False)
+    assert torch.diff(meta["isect_offsets"].flatten()).max() > 2000
+    assert_same(seen, run(step_by_step.rasterization, scene, leaves, packed=False)[0])
+    again, _ = run(rasterization, scene, leaves, packed=False)
+    assert all(torch.equal(seen[name], again[name]) for name in seen)
+
+
+def test_without_gradients_nothing_is_followed(make_scene):
+    scene = make_scene(100)
+    leaves = inputs(scene)
+    with torch.no_grad():
+        image, _, meta = rasterization(
+            **leaves, Ks=scene.Ks.float().cuda(), width=scene.width, height=scene.height, sh_degree=3
+        )
+    assert not image.requires_grad and not meta["means2d"].requires_grad
+    assert torch.equal(image, run(rasterization, scene, leaves)[0]["image"])
+
+
+def test_the_tile_size_and_subclasses_are_left_to_the_chain(make_scene, calls):
+    scene = make_scene(20)
+
+    class Named(torch.Tensor):
+        pass
+
+    leaves = {name: t.detach() for name, t in inputs(scene).items()}
+    arguments = {"Ks": scene.Ks.float().cuda(), "width": scene.width, "height": scene.height, "sh_degree": 3}
+    images = [
+        rasterization(**leaves, **arguments, tile_size=8)[0],
+        rasterization(**(leaves | {"means": leaves["means"].as_subclass(Named)}), **arguments)[0],
+        rasterization(**leaves, **arguments)[0],
+    ]
+    assert calls == [False, False, True]
+    for image in images:
+        torch.testing.assert_close(image.as_subclass(Tensor), images[2], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_opcheck(make_scene, packed):
+    scene = make_scene(30, cameras=2)
+    t = {name: value.detach() for name, value in inputs(scene).items()}
+    Ks = scene.Ks.float().cuda()
+    given = [t["means"], None, t["quats"], t["scales"], t["opacities"], t["colors"], t["viewmats"], Ks, None, None]
+    sizes = ([2], [scene.width, scene.height, 0, 3, 3, 2, True, packed, True], [0.3, 0.01, 1e10, 0.0])
+    ops = torch.ops.gsplat_core
+    torch.library.opcheck(ops.rasterize.default, (given, *sizes, True))
+    out = ops.rasterize(given, *sizes, True)
+    own = out[14:] if packed else out[11:]
+    row_of, radii, splat_ids = (own[5], own[6], own[7]) if packed else (None, out[6], out[9])
+    saved = [own[0], out[4], out[8], splat_ids, own[2], own[1], row_of, None, out[1], own[4], own[3]]
+    torch.library.opcheck(ops.rasterize_splats_backward.default, (saved, torch.ones_like(out[0]), None, *sizes))
+    v_records, v_means2d, _ = ops.rasterize_splats_backward(saved, torch.ones_like(out[0]), None, *sizes)
+    gradients = [v_records, v_means2d, None, None, None]
+    needs = [True, False, False, True, True, True, True, False, False, False]
+    torch.library.opcheck(ops.rasterize_inputs_backward.default, (given, radii, row_of, gradients, *sizes, needs))
+    with pytest.raises(RuntimeError, match="at least one camera"):
+        ops.rasterize(given, [], *sizes[1:], True)
+    with pytest.raises(RuntimeError, match="quats"):
+        ops.rasterize([*given[:2], t["quats"][:-1], *given[3:]], *sizes, True)
