@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import RecordingInvalid
+from gsplat_core.io.recordings.ahead import read_ahead
 from gsplat_core.io.recordings.calibration import Calibration
 from gsplat_core.io.recordings.decoded import Picture
 from gsplat_core.io.recordings.findings import Findings, printable
@@ -38,6 +40,15 @@ class FrameImages(Protocol):
     def frames(self, findings: Findings) -> Iterator[Picture | None]:
         """Frame after frame; None where one cannot be read at all."""
         ...
+
+
+class _Beside(NamedTuple):
+    """What lies beside one image, and what is wrong with it."""
+
+    right: Picture | None = None
+    depth: NDArray[np.float32] | None = None
+    mask: NDArray[np.uint8] | None = None
+    found: Findings = Findings()
 
 
 @dataclass(frozen=True)
@@ -71,18 +82,34 @@ class Contents:
         return frozenset(name for name, there in has.items() if there)
 
     def frames(self, findings: Findings, limit: int | None = None) -> Iterator[Frame | None]:
-        """Frame after frame at full size, decoded when asked for; None where one has a problem."""
+        """Frame after frame at full size, decoded when asked for; None where one has a problem.
+
+        What lies beside the images is read a few frames ahead, in a thread of its own, while the images are decoded in the caller's.
+        """
         pictures = islice(self.images.frames(findings), limit)
-        rights = self.right.frames(findings) if self.right else None
-        for index, picture in enumerate(pictures):
-            known = len(findings.problems)
+        with closing(self._beside()) as beside:
+            for index, (picture, (right, depth, mask, found)) in enumerate(zip(pictures, beside, strict=False)):
+                findings.add(found)
+                if picture is None or found.problems:
+                    yield None
+                    continue
+                yield self._frame(index, picture, right, depth, mask)
+
+    def _beside(self) -> Generator[_Beside, None, None]:
+        """What lies beside each image."""
+        if self.right is None and self.masks is None and self.depth is None:
+            return (_Beside() for _ in range(self.images.frame_count))
+        return read_ahead(self._read_beside(), f"read what lies beside the images of {printable(self.root.name)}")
+
+    def _read_beside(self) -> Generator[_Beside, None, None]:
+        # Findings of their own: those of a frame that is read ahead count when that frame is due.
+        found = Findings()
+        rights = self.right.frames(found) if self.right else None
+        for index in range(self.images.frame_count):
             right = next(rights, None) if rights else None
-            depth = self.depth.read(index, findings) if self.depth else None
-            mask = self.masks.read(index, findings) if self.masks else None
-            if picture is None or len(findings.problems) > known:
-                yield None
-                continue
-            yield self._frame(index, picture, right, depth, mask)
+            depth = self.depth.read(index, found) if self.depth else None
+            mask = self.masks.read(index, found) if self.masks else None
+            yield _Beside(right, depth, mask, found.taken())
 
     def _frame(
         self,

@@ -39,14 +39,28 @@ class Findings:
 
     def problem(self, file: Path | str, message: str, advice: str, *, missing: bool = False) -> None:
         """Note a fault that makes the recording unusable."""
-        finding = Finding(printable(file), printable(message), advice, missing)
-        self.problems.append(finding)
-        if self.strict:
-            raise (RecordingMissing if missing else RecordingInvalid)(str(finding))
+        self._add_problem(Finding(printable(file), printable(message), advice, missing))
 
     def warn(self, file: Path | str, message: str, advice: str) -> None:
         """Note a stated fallback, or something odd that does not stop the recording from being read."""
         self.warnings.append(Finding(printable(file), printable(message), advice))
+
+    def add(self, others: Findings) -> None:
+        """Note what another collector has found, in its order; a strict one raises at the first problem."""
+        self.warnings.extend(others.warnings)
+        for finding in others.problems:
+            self._add_problem(finding)
+
+    def taken(self) -> Findings:
+        """What was found since the last call, in a collector of its own; this one is empty then."""
+        found = Findings(problems=self.problems, warnings=self.warnings)
+        self.problems, self.warnings = [], []
+        return found
+
+    def _add_problem(self, finding: Finding) -> None:
+        self.problems.append(finding)
+        if self.strict:
+            raise (RecordingMissing if finding.missing else RecordingInvalid)(str(finding))
 
 
 @dataclass(frozen=True)

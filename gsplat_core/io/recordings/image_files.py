@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+import threading
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,15 +36,39 @@ class UnreadableImage(UnreadableFile):
     """Why an image cannot be decoded; the checks turn it into a finding."""
 
 
+class _QuietDecoders:
+    """How many threads keep OpenCV's log silent. The level is the whole process's: the first one takes it down, the last one restores it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._count = 0
+        self._level = 0
+
+    def enter(self) -> None:
+        with self._lock:
+            if self._count == 0:
+                self._level = cv2.utils.logging.getLogLevel()
+                cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+            self._count += 1
+
+    def leave(self) -> None:
+        with self._lock:
+            self._count -= 1
+            if self._count == 0:
+                cv2.utils.logging.setLogLevel(self._level)
+
+
+_quiet_decoders = _QuietDecoders()
+
+
 @contextmanager
 def quiet_decoder() -> Iterator[None]:
     """OpenCV's own log lines stay off the terminal: the finding says what is wrong."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    _quiet_decoders.enter()
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        _quiet_decoders.leave()
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:

@@ -59,7 +59,7 @@ class Recording(Protocol):
 
 
 class FileRecording:
-    """A recording on disk, seen at a scale. Holds one frame at a time, whatever its length."""
+    """A recording on disk, seen at a scale. Holds a few frames at a time, whatever its length."""
 
     def __init__(self, contents: Contents, scale: float, max_frames: int | None, notes: tuple[str, ...]) -> None:
         self._contents = contents

@@ -8,11 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
+import av
 import numpy as np
 import pytest
+from av.video.reformatter import Interpolation
 
 from gsplat_core.errors import RecordingInvalid, RecordingMissing
 from gsplat_core.io.recordings import Recording, open_recording, validate_recording
+from gsplat_core.io.recordings.decoder import PictureConverter
 from gsplat_core.scene.frames import FrameStatus
 
 Refused = Callable[..., str]
@@ -178,3 +181,16 @@ def test_bad_arguments(video_folder: Path, arguments: dict[str, float]) -> None:
 def test_camera_of_a_frame_that_is_not_there(video_folder: Path) -> None:
     with pytest.raises(ValueError, match="frame 8 is not in the recording"):
         open_recording(video_folder).camera_at(8)
+
+
+def test_one_conversion_for_frames_of_changing_size_and_format_gives_the_bytes_of_one_for_each(
+    rng: np.random.Generator,
+) -> None:
+    shared = PictureConverter(0)
+    for size in ((64, 48), (33, 17), (64, 48)):
+        for pixels in ("yuv420p", "yuvj420p", "yuv422p", "yuv444p", "gray", "rgb24"):
+            frame = av.VideoFrame(*size, pixels)
+            for plane in frame.planes:
+                plane.update(rng.integers(0, 256, plane.buffer_size, dtype=np.uint8).tobytes())
+            alone = frame.to_ndarray(format="bgr24", interpolation=Interpolation.BICUBIC)[..., ::-1]
+            assert np.array_equal(shared.picture(frame), alone), (size, pixels)

@@ -1,0 +1,86 @@
+"""Reading ahead: the next items of an iterator are made in a thread of their own while the present one is used."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Generator
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+ITEMS_AHEAD = 2
+
+
+def read_ahead(items: Generator[T, None, None], name: str, ahead: int = ITEMS_AHEAD) -> Generator[T, None, None]:
+    """The items in order, of which at most `ahead` are made and not yet taken.
+
+    What the iterator raises is raised here after the items that came before it. Closing this generator ends the thread, called `name`,
+    and waits for it; the iterator is closed in that thread. A daemon thread: a disk that does not answer keeps no program from ending.
+    """
+    made = _Made[T](ahead)
+    thread = threading.Thread(target=made.fill, args=(items,), name=name, daemon=True)
+    thread.start()
+    try:
+        yield from made.taken()
+    finally:
+        made.stop()
+        if thread is not threading.current_thread():  # a forgotten generator is closed wherever Python finds it
+            thread.join()
+
+
+class _Made(Generic[T]):
+    """Items that one thread makes and another one takes."""
+
+    def __init__(self, ahead: int) -> None:
+        self._ahead = ahead
+        self._changed = threading.Condition()
+        self._items: deque[T] = deque()
+        self._stopped = self._done = False
+        self._error: BaseException | None = None
+
+    def fill(self, items: Generator[T, None, None]) -> None:
+        """The life of the thread that makes them."""
+        error: BaseException | None = None
+        try:
+            try:
+                while self._wait_for_room():
+                    self._put(next(items))
+            except StopIteration:
+                pass
+            finally:
+                items.close()
+        except BaseException as raised:  # noqa: BLE001 - carried to the thread that takes the items
+            error = raised
+        with self._changed:
+            self._done, self._error = True, error
+            self._changed.notify_all()
+
+    def taken(self) -> Generator[T, None, None]:
+        """The items, in the thread that takes them."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._items or self._done)
+                if not self._items:
+                    break
+                item = self._items.popleft()
+                self._changed.notify_all()
+            yield item
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def stop(self) -> None:
+        """Let the thread end after the item that it is making."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+
+    def _wait_for_room(self) -> bool:
+        with self._changed:
+            self._changed.wait_for(lambda: self._stopped or len(self._items) < self._ahead)
+            return not self._stopped
+
+    def _put(self, item: T) -> None:
+        with self._changed:
+            self._items.append(item)
+            self._changed.notify_all()
