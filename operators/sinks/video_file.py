@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 from typing import cast
@@ -19,8 +21,10 @@ from operators.storage import StorageReserve, storage_errors
 
 CODEC = "libvpx-vp9"
 """VP9, by libvpx: browsers play it in an MP4, OpenCV reads it, and the encoder is under a BSD licence."""
-_QUALITY = "22"
+_QUALITY = "24"
 """libvpx's scale from 0 to 63, lower is better: 38 dB to the input and more (benchmarks/RESULTS.md)."""
+_FRAMES_WAITING = 2
+"""Frames that may wait for the encoder; the next one makes the caller wait."""
 _OPTIONS = {
     "deadline": "realtime",
     "cpu-used": "8",
@@ -39,7 +43,8 @@ MAX_THREADS = 8
 class VideoFile:
     """Writes RGB frames of one size to an MP4; use as a context manager or call `close()`, which finishes the file's index.
 
-    A file that an earlier run has left stays until this one is complete.
+    Frames are coded in a thread of the file's own, so that the caller makes the next one meanwhile. What goes wrong there is raised by the
+    next call, `close()` at the latest; no file is left then. A file that an earlier run has left stays until this one is complete.
     """
 
     def __init__(
@@ -66,6 +71,9 @@ class VideoFile:
                 f"{path}: PyAV {av.__version__} cannot write {CODEC} video of {width_px}x{height_px} px at {fps:g} fps ({error}); "
                 "install av from the package registry (`intrasplat doctor` tells more)"
             ) from error
+        self._encoder = ThreadPoolExecutor(1, thread_name_prefix=f"encode {path.name}")
+        self._waiting: deque[Future[None]] = deque()
+        self._failed = False
 
     def _add_stream(self) -> av.VideoStream:
         rate = Fraction(self._fps).limit_denominator(1001)
@@ -89,13 +97,15 @@ class VideoFile:
     def write(self, image: NDArray[np.uint8], time_s: float | None = None) -> None:
         """Add one RGB uint8 frame [H, W, 3], shown from `time_s` on; None: one frame after the other.
 
-        Raises StorageFull before the disk is so full that the file could not be finished.
+        Waits while as many frames as may wait for the encoder do so. Raises StorageFull before the disk is so full that the file could not
+        be finished.
         """
         if image.shape[:2] != self._size:
             raise OutputError(
                 f"{self.path}: frame {self.frames} is {list(image.shape[:2])}, the video {list(self._size)}; they must be equal"
             )
-        self._reserve.require(self._frame_bytes)
+        self._wait_for_frames(_FRAMES_WAITING)
+        self._reserve.require((len(self._waiting) + 1) * self._frame_bytes)
         if self._even != self._size:
             below, right = self._even[0] - self._size[0], self._even[1] - self._size[1]
             image = np.pad(image, ((0, below), (0, right), (0, 0)), mode="edge")
@@ -106,8 +116,17 @@ class VideoFile:
         # Times rise: a player refuses a frame that comes before the one that precedes it.
         self._last_ticks = max(self._last_ticks + 1, round(time_s * _TICKS_PER_S))
         frame.pts, frame.time_base = self._last_ticks, Fraction(1, _TICKS_PER_S)
-        self._write(frame)
+        self._waiting.append(self._encoder.submit(self._write, frame))
         self.frames += 1
+
+    def _wait_for_frames(self, most: int) -> None:
+        """Wait until at most `most` frames are with the encoder; raises what it has raised."""
+        while self._waiting and (len(self._waiting) > most or self._waiting[0].done()):
+            try:
+                self._waiting.popleft().result()
+            except BaseException:
+                self._failed = True
+                raise
 
     def _write(self, frame: av.VideoFrame | None) -> None:
         with storage_errors(self.path.parent):
@@ -120,6 +139,9 @@ class VideoFile:
         if partial is None:
             return
         try:
+            if self._failed:
+                return  # a frame is missing, and the caller knows why
+            self._wait_for_frames(0)
             if self.frames:
                 self._write(None)
             with storage_errors(self.path.parent):
@@ -127,6 +149,7 @@ class VideoFile:
                 if self.frames:
                     partial.finish()
         finally:
+            self._encoder.shutdown(cancel_futures=True)
             partial.discard()  # nothing, once it has its name
 
     def __enter__(self) -> VideoFile:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from itertools import pairwise
 from pathlib import Path
 
@@ -71,3 +72,55 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(StorageFull):
         VideoFile(tmp_path / "x.mp4", 64, 48, 30.0, StorageReserve(tmp_path, lambda: 2**62))
     assert [path.name for path in tmp_path.iterdir()] == ["v.mp4"]
+
+
+def _fail_from(frame: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the disk be full from the coding of that frame on."""
+    write = VideoFile._write
+    calls = iter(range(1000))
+
+    def full(self: VideoFile, picture: av.VideoFrame | None) -> None:
+        if next(calls) >= frame:
+            raise StorageFull("the disk is full")
+        write(self, picture)
+
+    monkeypatch.setattr(VideoFile, "_write", full)
+
+
+def _encoders() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("encode v.mp4")]
+
+
+def test_a_disk_that_is_full_while_a_frame_is_coded_is_told_by_a_later_call_and_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _fail_from(1, monkeypatch)
+    with pytest.raises(StorageFull, match="the disk is full"), VideoFile(tmp_path / "v.mp4", 64, 48, 30.0) as video:
+        for image in _pictures(10):
+            video.write(image)
+    assert 2 <= video.frames < 10, "writing stops soon after it"
+    assert list(tmp_path.iterdir()) == [] and _encoders() == []
+
+
+def test_a_last_frame_that_cannot_be_coded_is_told_by_closing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "v.mp4").write_bytes(b"earlier")
+    _fail_from(0, monkeypatch)
+    video = VideoFile(tmp_path / "v.mp4", 64, 48, 30.0)
+    video.write(_pictures(1)[0])
+    with pytest.raises(StorageFull, match="the disk is full"):
+        video.close()
+    video.close()
+    assert (tmp_path / "v.mp4").read_bytes() == b"earlier" and len(list(tmp_path.iterdir())) == 1
+    assert _encoders() == []
+
+
+def test_a_written_picture_may_be_changed_at_once(tmp_path: Path) -> None:
+    picture = np.full((48, 64, 3), 200, np.uint8)
+    with VideoFile(tmp_path / "v.mp4", 64, 48, 30.0) as video:
+        for _ in range(4):
+            video.write(picture)
+            picture[...] = 0
+            picture[...] = 200
+        picture[...] = 0
+    assert all(image.mean() > 190 for _, image in _read(tmp_path / "v.mp4"))
+    assert _encoders() == []
