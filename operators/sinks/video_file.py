@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import cast
@@ -49,6 +51,7 @@ class VideoFile:
         self.frames = 0
         self._fps = fps
         self._last_ticks = -1
+        self._broken = False
         self._size = (height_px, width_px)
         # 4:2:0 colour needs even sides.
         self._even = (height_px + height_px % 2, width_px + width_px % 2)
@@ -110,9 +113,24 @@ class VideoFile:
         self.frames += 1
 
     def _write(self, frame: av.VideoFrame | None) -> None:
-        with storage_errors(self.path.parent):
+        with self._writing():
             for packet in self._stream.encode(frame):
                 self._container.mux(packet)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Errors of the disk and of FFmpeg as OutputError; after one the file cannot be finished."""
+        try:
+            with storage_errors(self.path.parent):
+                yield
+        except OutputError:
+            self._broken = True
+            raise
+        except av.FFmpegError as error:  # those that are no OSError
+            self._broken = True
+            raise OutputError(
+                f"{self.path}: the video cannot be written ({error}); check the path, its permissions and its disk"
+            ) from error
 
     def close(self) -> None:
         """Finish the file and give it its name; without any frame there is none. Closing twice is allowed."""
@@ -120,9 +138,14 @@ class VideoFile:
         if partial is None:
             return
         try:
+            if self._broken:
+                # Whoever wrote has been told why; closing would fail for the same reason.
+                with suppress(OSError, av.FFmpegError):
+                    self._container.close()
+                return
             if self.frames:
                 self._write(None)
-            with storage_errors(self.path.parent):
+            with self._writing():
                 self._container.close()
                 if self.frames:
                     partial.finish()
