@@ -15,7 +15,7 @@ from typing import cast
 import av
 import cv2
 import numpy as np
-from av.video.reformatter import Interpolation
+from av.video.reformatter import Interpolation, VideoReformatter
 from numpy.typing import NDArray
 
 from gsplat_core.io.recordings.image_files import MAX_PIXELS
@@ -116,14 +116,26 @@ def _context(known: av.VideoCodecContext, decoder: str | None) -> av.VideoCodecC
     return context
 
 
-def picture(frame: av.VideoFrame, rotation: int) -> NDArray[np.uint8]:
-    """RGB uint8 [H, W, 3]: the bytes that OpenCV gives for the same frame, turned upright."""
-    # By way of BGR: FFmpeg's conversions to RGB round otherwise for some formats.
-    bgr = frame.to_ndarray(format="bgr24", interpolation=Interpolation.BICUBIC)
-    image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-    if turns := _QUARTER_TURNS.get(rotation, 0):
-        image = np.rot90(image, turns)
-    return np.ascontiguousarray(image)
+class PictureConverter:
+    """Makes RGB pictures of a stream's frames.
+
+    One for each stream: FFmpeg sets up a conversion once for all frames of one size and format. Setting it up for every frame takes longer
+    than decoding, and starts a thread for every core of the machine.
+    """
+
+    def __init__(self, rotation: int) -> None:
+        """rotation: degrees counter-clockwise by which pictures are turned; a multiple of 90 or ignored."""
+        self._reformatter = VideoReformatter()
+        self._turns = _QUARTER_TURNS.get(rotation, 0)
+
+    def picture(self, frame: av.VideoFrame) -> NDArray[np.uint8]:
+        """RGB uint8 [H, W, 3]: the bytes that OpenCV gives for the same frame, turned upright."""
+        # By way of BGR: FFmpeg's conversions to RGB round otherwise for some formats. One thread: more take longer to wake than to convert.
+        bgr = self._reformatter.reformat(frame, format="bgr24", interpolation=Interpolation.BICUBIC, threads=1)
+        image = np.asarray(cv2.cvtColor(bgr.to_ndarray(), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        if self._turns:
+            image = np.rot90(image, self._turns)
+        return np.ascontiguousarray(image)
 
 
 def frame_rate(stream: av.VideoStream) -> float:

@@ -10,7 +10,7 @@ import av
 
 from gsplat_core.io.recordings.containers import Container, UnusableContainer, recognise
 from gsplat_core.io.recordings.decoded import DEPENDS, Picture
-from gsplat_core.io.recordings.decoder import NO_PICTURE, PictureDecoder, captured_log, frame_rate, picture
+from gsplat_core.io.recordings.decoder import NO_PICTURE, PictureConverter, PictureDecoder, captured_log, frame_rate
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.image_files import MAX_PIXELS
 from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
@@ -92,7 +92,7 @@ class VideoFrames:
     def _decoded(self, spread: DamageSpread) -> Generator[tuple[int, Picture], None, None]:
         """The pictures as the decoder gives them, each with its position."""
         with _opened(self.path, self._container) as (container, stream):
-            decoder = PictureDecoder(stream)
+            decoder, converter = PictureDecoder(stream), PictureConverter(self._rotation)
             for number, packet in _numbered(container, stream):
                 shown = number < len(self._index.positions) and self._index.positions[number] >= 0
                 frames = decoder.decode(packet, number, shown)
@@ -100,7 +100,7 @@ class VideoFrames:
                 for own, frame in frames:
                     position = self._index.positions[own]
                     if position >= 0:
-                        yield position, Picture(picture(frame, self._rotation), spread.damage(position))
+                        yield position, Picture(converter.picture(frame), spread.damage(position))
 
 
 class DamageSpread:
