@@ -41,7 +41,7 @@ def implemented(device: str) -> set[str]:
     blocks = (
         block
         for path in sorted(ROOT.rglob("*.cpp"))
-        if not path.name.endswith((f"_{other}_op.cpp", f"_{other}_host.cpp"))
+        if not path.name.endswith(f"_{other}_host.cpp")
         for block in re.findall(
             rf"STABLE_TORCH_LIBRARY_IMPL\(gsplat_core, (?:{device}|GSPLAT_DEVICE), m\) {{(.*?)}}",
             path.read_text(),
