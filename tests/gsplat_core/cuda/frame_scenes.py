@@ -67,10 +67,7 @@ class FrameScene:
         leaves = {name: getattr(scene, name).clone().requires_grad_() for name in NAMES}
         if scene.deltas is not None:
             leaves["deltas"] = scene.deltas.clone().requires_grad_()
-        image, alphas = reference_frame(
-            *(leaves[name] for name in NAMES), leaves.get("deltas"), scene.viewmat, scene.K, scene.background,
-            scene.width, scene.height, camera_model=scene.camera_model,
-        )  # fmt: skip
+        image, alphas = reference_frame([leaves[name] for name in NAMES], leaves.get("deltas"), scene.view)
         v_image, v_alphas = self.picture_gradients(with_alphas)
         total = (image * v_image).sum() + (0 if v_alphas is None else (alphas * v_alphas).sum())
         total.backward()
