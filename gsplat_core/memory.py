@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 
 def available_bytes() -> int | None:
-    """Memory that a process can still take without swapping: the system's, or less where a control group limits it. None: not known."""
-    limits = [limit for limit in (_of_system(), _of_control_group()) if limit is not None]
+    """Memory that a process can still take without swapping: the system's, or less where a control group or `ulimit -v` limits it. None: not
+    known."""
+    limits = [limit for limit in (_of_system(), _of_control_group(), _of_process()) if limit is not None]
     return min(limits) if limits else None
 
 
@@ -30,6 +32,14 @@ def _of_control_group(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
     # Cached files are counted as used, but make room.
     stated = dict(line.split()[:2] for line in _text(folder / "memory.stat").splitlines() if " " in line)
     return max(0, int(limit) - int(current) + int(stated.get("inactive_file", "0")))
+
+
+def _of_process(path: Path = Path("/proc/self/statm")) -> int | None:
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    taken = _text(path).split()
+    if limit == resource.RLIM_INFINITY or not taken:
+        return None
+    return max(0, limit - int(taken[0]) * resource.getpagesize())
 
 
 def _text(path: Path) -> str:

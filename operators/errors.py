@@ -14,10 +14,11 @@ OperatorsError
 │   ├── EngineMissing                      the engine's package is not installed or cannot be loaded
 │   └── EngineUnsupported                  the engine cannot run this graph faithfully
 ├── OutputError (UserError)                what a run writes cannot be written
-│   ├── OutputFolderInUse                  the folder holds something that is not ours
+│   ├── OutputFolderInUse                  the folder holds something that is not ours, or another run writes into it
 │   └── StorageFull                        the disk has no room left
 └── RunError
     ├── DeviceMissing (UserError)          the device asked for is not there or not supported
+    ├── MemoryTooSmall (UserError)         what a run needs does not fit into this machine's memory
     └── RunFailed                          a run ended early; carries what it had reached
 """
 
@@ -103,7 +104,7 @@ class OutputError(OperatorsError, UserError):
 
 
 class OutputFolderInUse(OutputError):
-    """The folder holds something that is not ours."""
+    """The folder holds something that is not ours, or another run writes into it."""
 
 
 class StorageFull(OutputError):
@@ -116,6 +117,10 @@ class RunError(OperatorsError):
 
 class DeviceMissing(RunError, UserError):
     """The device asked for is not there, or this version cannot use it."""
+
+
+class MemoryTooSmall(RunError, UserError):
+    """What a run needs does not fit into this machine's memory, or into what this process may take."""
 
 
 class RunFailed(RunError):

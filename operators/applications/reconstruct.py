@@ -62,7 +62,7 @@ def reconstruct(
     check_steps("steps", steps)
 
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
-        source = prepare(inside, notes)
+        source = prepare(inside, notes, offline=True)
         start = Start.now()
         model, done = _fit(source, inside, steps, progress, stop_requested)
         if done < steps:

@@ -6,16 +6,20 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import RecordingError, UserError
 from gsplat_core.io.atomic_files import PartialFile
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording
+from gsplat_core.rendering.registry import check_renderer, new_renderer
+from gsplat_core.rendering.renderer import Renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.model import Model
 from operators.applications.device import check_device
 from operators.applications.limits import check_picture, check_scale, frames_to_render
+from operators.applications.memory import render_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.errors import OutputError
 from operators.output_folder import OutputFolder
@@ -36,6 +40,7 @@ def render_model(
     fps: float = 30.0,
     scale: float = 1.0,
     device: str = "cpu",
+    renderer: str = "alpha",
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
@@ -53,10 +58,14 @@ def render_model(
     if to_video:
         _check_video_path(bundle, out, overwrite)
     check_device(device)
+    check_renderer(renderer, device)
     model = load_bundle(bundle).to(device)
     camera = model.camera.scaled(scale)
     check_picture(camera, scale)
-    images = _images(model, camera, fps, progress, stop_requested)
+    if device == "cpu":
+        needed = render_bytes(camera.width_px, camera.height_px, model.parameter_count)
+        require_memory(needed, f"a picture of {camera.width_px}x{camera.height_px} px", "give a smaller --scale")
+    images = _images(model, new_renderer(renderer, camera, device), camera, fps, progress, stop_requested)
     if not to_video:
         return _write_images(images, bundle, out)
     if overwrite:
@@ -66,6 +75,7 @@ def render_model(
 
 def _images(
     model: Model,
+    renderer: Renderer,
     camera: Camera,
     fps: float,
     progress: ProgressCallback | None,
@@ -73,10 +83,12 @@ def _images(
 ) -> Iterator[NDArray]:
     """RGB uint8 [H, W, 3], over the time window, until a stop is requested."""
     count = frames_to_render(model.time_window_s, fps)
+    renderer.prepare(model)
     for k in range(count):
         if stop_requested():
             return
-        yield displayed(model.render(model.time_window_s[0] + k / fps, camera, depth=False).image)
+        with torch.inference_mode():
+            yield displayed(renderer.render(camera, model.time_window_s[0] + k / fps, ("image",)).result().image)
         if progress is not None:
             progress(Progress("render", k + 1, count))
 

@@ -28,6 +28,7 @@ from operators.applications.delivery import Report, delivered
 from operators.applications.device import check_device, scheduler_for
 from operators.applications.finishing import measures_baselines, saves_model
 from operators.applications.limits import check_max_frames, check_picture, check_scale, check_seed, check_steps
+from operators.applications.memory import replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.result import RunOutcome, RunSettings
 from operators.applications.session import Session
@@ -222,8 +223,9 @@ def replay(
     return delivered(settings, "replay", run, report)
 
 
-def prepare(settings: ReplaySettings, notes: list[str]) -> FrameSource:
+def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False) -> FrameSource:
     """Check everything that can be checked before the first frame; returns the source, and adds what is to be said about it to `notes`.
+    offline: whether all frames are kept for training.
 
     Raises as `replay` does before anything is written.
     """
@@ -235,6 +237,13 @@ def prepare(settings: ReplaySettings, notes: list[str]) -> FrameSource:
     if description.frame_count is None:
         raise InvalidSetting(f"{description.name} has no end; give --max-frames, or a recording")
     check_picture(description.camera, settings.scale)
+    if settings.device == "cpu":
+        sized = settings.reconstructor_config(description.width_px * description.height_px)
+        require_memory(
+            replay_bytes(description, sized, offline=offline),
+            f"{description.frame_count} frames of {description.name}",
+            "give a smaller --scale or --max-frames",
+        )
     notes.extend(description.notes)
     if "depth" not in description.fields:
         notes.append(

@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
+from services.cli.options import (
+    DeviceOption,
+    JsonOption,
+    ModelArgument,
+    OutOption,
+    RecordingArgument,
+    RendererOption,
+    RenderOutOption,
+    RunOptions,
+    ScaleOption,
+    SeedOption,
+    takes_run_options,
+)
 from services.cli.streams import printable
 
 # Wrong options and their like. Where the class lives has changed between releases of typer; what derives from it has not.
@@ -21,37 +33,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-
-
-def _path(text: str) -> Path:
-    if not text:
-        # An empty name would stand for the current folder.
-        raise typer.BadParameter("it is empty; give a path")
-    if "\0" in text:
-        raise typer.BadParameter(f"{text!r} holds a zero byte, which no name of a file can")
-    return Path(text)
-
-
-def _path_argument(name: str, help_text: str) -> Any:
-    return typer.Argument(parser=_path, metavar=name, help=help_text, show_default=False)
-
-
-def _path_option(name: str, help_text: str) -> Any:
-    return typer.Option(name, parser=_path, metavar="<path>", help=help_text, show_default=False)
-
-
-RecordingArgument = Annotated[
-    Path, _path_argument("RECORDING", "A video, or a folder with video.mp4, images/ or cameras.json.")
-]
-ModelArgument = Annotated[Path, _path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
-OutOption = Annotated[Path, _path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
-RenderOutOption = Annotated[Path, _path_option("--out", "A video (name.mp4) or a folder of images.")]
-DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
-FieldOption = Annotated[str, typer.Option(help="Deformation field: auto, basis or hexplane.")]
-SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
-ScaleOption = Annotated[float, typer.Option(help="Resize the frames by this factor.")]
-MaxFramesOption = Annotated[int | None, typer.Option(help="Stop after this many frames.", show_default=False)]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout, and nothing else.")]
 
 
 def run(arguments: list[str]) -> int:
@@ -97,18 +78,15 @@ def _common(
 
 
 @app.command()
+@takes_run_options
 def replay(
     recording: RecordingArgument,
     out: OutOption,
-    device: DeviceOption = "cpu",
+    options: RunOptions,
     engine: Annotated[str, typer.Option(help="Graph engine: embedded or holoscan.")] = "embedded",
-    field: FieldOption = "auto",
-    seed: SeedOption = 0,
     steps_per_frame: Annotated[
         int | None, typer.Option(help="Optimiser steps per frame.", show_default="the field's")
     ] = None,
-    max_frames: MaxFramesOption = None,
-    scale: ScaleOption = 1.0,
     heldout: Annotated[
         bool,
         typer.Option(
@@ -124,43 +102,28 @@ def replay(
     settings = ReplaySettings(
         recording=recording,
         out=out,
-        device=device,
         engine=engine,  # type: ignore[arg-type]
-        field=field,
-        seed=seed,
         steps_per_frame=steps_per_frame,
-        max_frames=max_frames,
-        scale=scale,
         heldout=heldout,
+        **options.settings(),
     )
     return replay_command(settings, as_json=json)
 
 
 @app.command()
+@takes_run_options
 def reconstruct(
     recording: RecordingArgument,
     out: OutOption,
-    device: DeviceOption = "cpu",
-    field: FieldOption = "auto",
-    seed: SeedOption = 0,
+    options: RunOptions,
     steps: Annotated[int, typer.Option(help="Optimiser steps over all training frames.")] = 2000,
-    max_frames: MaxFramesOption = None,
-    scale: ScaleOption = 1.0,
     json: JsonOption = False,
 ) -> int:
     """Reconstruct offline: train on all training frames, then evaluate the held-out ones."""
     from operators.applications.replay import ReplaySettings
     from services.cli.reconstruct import reconstruct_command
 
-    settings = ReplaySettings(
-        recording=recording,
-        out=out,
-        device=device,
-        field=field,
-        seed=seed,
-        max_frames=max_frames,
-        scale=scale,
-    )
+    settings = ReplaySettings(recording=recording, out=out, **options.settings())
     return reconstruct_command(settings, steps, as_json=json)
 
 
@@ -171,13 +134,16 @@ def render(
     fps: Annotated[float, typer.Option(help="Frames per second of the model's time.")] = 30.0,
     scale: ScaleOption = 1.0,
     device: DeviceOption = "cpu",
+    renderer: RendererOption = "alpha",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a video that is there already.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Render a model over its time window to a video or to images."""
     from services.cli.render import render_command
 
-    return render_command(model, out, fps, scale, device, overwrite=overwrite, as_json=json)
+    return render_command(
+        model, out, fps, scale=scale, device=device, renderer=renderer, overwrite=overwrite, as_json=json
+    )
 
 
 @app.command()

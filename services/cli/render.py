@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -13,21 +14,10 @@ from services.cli.interrupt import InterruptRequest
 from services.cli.progress import ProgressPrinter
 
 
-def render_command(
-    model: Path, out: Path, fps: float, scale: float, device: str, *, overwrite: bool, as_json: bool
-) -> int:
-    """Render a model and print where the result is."""
+def render_command(model: Path, out: Path, fps: float, *, as_json: bool, **options: Any) -> int:
+    """Render a model and print where the result is. options: those of `render_model`."""
     with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as progress:
-        frames = render_model(
-            model,
-            out,
-            fps=fps,
-            scale=scale,
-            device=device,
-            overwrite=overwrite,
-            progress=progress,
-            stop_requested=interrupt,
-        )
+        frames = render_model(model, out, fps=fps, progress=progress, stop_requested=interrupt, **options)
     if as_json:
         typer.echo(
             json.dumps({"path": str(out), "frames": frames, "fps": fps, "interrupted": interrupt.requested}, indent=2)

@@ -32,11 +32,16 @@ from gsplat_core.io.recordings.synthetic.renderer import Eye, render_eye
 from gsplat_core.io.recordings.synthetic.target import GENERATOR, check_target
 from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM, Tissue
 from gsplat_core.io.recordings.synthetic.tool import CYCLE_S, ToolMotion
+from gsplat_core.memory import available_bytes, in_gib
 from gsplat_core.scene.cameras import Camera
 
 BASELINE_MM = 4.4
 DEPTH_UNIT_MM = 0.01
 MAX_SEED = 2**63 - 1
+SCENE_BYTES = 1120
+"""Memory while the tissue's texture is made, for each pixel of a square with the longer side: its texels follow the resolution (measured)."""
+FRAME_BYTES = 300
+"""Memory while one frame is rendered, for each of its pixels (measured)."""
 
 
 @dataclass(frozen=True)
@@ -111,10 +116,11 @@ def synthesize(
     _check_arguments(frames, width_px, height_px, fps, seed, camera)
     target = Path(out)
     check_target(target)
+    threads = _threads_that_fit(width_px, height_px)
     target.parent.mkdir(parents=True, exist_ok=True)
     with PartialFolder(target) as partial:
         scene = SyntheticScene.from_seed(seed, width_px, height_px, frames / fps, camera == "moving")
-        _write(scene, partial.path, frames, fps, stereo, progress)
+        _write(scene, partial.path, frames, fps, stereo, progress, threads)
         _describe(partial.path, scene, frames, fps, seed, stereo)
         check_target(target)  # something may have been put there meanwhile
         earlier = partial.finish()
@@ -136,6 +142,21 @@ def _check_arguments(frames: int, width_px: int, height_px: int, fps: float, see
         raise InvalidSetting(f"camera must be 'fixed' or 'moving', got {camera!r}")
 
 
+def _threads_that_fit(width_px: int, height_px: int) -> int:
+    """How many frames are rendered at once. Raises InvalidSetting where the memory is too small for the scene and one frame."""
+    texture, frame = SCENE_BYTES * max(width_px, height_px) ** 2, FRAME_BYTES * width_px * height_px
+    threads = min(8, os.cpu_count() or 1)
+    available = available_bytes()
+    if available is None:
+        return threads
+    if texture + frame > available:
+        raise InvalidSetting(
+            f"frames of {width_px}x{height_px} px take about {in_gib(texture + frame)} of memory, and {in_gib(available)} are free; give a"
+            " smaller size"
+        )
+    return max(1, min(threads, (available - texture) // frame))
+
+
 def _write(
     scene: SyntheticScene,
     folder: Path,
@@ -143,6 +164,7 @@ def _write(
     fps: float,
     stereo: bool,
     progress: Callable[[int, int], None] | None,
+    threads: int,
 ) -> None:
     for name in ("images", "masks", "depth", *(["images_right"] if stereo else [])):
         (folder / name).mkdir()
@@ -166,7 +188,7 @@ def _write(
 
     rows, tracks = [], []
     # A frame depends on its index alone, so the order in which threads finish does not matter.
-    pool = ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1))
+    pool = ThreadPoolExecutor(max_workers=threads)
     try:
         for done, (row, track) in enumerate(pool.map(write_frame, range(frames)), start=1):
             rows.append(row)

@@ -1,0 +1,85 @@
+"""The options of `intrasplat`'s commands, and those that commands share."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+
+def _path(text: str) -> Path:
+    if not text:
+        # An empty name would stand for the current folder.
+        raise typer.BadParameter("it is empty; give a path")
+    if "\0" in text:
+        raise typer.BadParameter(f"{text!r} holds a zero byte, which no name of a file can")
+    return Path(text)
+
+
+def _path_argument(name: str, help_text: str) -> Any:
+    return typer.Argument(parser=_path, metavar=name, help=help_text, show_default=False)
+
+
+def _path_option(name: str, help_text: str) -> Any:
+    return typer.Option(name, parser=_path, metavar="<path>", help=help_text, show_default=False)
+
+
+RecordingArgument = Annotated[
+    Path, _path_argument("RECORDING", "A video, or a folder with video.mp4, images/ or cameras.json.")
+]
+ModelArgument = Annotated[Path, _path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
+OutOption = Annotated[Path, _path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
+RenderOutOption = Annotated[Path, _path_option("--out", "A video (name.mp4) or a folder of images.")]
+DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
+RendererOption = Annotated[str, typer.Option(help="How Gaussians become a picture: alpha.")]
+FieldOption = Annotated[str, typer.Option(help="Deformation field: auto, basis or hexplane.")]
+SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
+ScaleOption = Annotated[float, typer.Option(help="Resize the frames by this factor.")]
+MaxFramesOption = Annotated[int | None, typer.Option(help="Stop after this many frames.", show_default=False)]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout, and nothing else.")]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What `replay` and `reconstruct` have in common; the names are those of `ReplaySettings`."""
+
+    device: DeviceOption = "cpu"
+    field: FieldOption = "auto"
+    renderer: RendererOption = "alpha"
+    seed: SeedOption = 0
+    max_frames: MaxFramesOption = None
+    scale: ScaleOption = 1.0
+
+    def settings(self) -> dict[str, Any]:
+        """By name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def takes_run_options(command: Callable[..., int]) -> Callable[..., int]:
+    """A command whose parameter `options` is filled from an option for each field of RunOptions."""
+    shared = [
+        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default)
+        for field in fields(RunOptions)
+    ]
+
+    @functools.wraps(command)
+    def call(**values: Any) -> int:
+        options = RunOptions(**{field.name: values.pop(field.name) for field in fields(RunOptions)})
+        return command(options=options, **values)
+
+    parameters = list(inspect.signature(command).parameters.values())
+    place = [parameter.name for parameter in parameters].index("options")
+    hints = get_type_hints(command, include_extras=True) | get_type_hints(RunOptions, include_extras=True)
+    both = [
+        each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[each.name])
+        for each in [*parameters[:place], *shared, *parameters[place + 1 :]]
+    ]
+    call.__signature__ = inspect.Signature(both)  # type: ignore[attr-defined]
+    call.__annotations__ = {each.name: each.annotation for each in both}
+    del call.__dict__["__wrapped__"]  # typer would look at the command's own signature
+    return call
