@@ -131,8 +131,7 @@ class BasisField(DeformationField):
         tau: float | Tensor,
         gradient: Tensor,
         rates: Sequence[float] | Tensor,
-        beta1: float = 0.9,
-        beta2: float = 0.999,
+        betas: tuple[float, float] = (0.9, 0.999),
         epsilon: float = 1e-8,
     ) -> None:
         """As `adam_step`, at a `tau` of `self.tau` and with the six `rates` of `BasisRates` in order.
@@ -142,8 +141,8 @@ class BasisField(DeformationField):
         """
         moments = self._moments_in_use()
         self._ops.basis_field_backward_adam_(
-            gradient, tau, *(p.data for p in self._parameters_in_order()), moments.first, moments.second, moments.steps,
-            rates, beta1, beta2, epsilon,
+            gradient, tau, [p.data for p in self._parameters_in_order()], moments.first, moments.second, moments.steps,
+            rates, betas, epsilon,
         )  # fmt: skip
 
     @property

@@ -35,17 +35,3 @@ class CpuCall final : public CallArguments<CpuCall> {
  private:
   std::vector<Tensor> scratch_;
 };
-
-// What follows is for host files that are written for the CPU alone.
-inline Tensor floats(const Tensor& t, const char* name) { return CpuCall(t).floats(t, name); }
-inline Tensor ints(const Tensor& t, const char* name) { return CpuCall(t).ints(t, name); }
-inline Tensor empty_floats(std::initializer_list<int64_t> sizes) {
-  return torch::stable::empty(torch::headeronly::IntHeaderOnlyArrayRef(sizes.begin(), sizes.size()), ScalarType::Float);
-}
-inline Tensor zero_floats(std::initializer_list<int64_t> sizes) {
-  Tensor t = empty_floats(sizes);
-  return torch::stable::zero_(t);
-}
-inline Tensor empty_ints(std::initializer_list<int64_t> sizes) {
-  return torch::stable::empty(torch::headeronly::IntHeaderOnlyArrayRef(sizes.begin(), sizes.size()), ScalarType::Int);
-}

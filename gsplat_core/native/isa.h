@@ -42,29 +42,3 @@ Isa active_isa();
   inline const Type& kernels() { return ::baseline::op::kernels; } \
   }
 #endif
-
-// As GSPLAT_KERNELS, for tables with a name of their own outside of any op's namespace.
-#define GSPLAT_DECLARE_TABLE(isa, Type, name) \
-  namespace isa {                             \
-  extern const Type name;                     \
-  }
-
-#if defined(GSPLAT_X86)
-#define GSPLAT_DECLARE_KERNELS(Type, name)   \
-  GSPLAT_DECLARE_TABLE(baseline, Type, name) \
-  GSPLAT_DECLARE_TABLE(avx2, Type, name)     \
-  GSPLAT_DECLARE_TABLE(avx512, Type, name)   \
-  inline const Type& name() {                \
-    switch (active_isa()) {                  \
-      case Isa::avx512: return avx512::name; \
-      case Isa::avx2: return avx2::name;     \
-      default: return baseline::name;        \
-    }                                        \
-  }
-#elif defined(GSPLAT_ISA)
-#define GSPLAT_DECLARE_KERNELS(Type, name) GSPLAT_DECLARE_TABLE(GSPLAT_ISA, Type, name)
-#else
-#define GSPLAT_DECLARE_KERNELS(Type, name)   \
-  GSPLAT_DECLARE_TABLE(baseline, Type, name) \
-  inline const Type& name() { return baseline::name; }
-#endif

@@ -16,12 +16,12 @@ def adam_step(
     second_moment: Tensor,
     step: int,
     learning_rate: float,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
+    betas: tuple[float, float] = (0.9, 0.999),
     epsilon: float = 1e-8,
     row_size: int = 1,
 ) -> int:
     """As `gsplat_core.ops.adam.adam.adam_step`, which documents it."""
+    beta1, beta2 = betas
     usable = gradient.square().isfinite().reshape(-1, row_size).all(dim=1, keepdim=True)
     keep = usable.expand(-1, row_size).reshape(gradient.shape)
     first = first_moment + (1 - beta1) * (gradient - first_moment)

@@ -3,42 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.frame.view import View
 from gsplat_core.reference.rendering import rasterization
-from gsplat_core.rendering.settings import EPS2D, FAR_PLANE, NEAR_PLANE, RenderMode
+from gsplat_core.rendering.settings import RenderMode
 from gsplat_core.scene.layout import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION
 
 
 def render_frame(
-    means: Tensor,
-    quats: Tensor,
-    log_scales: Tensor,
-    logit_opacities: Tensor,
-    sh: Tensor,
-    deltas: Tensor | None,
-    viewmat: Tensor,
-    K: Tensor,
-    background: Tensor | None,
-    width: int,
-    height: int,
-    eps2d: float = EPS2D,
-    near_plane: float = NEAR_PLANE,
-    far_plane: float = FAR_PLANE,
-    camera_model: str = "pinhole",
-    expected_depth: bool = False,
+    gaussians: Sequence[Tensor], deltas: Tensor | None, view: View, *, expected_depth: bool = False
 ) -> tuple[Tensor, Tensor]:
     """Deform, activate and render N Gaussians for one camera (Kerbl et al. 2023), differentiable in all of them.
 
     Args:
-        means [N, 3], quats [N, 4] (wxyz, any length but zero), log_scales [N, 3], logit_opacities [N], sh [N, B, 3] with B a
-            square: raw parameters.
+        gaussians: raw parameters: means [N, 3], quats [N, 4] (wxyz, any length but zero), log_scales [N, 3],
+            logit_opacities [N], sh [N, B, 3] with B a square.
         deltas: [N, 16], added to them in the layout of `scene.layout`, or None.
-        viewmat: [4, 4] world to camera. K: [3, 3] in pixels. background: [3], black where None.
+        view: the camera; its tensors have the Gaussians' dtype.
         expected_depth: the fourth channel is the weighted mean of z over the splats and not the weighted sum.
 
     Returns:
@@ -47,6 +34,7 @@ def render_frame(
     A Gaussian with a value that is not finite, in its parameters or its deltas, is left out and gets zero gradients.
     Any floating-point dtype. Raises InvalidInput for wrong shapes.
     """
+    means, quats, log_scales, logit_opacities, sh = gaussians
     n, bases = len(means), sh.shape[1] if sh.dim() == 3 else 0
     require_shape("quats", quats, (n, 4), "[N, 4]")
     require_shape("log_scales", log_scales, (n, 3), "[N, 3]")
@@ -65,10 +53,11 @@ def render_frame(
         raw[usable][:, group] for group in (POSITION, ROTATION, LOG_SCALE, COLOUR, OPACITY)
     )
     mode: RenderMode = "RGB+ED" if expected_depth else "RGB+D"
+    background = None if view.background is None else view.background[None]
     image, alphas, _ = rasterization(
         mean, quat, log_scale.exp(), torch.sigmoid(logit[:, 0]), torch.cat([dc[:, None], sh[usable, 1:]], 1),
-        viewmat[None], K[None], width, height, near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, sh_degree=degree,
-        packed=False, backgrounds=None if background is None else background[None], render_mode=mode,
-        camera_model=camera_model,
+        view.viewmat[None], view.K[None], view.width, view.height, near_plane=view.near_plane, far_plane=view.far_plane,
+        eps2d=view.eps2d, sh_degree=degree, packed=False, backgrounds=background, render_mode=mode,
+        camera_model=view.camera_model,
     )  # fmt: skip
     return image[0], alphas[0, ..., 0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -13,7 +15,8 @@ from gsplat_core.ops.projection.arguments import (
     MAX_RADIUS_PX,
     DenseProjection,
     PackedProjection,
-    check_projection_arguments,
+    check_projection_options,
+    check_projection_tensors,
     pack,
 )
 from gsplat_core.reference.covariance import quat_scale_to_covar_preci, triu_to_matrix
@@ -97,29 +100,12 @@ def fully_fused_projection(
     opacities: Tensor | None = None,
 ) -> DenseProjection | PackedProjection:
     """Project Gaussians to image ellipses; see `gsplat_core.fully_fused_projection`."""
-    check_projection_arguments(
-        means, covars, quats, scales, viewmats, Ks, width, height, sparse_grad, camera_model, opacities
-    )
+    check_projection_tensors(means, covars, quats, scales, opacities, viewmats, Ks)
+    check_projection_options(width, height, sparse_grad, camera_model)
     # Unusable Gaussians are replaced before any arithmetic: a NaN behind a mask would still be a NaN in the gradient.
-    usable = means.isfinite().all(-1)
-    if covars is not None:
-        usable = usable & covars.isfinite().all(-1)
-    elif quats is not None and scales is not None:
-        usable = usable & quats.isfinite().all(-1) & (quats != 0).any(-1) & scales.isfinite().all(-1)
-    if opacities is not None:
-        usable = usable & opacities.isfinite()
+    usable = _usable(means, covars, quats, scales, opacities)
+    covariance = _covariance(usable, covars, quats, scales)
     means = torch.where(usable[..., None], means, torch.zeros_like(means))
-    if covars is not None:
-        identity = covars.new_tensor([1, 0, 0, 1, 0, 1])
-        covariance = triu_to_matrix(torch.where(usable[..., None], covars, identity))
-    else:
-        assert quats is not None and scales is not None
-        quats = torch.where(usable[..., None], quats, quats.new_tensor([1, 0, 0, 0]))
-        scales = torch.where(usable[..., None], scales, torch.ones_like(scales))
-        covar, _ = quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-        assert covar is not None
-        covariance = covar
-
     rotation, translation = viewmats[..., :3, :3], viewmats[..., :3, 3]
     p = torch.einsum("...cij,...nj->...cni", rotation, means) + translation[..., None, :]
     z = p[..., 2]
@@ -129,7 +115,67 @@ def fully_fused_projection(
 
     # covariance in the image: (J W) Σ (J W)ᵀ
     affine = jacobian @ rotation[..., None, :, :]
-    covars2d = affine @ covariance[..., None, :, :, :] @ affine.transpose(-1, -2)
+    ellipses = _blurred(affine @ covariance[..., None, :, :, :] @ affine.transpose(-1, -2), eps2d)
+    valid = in_range & ellipses.positive & means2d.isfinite().all(-1) & ellipses.conics.isfinite().all(-1)
+    reached = None
+    if opacities is not None:
+        reached = opacities[..., None, :] * (ellipses.compensations if calc_compensations else 1)
+    half_sizes, visible = _half_sizes(ellipses, reached)
+    with torch.no_grad():
+        valid = valid & visible & (half_sizes > radius_clip).any(-1)
+        size = means2d.new_tensor([width, height])
+        valid = valid & ((means2d + half_sizes > 0) & (means2d - half_sizes < size)).all(-1)
+
+    zero = torch.zeros_like(z)
+    dense = DenseProjection(
+        radii=torch.where(valid[..., None], half_sizes, zero[..., None]).to(torch.int32),
+        means2d=torch.where(valid[..., None], means2d, zero[..., None]),
+        depths=torch.where(valid, p[..., 2], zero),
+        conics=torch.where(valid[..., None], ellipses.conics, zero[..., None]),
+        compensations=torch.where(valid, ellipses.compensations, zero) if calc_compensations else None,
+    )
+    return pack(dense) if packed else dense
+
+
+def _usable(
+    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, opacities: Tensor | None
+) -> Tensor:
+    """Whether a Gaussian has finite values and a rotation, bool [..., N]."""
+    usable = means.isfinite().all(-1)
+    if covars is not None:
+        usable = usable & covars.isfinite().all(-1)
+    elif quats is not None and scales is not None:
+        usable = usable & quats.isfinite().all(-1) & (quats != 0).any(-1) & scales.isfinite().all(-1)
+    if opacities is not None:
+        usable = usable & opacities.isfinite()
+    return usable
+
+
+def _covariance(usable: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None) -> Tensor:
+    """Covariances in the world [..., N, 3, 3]; the identity for Gaussians that are not usable."""
+    if covars is not None:
+        identity = covars.new_tensor([1, 0, 0, 1, 0, 1])
+        return triu_to_matrix(torch.where(usable[..., None], covars, identity))
+    assert quats is not None and scales is not None
+    quats = torch.where(usable[..., None], quats, quats.new_tensor([1, 0, 0, 0]))
+    scales = torch.where(usable[..., None], scales, torch.ones_like(scales))
+    covar, _ = quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+    assert covar is not None
+    return covar
+
+
+class _Ellipses(NamedTuple):
+    """Blurred covariances in the image, [..., C, N]."""
+
+    variances: Tensor
+    """[..., C, N, 2]: along x and y."""
+    conics: Tensor
+    compensations: Tensor
+    positive: Tensor
+    """bool: whether the covariance has an inverse; without one the conic is meaningless."""
+
+
+def _blurred(covars2d: Tensor, eps2d: float) -> _Ellipses:
     a0, b, c0 = covars2d[..., 0, 0], covars2d[..., 0, 1], covars2d[..., 1, 1]
     a, c = a0 + eps2d, c0 + eps2d
     det = a * c - b * b
@@ -137,26 +183,16 @@ def fully_fused_projection(
     det = torch.where(positive, det, torch.ones_like(det))
     conics = torch.stack([c / det, -b / det, a / det], -1)
     compensations = ((a0 * c0 - b * b) / det).clamp(min=COMPENSATION_FLOOR**2).sqrt()
+    return _Ellipses(torch.stack([a, c], -1), conics, compensations, positive)
 
-    with torch.no_grad():
-        extent = torch.full_like(det, MAX_EXTENT_SIGMAS)
-        valid = in_range & positive & means2d.isfinite().all(-1) & conics.isfinite().all(-1)
-        if opacities is not None:
-            effective = opacities[..., None, :] * (compensations if calc_compensations else 1)
-            valid = valid & (effective >= ALPHA_CUTOFF)
-            extent = extent.minimum((2 * (effective / ALPHA_CUTOFF).clamp(min=1).log()).sqrt())
-        half_sizes = (extent[..., None] * torch.stack([a, c], -1).clamp(min=0).sqrt()).ceil().clamp(max=MAX_RADIUS_PX)
-        valid = valid & (half_sizes > radius_clip).any(-1)
-        size = means2d.new_tensor([width, height])
-        valid = valid & ((means2d + half_sizes > 0) & (means2d - half_sizes < size)).all(-1)
-        radii = torch.where(valid[..., None], half_sizes, torch.zeros_like(half_sizes)).to(torch.int32)
 
-    zero = torch.zeros_like(det)
-    dense = DenseProjection(
-        radii=radii,
-        means2d=torch.where(valid[..., None], means2d, zero[..., None]),
-        depths=torch.where(valid, p[..., 2], zero),
-        conics=torch.where(valid[..., None], conics, zero[..., None]),
-        compensations=torch.where(valid, compensations, zero) if calc_compensations else None,
-    )
-    return pack(dense) if packed else dense
+@torch.no_grad()
+def _half_sizes(ellipses: _Ellipses, opacities: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Half width and height in pixels [..., C, N, 2] of the box in which alpha reaches its cut-off, and whether it does at all."""
+    extent = torch.full_like(ellipses.compensations, MAX_EXTENT_SIGMAS)
+    visible = torch.ones_like(ellipses.positive)
+    if opacities is not None:
+        visible = opacities >= ALPHA_CUTOFF
+        extent = extent.minimum((2 * (opacities / ALPHA_CUTOFF).clamp(min=1).log()).sqrt())
+    half_sizes = (extent[..., None] * ellipses.variances.clamp(min=0).sqrt()).ceil().clamp(max=MAX_RADIUS_PX)
+    return half_sizes, visible

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
@@ -19,18 +20,14 @@ def bin_splats(
     means2d: Tensor,
     radii: Tensor,
     depths: Tensor,
-    tile_size: int,
-    tile_width: int,
-    tile_height: int,
+    grid: TileGrid,
     n_images: int | None = None,
     **options: Any,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`isect_tiles` (sorted) and `isect_offset_encode` in one; `options` are those of `isect_tiles`."""
-    tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
-        means2d, radii, depths, tile_size, tile_width, tile_height, n_images=n_images, **options
-    )
+    tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, *grid, n_images=n_images, **options)
     images = math.prod(depths.shape[:-1]) if n_images is None else n_images
-    offsets = isect_offset_encode(isect_ids, images, tile_width, tile_height)
+    offsets = isect_offset_encode(isect_ids, images, grid.tile_width, grid.tile_height)
     return tiles_per_gauss, flatten_ids, offsets
 
 
@@ -38,16 +35,12 @@ def bin_splats_within(
     means2d: Tensor,
     radii: Tensor,
     depths: Tensor,
-    tile_size: int,
-    tile_width: int,
-    tile_height: int,
+    grid: TileGrid,
     capacity: int,
     **options: Any,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The compiled `bin_splats` with a capacity, of splats that are not packed: the nearest that fit, unused entries first."""
-    tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
-        means2d, radii, depths, tile_size, tile_width, tile_height, **options
-    )
+    tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, *grid, **options)
     counts = tiles_per_gauss.reshape(-1)
     nearest_first = torch.argsort(depths.detach().reshape(-1).view(torch.int32).long() & 0xFFFFFFFF, stable=True)
     fits = torch.empty_like(counts, dtype=torch.bool)
@@ -55,7 +48,7 @@ def bin_splats_within(
     listed = fits[flatten_ids.long()]
     unused = flatten_ids.new_full((capacity - int(listed.sum()),), -1)
     images = math.prod(depths.shape[:-1])
-    offsets = isect_offset_encode(isect_ids[listed], images, tile_width, tile_height) + len(unused)
+    offsets = isect_offset_encode(isect_ids[listed], images, grid.tile_width, grid.tile_height) + len(unused)
     needed = torch.tensor([len(flatten_ids)], device=depths.device)
     return tiles_per_gauss, torch.cat([unused, flatten_ids[listed]]), offsets, needed
 

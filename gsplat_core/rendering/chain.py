@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, pack
+from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.rendering.settings import RenderSettings
 
 
@@ -104,9 +105,9 @@ def render_splats(
             zeros = backgrounds.new_zeros(*backgrounds.shape[:-1], 1)
             backgrounds = torch.cat([backgrounds, zeros], -1) if settings.has_colors else zeros
     assert channels is not None
-    grid = (settings.tile_size, *settings.tile_grid)
+    grid = TileGrid(settings.tile_size, *settings.tile_grid)
     tiles_per_gauss, flatten_ids, isect_offsets = ops.bin_splats(
-        rows.means2d, rows.radii, rows.depths, *grid, conics=rows.conics, opacities=opacities, **packing
+        rows.means2d, rows.radii, rows.depths, grid, conics=rows.conics, opacities=opacities, **packing
     )
     isect_offsets = isect_offsets.reshape(*batch_dims, n_cameras, *reversed(settings.tile_grid))
     image, alphas, *rest = ops.rasterize_to_pixels(

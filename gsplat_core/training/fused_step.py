@@ -169,7 +169,7 @@ class FusedStep:
         complete = gradient[:, :3] / fits
         first, second = self._adam.first_moments["means"], self._adam.second_moments["means"]
         adam_step_at_(
-            means, complete, first, second, rate, self._step, self._skipped[:1], *self._adam.betas,
+            means, complete, first, second, rate, self._step, self._skipped[:1], self._adam.betas,
             self._adam.epsilon, row_size=3,
         )  # fmt: skip
 

@@ -109,7 +109,7 @@ class FusedAdam:
                 self.second_moments[name],
                 self.steps,
                 self.learning_rates[name],
-                *self.betas,
+                self.betas,
                 self.epsilon,
                 row_size,
             )

@@ -18,6 +18,7 @@ from operators.graph.conditions import (
     PeriodicConditionPolicy,
     SchedulingStatus,
 )
+from operators.graph.contexts import ExecutionContext, InputContext, OutputContext
 from operators.graph.engines import Engine, run
 from operators.graph.faults import DISABLE_BRANCH, STOP_GRAPH, Fault, FaultAction, FaultPolicy
 from operators.graph.graph import RunResult, StopReason
@@ -27,7 +28,6 @@ from operators.graph.multithread import MultiThreadScheduler
 from operators.graph.operator import Operator
 from operators.graph.queues import EdgeStats
 from operators.graph.spec import REQUIRED, ConditionType, ConnectorType, IOSpec, OperatorSpec, QueuePolicy
-from operators.graph.task import ExecutionContext, InputContext, OutputContext
 from operators.graph.tracking import DurationSummary, FlowTracker
 
 __all__ = [

@@ -12,7 +12,7 @@ from operators.graph.spec import REQUIRED, ConditionType, IOSpec, OperatorSpec
 
 if TYPE_CHECKING:
     from operators.graph.application import Fragment
-    from operators.graph.task import ExecutionContext, InputContext, OutputContext
+    from operators.graph.contexts import ExecutionContext, InputContext, OutputContext
 
 
 class Operator:

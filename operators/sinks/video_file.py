@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 from collections import deque
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import cast
@@ -54,6 +56,7 @@ class VideoFile:
         self.frames = 0
         self._fps = fps
         self._last_ticks = -1
+        self._broken = False
         self._size = (height_px, width_px)
         # 4:2:0 colour needs even sides.
         self._even = (height_px + height_px % 2, width_px + width_px % 2)
@@ -73,7 +76,6 @@ class VideoFile:
             ) from error
         self._encoder = ThreadPoolExecutor(1, thread_name_prefix=f"encode {path.name}")
         self._waiting: deque[Future[None]] = deque()
-        self._failed = False
 
     def _add_stream(self) -> av.VideoStream:
         rate = Fraction(self._fps).limit_denominator(1001)
@@ -116,22 +118,41 @@ class VideoFile:
         # Times rise: a player refuses a frame that comes before the one that precedes it.
         self._last_ticks = max(self._last_ticks + 1, round(time_s * _TICKS_PER_S))
         frame.pts, frame.time_base = self._last_ticks, Fraction(1, _TICKS_PER_S)
-        self._waiting.append(self._encoder.submit(self._write, frame))
+        self._waiting.append(self._encoder.submit(self._encode, frame))
         self.frames += 1
 
     def _wait_for_frames(self, most: int) -> None:
-        """Wait until at most `most` frames are with the encoder; raises what it has raised."""
+        """Wait until at most `most` frames are with the encoder; raises what it has raised, once."""
         while self._waiting and (len(self._waiting) > most or self._waiting[0].done()):
-            try:
-                self._waiting.popleft().result()
-            except BaseException:
-                self._failed = True
-                raise
+            error = self._waiting.popleft().exception()
+            if error is not None:
+                self._waiting.clear()
+                raise error
+
+    def _encode(self, frame: av.VideoFrame) -> None:
+        """The encoder's thread: one frame, unless one before it could not be written."""
+        if not self._broken:
+            self._write(frame)
 
     def _write(self, frame: av.VideoFrame | None) -> None:
-        with storage_errors(self.path.parent):
+        with self._writing():
             for packet in self._stream.encode(frame):
                 self._container.mux(packet)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Errors of the disk and of FFmpeg as OutputError; after one the file cannot be finished."""
+        try:
+            with storage_errors(self.path.parent):
+                yield
+        except OutputError:
+            self._broken = True
+            raise
+        except av.FFmpegError as error:  # those that are no OSError
+            self._broken = True
+            raise OutputError(
+                f"{self.path}: the video cannot be written ({error}); check the path, its permissions and its disk"
+            ) from error
 
     def close(self) -> None:
         """Finish the file and give it its name; without any frame there is none. Closing twice is allowed."""
@@ -139,17 +160,20 @@ class VideoFile:
         if partial is None:
             return
         try:
-            if self._failed:
-                return  # a frame is missing, and the caller knows why
             self._wait_for_frames(0)
+            if self._broken:
+                return  # whoever wrote has been told why; finishing would fail for the same reason
             if self.frames:
                 self._write(None)
-            with storage_errors(self.path.parent):
+            with self._writing():
                 self._container.close()
                 if self.frames:
                     partial.finish()
         finally:
-            self._encoder.shutdown(cancel_futures=True)
+            self._encoder.shutdown()
+            if self._broken:
+                with suppress(OSError, av.FFmpegError):
+                    self._container.close()
             partial.discard()  # nothing, once it has its name
 
     def __enter__(self) -> VideoFile:

@@ -49,6 +49,7 @@ def build_report(outcome: RunOutcome) -> RunReport:
             ingested=source.frames,
             displayed=quality.frames if display is None else display.frames,
             dropped=outcome.dropped,
+            damaged=source.damaged,
         ),
         latency_ms={
             path: Latency(p50=_ms(t.p50_ms), p95=_ms(t.p95_ms), p99=_ms(t.p99_ms), max=_ms(t.max_ms))

@@ -65,6 +65,8 @@ class FrameCounts(_Part):
     ingested: Count
     displayed: Count
     dropped: Count
+    damaged: Count = 0
+    """Of the ingested ones: repaired, guessed or skipped by the decoder; shown, neither trained on nor scored."""
 
 
 class Latency(_Part):

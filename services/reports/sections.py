@@ -36,9 +36,15 @@ def tiles_section(report: RunReport) -> str:
         versus = f'<span class="{"good" if gain >= 0 else "bad"}">{gain:+.2f} dB</span> against the previous frame'
     frames, wall = report.frames, report.run.wall_s
     rate = frames.displayed / wall if wall else 0.0
+    damaged = f", {frames.damaged:,} damaged" if frames.damaged else ""
     tiles = [
         _tile(name, _decibels(psnr), "dB", versus),
-        _tile("Frames displayed", f"{frames.displayed:,}", f"of {frames.ingested:,}", f"{frames.dropped:,} dropped"),
+        _tile(
+            "Frames displayed",
+            f"{frames.displayed:,}",
+            f"of {frames.ingested:,}",
+            f"{frames.dropped:,} dropped{damaged}",
+        ),
     ]
     if report.latency_ms:
         path = _display_path(report)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -17,15 +19,14 @@ def adam_step(
     second_moment: Tensor,
     step: int,
     learning_rate: float,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
+    betas: tuple[float, float] = (0.9, 0.999),
     epsilon: float = 1e-8,
     row_size: int = 1,
 ) -> int:
     """`adam_step_queued`, and the number of rows left alone read at once: on CUDA the host waits for it."""
     return int(
         adam_step_queued(
-            parameter, gradient, first_moment, second_moment, step, learning_rate, beta1, beta2, epsilon, row_size
+            parameter, gradient, first_moment, second_moment, step, learning_rate, betas, epsilon, row_size
         )
     )
 
@@ -37,8 +38,7 @@ def adam_step_queued(
     second_moment: Tensor,
     step: int,
     learning_rate: float,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
+    betas: tuple[float, float] = (0.9, 0.999),
     epsilon: float = 1e-8,
     row_size: int = 1,
 ) -> Tensor:
@@ -64,7 +64,7 @@ def adam_step_queued(
     if step < 1:
         raise InvalidInput(f"step counts from 1, got step {step}")
     return torch.ops.gsplat_core.adam_(
-        parameter.detach(), gradient, first_moment, second_moment, step, learning_rate, beta1, beta2, epsilon, row_size
+        parameter.detach(), gradient, first_moment, second_moment, step, learning_rate, *betas, epsilon, row_size
     )
 
 
@@ -76,8 +76,7 @@ def adam_step_at_(
     rate: Tensor,
     step: Tensor,
     skipped: Tensor,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
+    betas: tuple[float, float] = (0.9, 0.999),
     epsilon: float = 1e-8,
     row_size: int = 1,
 ) -> None:
@@ -99,7 +98,7 @@ def adam_step_at_(
                 f"{name} must be one {dtype} on {parameter.device}, got {tensor.dtype} {list(tensor.shape)} on {tensor.device}"
             )
     torch.ops.gsplat_core.adam_at_(
-        parameter.detach(), gradient, first_moment, second_moment, rate, step, beta1, beta2, epsilon, row_size, skipped
+        parameter.detach(), gradient, first_moment, second_moment, rate, step, *betas, epsilon, row_size, skipped
     )
 
 
@@ -118,33 +117,11 @@ def _check(parameter: Tensor, gradient: Tensor, first_moment: Tensor, second_mom
 
 
 @torch.library.register_fake("gsplat_core::adam_")
-def _(
-    parameter: Tensor,
-    gradient: Tensor,
-    first_moment: Tensor,
-    second_moment: Tensor,
-    step: int,
-    learning_rate: float,
-    beta1: float,
-    beta2: float,
-    epsilon: float,
-    row_size: int,
-) -> Tensor:
+def _(*arguments: Any) -> Tensor:
+    _, gradient, *_ = arguments
     return gradient.new_empty((), dtype=torch.int64)
 
 
 @torch.library.register_fake("gsplat_core::adam_at_")
-def _(
-    parameter: Tensor,
-    gradient: Tensor,
-    first_moment: Tensor,
-    second_moment: Tensor,
-    rate: Tensor,
-    step: Tensor,
-    beta1: float,
-    beta2: float,
-    epsilon: float,
-    row_size: int,
-    skipped: Tensor,
-) -> None:
+def _(*arguments: Any) -> None:
     return None

@@ -54,15 +54,12 @@ def basis_field_backward(
 def basis_field_backward_adam_(
     gradient: Tensor,
     tau: float | Tensor,
-    centers: Tensor,
-    log_widths: Tensor,
-    weights: Tensor,
+    field: Sequence[Tensor],
     first_moments: Sequence[Tensor],
     second_moments: Sequence[Tensor],
     steps: Tensor,
     learning_rates: Sequence[float] | Tensor,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
+    betas: tuple[float, float] = (0.9, 0.999),
     epsilon: float = 1e-8,
 ) -> None:
     """Gradients and one lazy Adam step of every bump active at `tau`, in place and in one pass.
@@ -70,7 +67,8 @@ def basis_field_backward_adam_(
     Arguments as `gsplat_core.reference.basis_field_backward_adam_`; every tensor that is updated must be contiguous. `gradient`
     may be [N, 16] as in `basis_field_backward`; `tau` and `learning_rates` may be float32 tensors on the field's device.
     """
-    _check(centers, log_widths, weights)
+    centers = field[0]
+    _check(*field)
     _check(*first_moments)
     _check(*second_moments)
     _check_gradient(gradient, centers)
@@ -79,8 +77,8 @@ def basis_field_backward_adam_(
     if first_moments[0].shape != centers.shape or second_moments[0].shape != centers.shape:
         raise InvalidInput(f"moments must have the shapes of the field's tensors, {list(centers.shape)} and one of 13")
     torch.ops.gsplat_core.basis_field_backward_adam_(
-        gradient, _scalars("tau", tau, centers, 1), centers, log_widths, weights, *first_moments, *second_moments, steps,
-        _scalars("learning_rates", learning_rates, centers, RATES), beta1, beta2, epsilon,
+        gradient, _scalars("tau", tau, centers, 1), *field, *first_moments, *second_moments, steps,
+        _scalars("learning_rates", learning_rates, centers, RATES), *betas, epsilon,
     )  # fmt: skip
 
 

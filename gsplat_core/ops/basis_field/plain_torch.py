@@ -53,15 +53,12 @@ def basis_field_backward(
 def basis_field_backward_adam_(
     gradient: Tensor,
     tau: float | Tensor,
-    centers: Tensor,
-    log_widths: Tensor,
-    weights: Tensor,
+    field: Sequence[Tensor],
     first_moments: Sequence[Tensor],
     second_moments: Sequence[Tensor],
     steps: Tensor,
     learning_rates: Sequence[float] | Tensor,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
+    betas: tuple[float, float] = (0.9, 0.999),
     epsilon: float = 1e-8,
 ) -> None:
     """One lazy Adam step of every bump active at `tau`, in place; the other bumps and their moments are left alone.
@@ -69,10 +66,12 @@ def basis_field_backward_adam_(
     So is a Gaussian whose gradient is zero in every channel: the frame does not show it, and momentum must not move what nobody sees.
     And one whose gradient, squared, is not finite: it would poison the moments for good.
 
-    `first_moments` and `second_moments` hold (centers, log_widths, weights) shaped tensors; `steps` int32 [N, B] counts the
+    `field` holds (centers, log_widths, weights), `first_moments` and `second_moments` tensors of their shapes; `steps` int32 [N, B] counts the
     updates of each bump, so that each one sees Adam's bias correction (Kingma and Ba 2015, algorithm 1) from its own first
     update, however late in a stream it was added. `learning_rates`: position, rotation, log-scale, colour, centres, widths.
     """
+    centers, log_widths, weights = field
+    beta1, beta2 = betas
     with torch.no_grad():
         gradients = basis_field_backward(gradient, centers, log_widths, weights, tau)
         active = ~(((tau - centers) * torch.exp(-log_widths)).abs() > BUMP_REACH)
@@ -86,9 +85,7 @@ def basis_field_backward_adam_(
             torch.tensor([width_of(group) for group in BASIS_GROUPS], device=centers.device)
         )
         rates = (each[4], each[5], channel_rates)
-        for parameter, g, m, v, rate in zip(
-            (centers, log_widths, weights), gradients, first_moments, second_moments, rates, strict=True
-        ):
+        for parameter, g, m, v, rate in zip(field, gradients, first_moments, second_moments, rates, strict=True):
             shape = active.shape + (1,) * (g.dim() - 2)
             chosen = active.reshape(shape)
             m.copy_(torch.where(chosen, m + (1 - beta1) * (g - m), m))

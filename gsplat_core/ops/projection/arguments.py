@@ -53,20 +53,16 @@ class PackedProjection(NamedTuple):
     compensations: Tensor | None
 
 
-def check_projection_arguments(
+def check_projection_tensors(
     means: Tensor,
     covars: Tensor | None,
     quats: Tensor | None,
     scales: Tensor | None,
+    opacities: Tensor | None,
     viewmats: Tensor,
     Ks: Tensor,
-    width: int,
-    height: int,
-    sparse_grad: bool,
-    camera_model: str,
-    opacities: Tensor | None,
 ) -> tuple[int, ...]:
-    """Raise InvalidInput or NotImplementedError on what projection cannot take; returns the batch dimensions."""
+    """Raise InvalidInput on shapes, dtypes or devices that do not go together; returns the batch dimensions."""
     *batch, n = require_trailing("means", means, (3,), "[..., N, 3]") or (None,)
     if n is None:
         raise InvalidInput(f"means must be [..., N, 3], got {list(means.shape)}")
@@ -88,6 +84,11 @@ def check_projection_arguments(
     require_same_kind(
         means=means, covars=covars, quats=quats, scales=scales, opacities=opacities, viewmats=viewmats, Ks=Ks
     )
+    return batch_dims
+
+
+def check_projection_options(width: int, height: int, sparse_grad: bool, camera_model: str) -> None:
+    """Raise InvalidInput on an image without pixels or an unknown camera, NotImplementedError on what only gsplat has."""
     if width < 1 or height < 1:
         raise InvalidInput(f"the image must be at least 1x1 px, got width={width}, height={height}")
     if sparse_grad:
@@ -98,7 +99,6 @@ def check_projection_arguments(
                 f"camera_model={camera_model!r} is not supported; the models are {', '.join(CAMERA_MODELS)}"
             )
         raise InvalidInput(f"unknown camera_model {camera_model!r}; the models are {', '.join(CAMERA_MODELS)}")
-    return batch_dims
 
 
 def pack(dense: DenseProjection) -> PackedProjection:

@@ -10,7 +10,13 @@ from torch import Tensor
 
 from gsplat_core.argument_checks import require_float32
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
-from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, check_projection_arguments, pack
+from gsplat_core.ops.projection.arguments import (
+    DenseProjection,
+    PackedProjection,
+    check_projection_options,
+    check_projection_tensors,
+    pack,
+)
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 
@@ -59,9 +65,33 @@ def fully_fused_projection(
     Raises InvalidInput for wrong shapes, dtypes (float64 is for `gsplat_core.reference`) or devices, NotImplementedError
     for sparse_grad and gsplat's other camera models.
     """
-    batch_dims = check_projection_arguments(
-        means, covars, quats, scales, viewmats, Ks, width, height, sparse_grad, camera_model, opacities
-    )
+    inputs = (means, covars, quats, scales, opacities, viewmats, Ks)
+    batch_dims = check_projection_tensors(*inputs)
+    check_projection_options(width, height, sparse_grad, camera_model)
+    outputs = torch.ops.gsplat_core.project_gaussians(
+        *_flat(math.prod(batch_dims), *inputs), width, height, eps2d, near_plane, far_plane, radius_clip,
+        calc_compensations, CAMERA_MODELS.index(camera_model),
+    )  # fmt: skip
+    means2d, depths, conics, compensations, radii = outputs
+    rows = (*batch_dims, viewmats.shape[-3], means.shape[-2])
+    dense = DenseProjection(
+        radii.reshape(*rows, 2), means2d.reshape(*rows, 2), depths.reshape(rows), conics.reshape(*rows, 3),
+        compensations.reshape(rows) if calc_compensations else None,
+    )  # fmt: skip
+    return pack(dense) if packed else dense
+
+
+def _flat(
+    batches: int,
+    means: Tensor,
+    covars: Tensor | None,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+) -> tuple[Tensor | None, ...]:
+    """The tensors with one batch dimension, as the op takes them; raises InvalidInput unless all are float32."""
     require_float32(
         "fully_fused_projection", means=means, covars=covars, quats=quats, scales=scales, viewmats=viewmats, Ks=Ks,
         opacities=opacities,
@@ -69,29 +99,17 @@ def fully_fused_projection(
     n, c = means.shape[-2], viewmats.shape[-3]
 
     def flat(tensor: Tensor | None, *trailing: int) -> Tensor | None:
-        return None if tensor is None else tensor.reshape(math.prod(batch_dims), *trailing)
+        return None if tensor is None else tensor.reshape(batches, *trailing)
 
-    means2d, depths, conics, compensations, radii = torch.ops.gsplat_core.project_gaussians(
+    return (
         flat(means, n, 3), flat(covars, n, 6), flat(quats, n, 4), flat(scales, n, 3),
         None if opacities is None else flat(opacities.detach(), n), flat(viewmats, c, 4, 4), flat(Ks.detach(), c, 3, 3),
-        width, height, eps2d, near_plane, far_plane, radius_clip, calc_compensations, CAMERA_MODELS.index(camera_model),
     )  # fmt: skip
-    dense = DenseProjection(
-        radii.reshape(*batch_dims, c, n, 2),
-        means2d.reshape(*batch_dims, c, n, 2),
-        depths.reshape(*batch_dims, c, n),
-        conics.reshape(*batch_dims, c, n, 3),
-        compensations.reshape(*batch_dims, c, n) if calc_compensations else None,
-    )
-    return pack(dense) if packed else dense
 
 
 @torch.library.register_fake("gsplat_core::project_gaussians")
-def _fake(
-    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, opacities: Tensor | None,
-    viewmats: Tensor, Ks: Tensor, width: int, height: int, eps2d: float, near_plane: float, far_plane: float,
-    radius_clip: float, compensate: bool, camera_model: int,
-) -> tuple[Tensor, ...]:  # fmt: skip
+def _fake(*arguments: Any) -> tuple[Tensor, ...]:
+    means, _, _, _, _, viewmats, *_, compensate, _ = arguments
     b, n, _ = means.shape
     c = viewmats.shape[1]
     return (
@@ -104,11 +122,8 @@ def _fake(
 
 
 @torch.library.register_fake("gsplat_core::project_gaussians_backward")
-def _fake_backward(
-    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
-    radii: Tensor, v_means2d: Tensor | None, v_depths: Tensor | None, v_conics: Tensor | None,
-    v_compensations: Tensor | None, width: int, height: int, eps2d: float, camera_model: int, needs_viewmats: bool,
-) -> tuple[Tensor, ...]:  # fmt: skip
+def _fake_backward(*arguments: Any) -> tuple[Tensor, ...]:
+    means, covars, _, _, viewmats, *_, needs_viewmats = arguments
     b, n, _ = means.shape
     return (
         means.new_empty((b, n, 3)),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import overload
+from typing import Any, overload
 
 import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.tiles.grid import TileGrid
 
 
 def isect_tiles(
@@ -57,7 +58,7 @@ def isect_tiles(
 
 @overload
 def bin_splats(
-    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int,
+    means2d: Tensor, radii: Tensor, depths: Tensor, grid: TileGrid,
     packed: bool = ..., n_images: int | None = ..., image_ids: Tensor | None = ...,
     *, conics: Tensor | None = ..., opacities: Tensor | None = ..., capacity: None = ...,
 ) -> tuple[Tensor, Tensor, Tensor]: ...  # fmt: skip
@@ -65,7 +66,7 @@ def bin_splats(
 
 @overload
 def bin_splats(
-    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int,
+    means2d: Tensor, radii: Tensor, depths: Tensor, grid: TileGrid,
     packed: bool = ..., n_images: int | None = ..., image_ids: Tensor | None = ...,
     *, conics: Tensor | None = ..., opacities: Tensor | None = ..., capacity: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]: ...  # fmt: skip
@@ -75,9 +76,7 @@ def bin_splats(
     means2d: Tensor,
     radii: Tensor,
     depths: Tensor,
-    tile_size: int,
-    tile_width: int,
-    tile_height: int,
+    grid: TileGrid,
     packed: bool = False,
     n_images: int | None = None,
     image_ids: Tensor | None = None,
@@ -89,6 +88,7 @@ def bin_splats(
     """`isect_tiles` (sorted) and `isect_offset_encode` in one, without the 64-bit ids that only they need.
 
     Args:
+        grid: the tiles; the other tensors and options are those of `isect_tiles`.
         capacity: None makes the lists exactly as long as they must be, for which the host waits on CUDA. A number makes
             them this long on any device: nothing waits, and the call can be captured in a CUDA graph. Entries that are
             not used are -1 and lie in front of the first tile's list, so no offset refers to them. When `needed` is
@@ -102,17 +102,20 @@ def bin_splats(
     """
     images, chosen = _check(means2d, radii, depths, packed, n_images, image_ids, conics, opacities)
     splats = (*_flat(means2d, radii, depths, conics, opacities), chosen)
-    grid = (images, tile_size, tile_width, tile_height)
     ops = torch.ops.gsplat_core
     if capacity is None:
-        tiles_per_gauss, flatten_ids, offsets = ops.bin_splats(*splats, *grid)
+        tiles_per_gauss, flatten_ids, offsets = ops.bin_splats(*splats, images, *grid)
         needed = None
     else:
         if not 0 <= capacity < 2**31:
             raise InvalidInput(f"capacity must be 0 to 2^31 - 1 entries, or None for exactly as many, got {capacity}")
-        tiles_per_gauss, flatten_ids, offsets, needed = ops.bin_splats_within(*splats, *grid, capacity)
+        tiles_per_gauss, flatten_ids, offsets, needed = ops.bin_splats_within(*splats, images, *grid, capacity)
     image_dims = (images,) if packed else depths.shape[:-1]
-    lists = (tiles_per_gauss.reshape(depths.shape), flatten_ids, offsets.reshape(*image_dims, tile_height, tile_width))
+    lists = (
+        tiles_per_gauss.reshape(depths.shape),
+        flatten_ids,
+        offsets.reshape(*image_dims, grid.tile_height, grid.tile_width),
+    )
     return lists if needed is None else (*lists, needed)
 
 
@@ -173,37 +176,16 @@ def _flat(
 
 
 @torch.library.register_fake("gsplat_core::isect_tiles")
-def _isect_tiles_fake(
-    means2d: Tensor,
-    radii: Tensor,
-    depths: Tensor,
-    conics: Tensor | None,
-    opacities: Tensor | None,
-    image_ids: Tensor | None,
-    images: int,
-    tile_size: int,
-    tile_width: int,
-    tile_height: int,
-    sort: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
+def _isect_tiles_fake(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
+    _, _, depths, *_ = arguments
     found = torch.library.get_ctx().new_dynamic_size()
     counts = depths.new_empty(depths.numel(), dtype=torch.int32)
     return counts, depths.new_empty(found, dtype=torch.int64), depths.new_empty(found, dtype=torch.int32)
 
 
 @torch.library.register_fake("gsplat_core::bin_splats")
-def _bin_splats_fake(
-    means2d: Tensor,
-    radii: Tensor,
-    depths: Tensor,
-    conics: Tensor | None,
-    opacities: Tensor | None,
-    image_ids: Tensor | None,
-    images: int,
-    tile_size: int,
-    tile_width: int,
-    tile_height: int,
-) -> tuple[Tensor, Tensor, Tensor]:
+def _bin_splats_fake(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
+    _, _, depths, *_, images, _, tile_width, tile_height = arguments
     found = torch.library.get_ctx().new_dynamic_size()
     counts = depths.new_empty(depths.numel(), dtype=torch.int32)
     offsets = depths.new_empty(images, tile_height, tile_width, dtype=torch.int32)
@@ -211,19 +193,8 @@ def _bin_splats_fake(
 
 
 @torch.library.register_fake("gsplat_core::bin_splats_within")
-def _bin_splats_within_fake(
-    means2d: Tensor,
-    radii: Tensor,
-    depths: Tensor,
-    conics: Tensor | None,
-    opacities: Tensor | None,
-    image_ids: Tensor | None,
-    images: int,
-    tile_size: int,
-    tile_width: int,
-    tile_height: int,
-    capacity: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _bin_splats_within_fake(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    _, _, depths, *_, images, _, tile_width, tile_height, capacity = arguments
     counts = depths.new_empty(depths.numel(), dtype=torch.int32)
     offsets = depths.new_empty(images, tile_height, tile_width, dtype=torch.int32)
     lists = depths.new_empty(capacity, dtype=torch.int32)

@@ -38,17 +38,16 @@ class Scene:
     def render(self, capacity: int = 1 << 16, mode: FrameMode = FrameMode.SHARED) -> Frame:
         return self.render_tensors(self.tensors("cuda", torch.float32), capacity, mode)
 
+    def view(self, viewmat: Tensor, K: Tensor, background: Tensor | None) -> View:
+        return View(viewmat, K, self.width, self.height, background, self.camera_model)
+
     def render_tensors(self, tensors: list[Tensor | None], capacity: int, mode: FrameMode) -> Frame:
         """With others in place of `tensors`."""
-        gaussians, (deltas, viewmat, K, background) = tensors[:5], tensors[5:]
-        view = View(viewmat, K, self.width, self.height, background, self.camera_model)
-        return render_frame(gaussians, deltas, view, capacity, mode)
+        return render_frame(tensors[:5], tensors[5], self.view(*tensors[6:]), capacity, mode)
 
     def exact(self, training: bool = False) -> tuple[Tensor, Tensor]:
-        return reference.render_frame(
-            *self.tensors("cpu", torch.float64), self.width, self.height,
-            camera_model=self.camera_model, expected_depth=not training,
-        )  # fmt: skip
+        tensors = self.tensors("cpu", torch.float64)
+        return reference.render_frame(tensors[:5], tensors[5], self.view(*tensors[6:]), expected_depth=not training)
 
 
 def scene(

@@ -11,6 +11,7 @@ from torch import Tensor
 from gsplat_core import fully_fused_projection, spherical_harmonics
 from gsplat_core.ops.frame.frame import Frame, FrameMode, View, render_frame
 from gsplat_core.ops.frame_gradients.frame_gradients import RawGradients, render_frame_backward
+from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.reference.frame import render_frame as reference_frame
 from gsplat_core.rendering.settings import FAR_PLANE, NEAR_PLANE
@@ -66,10 +67,7 @@ class FrameScene:
         leaves = {name: getattr(scene, name).clone().requires_grad_() for name in NAMES}
         if scene.deltas is not None:
             leaves["deltas"] = scene.deltas.clone().requires_grad_()
-        image, alphas = reference_frame(
-            *(leaves[name] for name in NAMES), leaves.get("deltas"), scene.viewmat, scene.K, scene.background,
-            scene.width, scene.height, camera_model=scene.camera_model,
-        )  # fmt: skip
+        image, alphas = reference_frame([leaves[name] for name in NAMES], leaves.get("deltas"), scene.view)
         v_image, v_alphas = self.picture_gradients(with_alphas)
         total = (image * v_image).sum() + (0 if v_alphas is None else (alphas * v_alphas).sum())
         total.backward()
@@ -157,9 +155,9 @@ def forward_of_plain_ops(scene: FrameScene) -> Frame:
     colors = (spherical_harmonics(degree, mean - center, sh) + 0.5).clamp_min(0)
     colors = torch.where((projected.radii[0] > 0).all(-1)[:, None], colors, 0)
     channels = torch.cat([colors, depths[:, None]], 1)
-    grid = (TILE, math.ceil(scene.width / TILE), math.ceil(scene.height / TILE))
+    grid = TileGrid(TILE, math.ceil(scene.width / TILE), math.ceil(scene.height / TILE))
     _, ids, offsets = bin_splats(
-        means2d[None], projected.radii, depths[None], *grid, conics=conics[None], opacities=opacity[None]
+        means2d[None], projected.radii, depths[None], grid, conics=conics[None], opacities=opacity[None]
     )
     background = None if scene.background is None else torch.cat([scene.background, scene.background.new_zeros(1)])
     image, alphas, last = torch.ops.gsplat_core.composite(

@@ -64,11 +64,11 @@ def test_fused_adam_equals_the_reference_over_many_steps_and_itself_to_the_bit(g
         gradient[::5] = 0
         gradient[3::7, 4] = torch.nan
         wide = torch.cat([gradient, torch.full((n, 3), torch.nan)], 1).to(gpu)
-        reference.basis_field_backward_adam_(gradient.double(), tau, *exact[0], *exact[1:], RATES)
-        basis_field_backward_adam_(gradient.to(gpu), tau, *twins[0][0], *twins[0][1:], RATES)
+        reference.basis_field_backward_adam_(gradient.double(), tau, *exact, RATES)
+        basis_field_backward_adam_(gradient.to(gpu), tau, *twins[0], RATES)
         times = torch.tensor([0.0, tau], device=gpu)[1:]  # a view that is aligned to 4 bytes only
         rates = torch.tensor([0.0, *RATES], device=gpu)[1:]
-        basis_field_backward_adam_(wide, times, *twins[1][0], *twins[1][1:], rates)
+        basis_field_backward_adam_(wide, times, *twins[1], rates)
     ours, same = ((*t[0], *t[1], *t[2], t[3]) for t in twins)
     assert all(torch.equal(a, b) for a, b in zip(ours, same, strict=True))
     assert torch.equal(twins[0][3].cpu(), exact[3])
@@ -87,8 +87,8 @@ def test_bias_corrections_hold_for_a_bump_that_was_updated_often(gpu):
         state[3].copy_(torch.tensor([0, 1, 50, 1_000_000])[:, None].expand(4, 5))
     gradient = gradient_of(4)
     before = [t.clone() for t in exact[0]]
-    reference.basis_field_backward_adam_(gradient.double(), 2.0, *exact[0], *exact[1:], RATES)
-    basis_field_backward_adam_(gradient.to(gpu), 2.0, *ours[0], *ours[1:], RATES)
+    reference.basis_field_backward_adam_(gradient.double(), 2.0, *exact, RATES)
+    basis_field_backward_adam_(gradient.to(gpu), 2.0, *ours, RATES)
     step = (exact[0][2] - before[2]).abs()
     assert ((ours[0][2].cpu().double() - exact[0][2]).abs() < 1e-4 * step + 1e-6).all()
 
@@ -100,7 +100,7 @@ def test_a_captured_step_reads_time_and_rates_anew(gpu):
 
     def step():
         deltas = basis_field(*state[0], tau, padded=True)
-        basis_field_backward_adam_(gradient, tau, *state[0], *state[1:], rates)
+        basis_field_backward_adam_(gradient, tau, *state, rates)
         return deltas
 
     first = [t.clone() for t in (*state[0], *state[1], *state[2], state[3])]
@@ -116,7 +116,7 @@ def test_a_captured_step_reads_time_and_rates_anew(gpu):
         graph.replay()
         deltas = basis_field(*told[0], time, padded=True)
         assert torch.equal(captured, deltas)
-        basis_field_backward_adam_(gradient, time, *told[0], *told[1:], [scale * r for r in RATES])
+        basis_field_backward_adam_(gradient, time, *told, [scale * r for r in RATES])
     for a, b in zip((*state[0], *state[1], *state[2], state[3]), (*told[0], *told[1], *told[2], told[3]), strict=True):
         assert torch.equal(a, b)
 

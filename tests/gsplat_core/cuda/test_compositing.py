@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
+from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.reference import compositing as reference
 
@@ -36,12 +37,12 @@ class Scene:
         """The CPU's lists: every splat in every tile that its contour may touch, in the order of its index."""
         shape = self.opacities.shape
         covers = torch.full((*shape, 2), 2**30, dtype=torch.int32)
-        grid = math.ceil(self.width / self.tile_size), math.ceil(self.height / self.tile_size)
+        across, down = math.ceil(self.width / self.tile_size), math.ceil(self.height / self.tile_size)
         depths = torch.arange(1.0, shape[-1] + 1).expand(shape)
         # Values that are not finite are listed all the same: compositing must skip them itself.
         options = dict(conics=self.conics.nan_to_num(posinf=0.1), opacities=self.opacities.nan_to_num(posinf=0.5))
         means2d = self.means2d.nan_to_num(posinf=20.0)
-        _, flatten_ids, offsets = bin_splats(means2d, covers, depths, self.tile_size, *grid, **options)
+        _, flatten_ids, offsets = bin_splats(means2d, covers, depths, TileGrid(self.tile_size, across, down), **options)
         return offsets, flatten_ids
 
     def run(

@@ -35,10 +35,7 @@ def rendered(scene: FrameScene, half: bool = True, capacity: int = 1 << 20, eps2
 
 def exact(scene: FrameScene) -> tuple[Tensor, Tensor]:
     s = scene.to(torch.float64)
-    return reference_frame(
-        *s.gaussians, s.deltas, s.viewmat, s.K, s.background, s.width, s.height,
-        camera_model=s.camera_model, expected_depth=True,
-    )  # fmt: skip
+    return reference_frame(s.gaussians, s.deltas, s.view, expected_depth=True)
 
 
 def assert_near(frame: Frame, image: Tensor, alphas: Tensor, psnr_db: float = 58.0) -> None:

@@ -17,6 +17,7 @@ from gsplat_core import (
     rasterize_to_pixels,
     spherical_harmonics,
 )
+from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.rendering.view_colors import camera_centers
 
@@ -44,7 +45,7 @@ def assert_same_bits(seen, wanted) -> None:
 
 def test_a_frame_and_its_gradient_are_captured_and_replayed_with_another_camera(make_scene):
     scene = place(make_scene(3000, width=200, height=120))
-    opacities, grid = scene.opacities[None], (16, math.ceil(200 / 16), math.ceil(120 / 16))
+    opacities, grid = scene.opacities[None], TileGrid(16, math.ceil(200 / 16), math.ceil(120 / 16))
 
     def frame(capacity: int | None) -> tuple[list[Tensor], Tensor | None]:
         leaves = [t.detach().requires_grad_() for t in scene.leaves()]
@@ -56,7 +57,7 @@ def test_a_frame_and_its_gradient_are_captured_and_replayed_with_another_camera(
         toward = means[None] - camera_centers(views)[:, None]
         colors = (spherical_harmonics(3, toward, sh, masks=visible) + 0.5).clamp_min(0)
         exact = {"conics": rows.conics, "opacities": opacities}
-        lists = bin_splats(rows.means2d, rows.radii, rows.depths, *grid, **exact, capacity=capacity)
+        lists = bin_splats(rows.means2d, rows.radii, rows.depths, grid, **exact, capacity=capacity)
         image, alphas = rasterize_to_pixels(
             rows.means2d, rows.conics, colors, opacity[None], scene.width, scene.height, 16, lists[2], lists[1]
         )

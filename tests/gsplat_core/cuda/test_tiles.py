@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats, isect_offset_encode, isect_tiles
 from gsplat_core.reference import tiles as reference
 from gsplat_core.reference.rendering import bin_splats_within
@@ -34,8 +35,8 @@ def splats(count: int, image_dims: tuple[int, ...] = (1,), seed: int = 0, median
     return [means2d, radii, depths, conics, opacities]
 
 
-def grid(tile_size: int) -> tuple[int, int, int]:
-    return tile_size, math.ceil(WIDTH / tile_size), math.ceil(HEIGHT / tile_size)
+def grid(tile_size: int) -> TileGrid:
+    return TileGrid(tile_size, math.ceil(WIDTH / tile_size), math.ceil(HEIGHT / tile_size))
 
 
 def cuda(tensors: list[Tensor]) -> list[Tensor]:
@@ -97,7 +98,7 @@ def test_bin_splats_is_isect_tiles_and_offsets_in_one(exact: bool) -> None:
     offsets = isect_offset_encode(ids, 4, across, down)
     assert torch.equal(offsets.cpu(), reference.isect_offset_encode(ids.cpu(), 4, across, down))
     wanted = (counts, order, offsets.reshape(2, 2, down, across))
-    assert_equal(bin_splats(means2d, radii, depths, size, across, down, **options), wanted)
+    assert_equal(bin_splats(means2d, radii, depths, grid(16), **options), wanted)
 
 
 @pytest.mark.parametrize("image_dims", [(1,), (2, 3)])
@@ -105,19 +106,19 @@ def test_bin_splats_is_isect_tiles_and_offsets_in_one(exact: bool) -> None:
 def test_lists_of_a_capacity_are_those_of_the_reference(image_dims: tuple[int, ...], share: float) -> None:
     here = splats(400, image_dims, median_px=8.0)[:3]
     capacity = int(share * int(isect_tiles(*here, *grid(16))[0].sum()))
-    seen = bin_splats(*cuda(here), *grid(16), capacity=capacity)
+    seen = bin_splats(*cuda(here), grid(16), capacity=capacity)
     assert all(t.is_cuda for t in seen)
-    wanted = list(bin_splats_within(*here, *grid(16), capacity=capacity))
+    wanted = list(bin_splats_within(*here, grid(16), capacity=capacity))
     wanted[2] = wanted[2].reshape(seen[2].shape)
     assert_equal(seen, tuple(wanted))
-    assert_equal(seen, bin_splats(*here, *grid(16), capacity=capacity))
+    assert_equal(seen, bin_splats(*here, grid(16), capacity=capacity))
 
 
 @pytest.mark.parametrize("count", [0, 5])
 def test_lists_of_a_capacity_without_any_splats(count: int) -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(count))
     exact = {"conics": conics, "opacities": opacities}
-    _, order, offsets, needed = bin_splats(means2d, radii * 0, depths, *grid(16), **exact, capacity=9)
+    _, order, offsets, needed = bin_splats(means2d, radii * 0, depths, grid(16), **exact, capacity=9)
     assert order.tolist() == [-1] * 9
     assert (offsets == 9).all()
     assert needed.tolist() == [0]
@@ -126,7 +127,7 @@ def test_lists_of_a_capacity_without_any_splats(count: int) -> None:
 def test_a_capacity_out_of_range_is_refused() -> None:
     for capacity in (-1, 2**31):
         with pytest.raises(InvalidInput, match=f"got {capacity}"):
-            bin_splats(*cuda(splats(5))[:3], *grid(16), capacity=capacity)
+            bin_splats(*cuda(splats(5))[:3], grid(16), capacity=capacity)
 
 
 def test_lists_of_a_capacity_are_made_in_a_graph_and_say_when_it_is_too_small() -> None:
@@ -134,16 +135,16 @@ def test_lists_of_a_capacity_are_made_in_a_graph_and_say_when_it_is_too_small() 
     exact = {"conics": conics, "opacities": opacities}
     small = means2d.clone()
     small[:, 60:] = -1e4  # most are out of sight at first
-    needed = int(bin_splats(means2d, radii, depths, *grid(16), **exact, capacity=0)[3])
+    needed = int(bin_splats(means2d, radii, depths, grid(16), **exact, capacity=0)[3])
     where = small.clone()
-    bin_splats(where, radii, depths, *grid(16), **exact, capacity=needed)
+    bin_splats(where, radii, depths, grid(16), **exact, capacity=needed)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):  # a host that waited would be refused here
-        lists = bin_splats(where, radii, depths, *grid(16), **exact, capacity=needed // 2)
+        lists = bin_splats(where, radii, depths, grid(16), **exact, capacity=needed // 2)
     for means in (small, means2d, small):
         where.copy_(means)
         graph.replay()
-        assert_equal(lists, bin_splats(means, radii, depths, *grid(16), **exact, capacity=needed // 2))
+        assert_equal(lists, bin_splats(means, radii, depths, grid(16), **exact, capacity=needed // 2))
         assert (int(lists[3]) > needed // 2) == (means is means2d)
 
 
@@ -181,7 +182,7 @@ def test_packed_splats_give_the_lists_of_their_images() -> None:
 @pytest.mark.parametrize("count", [0, 1, 64])
 def test_nothing_visible_gives_empty_lists(count: int) -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(count))
-    counts, order, offsets = bin_splats(means2d, radii * 0, depths, *grid(16), conics=conics, opacities=opacities)
+    counts, order, offsets = bin_splats(means2d, radii * 0, depths, grid(16), conics=conics, opacities=opacities)
     assert order.numel() == 0
     assert counts.shape == (1, count)
     assert not counts.any()
@@ -197,7 +198,7 @@ def test_splats_that_are_not_finite_or_far_away_are_in_no_list() -> None:
     depths[0, 4], depths[0, 5], conics[0, 6, 0], conics[0, 7, 2] = math.nan, math.inf, math.nan, math.inf
     opacities[0, 8:13] = torch.tensor([math.nan, math.inf, 0.0, -1.0, 0.9 / 255])
     means2d, radii, depths, conics, opacities = cuda([means2d, radii, depths, conics, opacities])
-    counts, order, _ = bin_splats(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities)
+    counts, order, _ = bin_splats(means2d, radii, depths, grid(16), conics=conics, opacities=opacities)
     assert counts[0, :13].tolist() == [0] * 13
     assert set(order.tolist()) == {13}
 
@@ -211,34 +212,34 @@ def test_an_image_id_that_is_no_images_is_in_no_list() -> None:
 
 
 def test_a_splat_over_everything_is_in_every_tile() -> None:
-    size, across, down = grid(8)
+    _, across, down = grid(8)
     means2d = torch.tensor([[[1e4, -1e4]]], device="cuda")
     radii = torch.full((1, 1, 2), 2**31 - 1, dtype=torch.int32, device="cuda")
     conics = torch.tensor([[[1e-12, 0.0, 1e-12]]], device="cuda")
     one = torch.ones(1, 1, device="cuda")
-    counts, order, offsets = bin_splats(means2d, radii, one, size, across, down, conics=conics, opacities=one)
+    counts, order, offsets = bin_splats(means2d, radii, one, grid(8), conics=conics, opacities=one)
     assert counts.item() == order.numel() == across * down
     assert torch.equal(offsets.flatten(), torch.arange(across * down, dtype=torch.int32, device="cuda"))
 
 
 def test_the_same_lists_twice_and_on_a_side_stream() -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(100_000, median_px=1.0))
-    found = [bin_splats(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities) for _ in range(2)]
+    found = [bin_splats(means2d, radii, depths, grid(16), conics=conics, opacities=opacities) for _ in range(2)]
     assert_equal(found[0], found[1])
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
-        aside = bin_splats(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities)
+        aside = bin_splats(means2d, radii, depths, grid(16), conics=conics, opacities=opacities)
     stream.synchronize()
     assert_equal(found[0], aside)
 
 
 def test_strided_inputs_are_taken() -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(400))
-    wanted = bin_splats(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities)
+    wanted = bin_splats(means2d, radii, depths, grid(16), conics=conics, opacities=opacities)
     wide = torch.cat([conics, conics], -1)[..., :3]
     turned = means2d.mT.contiguous().mT
-    assert_equal(bin_splats(turned, radii, depths, *grid(16), conics=wide, opacities=opacities), wanted)
+    assert_equal(bin_splats(turned, radii, depths, grid(16), conics=wide, opacities=opacities), wanted)
 
 
 def test_ops_pass_opcheck() -> None:

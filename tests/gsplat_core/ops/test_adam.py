@@ -24,7 +24,7 @@ def test_equals_torchs_adam(shape):
     generator = torch.Generator().manual_seed(1)
     for step in range(1, 6):
         gradient = torch.randn(shape, generator=generator)
-        assert adam_step(parameter, gradient, first, second, step, 0.02, 0.9, 0.999, 1e-10) == 0
+        assert adam_step(parameter, gradient, first, second, step, 0.02, (0.9, 0.999), 1e-10) == 0
         other.grad = gradient.clone()
         optimiser.step()
         torch.testing.assert_close(parameter, other.detach(), rtol=1e-6, atol=1e-6)

@@ -87,8 +87,8 @@ def test_fused_adam_equals_the_reference_over_many_steps(n, b):
     seen_steps, wanted_steps = torch.zeros(n, b, dtype=torch.int32), torch.zeros(n, b, dtype=torch.int32)
     for step in range(12):
         gradient, tau = gradient_of(n, step), (step % 4) * 1.37
-        basis_field_backward_adam_(gradient, tau, *seen, seen_m, seen_v, seen_steps, RATES)
-        reference.basis_field_backward_adam_(gradient.double(), tau, *wanted, wanted_m, wanted_v, wanted_steps, RATES)
+        basis_field_backward_adam_(gradient, tau, seen, seen_m, seen_v, seen_steps, RATES)
+        reference.basis_field_backward_adam_(gradient.double(), tau, wanted, wanted_m, wanted_v, wanted_steps, RATES)
     assert torch.equal(seen_steps, wanted_steps)
     for s, w, rate in zip(seen, wanted, (5e-4, 6e-4, 1e-2), strict=True):
         # Adam divides by the gradient's own size, so a gradient near zero may differ by a part of one step.
@@ -100,11 +100,11 @@ def test_fused_adam_equals_the_reference_over_many_steps(n, b):
 def test_momentum_does_not_move_what_the_frame_does_not_show():
     seen, m, v = training_state(50, 7)
     steps = torch.zeros(50, 7, dtype=torch.int32)
-    basis_field_backward_adam_(gradient_of(50), 3.0, *seen, m, v, steps, RATES)
+    basis_field_backward_adam_(gradient_of(50), 3.0, seen, m, v, steps, RATES)
     before = [t.clone() for t in (*seen, *m, *v, steps)]
     hidden = gradient_of(50, 1)
     hidden[::2] = 0
-    basis_field_backward_adam_(hidden, 3.0, *seen, m, v, steps, RATES)
+    basis_field_backward_adam_(hidden, 3.0, seen, m, v, steps, RATES)
     after = (*seen, *m, *v, steps)
     assert all(torch.equal(a[::2], b[::2]) for a, b in zip(after, before, strict=True))
     assert not any(torch.equal(a[1::2], b[1::2]) for a, b in zip(after, before, strict=True))
@@ -117,7 +117,7 @@ def test_fused_adam_is_torch_adam_while_every_bump_is_active():
     steps = torch.zeros(50, 3, dtype=torch.int32)
     for step in range(5):
         gradient = gradient_of(50, step)
-        basis_field_backward_adam_(gradient, 1.0, *seen, m, v, steps, (3e-3, 3e-3, 3e-3, 3e-3, 1e-3, 2e-3))
+        basis_field_backward_adam_(gradient, 1.0, seen, m, v, steps, (3e-3, 3e-3, 3e-3, 3e-3, 1e-3, 2e-3))
         optimiser.zero_grad()
         reference.basis_field(*wanted, 1.0).backward(gradient)
         optimiser.step()
@@ -129,7 +129,7 @@ def test_inactive_bumps_and_their_moments_stay_bit_for_bit():
     field, m, v = training_state(40, 26)
     before = [t.clone() for t in field]
     steps = torch.zeros(40, 26, dtype=torch.int32)
-    basis_field_backward_adam_(gradient_of(40), 3.0, *field, m, v, steps, RATES)
+    basis_field_backward_adam_(gradient_of(40), 3.0, field, m, v, steps, RATES)
     inactive = ((3.0 - before[0]) * torch.exp(-before[1])).abs() > 4.001
     assert inactive.any() and (steps[inactive] == 0).all()
     for tensor, old in zip(field, before, strict=True):
@@ -166,7 +166,7 @@ def test_padded_rows_give_the_same_and_their_padding_is_not_looked_at():
         for g, time, rates in ((gradient, 3.0, RATES), (wide, tau, torch.tensor(RATES))):
             state, m, v = training_state(50, 26)
             steps = torch.zeros(50, 26, dtype=torch.int32)
-            function(g, time, *state, m, v, steps, rates)
+            function(g, time, state, m, v, steps, rates)
             results.append((*state, *m, *v, steps))
         assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
@@ -176,11 +176,11 @@ def test_padded_rows_give_the_same_and_their_padding_is_not_looked_at():
 def test_a_gradient_that_is_not_finite_leaves_its_gaussian_alone(function, bad):
     field, m, v = training_state(20, 7)
     steps = torch.zeros(20, 7, dtype=torch.int32)
-    function(gradient_of(20), 3.0, *field, m, v, steps, RATES)
+    function(gradient_of(20), 3.0, field, m, v, steps, RATES)
     before = [t.clone() for t in (*field, *m, *v, steps)]
     gradient = gradient_of(20, 1)
     gradient[::3, 5] = bad  # 1e30 is finite, and its square is not
-    function(gradient, 3.0, *field, m, v, steps, RATES)
+    function(gradient, 3.0, field, m, v, steps, RATES)
     for now, old in zip((*field, *m, *v, steps), before, strict=True):
         assert torch.equal(now[::3], old[::3]) and now.isfinite().all()
         assert not torch.equal(now[1::3], old[1::3])
@@ -201,7 +201,7 @@ def test_the_result_does_not_depend_on_the_number_of_threads():
         try:
             field, m, v = training_state(5000, 12)
             steps = torch.zeros(5000, 12, dtype=torch.int32)
-            basis_field_backward_adam_(gradient_of(5000), 3.0, *field, m, v, steps, RATES)
+            basis_field_backward_adam_(gradient_of(5000), 3.0, field, m, v, steps, RATES)
             return (*field, basis_field(*field, 3.3), *basis_field_backward(gradient_of(5000), *field, 3.3))
         finally:
             torch.set_num_threads(old)
@@ -210,7 +210,7 @@ def test_the_result_does_not_depend_on_the_number_of_threads():
 
 
 def test_wrong_input_is_refused_with_its_value():
-    centers, log_widths, weights = bumps(3, 4)
+    centers, log_widths, weights = field = bumps(3, 4)
     with pytest.raises(InvalidInput, match=r"\[3, 4, 12\]"):
         basis_field(centers, log_widths, weights[..., :12], 0.0)
     with pytest.raises(InvalidInput, match=r"float64.*gsplat_core\.reference"):
@@ -219,20 +219,10 @@ def test_wrong_input_is_refused_with_its_value():
         basis_field_backward(gradient_of(2), centers, log_widths, weights, 0.0)
     with pytest.raises(InvalidInput, match=r"tau must be 1 float32 .*\[2\]"):
         basis_field(centers, log_widths, weights, torch.zeros(2))
-    moments = [torch.zeros_like(t) for t in (centers, log_widths, weights)]
+    moments = [torch.zeros_like(t) for t in field]
     with pytest.raises(InvalidInput, match="6 numbers, got 5"):
         basis_field_backward_adam_(
-            gradient_of(3),
-            0.0,
-            centers,
-            log_widths,
-            weights,
-            moments,
-            moments,
-            torch.zeros(3, 4, dtype=torch.int32),
-            RATES[:5],
+            gradient_of(3), 0.0, field, moments, moments, torch.zeros(3, 4, dtype=torch.int32), RATES[:5]
         )
     with pytest.raises(InvalidInput, match="int32"):
-        basis_field_backward_adam_(
-            gradient_of(3), 0.0, centers, log_widths, weights, moments, moments, torch.zeros(3, 4), RATES
-        )
+        basis_field_backward_adam_(gradient_of(3), 0.0, field, moments, moments, torch.zeros(3, 4), RATES)

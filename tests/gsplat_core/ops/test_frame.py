@@ -31,17 +31,26 @@ def raw_gaussians(count: int = 40, dtype: torch.dtype = torch.float64, degree: i
     ]  # fmt: skip
 
 
+def view_of(inputs: list[Tensor], **options: Any) -> View:
+    viewmat, K, background = inputs[6:]
+    sizes = {"width": WIDTH, "height": HEIGHT} | options
+    return View(viewmat, K, background=background, **sizes)
+
+
 def rendered(inputs: list[Tensor], capacity: int = 100, mode: FrameMode = FrameMode.SHARED, **view: Any) -> Frame:
     """`render_frame` of what `raw_gaussians` gives."""
-    gaussians, (deltas, viewmat, K, background) = inputs[:5], inputs[5:]
-    sizes = {"width": WIDTH, "height": HEIGHT} | view
-    return render_frame(gaussians, deltas, View(viewmat, K, background=background, **sizes), capacity, mode)
+    return render_frame(inputs[:5], inputs[5], view_of(inputs, **view), capacity, mode)
+
+
+def by_reference(inputs: list[Tensor], **options: Any) -> tuple[Tensor, Tensor]:
+    """Image and alphas of what `raw_gaussians` gives, by `reference.render_frame`."""
+    return reference.render_frame(inputs[:5], inputs[5], view_of(inputs), **options)
 
 
 @pytest.mark.parametrize("expected_depth", [False, True])
 def test_reference_is_rasterization_of_the_deformed_and_activated_gaussians(assert_near, expected_depth):
     means, quats, log_scales, logits, sh, d, viewmat, K, background = inputs = raw_gaussians()
-    image, alphas = reference.render_frame(*inputs, WIDTH, HEIGHT, expected_depth=expected_depth)
+    image, alphas = by_reference(inputs, expected_depth=expected_depth)
     colored = torch.cat([sh[:, :1] + d[:, None, 10:13], sh[:, 1:]], 1)
     wanted, wanted_alphas, _ = reference.rasterization(
         means + d[:, :3], quats + d[:, 3:7], (log_scales + d[:, 7:10]).exp(), torch.sigmoid(logits + d[:, 13]), colored,
@@ -61,7 +70,7 @@ def test_reference_leaves_out_what_is_not_finite_and_gives_it_no_gradient():
         inputs[3][3] = math.inf  # this and the next are finite again after the activation
         inputs[2][4, 2] = -math.inf
     leaves = [t.requires_grad_() for t in inputs[:6]]
-    image, alphas = reference.render_frame(*inputs, WIDTH, HEIGHT)
+    image, alphas = by_reference(inputs)
     assert image.isfinite().all()
     (image.sum() + alphas.sum()).backward()
     for leaf in leaves:
@@ -75,7 +84,7 @@ def test_reference_refuses_wrong_shapes():
         inputs = raw_gaussians()
         inputs[index] = inputs[index][1:]
         with pytest.raises(InvalidInput, match=name):
-            reference.render_frame(*inputs, WIDTH, HEIGHT)
+            by_reference(inputs)
 
 
 def test_cpu_tensors_and_float64_are_refused_with_what_to_use_instead():

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
+from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats, isect_offset_encode, isect_tiles
 from gsplat_core.reference import tiles as reference
 from gsplat_core.reference.rendering import bin_splats_within
@@ -38,8 +39,8 @@ def splats(
     return means2d, radii, depths, conics, opacities
 
 
-def grid(tile_size: int) -> tuple[int, int, int]:
-    return tile_size, math.ceil(WIDTH / tile_size), math.ceil(HEIGHT / tile_size)
+def grid(tile_size: int) -> TileGrid:
+    return TileGrid(tile_size, math.ceil(WIDTH / tile_size), math.ceil(HEIGHT / tile_size))
 
 
 def assert_equal(seen: tuple[Tensor, ...], wanted: tuple[Tensor, ...]) -> None:
@@ -98,7 +99,7 @@ def test_bin_splats_is_isect_tiles_and_offsets_in_one(exact: bool) -> None:
     offsets = isect_offset_encode(ids, 4, across, down)
     assert torch.equal(offsets, reference.isect_offset_encode(ids, 4, across, down))
     wanted = (counts, order, offsets.reshape(2, 2, down, across))
-    assert_equal(bin_splats(means2d, radii, depths, size, across, down, **options), wanted)
+    assert_equal(bin_splats(means2d, radii, depths, grid(16), **options), wanted)
     assert (ids.diff() >= 0).all()
 
 
@@ -119,7 +120,7 @@ def test_packed_splats_give_the_lists_of_their_images() -> None:
 def test_nothing_visible_gives_empty_lists(count: int) -> None:
     means2d, radii, depths, conics, opacities = splats(count)
     for hidden in (radii * 0, radii * torch.tensor([1, 0], dtype=torch.int32)):
-        counts, order, offsets = bin_splats(means2d, hidden, depths, *grid(16), conics=conics, opacities=opacities)
+        counts, order, offsets = bin_splats(means2d, hidden, depths, grid(16), conics=conics, opacities=opacities)
         assert order.numel() == 0
         assert not counts.any()
         assert not offsets.any()
@@ -143,19 +144,19 @@ def test_splats_that_are_not_finite_or_far_away_are_in_no_list() -> None:
     opacities[0, 10] = 0.0
     opacities[0, 11] = -1.0
     opacities[0, 12] = 0.9 / 255
-    counts, order, _ = bin_splats(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities)
+    counts, order, _ = bin_splats(means2d, radii, depths, grid(16), conics=conics, opacities=opacities)
     assert counts[0, :13].tolist() == [0] * 13
     assert set(order.tolist()) == {13}
     assert isect_tiles(means2d, radii, depths, *grid(16))[0][0, :6].tolist() == [0] * 6
 
 
 def test_a_splat_over_everything_is_in_every_tile() -> None:
-    size, across, down = grid(8)
+    _, across, down = grid(8)
     means2d = torch.tensor([[[1e4, -1e4]]])
     radii = torch.tensor([[[2**31 - 1, 2**31 - 1]]], dtype=torch.int32)
     conics = torch.tensor([[[1e-12, 0.0, 1e-12]]])
     counts, order, offsets = bin_splats(
-        means2d, radii, torch.ones(1, 1), size, across, down, conics=conics, opacities=torch.ones(1, 1)
+        means2d, radii, torch.ones(1, 1), grid(8), conics=conics, opacities=torch.ones(1, 1)
     )
     assert counts.item() == order.numel() == across * down
     assert torch.equal(offsets.flatten(), torch.arange(across * down, dtype=torch.int32))
@@ -194,11 +195,11 @@ def test_lists_do_not_depend_on_the_number_of_threads() -> None:
 def test_lists_of_a_capacity_equal_the_reference(image_dims: tuple[int, ...], share: float) -> None:
     """Unused entries in front; what does not fit is what is farthest, whole splats at a time."""
     here = splats(400, image_dims, median_px=8.0)[:3]
-    exact = bin_splats(*here, *grid(16))
+    exact = bin_splats(*here, grid(16))
     total = exact[1].numel()
     capacity = int(share * total)
-    counts, order, offsets, needed = bin_splats(*here, *grid(16), capacity=capacity)
-    wanted = list(bin_splats_within(*here, *grid(16), capacity=capacity))
+    counts, order, offsets, needed = bin_splats(*here, grid(16), capacity=capacity)
+    wanted = list(bin_splats_within(*here, grid(16), capacity=capacity))
     wanted[2] = wanted[2].reshape(offsets.shape)
     assert_equal((counts, order, offsets, needed), tuple(wanted))
     assert needed.tolist() == [total]
@@ -212,7 +213,7 @@ def test_lists_of_a_capacity_blend_to_the_same_image_and_gradients() -> None:
     colors = torch.rand(2, 200, 3, generator=torch.Generator().manual_seed(1))
     results = []
     for capacity in (None, 20_000):
-        lists = bin_splats(means2d, radii, depths, *grid(16), conics=conics, opacities=opacities, capacity=capacity)
+        lists = bin_splats(means2d, radii, depths, grid(16), conics=conics, opacities=opacities, capacity=capacity)
         leaves = [t.clone().requires_grad_() for t in (means2d, conics, colors, opacities)]
         image, _ = rasterize_to_pixels(*leaves, WIDTH, HEIGHT, 16, lists[2], lists[1])
         results.append((image, *torch.autograd.grad(image.square().sum(), leaves)))
@@ -236,7 +237,7 @@ def test_wrong_arguments_are_named() -> None:
         isect_tiles(means2d[0], radii[0], depths[0], *grid(16), packed=True, n_images=1, image_ids=torch.full((5,), 7))
     for capacity in (-1, 2**31):
         with pytest.raises(InvalidInput, match=f"got {capacity}"):
-            bin_splats(means2d, radii, depths, *grid(16), capacity=capacity)
+            bin_splats(means2d, radii, depths, grid(16), capacity=capacity)
     with pytest.raises(RuntimeError, match="for image 5"):
         isect_offset_encode(torch.tensor([5 << 40]), 1, 10, 20)
 

@@ -98,6 +98,12 @@ def test_a_run_that_was_interrupted_says_so(report):
     assert 'role="alert"' in text and "interrupted" in text
 
 
+def test_damaged_frames_are_counted_where_there_are_any(report, text):
+    assert "damaged" not in text
+    frames = report.frames.model_copy(update={"damaged": 3})
+    assert "0 dropped, 3 damaged" in render_html(report.model_copy(update={"frames": frames}), [])
+
+
 def test_an_empty_run_still_has_a_page(report):
     content = report.model_dump() | {
         "latency_ms": {},
