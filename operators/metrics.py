@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,6 +87,7 @@ class MetricsOp(Operator):
         self.frames = 0
         """How many frames arrived so far."""
         self._digest = hashlib.sha256()
+        self._hashing = ThreadPoolExecutor(1, thread_name_prefix="hash frames")
         self._previous: Frame | None = None
         super().__init__(fragment, *args, **kwargs)
 
@@ -96,11 +98,13 @@ class MetricsOp(Operator):
     def start(self) -> None:
         self.live, self.held_out, self.frames = QualityTracker(), QualityTracker(), 0
         self._digest = hashlib.sha256()
+        self._hashing = ThreadPoolExecutor(1, thread_name_prefix="hash frames")
         self._previous = None
         if self.log is not None:
             self.log.open()
 
     def stop(self) -> None:
+        self._hashing.shutdown()
         self._previous = None
         if self.log is not None:
             self.log.close()
@@ -109,7 +113,8 @@ class MetricsOp(Operator):
         rendered: RenderedFrame = op_input.receive("rendered")
         frame, previous = rendered.frame, self._previous
         self._digest.update(f"{frame.seq} {frame.width_px} {frame.height_px}\n".encode())
-        self._digest.update(np.ascontiguousarray(rendered.image).data)
+        # Beside the scoring: neither keeps the interpreter's lock for long.
+        hashed = self._hashing.submit(self._digest.update, np.ascontiguousarray(rendered.image).data)
         self.frames += 1
         quality, before_db = FrameQuality(frame.seq, math.nan, math.nan, math.nan), math.nan
         if frame.status is not FrameStatus.DAMAGED:
@@ -117,6 +122,7 @@ class MetricsOp(Operator):
             quality = tracker.observe(frame.seq, rendered.image, frame.image, frame.mask)
             if previous is not None and previous.image.shape == frame.image.shape:
                 before_db = psnr_tissue_db(previous.image, frame.image, frame.mask)
+        hashed.result()
         scored = ScoredFrame(rendered, quality, before_db)
         if self.log is not None:
             self.log.write(scored.as_json())
