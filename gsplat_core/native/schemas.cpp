@@ -21,12 +21,13 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "project_gaussians(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "
       "Tensor Ks, int width, int height, float eps2d, float near_plane, float far_plane, float radius_clip, bool compensate, "
-      "int camera_model) -> (Tensor means2d, Tensor depths, Tensor conics, Tensor compensations, Tensor radii)");
+      "int camera_model, float compensation_floor=0.005) -> (Tensor means2d, Tensor depths, Tensor conics, Tensor compensations, "
+      "Tensor radii)");
   m.def(
       "project_gaussians_backward(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor viewmats, Tensor Ks, "
       "Tensor radii, Tensor? v_means2d, Tensor? v_depths, Tensor? v_conics, Tensor? v_compensations, int width, int height, "
-      "float eps2d, int camera_model, bool needs_viewmats) -> (Tensor v_means, Tensor v_covars, Tensor v_quats, "
-      "Tensor v_scales, Tensor v_viewmats)");
+      "float eps2d, int camera_model, bool needs_viewmats, float compensation_floor=0.005) -> (Tensor v_means, Tensor v_covars, "
+      "Tensor v_quats, Tensor v_scales, Tensor v_viewmats)");
 
   // R rows of directions [R, M, 3] with coefficients [M, K, 3] that the rows share; where the mask is false the sum is 0.
   m.def("spherical_harmonics(int degree, Tensor dirs, Tensor coeffs, Tensor? masks) -> Tensor");
@@ -63,13 +64,13 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // `absgrad_probe` is not read: its gradient is the sum over pixels of |dL/dmeans2d|.
   m.def(
       "composite(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor isect_offsets, Tensor flatten_ids, "
-      "Tensor? backgrounds, Tensor? masks, Tensor? absgrad_probe, int width, int height, int tile_size) -> "
+      "Tensor? backgrounds, Tensor? masks, Tensor? absgrad_probe, int width, int height, int tile_size, float max_alpha=0.99) -> "
       "(Tensor colors, Tensor alphas, Tensor last)");
   m.def(
       "composite_backward(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor isect_offsets, "
       "Tensor flatten_ids, Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size, Tensor alphas, Tensor last, "
-      "Tensor v_colors, Tensor v_alphas, bool absgrad) -> (Tensor v_means2d, Tensor v_conics, Tensor v_colors, "
-      "Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
+      "Tensor v_colors, Tensor v_alphas, bool absgrad, float max_alpha=0.99) -> (Tensor v_means2d, Tensor v_conics, "
+      "Tensor v_colors, Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
 
   // The whole of `rasterization()`, CUDA only: gsplat_core/ops/rasterization/rasterization.py names what is in the lists.
   m.def("rasterize(Tensor?[] inputs, int[] image_dims, int[] options, float[] ranges, bool training) -> Tensor[]");

@@ -1,6 +1,6 @@
 """Alpha compositing of depth-ordered splats in plain torch, any dtype, differentiable: the oracle of the compiled op.
 
-Equations of Kerbl et al. 2023 ("3D Gaussian Splatting", eq. 3), with the constants of gsplat.
+Equations of Kerbl et al. 2023 ("3D Gaussian Splatting", eq. 3), with the constants of gsplat 1.6 unless others are given.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ def rasterize_to_pixels(
     masks: Tensor | None = None,
     packed: bool = False,
     absgrad: bool = False,
+    *,
+    max_alpha: float = ALPHA_MAX,
 ) -> tuple[Tensor, Tensor]:
     """Blend splats front to back over every pixel; the same arguments and results as `gsplat_core.rasterize_to_pixels`.
 
@@ -40,7 +42,7 @@ def rasterize_to_pixels(
     images = image_dims.numel()
     background = None if backgrounds is None else backgrounds.reshape(images, channels)
     starts = torch.cat([isect_offsets.flatten(), isect_offsets.new_tensor([flatten_ids.numel()])])
-    instances = _Instances(means2d, conics, colors, opacities, starts, flatten_ids, masks, absgrad)
+    instances = _Instances(means2d, conics, colors, opacities, starts, flatten_ids, masks, absgrad, max_alpha)
     all_colors, all_alphas = [], []
     for image in range(images):
         rows = []
@@ -78,7 +80,9 @@ class _Instances:
         flatten_ids: Tensor,
         masks: Tensor | None,
         absgrad: bool,
+        max_alpha: float,
     ) -> None:
+        self.max_alpha = max_alpha
         values = torch.cat(
             [
                 means2d.reshape(-1, 2),
@@ -139,7 +143,7 @@ class _Instances:
         sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
         # Not clamp: its gradient is zero at the bound, which sigma reaches where the mean is on a pixel's centre.
         falloff = torch.exp(-torch.where(sigma >= 0, sigma, 0))
-        alpha = (opacities * falloff).clamp(max=ALPHA_MAX)
+        alpha = (opacities * falloff).clamp(max=self.max_alpha)
         alpha = torch.where((sigma >= 0) & (alpha >= ALPHA_MIN), alpha, 0)
         # The product of (1 - alpha) by its logarithm, whose gradient is cheaper.
         after = product[:, None] * torch.exp(torch.cumsum(torch.log1p(-alpha), 1))

@@ -98,10 +98,12 @@ def fully_fused_projection(
     calc_compensations: bool = False,
     camera_model: str = "pinhole",
     opacities: Tensor | None = None,
+    *,
+    compensation_floor: float = COMPENSATION_FLOOR,
 ) -> DenseProjection | PackedProjection:
     """Project Gaussians to image ellipses; see `gsplat_core.fully_fused_projection`."""
     check_projection_tensors(means, covars, quats, scales, opacities, viewmats, Ks)
-    check_projection_options(width, height, sparse_grad, camera_model)
+    check_projection_options(width, height, sparse_grad, camera_model, compensation_floor)
     # Unusable Gaussians are replaced before any arithmetic: a NaN behind a mask would still be a NaN in the gradient.
     usable = _usable(means, covars, quats, scales, opacities)
     covariance = _covariance(usable, covars, quats, scales)
@@ -115,7 +117,7 @@ def fully_fused_projection(
 
     # covariance in the image: (J W) Σ (J W)ᵀ
     affine = jacobian @ rotation[..., None, :, :]
-    ellipses = _blurred(affine @ covariance[..., None, :, :, :] @ affine.transpose(-1, -2), eps2d)
+    ellipses = _blurred(affine @ covariance[..., None, :, :, :] @ affine.transpose(-1, -2), eps2d, compensation_floor)
     valid = in_range & ellipses.positive & means2d.isfinite().all(-1) & ellipses.conics.isfinite().all(-1)
     reached = None
     if opacities is not None:
@@ -175,14 +177,17 @@ class _Ellipses(NamedTuple):
     """bool: whether the covariance has an inverse; without one the conic is meaningless."""
 
 
-def _blurred(covars2d: Tensor, eps2d: float) -> _Ellipses:
+def _blurred(covars2d: Tensor, eps2d: float, compensation_floor: float) -> _Ellipses:
     a0, b, c0 = covars2d[..., 0, 0], covars2d[..., 0, 1], covars2d[..., 1, 1]
     a, c = a0 + eps2d, c0 + eps2d
     det = a * c - b * b
     positive = det > 0
     det = torch.where(positive, det, torch.ones_like(det))
     conics = torch.stack([c / det, -b / det, a / det], -1)
-    compensations = ((a0 * c0 - b * b) / det).clamp(min=COMPENSATION_FLOOR**2).sqrt()
+    ratio = (a0 * c0 - b * b) / det
+    # Not clamp: at a floor of 0 the square root's gradient is infinite.
+    above = ratio > compensation_floor**2
+    compensations = torch.where(above, torch.where(above, ratio, 1).sqrt(), compensation_floor)
     return _Ellipses(torch.stack([a, c], -1), conics, compensations, positive)
 
 

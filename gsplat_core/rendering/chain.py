@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, pack
 from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.rendering.settings import RenderSettings
+from gsplat_core.rendering.settings import CONSTANTS, RenderSettings
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,13 @@ def render_splats(
 ) -> RenderedSplats:
     """Project, colour, list by tile and blend; without `coloring` the depth is rendered alone. Shapes have been checked."""
     means, covars, quats, scales, opacities, viewmats, Ks = geometry
+    max_alpha, compensation_floor = CONSTANTS[settings.constants]
     batch_dims, n_gaussians, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
     dense: DenseProjection = ops.fully_fused_projection(
         means, covars, quats, scales, viewmats, Ks, settings.width, settings.height,
         eps2d=settings.eps2d, near_plane=settings.near_plane, far_plane=settings.far_plane,
         radius_clip=settings.radius_clip, calc_compensations=settings.rasterize_mode == "antialiased",
-        camera_model=settings.camera_model, opacities=opacities,
+        camera_model=settings.camera_model, opacities=opacities, compensation_floor=compensation_floor,
     )  # fmt: skip
     channels = None
     if coloring is not None:
@@ -112,7 +113,7 @@ def render_splats(
     isect_offsets = isect_offsets.reshape(*batch_dims, n_cameras, *reversed(settings.tile_grid))
     image, alphas, *rest = ops.rasterize_to_pixels(
         rows.means2d, rows.conics, channels, opacities, settings.width, settings.height, settings.tile_size, isect_offsets,
-        flatten_ids, backgrounds=backgrounds, packed=settings.packed, absgrad=settings.absgrad,
+        flatten_ids, backgrounds=backgrounds, packed=settings.packed, absgrad=settings.absgrad, max_alpha=max_alpha,
     )  # fmt: skip
     return RenderedSplats(
         image, alphas, rows, channels, opacities, tiles_per_gauss, flatten_ids, isect_offsets, tuple(rest)

@@ -20,6 +20,7 @@ from gsplat_core.rendering.settings import (
     NEAR_PLANE,
     TILE_SIZE,
     Arguments,
+    GsplatVersion,
     RasterizeMode,
     RenderMode,
     RenderSettings,
@@ -77,11 +78,10 @@ class Operations(StepOperations):
         ftheta_coeffs: Any = None,
         rolling_shutter: Any = None,
         viewmats_rs: Tensor | None = None,
+        *,
+        constants: GsplatVersion = "1.6",
     ) -> tuple[Tensor, Tensor, Meta]:
         """Render 3D Gaussians (Kerbl et al. 2023) with gsplat 1.5.3's arguments, in its order, and its results.
-
-        Constants are those of gsplat 1.6, here and in all operations: alpha is at most 0.99, and the compensation for
-        antialiasing at least 0.005. gsplat 1.5.3 has 0.999 and 0; that is not offered.
 
         Shapes; `...` are any batch dimensions, the same everywhere:
             means [..., N, 3]; quats [..., N, 4] wxyz, of any length but zero; scales [..., N, 3]; opacities [..., N];
@@ -103,10 +103,13 @@ class Operations(StepOperations):
             rasterize_mode: "antialiased" scales the opacity by sqrt(det Σ / det (Σ + blur)) (Yu et al. 2024).
             camera_model: "pinhole", "ortho" or "fisheye" (equidistant).
             covars: [..., N, 3, 3] in place of quats and scales.
+            constants: the version of gsplat whose constants hold. "1.6": alpha is at most 0.99, and the factor of "antialiased"
+                at least 0.005. "1.5.3": 0.999 and 0. A value at its limit has no gradient. The other constants are the same.
             channel_chunk, segmented: accepted and without effect; neither changes the result.
 
-        On CUDA one native call per pass renders tiles of 16 px and spherical harmonics or up to 3 plain colours; the rest goes
-        through the chain of operations. Either way the host waits once, for the length of the tiles' lists.
+        On CUDA one native call per pass renders tiles of 16 px and spherical harmonics or up to 3 plain colours with the
+        constants of 1.6; the rest goes through the chain of operations. Either way the host waits once, for the length of the
+        tiles' lists.
 
         Returns:
             render_colors [..., C, H, W, X], render_alphas [..., C, H, W, 1] and `meta`, a dict with batch_ids, camera_ids and
@@ -135,6 +138,7 @@ class Operations(StepOperations):
             width=width, height=height, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
             sh_degree=sh_degree, packed=packed, tile_size=TILE_SIZE if tile_size is None else tile_size,
             render_mode=render_mode, absgrad=absgrad, rasterize_mode=rasterize_mode, camera_model=camera_model,
+            constants=constants,
         )  # fmt: skip
         arguments = Arguments(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
         rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)

@@ -12,6 +12,7 @@ from gsplat_core.scene.gaussians import MAX_SH_DEGREE
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
+GsplatVersion = Literal["1.6", "1.5.3"]
 _RENDER_MODES, _RASTERIZE_MODES = get_args(RenderMode), get_args(RasterizeMode)
 
 NEAR_PLANE, FAR_PLANE = 0.01, 1e10
@@ -20,6 +21,19 @@ EPS2D = 0.3
 """Default blur, pixels² added to the diagonal of a splat's covariance."""
 TILE_SIZE = 16
 """Default side of a tile in pixels."""
+
+
+class Constants(NamedTuple):
+    """What differs between gsplat's versions."""
+
+    max_alpha: float
+    """The most opaque that a splat can be at a pixel."""
+    compensation_floor: float
+    """The least that antialiasing scales an opacity by; there it has no gradient. gsplat 1.5.3 has one at 0, but Gaussians with
+    less than 1/255 are culled before."""
+
+
+CONSTANTS: dict[GsplatVersion, Constants] = {"1.6": Constants(0.99, 0.005), "1.5.3": Constants(0.999, 0.0)}
 
 
 class Arguments(NamedTuple):
@@ -53,6 +67,7 @@ class RenderSettings:
     absgrad: bool = False
     rasterize_mode: RasterizeMode = "classic"
     camera_model: str = "pinhole"
+    constants: GsplatVersion = "1.6"
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -61,6 +76,8 @@ class RenderSettings:
         ):
             if value not in known:
                 raise InvalidInput(f"unknown {name} {value!r}; the modes are {', '.join(known)}")
+        if self.constants not in tuple(CONSTANTS):
+            raise InvalidInput(f"unknown constants {self.constants!r}; the versions are {', '.join(CONSTANTS)}")
         if self.tile_size < 1:
             raise InvalidInput(f"tile_size must be at least 1 px, got {self.tile_size}")
         if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:

@@ -26,6 +26,8 @@ from gsplat_core.rendering.settings import Arguments, RenderSettings
 from gsplat_core.rendering.view_colors import camera_centers
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
+NATIVE_CONSTANTS = "1.6"
+"""The version of gsplat whose constants the native call is compiled with."""
 _PLAIN_TENSORS = (Tensor, Parameter)
 _DEPTH_MODES = {"RGB": NO_DEPTH, "D": DEPTH_SUM, "ED": EXPECTED_DEPTH, "RGB+D": DEPTH_SUM, "RGB+ED": EXPECTED_DEPTH}
 
@@ -39,7 +41,7 @@ def rasterize_in_one_call(arguments: Arguments, settings: RenderSettings) -> Ras
 def _takes(arguments: Arguments, settings: RenderSettings) -> bool:
     if CUDA_MISSING is not None or settings.tile_size != NATIVE_TILE_SIZE or torch.compiler.is_compiling():
         return False
-    if not _are_plain_cuda_floats(arguments):
+    if settings.constants != NATIVE_CONSTANTS or not _are_plain_cuda_floats(arguments):
         return False
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars = arguments
     if means.dim() < 2 or viewmats.dim() < 3 or settings.camera_model not in CAMERA_MODELS:

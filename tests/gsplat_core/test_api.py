@@ -280,6 +280,7 @@ def test_wrong_arguments_are_refused(scene):
         ({"render_mode": "RGBD"}, r"render_mode 'RGBD'.*RGB\+ED"),
         ({"rasterize_mode": "smooth"}, "'smooth'"),
         ({"camera_model": "mirror"}, "'mirror'"),
+        ({"constants": "1.5"}, r"unknown constants '1.5'; the versions are 1\.6, 1\.5\.3"),
         ({"tile_size": 0}, "tile_size .*got 0"),
         ({"height": 0}, "height=0"),
         ({"colors": scene.sh.double()}, "colors: torch.float64"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import gsplat_core
+from gsplat_core import reference
 from gsplat_core.ops.projection import arguments
 from gsplat_core.reference import compositing
 from gsplat_core.rendering import settings
@@ -41,6 +43,15 @@ def test_every_constant_is_compared():
 @pytest.mark.parametrize("name", PYTHON)
 def test_compiled_and_python_agree(name):
     assert compiled()[name] == pytest.approx(PYTHON[name], rel=1e-6)
+
+
+def test_the_constants_of_1_6_are_those_compiled_and_the_defaults():
+    of_1_6 = settings.CONSTANTS["1.6"]
+    assert of_1_6 == (compositing.ALPHA_MAX, arguments.COMPENSATION_FLOOR)
+    for home in (gsplat_core, reference):
+        defaults = inspect.signature(home.rasterize_to_pixels).parameters["max_alpha"].default
+        floor = inspect.signature(home.fully_fused_projection).parameters["compensation_floor"].default
+        assert (defaults, floor) == of_1_6
 
 
 def test_python_states_the_cutoff_once():

@@ -68,6 +68,16 @@ def test_rasterization_takes_gsplats_arguments_by_position_too():
         assert parameters[name].kind is inspect.Parameter.POSITIONAL_OR_KEYWORD, name
 
 
+def test_the_version_of_the_constants_is_asked_for_by_keyword_and_1_6_unless():
+    for home in (gsplat_core, reference):
+        *_, constants = inspect.signature(home.rasterization).parameters.values()
+        assert (constants.name, constants.kind, constants.default) == (
+            "constants",
+            inspect.Parameter.KEYWORD_ONLY,
+            "1.6",
+        )
+
+
 def test_an_unknown_name_is_an_attribute_error():
     try:
         gsplat_core.rasterisation  # noqa: B018

@@ -60,16 +60,17 @@ __device__ inline int list_hits_backward(unsigned (&groups)[kBackwardBatch / 32]
 
 // A pixel's terms in a splat's gradient; advances the pixel to in front of the splat.
 struct Terms {
-  float s, w;  // both in units of 1 / kMaxAlpha
+  float s, w;  // both in units of 1 / AlphaLimit::most
 };
 struct PixelState {
   float through;  // transmittance in front of the splats seen so far
   float behind;   // <dL/dcolour, what is seen behind the splats in front>
 };
 template <int D>
-__device__ inline Terms terms_of(const StagedSplat<D>& r, float power, bool drawn, const float (&v_color)[D], PixelState& pixel) {
-  const float alpha = drawn ? __saturatef(exp2_fast(power)) : 0;  // in units of 1 / kMaxAlpha
-  const float lets_through = fmaf(alpha, -kMaxAlpha, 1.0f);
+__device__ inline Terms terms_of(const StagedSplat<D>& r, float power, bool drawn, const float (&v_color)[D],
+                                 const AlphaLimit& limit, PixelState& pixel) {
+  const float alpha = drawn ? __saturatef(exp2_fast(power)) : 0;  // in units of 1 / limit.most
+  const float lets_through = fmaf(alpha, -limit.most, 1.0f);
   float g = v_color[0] * r.colors[0];
 #pragma unroll
   for (int d = 1; d < D; ++d) g = fmaf(v_color[d], r.colors[d], g);
@@ -82,7 +83,8 @@ __device__ inline Terms terms_of(const StagedSplat<D>& r, float power, bool draw
 
 // The sums over the window of one of the batch's splats whose mean is (x, y), from those of the quadrants, into its row.
 template <int D, bool kAbs, class Row>
-__device__ inline void write_row(const BackwardStage<D, kAbs>& stage, const Window& w, int i, float x, float y, const Row& row) {
+__device__ inline void write_row(const BackwardStage<D, kAbs>& stage, const Window& w, int i, float x, float y, float most,
+                                 const Row& row) {
   constexpr int kShape = shape_size(D, kAbs), kQuads = BackwardStage<D, kAbs>::kQuads;
   float v[4 * kQuads] = {};
 #pragma unroll
@@ -103,8 +105,7 @@ __device__ inline void write_row(const BackwardStage<D, kAbs>& stage, const Wind
   }
 #pragma unroll
   for (int quad = 0; quad < kQuads; ++quad)
-    row[quad] = make_float4(kMaxAlpha * v[4 * quad], kMaxAlpha * v[4 * quad + 1], kMaxAlpha * v[4 * quad + 2],
-                            kMaxAlpha * v[4 * quad + 3]);
+    row[quad] = make_float4(most * v[4 * quad], most * v[4 * quad + 1], most * v[4 * quad + 2], most * v[4 * quad + 3]);
 }
 
 // `fetch(position)` gives the splat at a position in [w.begin, w.end), `row(position)` where its row goes: the sums over the
@@ -112,7 +113,8 @@ __device__ inline void write_row(const BackwardStage<D, kAbs>& stage, const Wind
 // additions. `v_color` is dL/dcolour of the thread's pixels, 0 outside of the image.
 template <int D, bool kAbs, bool kCapped, class Fetch, class Row>
 __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const Pixel (&pixels)[kPixelsEach],
-                                      const float (&v_color)[kPixelsEach][D], const Row& row, BackwardStage<D, kAbs>& stage) {
+                                      const float (&v_color)[kPixelsEach][D], const Row& row, BackwardStage<D, kAbs>& stage,
+                                      const AlphaLimit& limit = {}) {
   constexpr int kBatch = kBackwardBatch, kShape = shape_size(D, kAbs), kQuads = BackwardStage<D, kAbs>::kQuads;
   constexpr int kUnrolled = 4;
   const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
@@ -139,13 +141,13 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
     const int position = first + mine;
     return mine < kBatch && position >= w.begin && position < end ? fetch(position) : faint_record<D>();
   };
-  if (threadIdx.x == kBlockThreads - 1) stage.splats[kBatch] = staged(faint_record<D>(), middle_x, middle_y);
+  if (threadIdx.x == kBlockThreads - 1) stage.splats[kBatch] = staged(faint_record<D>(), middle_x, middle_y, limit);
   int first = w.begin + (end - 1 - w.begin) / kBatch * kBatch;
   Record<D> next = fetch_ahead(first);
   for (; first >= w.begin; first -= kBatch) {
     __syncwarp();  // the warp's lanes have finished reading what is overwritten now
     const float mean_x = next.xyab.x, mean_y = next.xyab.y;
-    if (mine < kBatch) stage_splat<kQuadrant>(mine, first + mine / 32 * 32 < end, next, w, stage.splats, stage.reached);
+    if (mine < kBatch) stage_splat<kQuadrant>(mine, first + mine / 32 * 32 < end, next, w, stage.splats, stage.reached, limit);
     __syncthreads();
     next = fetch_ahead(first - kBatch);  // prefetched
     unsigned groups[kBatch / 32];
@@ -178,8 +180,8 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
 #pragma unroll
           for (int p = 0; p < kPixelsEach; ++p) {
             const float power = fmaf(fmaf(r.by_yy, y[p], by_y), y[p], constant);
-            const bool drawn = power >= kStagedCutoff && offset[n] < limits[p] && (!kCapped || power <= r.cap);
-            terms[p] = terms_of<D>(r, power, drawn, v_color[p], states[p]);
+            const bool drawn = power >= staged_cutoff(limit) && offset[n] < limits[p] && (!kCapped || power <= r.cap);
+            terms[p] = terms_of<D>(r, power, drawn, v_color[p], limit, states[p]);
             if constexpr (kAbs) {
               const float s = kLn2 * fabsf(terms[p].s);
               absolute[0] = fmaf(s, fabsf(fmaf(2 * r.by_xx, x, fmaf(r.by_xy, y[p], r.by_x))), absolute[0]);
@@ -209,7 +211,7 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
       __syncwarp();
     }
     __syncthreads();
-    if (mine < kBatch && first + mine < end) write_row(stage, w, mine, mean_x, mean_y, row(first + mine));
+    if (mine < kBatch && first + mine < end) write_row(stage, w, mine, mean_x, mean_y, limit.most, row(first + mine));
   }
 }
 

@@ -20,8 +20,9 @@ struct FloatPixels {
   float front[kPixelsEach];  // the transmittance in front of the next splat
   float through[kPixelsEach], sum[kPixelsEach][D];
   uint32_t last[kPixelsEach];  // address of the splat that was blended last
+  AlphaLimit limit;
 
-  __device__ explicit FloatPixels(const Window& w) {
+  __device__ FloatPixels(const Window& w, const AlphaLimit& limit_) : limit(limit_) {
     for (int p = 0; p < kPixelsEach; ++p) {
       front[p] = w.inside[p] ? 1 : 0;
       through[p] = 1;
@@ -32,9 +33,9 @@ struct FloatPixels {
   __device__ void blend(const StagedSplat<D>& r, const float (&power)[kPixelsEach], uint32_t address) {
 #pragma unroll
     for (int p = 0; p < kPixelsEach; ++p) {
-      const bool drawn = power[p] >= kStagedCutoff && (!kCapped || power[p] <= r.cap);
-      const float weight = drawn ? __saturatef(exp2_fast(power[p])) * front[p] : 0;  // in units of 1 / kMaxAlpha
-      front[p] = fmaf(weight, -kMaxAlpha, front[p]);
+      const bool drawn = power[p] >= staged_cutoff(limit) && (!kCapped || power[p] <= r.cap);
+      const float weight = drawn ? __saturatef(exp2_fast(power[p])) * front[p] : 0;  // in units of 1 / limit.most
+      front[p] = fmaf(weight, -limit.most, front[p]);
       if (front[p] > kMinTransmittance) {
         through[p] = front[p];
         for (int d = 0; d < D; ++d) sum[p][d] = fmaf(weight, r.colors[d], sum[p][d]);
@@ -45,7 +46,7 @@ struct FloatPixels {
   __device__ void finish(BlendedPixels<D>& out) const {
     for (int p = 0; p < kPixelsEach; ++p) {
       out.through[p] = through[p];
-      for (int d = 0; d < D; ++d) out.sum[p][d] = kMaxAlpha * sum[p][d];
+      for (int d = 0; d < D; ++d) out.sum[p][d] = limit.most * sum[p][d];
     }
   }
 };
@@ -93,13 +94,14 @@ __device__ inline int list_hits(const uint4* reached, const StagedSplat<D>* spla
 // `fetch(position)` gives the splat at a position in [w.begin, w.end), which are in the order of depth. kCapped: there may be
 // splats with a finite `cap` (an indefinite conic). kLast: `last` is wanted. All threads of the block take part.
 template <int D, bool kCapped, bool kLast = true, class Fetch>
-__device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& fetch, ForwardStage<D>& stage) {
+__device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& fetch, ForwardStage<D>& stage,
+                                                 const AlphaLimit& limit = {}) {
   constexpr int kBatch = kForwardBatch;
   constexpr uint32_t kNone = ~0u;
   const int lane = threadIdx.x & 31, warp = threadIdx.x / 32, first_part = warp / 2 * 4 + warp % 2;
   const uint4* const hits = stage.hits[2 * warp + lane / 16];
   const float middle_x = float(w.left + kQuadrant), middle_y = float(w.top + kQuadrant), x = float(w.x) + 0.5f - middle_x;
-  FloatPixels<D, kCapped, kLast> pixels(w);
+  FloatPixels<D, kCapped, kLast> pixels(w, limit);
   BlendedPixels<D> out;
   float y[kPixelsEach];
   for (int p = 0; p < kPixelsEach; ++p) {
@@ -110,11 +112,11 @@ __device__ inline BlendedPixels<D> blend_forward(const Window& w, const Fetch& f
   const auto fetch_ahead = [&](int left) {  // this thread's splat in the batch that has `left` more and what follows it
     return int(threadIdx.x) < left ? fetch(w.end - left + int(threadIdx.x)) : faint_record<D>();
   };
-  if (threadIdx.x < 2) stage.splats[threadIdx.x][kBatch] = staged(faint_record<D>(), middle_x, middle_y);
+  if (threadIdx.x < 2) stage.splats[threadIdx.x][kBatch] = staged(faint_record<D>(), middle_x, middle_y, limit);
   Record<D> next = fetch_ahead(w.end - w.begin);
   int now = 0;
   for (int left = w.end - w.begin; left > 0; left -= kBatch, now ^= 1) {
-    stage_splat<kQuadrant / 2>(int(threadIdx.x), 32 * warp < left, next, w, stage.splats[now], stage.reached[now]);
+    stage_splat<kQuadrant / 2>(int(threadIdx.x), 32 * warp < left, next, w, stage.splats[now], stage.reached[now], limit);
     bool warp_open = __any_sync(kAll, pixels.open());
     if (!__syncthreads_or(warp_open)) break;
     next = fetch_ahead(left - kBatch);  // prefetched

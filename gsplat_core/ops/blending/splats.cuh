@@ -104,7 +104,7 @@ __device__ inline bool reaches(const Record<D>& r, float x, float y) {
   return right >= 0 && left <= float(kQuadrant - 1);
 }
 
-// log2(alpha / 0.99) before the cut-offs, as a polynomial in the offset (x, y) from the window's centre to the pixel:
+// log2(alpha / its maximum) before the cut-offs, as a polynomial in the offset (x, y) from the window's centre to the pixel:
 // one + y (by_y + y by_yy) where one = k + x (by_x + x by_xx) and by_y = ky + x by_xy are the same for a whole column.
 // Beyond `cap` a splat is skipped.
 template <int D>
@@ -140,20 +140,21 @@ __device__ inline StagedSplat<D> staged_at(uint32_t address) {
 }
 __device__ inline uint32_t shared_address(const void* at) { return uint32_t(__cvta_generic_to_shared(at)); }
 
-constexpr float kStagedCutoff = kLog2AlphaCutoff - kLog2MaxAlpha;  // the cut-off of 1/255, as the polynomial counts
+// The cut-off of 1/255, as the polynomial counts.
+__device__ inline float staged_cutoff(const AlphaLimit& limit) { return kLog2AlphaCutoff - limit.log2_most; }
 
 // (x, y) is the window's centre. The order of operations is explicit, so that both passes get the same bits.
 template <int D>
-__device__ inline StagedSplat<D> staged(const Record<D>& r, float x, float y) {
+__device__ inline StagedSplat<D> staged(const Record<D>& r, float x, float y, const AlphaLimit& limit = {}) {
   const float a = r.xyab.z, b = r.xyab.w, c = r.c, dx = x - r.xyab.x, dy = y - r.xyab.y;
   StagedSplat<D> s;
   s.by_x = fmaf(2 * a, dx, __fmul_rn(b, dy));
   s.by_y = fmaf(2 * c, dy, __fmul_rn(b, dx));
-  s.k = fmaf(fmaf(b, dy, __fmul_rn(a, dx)), dx, fmaf(__fmul_rn(c, dy), dy, r.l - kLog2MaxAlpha));
+  s.k = fmaf(fmaf(b, dy, __fmul_rn(a, dx)), dx, fmaf(__fmul_rn(c, dy), dy, r.l - limit.log2_most));
   s.by_xx = a;
   s.by_xy = b;
   s.by_yy = c;
-  s.cap = r.cap - kLog2MaxAlpha;
+  s.cap = r.cap - limit.log2_most;
   for (int d = 0; d < D; ++d) s.colors[d] = r.colors[d];
   return s;
 }
@@ -203,11 +204,11 @@ __device__ inline unsigned reaching_parts(bool shown, const Record<D>& r, float 
 // reach it. `any`: one of the warp's threads has a splat.
 template <int kRows, int D>
 __device__ inline void stage_splat(int i, bool any, const Record<D>& r, const Window& w, StagedSplat<D>* splats,
-                                   uint4* reached_by_part) {
+                                   uint4* reached_by_part, const AlphaLimit& limit = {}) {
   const int lane = threadIdx.x & 31;
   unsigned reaching = 0;
   if (any) {
-    splats[i] = staged(r, float(w.left + kQuadrant), float(w.top + kQuadrant));
+    splats[i] = staged(r, float(w.left + kQuadrant), float(w.top + kQuadrant), limit);
     reaching = reaching_parts<kRows>(true, r, float(w.left) + 0.5f, float(w.top) + 0.5f);
   }
   if (lane < 4 * kQuadrant / kRows) reinterpret_cast<unsigned*>(&reached_by_part[lane])[i / 32] = reaching;

@@ -36,7 +36,7 @@ GSPLAT_INLINE void splat_backward(const Splats& in, int32_t id, int64_t position
     __builtin_memcpy(&last, w.last + at, sizeof(last));
     const vmask valid = at_least(f.power, splat(kLog2AlphaCutoff)) & at_least(splat(record.cap), f.power) &
                         at_least(last, splat_int(int32_t(position)));
-    const vfloat alpha = zero_unless(valid, exp2(smaller(f.power, splat(kLog2MaxAlpha))));
+    const vfloat alpha = zero_unless(valid, exp2(smaller(f.power, splat(in.alpha.log2_most))));
     const vfloat widen = reciprocal(1.0f - alpha);
     const vfloat through = load(w.through + at) * widen, weight = alpha * through;
     vfloat g = {};
@@ -50,7 +50,7 @@ GSPLAT_INLINE void splat_backward(const Splats& in, int32_t id, int64_t position
     store(w.through + at, through);
     store(w.behind + at, fma(weight, g, behind));
     // Where alpha is clamped to its maximum, opacity and shape have no gradient.
-    const vfloat s = zero_unless(valid & at_least(splat(kLog2MaxAlpha), f.power), alpha * v_alpha);
+    const vfloat s = zero_unless(valid & at_least(splat(in.alpha.log2_most), f.power), alpha * v_alpha);
     const vfloat sx = s * f.dx, sy = s * f.dy;
     sum[0] = sum[0] + s;
     sum[1] = sum[1] + sx;

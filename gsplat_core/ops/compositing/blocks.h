@@ -10,7 +10,6 @@ namespace GSPLAT_ISA::compositing {
 
 using namespace gsplat::compositing;
 using gsplat::kLog2AlphaCutoff;
-using gsplat::kLog2MaxAlpha;
 using gsplat::kMinTransmittance;
 
 void make_records(const Inputs& in, int64_t begin, int64_t end, SplatRecord* records);
@@ -46,10 +45,8 @@ GSPLAT_INLINE void store_quad(float* p, quad v) { __builtin_memcpy(p, &v, sizeof
 
 // Transposes 4x4: 4 pixels of 4 channels from 4 channels of 4 pixels, and back.
 GSPLAT_INLINE void transpose(quad& a, quad& b, quad& c, quad& d) {
-  const quad ab_low = __builtin_shufflevector(a, b, 0, 4, 1, 5),
-             ab_high = __builtin_shufflevector(a, b, 2, 6, 3, 7);
-  const quad cd_low = __builtin_shufflevector(c, d, 0, 4, 1, 5),
-             cd_high = __builtin_shufflevector(c, d, 2, 6, 3, 7);
+  const quad ab_low = __builtin_shufflevector(a, b, 0, 4, 1, 5), ab_high = __builtin_shufflevector(a, b, 2, 6, 3, 7);
+  const quad cd_low = __builtin_shufflevector(c, d, 0, 4, 1, 5), cd_high = __builtin_shufflevector(c, d, 2, 6, 3, 7);
   a = __builtin_shufflevector(ab_low, cd_low, 0, 1, 4, 5);
   b = __builtin_shufflevector(ab_low, cd_low, 2, 3, 6, 7);
   c = __builtin_shufflevector(ab_high, cd_high, 0, 1, 4, 5);

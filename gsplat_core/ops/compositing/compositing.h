@@ -8,6 +8,7 @@
 
 #include <cstdint>
 
+#include "constants.h"
 #include "cuda_stream.h"
 #include "isa.h"
 
@@ -30,6 +31,7 @@ struct Inputs {
   const bool* masks;         // [images, tile_height, tile_width] or null
   int64_t count, instances;
   int32_t images, channels, width, height, tile_size, tile_width, tile_height;
+  AlphaLimit alpha;
 
   constexpr int64_t tiles() const { return int64_t(images) * tile_width * tile_height; }
   constexpr int64_t windows() const {  // of one tile

@@ -26,12 +26,14 @@ def rasterize_to_pixels(
     masks: Tensor | None = None,
     packed: bool = False,
     absgrad: bool = False,
+    *,
+    max_alpha: float = 0.99,
 ) -> tuple[Tensor, Tensor]:
     """Blend splats front to back over every pixel. Names and results of gsplat 1.5.3; `...` are the images.
 
-    alpha = min(0.99, opacity exp(-sigma)) at the pixel's centre, sigma the quadratic form of the conic. A splat with alpha
+    alpha = min(max_alpha, opacity exp(-sigma)) at the pixel's centre, sigma the quadratic form of the conic. A splat with alpha
     below 1/255 or sigma below 0 is skipped; one that would leave a transmittance of 1e-4 or less ends the pixel. A splat with
-    a value that is not finite is skipped and has no gradient.
+    a value that is not finite is skipped and has no gradient. Where alpha is clamped, opacity, mean and conic have no gradient.
 
     Args:
         means2d: [..., N, 2] pixels; pixel (0, 0) has its centre at (0.5, 0.5). Packed: [nnz, 2].
@@ -42,33 +44,29 @@ def rasterize_to_pixels(
         isect_offsets: int32 [..., tile_height, tile_width] and flatten_ids: int32 [M], of `isect_tiles`.
         backgrounds: [..., D]; masks: bool [..., tile_height, tile_width], a tile with False shows the background only.
         absgrad: the backward pass leaves the sum over pixels of |dL/dmeans2d| in `means2d.absgrad` (AbsGS, Ye et al. 2024).
+        max_alpha: 0.99 as in gsplat 1.6, or another from 1/255 to below 1; gsplat 1.5.3 has 0.999.
 
     Returns colors [..., image_height, image_width, D] and alphas [..., image_height, image_width, 1], float32. Raises InvalidInput
-    for wrong shapes or types. The result is the same for any number of threads.
+    for wrong shapes, types or limits. The result is the same for any number of threads.
     """
     channels = colors.shape[-1] if colors.ndim else 0
     image_dims = isect_offsets.shape[:-2]
     images = math.prod(image_dims)
     _check(means2d, conics, colors, opacities, isect_offsets, flatten_ids, backgrounds, masks, packed)
     _check_tiles(image_width, image_height, tile_size, isect_offsets)
+    if not 1 / 255 <= max_alpha < 1:
+        raise InvalidInput(f"max_alpha must be from 1/255 to below 1, got {max_alpha}")
     probe = None
     if absgrad and means2d.requires_grad:
         probe = torch.zeros_like(means2d).requires_grad_()
         probe.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient))
     image, alphas, _ = torch.ops.gsplat_core.composite(
-        means2d.reshape(-1, 2),
-        conics.reshape(-1, 3),
-        colors.reshape(-1, channels),
-        opacities.reshape(-1),
-        isect_offsets.reshape(images, *isect_offsets.shape[-2:]),
-        flatten_ids,
+        means2d.reshape(-1, 2), conics.reshape(-1, 3), colors.reshape(-1, channels), opacities.reshape(-1),
+        isect_offsets.reshape(images, *isect_offsets.shape[-2:]), flatten_ids,
         None if backgrounds is None else backgrounds.reshape(images, channels),
         None if masks is None else masks.reshape(images, *isect_offsets.shape[-2:]),
-        None if probe is None else probe.reshape(-1, 2),
-        image_width,
-        image_height,
-        tile_size,
-    )
+        None if probe is None else probe.reshape(-1, 2), image_width, image_height, tile_size, max_alpha,
+    )  # fmt: skip
     shape = (*image_dims, image_height, image_width)
     return image.reshape(*shape, channels), alphas.reshape(*shape, 1)
 
@@ -141,7 +139,7 @@ def _composite_fake(
     isect_offsets: Tensor,
     *rest: Any,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    *_, width, height, _tile_size = rest
+    width, height = rest[4:6]  # max_alpha is left out at its default
     shape = (isect_offsets.shape[0], height, width)
     last = isect_offsets.new_empty(shape)
     return colors.new_empty(*shape, colors.shape[-1]), colors.new_empty(*shape, 1), last
@@ -158,7 +156,7 @@ def _composite_backward_fake(
     backgrounds: Tensor | None,
     *rest: Any,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    *_, absgrad = rest
+    absgrad = rest[8]
     count, channels = colors.shape
     return (
         colors.new_empty(count, 2),
@@ -171,24 +169,25 @@ def _composite_backward_fake(
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
-    *tensors, probe, width, height, tile_size = inputs
+    *tensors, probe, width, height, tile_size, max_alpha = inputs
     _, alphas, last = output
     ctx.mark_non_differentiable(last)
     ctx.save_for_backward(*tensors, alphas, last)
     ctx.sizes = (width, height, tile_size)
+    ctx.max_alpha = max_alpha
     ctx.absgrad = probe is not None
 
 
 def _backward(ctx: Any, v_image: Tensor, v_alphas: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
     *tensors, alphas, last = ctx.saved_tensors
     v_means2d, v_conics, v_colors, v_opacities, v_backgrounds, absolute = torch.ops.gsplat_core.composite_backward(
-        *tensors, *ctx.sizes, alphas, last, v_image, v_alphas, ctx.absgrad
+        *tensors, *ctx.sizes, alphas, last, v_image, v_alphas, ctx.absgrad, ctx.max_alpha
     )
     has_backgrounds = tensors[6] is not None
     return (
         *(v_means2d, v_conics, v_colors, v_opacities, None, None),
         *(v_backgrounds if has_backgrounds else None, None),
-        *(absolute if ctx.absgrad else None, None, None, None),
+        *(absolute if ctx.absgrad else None, None, None, None, None),
     )
 
 

@@ -81,16 +81,16 @@ __global__ void __launch_bounds__(kBlockThreads, 5)
     for (int d = 0; d < D; ++d) v_color[p][d] = w.inside[p] ? from.v_colors[place.pixel(in, w, p) * D + d] : 0;
   const auto fetch = [&](int position) { return record_at(in, records, position); };
   const auto row = [&](int position) { return rows + row_of(in, position) * stage.kQuads; };
-  blend_backward<D, kAbs, true>(w, fetch, pixels, v_color, row, stage);
+  blend_backward<D, kAbs, true>(w, fetch, pixels, v_color, row, stage, in.alpha);
 }
 
 // What a splat's gradient needs of a pixel.
 struct Blend {
   float alpha, through, widen, weight;
 };
-__device__ inline Blend blend(const Pixel& pixel, float power) {
+__device__ inline Blend blend(const Pixel& pixel, float power, const AlphaLimit& limit) {
   Blend b;
-  b.alpha = exp2_fast(fminf(power, kLog2MaxAlpha));
+  b.alpha = exp2_fast(fminf(power, limit.log2_most));
   b.widen = reciprocal(1 - b.alpha);
   b.through = pixel.through * b.widen;
   b.weight = b.alpha * b.through;
@@ -99,12 +99,13 @@ __device__ inline Blend blend(const Pixel& pixel, float power) {
 
 // Adds a pixel's part of the moments and advances the pixel to in front of the splat.
 template <bool kAbs, int D>
-__device__ inline void add_moments(const Record<D>& r, const Falloff& f, const Blend& b, float g, Pixel& pixel, float* v) {
+__device__ inline void add_moments(const Record<D>& r, const Falloff& f, const Blend& b, float g, const AlphaLimit& limit,
+                                   Pixel& pixel, float* v) {
   const float v_alpha = fmaf(b.through, g, -(pixel.behind * b.widen));
   pixel.through = b.through;
   pixel.behind = fmaf(b.weight, g, pixel.behind);
   // Where alpha is clamped to its maximum, opacity and shape have no gradient.
-  const float s = f.power <= kLog2MaxAlpha ? b.alpha * v_alpha : 0, sx = s * f.dx, sy = s * f.dy;
+  const float s = f.power <= limit.log2_most ? b.alpha * v_alpha : 0, sx = s * f.dx, sy = s * f.dy;
   v[0] += s;
   v[1] += sx;
   v[2] += sy;
@@ -140,12 +141,12 @@ __global__ void __launch_bounds__(kBlockThreads)
     for (int p = 0; p < kPixelsEach; ++p) {
       const Falloff f = falloff(r, center_x, float(w.y[p]) + 0.5f);
       if (!(f.power >= kLog2AlphaCutoff && f.power <= r.cap && position <= pixels[p].last)) continue;
-      const Blend b = blend(pixels[p], f.power);
+      const Blend b = blend(pixels[p], f.power, in.alpha);
       const float* const v_color = from.v_colors + place.pixel(in, w, p) * in.channels;
       float g = 0;
       for (int d = 0; d < in.channels; ++d) g = fmaf(v_color[d], color[d], g);
       weight[p] = b.weight;
-      add_moments<kAbs>(r, f, b, g, pixels[p], shape);
+      add_moments<kAbs>(r, f, b, g, in.alpha, pixels[p], shape);
     }
     for (int base = 0; base < 4 * quads; base += kValues) {
       float v[kValues] = {};

@@ -33,7 +33,7 @@ __global__ void __launch_bounds__(kBlockThreads, 8) composite_windows(Inputs in,
   Window w = place.window(in);
   if (in.masks != nullptr && !in.masks[place.tile]) w.end = w.begin;  // nothing but the background
   const auto fetch = [&](int position) { return record_at(in, records, position); };
-  BlendedPixels<D> blended = blend_forward<D, true>(w, fetch, stage);
+  BlendedPixels<D> blended = blend_forward<D, true>(w, fetch, stage, in.alpha);
   write_pixels<D>(in, place, w, blended, out);
 }
 
@@ -69,7 +69,7 @@ __global__ void __launch_bounds__(kBlockThreads) composite_windows_of_any(Inputs
         for (int p = 0; p < kPixelsEach; ++p) {
           const float power = falloff(staged[i], center_x, float(w.y[p]) + 0.5f).power;
           if (!(open[p] && power >= kLog2AlphaCutoff && power <= staged[i].cap)) continue;
-          const float alpha = exp2_fast(fminf(power, kLog2MaxAlpha)), behind = fmaf(-alpha, through[p], through[p]);
+          const float alpha = exp2_fast(fminf(power, in.alpha.log2_most)), behind = fmaf(-alpha, through[p], through[p]);
           if (!(behind > kMinTransmittance)) {
             open[p] = false;
             continue;

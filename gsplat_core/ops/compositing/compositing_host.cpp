@@ -1,6 +1,7 @@
 // composite and composite_backward: checks, memory, and how each device runs them.
 #include <algorithm>
 #include <atomic>
+#include <cmath>
 #include <tuple>
 #include <vector>
 
@@ -15,6 +16,13 @@ namespace {
 
 constexpr int64_t kMaxInts = (int64_t(1) << 31) - 1;
 
+AlphaLimit limit_of(double max_alpha) {
+  check(max_alpha >= kAlphaCutoff && max_alpha < 1, "composite: max_alpha must be from 1/255 to below 1, found ", max_alpha);
+  const float most = float(max_alpha);
+  // The constant's last bit is not that of the rounded logarithm.
+  return most == kMaxAlpha ? AlphaLimit{} : AlphaLimit{most, float(std::log2(max_alpha))};
+}
+
 // The inputs of either pass, checked; the tensors keep the memory alive that `in` points to.
 struct Arguments {
   Tensor means2d, conics, colors, opacities, offsets, flatten_ids;
@@ -23,7 +31,7 @@ struct Arguments {
 
   Arguments(const Call& call, const Tensor& means2d_, const Tensor& conics_, const Tensor& colors_, const Tensor& opacities_,
             const Tensor& offsets_, const Tensor& flatten_ids_, const OptionalTensor& backgrounds_, const OptionalTensor& masks_,
-            int64_t width, int64_t height, int64_t tile_size)
+            int64_t width, int64_t height, int64_t tile_size, double max_alpha)
       : means2d(call.floats(means2d_, "means2d")),
         conics(call.floats(conics_, "conics")),
         colors(call.floats(colors_, "colors")),
@@ -58,7 +66,8 @@ struct Arguments {
           .height = int32_t(height),
           .tile_size = int32_t(tile_size),
           .tile_width = int32_t(tile_width),
-          .tile_height = int32_t(tile_height)};
+          .tile_height = int32_t(tile_height),
+          .alpha = limit_of(max_alpha)};
   }
 };
 
@@ -175,10 +184,11 @@ void backward(Call&, const Inputs& in, const PictureGradient& from, const InputG
 
 std::tuple<Tensor, Tensor, Tensor> composite(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor offsets,
                                              Tensor flatten_ids, OptionalTensor backgrounds, OptionalTensor masks,
-                                             OptionalTensor absgrad_probe, int64_t width, int64_t height, int64_t tile_size) {
+                                             OptionalTensor absgrad_probe, int64_t width, int64_t height, int64_t tile_size,
+                                             double max_alpha) {
   Call call(means2d);
   const Arguments arguments(call, means2d, conics, colors, opacities, offsets, flatten_ids, backgrounds, masks, width, height,
-                            tile_size);
+                            tile_size, max_alpha);
   const Inputs& in = arguments.in;
   Tensor out_colors = call.empty({in.images, height, width, in.channels}), alphas = call.empty({in.images, height, width, 1});
   Tensor last = call.empty({in.images, height, width}, ScalarType::Int);
@@ -187,15 +197,13 @@ std::tuple<Tensor, Tensor, Tensor> composite(Tensor means2d, Tensor conics, Tens
   return {out_colors, alphas, last};
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(Tensor means2d, Tensor conics, Tensor colors,
-                                                                              Tensor opacities, Tensor offsets,
-                                                                              Tensor flatten_ids, OptionalTensor backgrounds,
-                                                                              OptionalTensor masks, int64_t width, int64_t height,
-                                                                              int64_t tile_size, Tensor alphas, Tensor last,
-                                                                              Tensor v_colors, Tensor v_alphas, bool absgrad) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> composite_backward(
+    Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor offsets, Tensor flatten_ids,
+    OptionalTensor backgrounds, OptionalTensor masks, int64_t width, int64_t height, int64_t tile_size, Tensor alphas,
+    Tensor last, Tensor v_colors, Tensor v_alphas, bool absgrad, double max_alpha) {
   Call call(means2d);
   const Arguments arguments(call, means2d, conics, colors, opacities, offsets, flatten_ids, backgrounds, masks, width, height,
-                            tile_size);
+                            tile_size, max_alpha);
   const Inputs& in = arguments.in;
   const int64_t count = in.count, channels = in.channels, pixels = in.images * height * width;
   const Tensor alphas_ = call.floats(alphas, "alphas"), last_ = call.ints(last, "last");

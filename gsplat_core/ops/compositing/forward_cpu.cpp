@@ -30,7 +30,7 @@ void blend_block(const Splats& in, const int32_t* ids, int64_t position, uint64_
     const SplatRecord& record = in.records[ids[i]];
     const vfloat power = falloff(record, x, y).power;
     const vmask valid = at_least(power, splat(kLog2AlphaCutoff)) & at_least(splat(record.cap), power);
-    const vfloat alpha = zero_unless(valid, exp2(smaller(power, splat(kLog2MaxAlpha))));
+    const vfloat alpha = zero_unless(valid, exp2(smaller(power, splat(in.alpha.log2_most))));
     const vfloat next = fma(-alpha, through, through);
     // Past the stop the transmittance only falls, so this test alone ends a pixel for good.
     const vmask open = above(next, splat(kMinTransmittance));

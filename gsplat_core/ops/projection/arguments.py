@@ -15,7 +15,7 @@ MAX_EXTENT_SIGMAS = 3.33
 """Beyond this many standard deviations a fully opaque Gaussian falls below the alpha cut-off of 1/255."""
 ALPHA_CUTOFF = 1.0 / 255.0
 COMPENSATION_FLOOR = 0.005
-"""Smallest antialiasing compensation (Yu et al. 2024, Mip-Splatting, as published in its code)."""
+"""Smallest antialiasing compensation (Yu et al. 2024, Mip-Splatting, as published in its code), unless another is given."""
 MAX_RADIUS_PX = 1e9
 """Radii are clamped to this, to fit an int32."""
 FOV_MARGIN = 0.3
@@ -87,10 +87,15 @@ def check_projection_tensors(
     return batch_dims
 
 
-def check_projection_options(width: int, height: int, sparse_grad: bool, camera_model: str) -> None:
-    """Raise InvalidInput on an image without pixels or an unknown camera, NotImplementedError on what only gsplat has."""
+def check_projection_options(
+    width: int, height: int, sparse_grad: bool, camera_model: str, compensation_floor: float
+) -> None:
+    """Raise InvalidInput on an image without pixels, an unknown camera or a floor that is no factor of an opacity,
+    NotImplementedError on what only gsplat has."""
     if width < 1 or height < 1:
         raise InvalidInput(f"the image must be at least 1x1 px, got width={width}, height={height}")
+    if not 0 <= compensation_floor <= 1:
+        raise InvalidInput(f"compensation_floor must be from 0 to 1, got {compensation_floor}")
     if sparse_grad:
         raise NotImplementedError("sparse_grad=True is not supported; gradients are dense (use sparse_grad=False)")
     if camera_model not in CAMERA_MODELS:

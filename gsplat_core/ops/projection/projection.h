@@ -4,6 +4,7 @@
 
 #include <cstdint>
 
+#include "constants.h"
 #include "cuda_stream.h"
 #include "isa.h"
 
@@ -29,6 +30,7 @@ struct ProjectionInput {
   float near_plane, far_plane;  // z
   float radius_clip;            // px
   CameraModel model;
+  float compensation_floor = kCompensationFloor;
 };
 
 struct ProjectionOutput {

@@ -11,6 +11,7 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_float32
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.projection.arguments import (
+    COMPENSATION_FLOOR,
     DenseProjection,
     PackedProjection,
     check_projection_options,
@@ -38,23 +39,25 @@ def fully_fused_projection(
     calc_compensations: bool = False,
     camera_model: str = "pinhole",
     opacities: Tensor | None = None,
+    *,
+    compensation_floor: float = COMPENSATION_FLOOR,
 ) -> DenseProjection | PackedProjection:
     """Project Gaussians to image ellipses, as gsplat 1.5.3 does.
 
     Args:
         means: [..., N, 3]; `...` are any batch dimensions, the same everywhere.
         covars: upper triangles [..., N, 6], or None with quats and scales given.
-        quats: [..., N, 4] wxyz, of any length but zero.
-        scales: [..., N, 3].
+        quats: [..., N, 4] wxyz, of any length but zero. scales: [..., N, 3].
         viewmats: world to camera [..., C, 4, 4], OpenCV axes. Ks: [..., C, 3, 3] in pixels, without skew.
         eps2d: blur in pixels² added to the diagonal of the 2D covariance.
         near_plane, far_plane: a Gaussian whose centre's z lies outside is culled.
         radius_clip: a Gaussian with both radii at or below this many pixels is culled.
         packed: one row per Gaussian that is not culled.
-        calc_compensations: also sqrt(max(0.005², det Σ / det (Σ + blur))) (Yu et al. 2024).
+        calc_compensations: also max(compensation_floor, sqrt(det Σ / det (Σ + blur))) (Yu et al. 2024).
         camera_model: "pinhole" (Jacobian clamped at 1.3 times the field of view), "ortho" or "fisheye" (equidistant).
         opacities: [..., N]; makes the box as tight as the opacity allows, min(3.33, sqrt(2 ln(255 o))) standard
             deviations, and culls Gaussians that cannot reach an alpha of 1/255.
+        compensation_floor: 0.005 as in gsplat 1.6, or another (1.5.3 has 0); where it holds there is no gradient.
 
     Returns:
         `DenseProjection` (radii, means2d, depths, conics, compensations), zero where culled, or `PackedProjection`.
@@ -67,12 +70,11 @@ def fully_fused_projection(
     """
     inputs = (means, covars, quats, scales, opacities, viewmats, Ks)
     batch_dims = check_projection_tensors(*inputs)
-    check_projection_options(width, height, sparse_grad, camera_model)
-    outputs = torch.ops.gsplat_core.project_gaussians(
+    check_projection_options(width, height, sparse_grad, camera_model, compensation_floor)
+    means2d, depths, conics, compensations, radii = torch.ops.gsplat_core.project_gaussians(
         *_flat(math.prod(batch_dims), *inputs), width, height, eps2d, near_plane, far_plane, radius_clip,
-        calc_compensations, CAMERA_MODELS.index(camera_model),
+        calc_compensations, CAMERA_MODELS.index(camera_model), compensation_floor,
     )  # fmt: skip
-    means2d, depths, conics, compensations, radii = outputs
     rows = (*batch_dims, viewmats.shape[-3], means.shape[-2])
     dense = DenseProjection(
         radii.reshape(*rows, 2), means2d.reshape(*rows, 2), depths.reshape(rows), conics.reshape(*rows, 3),
@@ -109,7 +111,7 @@ def _flat(
 
 @torch.library.register_fake("gsplat_core::project_gaussians")
 def _fake(*arguments: Any) -> tuple[Tensor, ...]:
-    means, _, _, _, _, viewmats, *_, compensate, _ = arguments
+    means, viewmats, compensate = arguments[0], arguments[5], arguments[13]  # arguments at their defaults are left out
     b, n, _ = means.shape
     c = viewmats.shape[1]
     return (
@@ -123,7 +125,7 @@ def _fake(*arguments: Any) -> tuple[Tensor, ...]:
 
 @torch.library.register_fake("gsplat_core::project_gaussians_backward")
 def _fake_backward(*arguments: Any) -> tuple[Tensor, ...]:
-    means, covars, _, _, viewmats, *_, needs_viewmats = arguments
+    means, covars, viewmats, needs_viewmats = arguments[0], arguments[1], arguments[4], arguments[15]
     b, n, _ = means.shape
     return (
         means.new_empty((b, n, 3)),
@@ -139,6 +141,7 @@ def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(means, covars, quats, scales, viewmats, Ks, output[4])
     ctx.width, ctx.height, ctx.eps2d, ctx.compensate, ctx.camera_model = *inputs[7:10], inputs[13], inputs[14]
+    ctx.compensation_floor = inputs[15]
 
 
 def _backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
@@ -148,6 +151,7 @@ def _backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
     v_means, v_covars, v_quats, v_scales, v_viewmats = torch.ops.gsplat_core.project_gaussians_backward(
         means, covars, quats, scales, viewmats, Ks, radii, v_means2d, v_depths, v_conics,
         v_compensations if ctx.compensate else None, ctx.width, ctx.height, ctx.eps2d, ctx.camera_model, needs[5],
+        ctx.compensation_floor,
     )  # fmt: skip
     return (
         v_means if needs[0] else None,
@@ -156,7 +160,7 @@ def _backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
         v_scales if needs[3] else None,
         None,
         v_viewmats if needs[5] else None,
-        *[None] * 9,
+        *[None] * 10,
     )
 
 

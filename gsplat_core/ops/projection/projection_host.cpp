@@ -105,13 +105,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians(Tensor mean
                                                                      Tensor viewmats, Tensor intrinsics, int64_t width,
                                                                      int64_t height, double eps2d, double near_plane,
                                                                      double far_plane, double radius_clip, bool compensate,
-                                                                     int64_t camera_model) {
+                                                                     int64_t camera_model, double compensation_floor) {
   const Call call(means);
   Scene scene(call, means, covars, quats, scales, opacities, viewmats, intrinsics);
   ProjectionInput& in = scene.input;
   in.width = float(width), in.height = float(height), in.eps2d = float(eps2d);
   in.near_plane = float(near_plane), in.far_plane = float(far_plane), in.radius_clip = float(radius_clip);
-  in.model = CameraModel(camera_model);
+  in.model = CameraModel(camera_model), in.compensation_floor = float(compensation_floor);
   const auto [B, C, N] = scene.size;
   Tensor radii = call.empty({B, C, N, 2}, ScalarType::Int), means2d = call.empty({B, C, N, 2}), depths = call.empty({B, C, N}),
          conics = call.empty({B, C, N, 3}), compensations = compensate ? call.empty({B, C, N}) : call.empty({0});
@@ -125,11 +125,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians(Tensor mean
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> project_gaussians_backward(
     Tensor means, OptionalTensor covars, OptionalTensor quats, OptionalTensor scales, Tensor viewmats, Tensor intrinsics,
     Tensor radii_, OptionalTensor v_means2d_, OptionalTensor v_depths_, OptionalTensor v_conics_, OptionalTensor v_compensations_,
-    int64_t width, int64_t height, double eps2d, int64_t camera_model, bool needs_viewmats) {
+    int64_t width, int64_t height, double eps2d, int64_t camera_model, bool needs_viewmats, double compensation_floor) {
   Call call(means);
   Scene scene(call, means, covars, quats, scales, std::nullopt, viewmats, intrinsics);
   ProjectionInput& in = scene.input;
   in.width = float(width), in.height = float(height), in.eps2d = float(eps2d), in.model = CameraModel(camera_model);
+  in.compensation_floor = float(compensation_floor);
   const auto [B, C, N] = scene.size;
   const int64_t rows = B * C * N;
   const Tensor radii = call.ints(radii_, "radii");

@@ -91,8 +91,8 @@ GSPLAT_INLINE Ellipse ellipse_of(const View<model>& view, const ImagePoint& imag
   return e;
 }
 
-GSPLAT_INLINE vfloat compensation_of(const Ellipse& e, vfloat det) {
-  return sqrt(max((e.a0 * e.c0 - e.b * e.b) / det, splat(gsplat::kCompensationFloor * gsplat::kCompensationFloor)));
+GSPLAT_INLINE vfloat compensation_of(const Ellipse& e, vfloat det, float floor) {
+  return sqrt(max((e.a0 * e.c0 - e.b * e.b) / det, splat(floor * floor)));
 }
 
 struct Projected {
@@ -117,7 +117,7 @@ GSPLAT_INLINE Projected project(const ProjectionInput& in, const View<model>& vi
   valid &= finite(out.conic[0]) & finite(out.conic[1]) & finite(out.conic[2]);
 
   vfloat extent = splat(gsplat::kMaxExtentSigmas);
-  if (compensate) out.compensation = compensation_of(e, det);
+  if (compensate) out.compensation = compensation_of(e, det, in.compensation_floor);
   if (opacity != nullptr) {
     const vfloat effective = compensate ? *opacity * out.compensation : *opacity;
     valid &= (effective >= gsplat::kAlphaCutoff) & finite(effective);
@@ -135,10 +135,11 @@ GSPLAT_INLINE Projected project(const ProjectionInput& in, const View<model>& vi
   return out;
 }
 
-// Gradient of the blurred 2D covariance, as a symmetric matrix (xx, xy, yy), from those of its inverse and compensation.
-GSPLAT_INLINE void covariance2d_gradient(const Ellipse& e, float eps2d, const vfloat v_conic[3], bool compensate,
+// Gradient of the blurred 2D covariance, as a symmetric matrix (xx, xy, yy), from those of its inverse and compensation. At its
+// floor the compensation has no gradient.
+GSPLAT_INLINE void covariance2d_gradient(const Ellipse& e, const ProjectionInput& in, const vfloat v_conic[3], bool compensate,
                                          vfloat v_compensation, vfloat g[3]) {
-  const vfloat a = e.a0 + eps2d, c = e.c0 + eps2d, b = e.b;
+  const vfloat a = e.a0 + in.eps2d, c = e.c0 + in.eps2d, b = e.b;
   const vfloat det = a * c - b * b, inverse = 1.0f / det;
   const vfloat x = c * inverse, y = -b * inverse, z = a * inverse;  // the conic X; the gradient is -X V X
   const vfloat v0 = v_conic[0], v1 = 0.5f * v_conic[1], v2 = v_conic[2];
@@ -148,7 +149,7 @@ GSPLAT_INLINE void covariance2d_gradient(const Ellipse& e, float eps2d, const vf
   g[2] = -(y * m01 + z * m11);
   if (compensate) {
     const vfloat ratio = (e.a0 * e.c0 - b * b) * inverse;
-    const vint free = ratio > gsplat::kCompensationFloor * gsplat::kCompensationFloor;
+    const vint free = ratio > in.compensation_floor * in.compensation_floor;
     const vfloat v_ratio = select(free, 0.5f * v_compensation / sqrt(select(free, ratio, splat(1.0f))), vfloat{}) * inverse;
     g[0] += v_ratio * (e.c0 - ratio * c);
     g[1] += v_ratio * b * (ratio - 1);
@@ -219,7 +220,7 @@ GSPLAT_INLINE BackProjected project_backward(const ProjectionInput& in, const Vi
   const ImagePoint image = Projector<model>::forward(view.k, p);
   const Ellipse e = ellipse_of(view, image, geometry.sigma);
   vfloat g[3];
-  covariance2d_gradient(e, in.eps2d, v.conic, compensate, v.compensation, g);
+  covariance2d_gradient(e, in, v.conic, compensate, v.compensation, g);
   return project_backward(in, view, mean, geometry, p, image, e, g, v.means2d, v.depth, needs_viewmat);
 }
 

@@ -16,6 +16,7 @@ constexpr unsigned kWholeWarp = 0xffffffffu;
 // The inputs of projection for one batch and one camera.
 __device__ inline ProjectionInput seen_by(const Scene& scene, int64_t batch, int64_t image) {
   ProjectionInput in = scene.projection;
+  in.compensation_floor = kCompensationFloor;  // so that the compiler knows it
   const int64_t row = batch * scene.gaussians;
   in.means += 3 * row;
   if (in.covars != nullptr) {

@@ -72,11 +72,12 @@ __device__ inline BackProjected project_back(const Scene& scene, const Projectio
     // The opacity blended is the product with the compensation, and the first moment its dL/d log.
     float more[3], v_compensation = 0;
     if (scene.antialiased) {
-      const float a = e.a0 + in.eps2d, c = e.c0 + in.eps2d, compensation = compensation_of(e, a * c - e.b * e.b);
+      const float a = e.a0 + in.eps2d, c = e.c0 + in.eps2d, det = a * c - e.b * e.b;
+      const float compensation = compensation_of(e, det, in.compensation_floor);
       v_compensation = fmaf(v.opacity, opacity, v.moments[0] / compensation);
       v_opacity += v.opacity * compensation;
     }
-    covariance2d_gradient(e, in.eps2d, v.conic, scene.antialiased, v_compensation, more);
+    covariance2d_gradient(e, in, v.conic, scene.antialiased, v_compensation, more);
     for (int k = 0; k < 3; ++k) g[k] += more[k];
   }
   if (!scene.antialiased) v_opacity += v.opacity;

@@ -32,6 +32,7 @@ class Scene:
     tile_size: int = 16
     backgrounds: Tensor | None = None
     masks: Tensor | None = None
+    max_alpha: float = 0.99
 
     def lists(self) -> tuple[Tensor, Tensor]:
         """The CPU's lists: every splat in every tile that its contour may touch, in the order of its index."""
@@ -59,7 +60,7 @@ class Scene:
             if (value := getattr(self, name)) is not None
         }
         masks = None if self.masks is None else self.masks.to(device)
-        named = dict(backgrounds=inputs.get("backgrounds"), masks=masks, absgrad=absgrad)
+        named = dict(backgrounds=inputs.get("backgrounds"), masks=masks, absgrad=absgrad, max_alpha=self.max_alpha)
         splats = [inputs[name] for name in ("means2d", "conics", "colors", "opacities")]
         lists = [t.to(device) for t in self.lists()]
         image, alphas = rasterize(*splats, self.width, self.height, self.tile_size, *lists, **named)
@@ -278,7 +279,8 @@ def test_strided_inputs_and_a_side_stream() -> None:
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
 @pytest.mark.parametrize("background", [True, False])
-def test_ops_pass_opcheck(background: bool) -> None:
+@pytest.mark.parametrize("limit", [(), (0.999,)])
+def test_ops_pass_opcheck(background: bool, limit: tuple[float, ...]) -> None:
     s = scene(30, 20, 18)
     lists = [t.cuda() for t in s.lists()]
     splats = [t[0].cuda().requires_grad_() for t in (s.means2d, s.conics, s.colors, s.opacities)]
@@ -286,9 +288,9 @@ def test_ops_pass_opcheck(background: bool) -> None:
     masks = torch.ones(1, 2, 2, dtype=torch.bool, device="cuda") if background else None
     probe = torch.zeros(30, 2, device="cuda", requires_grad=True) if background else None
     ops, size = torch.ops.gsplat_core, (s.width, s.height, 16)
-    torch.library.opcheck(ops.composite.default, (*splats, *lists, behind, masks, probe, *size))
+    torch.library.opcheck(ops.composite.default, (*splats, *lists, behind, masks, probe, *size, *limit))
     with torch.no_grad():
         plain = [t.detach() for t in splats]
-        image, alphas, last = ops.composite(*plain, *lists, behind, masks, None, *size)
-        args = (*plain, *lists, behind, masks, *size, alphas, last, image, alphas, background)
+        image, alphas, last = ops.composite(*plain, *lists, behind, masks, None, *size, *limit)
+        args = (*plain, *lists, behind, masks, *size, alphas, last, image, alphas, background, *limit)
         torch.library.opcheck(ops.composite_backward.default, args)

@@ -28,7 +28,8 @@ def project(function, scene, covars=False, **options):
     for leaf in leaves:
         leaf.requires_grad_()
     out = function(
-        scene.means, *geometry, scene.viewmats, scene.Ks, scene.width, scene.height, opacities=scene.opacities, **options
+        scene.means, *geometry, scene.viewmats, scene.Ks, scene.width, scene.height,
+        **({"opacities": scene.opacities} | options),
     )  # fmt: skip
     g = torch.Generator().manual_seed(5)
     terms = [(t * torch.rand(t.shape, generator=g, dtype=torch.float64).to(t)).sum() for t in out[1:] if t is not None]
@@ -122,22 +123,40 @@ def test_what_it_cannot_take_is_refused(gpu, make_scene):
         }))  # fmt: skip
 
 
-def test_opcheck(gpu, make_scene):
+@pytest.mark.parametrize("floor", [(), (0.0,)])
+def test_opcheck(gpu, make_scene, floor):
     scene = to_gpu(make_scene(10), gpu)
     leaves = [t[None].detach().requires_grad_() for t in (scene.means, scene.quats, scene.scales, scene.viewmats)]
     torch.library.opcheck(
         torch.ops.gsplat_core.project_gaussians,
-        (leaves[0], None, leaves[1], leaves[2], None, leaves[3], scene.Ks[None], 52, 37, 0.3, 0.01, 1e10, 0.0, True, 0),
+        (
+            leaves[0],
+            None,
+            leaves[1],
+            leaves[2],
+            None,
+            leaves[3],
+            scene.Ks[None],
+            52,
+            37,
+            0.3,
+            0.01,
+            1e10,
+            0.0,
+            True,
+            0,
+            *floor,
+        ),
     )
     means, quats, scales, viewmats = (t.detach() for t in leaves)
     ops, size = torch.ops.gsplat_core, (52, 37, 0.3)
     seen = ops.project_gaussians(
-        means, None, quats, scales, None, viewmats, scene.Ks[None], *size, 0.01, 1e10, 0.0, True, 0
+        means, None, quats, scales, None, viewmats, scene.Ks[None], *size, 0.01, 1e10, 0.0, True, 0, *floor
     )
     covars = reference.quat_scale_to_covar_preci(quats, scales, compute_preci=False, triu=True)[0]
     for geometry in ((None, quats, scales), (covars, None, None)):
         inputs = (means, *geometry, viewmats, scene.Ks[None], seen[4])
-        torch.library.opcheck(ops.project_gaussians_backward.default, (*inputs, *seen[:4], *size, 0, True))
+        torch.library.opcheck(ops.project_gaussians_backward.default, (*inputs, *seen[:4], *size, 0, True, *floor))
         torch.library.opcheck(
-            ops.project_gaussians_backward.default, (*inputs, seen[0], None, None, None, *size, 1, False)
+            ops.project_gaussians_backward.default, (*inputs, seen[0], None, None, None, *size, 1, False, *floor)
         )

@@ -173,6 +173,23 @@ def test_the_tile_size_and_subclasses_are_left_to_the_chain(make_scene, calls):
 
 
 @pytest.mark.parametrize("packed", [False, True])
+def test_other_constants_are_left_to_the_chain(make_scene, calls, packed):
+    scene = make_scene(60)
+    scene.opacities[::2] = 1.0
+    scene.means[0], scene.scales[0] = torch.tensor([0.1, 0.2, 2.0]), 1.0  # before all others, and large beside the blur
+    options = {"packed": packed, "rasterize_mode": "antialiased", "render_mode": "RGB+ED"}
+    leaves, shape = inputs(scene), {"width": scene.width, "height": scene.height, "sh_degree": 3}
+    alphas = {}
+    for version in ("1.6", "1.5.3"):
+        alphas[version] = rasterization(**leaves, Ks=scene.Ks.float().cuda(), **shape, **options, constants=version)[1]
+        cpu = {name: t.detach().double().cpu() for name, t in leaves.items()}
+        wanted = reference.rasterization(**cpu, Ks=scene.Ks, **shape, **options, constants=version)[1]
+        torch.testing.assert_close(alphas[version].double().cpu(), wanted, rtol=1e-3, atol=1e-4)
+    assert calls == [True, False]
+    assert (alphas["1.5.3"] - alphas["1.6"]).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("packed", [False, True])
 def test_opcheck(make_scene, packed):
     scene = make_scene(30, cameras=2)
     t = {name: value.detach() for name, value in inputs(scene).items()}

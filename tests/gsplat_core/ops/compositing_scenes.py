@@ -30,6 +30,7 @@ class Scene:
     tile_size: int = 16
     backgrounds: Tensor | None = None
     masks: Tensor | None = None
+    max_alpha: float = 0.99
 
     def lists(self) -> tuple[Tensor, Tensor]:
         """Every splat in every tile that its contour may touch, in the order of its index."""
@@ -50,7 +51,7 @@ class Scene:
             for name in ("means2d", "conics", "colors", "opacities", "backgrounds")
             if (value := getattr(self, name)) is not None
         }
-        named = dict(backgrounds=inputs.get("backgrounds"), masks=self.masks, absgrad=absgrad)
+        named = dict(backgrounds=inputs.get("backgrounds"), masks=self.masks, absgrad=absgrad, max_alpha=self.max_alpha)
         splats = [inputs[name] for name in ("means2d", "conics", "colors", "opacities")]
         image, alphas = rasterize(*splats, self.width, self.height, self.tile_size, *self.lists(), **named)
         random = torch.Generator().manual_seed(11)

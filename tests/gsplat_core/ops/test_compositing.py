@@ -215,6 +215,9 @@ def test_wrong_arguments_are_named() -> None:
         rasterize_to_pixels(s.means2d, s.conics, s.colors, s.opacities, *rest, backgrounds=torch.zeros(3))
     with pytest.raises(InvalidInput, match="do not cover the image"):
         rasterize_to_pixels(s.means2d, s.conics, s.colors, s.opacities, 500, 45, 16, offsets, flatten_ids)
+    for most in (0.0, 1.0, math.nan):
+        with pytest.raises(InvalidInput, match="max_alpha must be from 1/255"):
+            rasterize_to_pixels(s.means2d, s.conics, s.colors, s.opacities, *rest, max_alpha=most)
     with pytest.raises(RuntimeError, match="flatten_ids must be in"):
         rasterize_to_pixels(s.means2d, s.conics, s.colors, s.opacities, *rest[:4], flatten_ids + 5)
     with pytest.raises(RuntimeError, match="isect_offsets must rise"):
@@ -223,7 +226,8 @@ def test_wrong_arguments_are_named() -> None:
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
 @pytest.mark.parametrize("background", [True, False])
-def test_ops_pass_opcheck(background: bool) -> None:
+@pytest.mark.parametrize("limit", [(), (0.999,)])
+def test_ops_pass_opcheck(background: bool, limit: tuple[float, ...]) -> None:
     s = scene(30, 20, 18)
     offsets, flatten_ids = s.lists()
     splats = [t[0].requires_grad_() for t in (s.means2d, s.conics, s.colors, s.opacities)]
@@ -232,11 +236,13 @@ def test_ops_pass_opcheck(background: bool) -> None:
     probe = torch.zeros(30, 2, requires_grad=True) if background else None
     ops = torch.ops.gsplat_core
     torch.library.opcheck(
-        ops.composite.default, (*splats, offsets, flatten_ids, behind, masks, probe, s.width, s.height, 16)
+        ops.composite.default, (*splats, offsets, flatten_ids, behind, masks, probe, s.width, s.height, 16, *limit)
     )
     with torch.no_grad():
         plain = [t.detach() for t in splats]
-        image, alphas, last = ops.composite(*plain, offsets, flatten_ids, behind, masks, None, s.width, s.height, 16)
+        image, alphas, last = ops.composite(
+            *plain, offsets, flatten_ids, behind, masks, None, s.width, s.height, 16, *limit
+        )
         torch.library.opcheck(
             ops.composite_backward.default,
             (
@@ -253,5 +259,6 @@ def test_ops_pass_opcheck(background: bool) -> None:
                 image,
                 alphas,
                 background,
+                *limit,
             ),
         )

@@ -30,8 +30,7 @@ def project(function, scene, weights_seed=None, covars=False, **options):
         scene.Ks,
         scene.width,
         scene.height,
-        opacities=scene.opacities,
-        **options,
+        **({"opacities": scene.opacities} | options),
     )
     if weights_seed is None:
         return out, None
@@ -251,7 +250,8 @@ def test_reference_gradcheck(make_scene, model):
 # opcheck itself reads .grad of tensors that are not leaves.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.parametrize("covars", [False, True])
-def test_opcheck(make_scene, covars):
+@pytest.mark.parametrize("floor", [(), (0.0,)])
+def test_opcheck(make_scene, covars, floor):
     scene = make_scene(9, cameras=2).to(torch.float32)
     triu = reference.quat_scale_to_covar_preci(scene.quats, scene.scales, triu=True)[0]
     means, quats, scales, viewmats = (
@@ -260,7 +260,7 @@ def test_opcheck(make_scene, covars):
     geometry = (triu[None].requires_grad_(), None, None) if covars else (None, quats, scales)
     arguments = (
         means, *geometry, scene.opacities[None], viewmats, scene.Ks[None], scene.width, scene.height,
-        0.3, 0.01, 1e10, 0.0, True, 2,
+        0.3, 0.01, 1e10, 0.0, True, 2, *floor,
     )  # fmt: skip
     torch.library.opcheck(torch.ops.gsplat_core.project_gaussians, arguments)
     means2d, depths, _, compensations, radii = torch.ops.gsplat_core.project_gaussians(*arguments)
@@ -269,6 +269,6 @@ def test_opcheck(make_scene, covars):
         torch.ops.gsplat_core.project_gaussians_backward,
         (
             *detached, scene.Ks[None], radii, means2d.detach(), depths.detach(), None, compensations.detach(),
-            scene.width, scene.height, 0.3, 2, True,
+            scene.width, scene.height, 0.3, 2, True, *floor,
         ),
     )  # fmt: skip
