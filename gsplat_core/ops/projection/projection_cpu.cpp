@@ -1,7 +1,7 @@
 #include "projection.h"
 #include "projection_math.h"
-#include "transposed_rows.h"
 #include "simd.h"
+#include "transposed_rows.h"
 
 namespace GSPLAT_ISA::projection {
 
