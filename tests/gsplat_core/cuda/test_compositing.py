@@ -279,7 +279,7 @@ def test_strided_inputs_and_a_side_stream() -> None:
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
 @pytest.mark.parametrize("background", [True, False])
-@pytest.mark.parametrize("limit", [(), (0.999,)])
+@pytest.mark.parametrize("limit", [(), (0.999,)], ids=["default", "0.999"])
 def test_ops_pass_opcheck(background: bool, limit: tuple[float, ...]) -> None:
     s = scene(30, 20, 18)
     lists = [t.cuda() for t in s.lists()]
