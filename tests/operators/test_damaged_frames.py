@@ -12,6 +12,7 @@ from operators.applications.replay import ReplaySettings, replay
 from operators.ingest import SourceResult
 from operators.metrics import QualityResult
 from operators.sinks.video import DisplayResult
+from services.reports.build import build_report
 from tests.gsplat_core.io.recordings import videos
 
 
@@ -29,6 +30,7 @@ def test_damaged_frames_are_shown_and_not_used(damaged: Path, tmp_path: Path, ca
     source, display, quality = (outcome.find(kind) for kind in (SourceResult, DisplayResult, QualityResult))
     assert source is not None and display is not None and quality is not None
     assert (source.frames, source.damaged, display.frames) == (videos.FRAMES, 7, videos.FRAMES)
+    assert build_report(outcome).frames.damaged == 7
     sentence = "7 of 20 frames are damaged (13-19)"
     assert any(sentence in note for note in outcome.notes)
     assert any(sentence in message for message in caplog.messages)  # which reaches the terminal, with --json too
