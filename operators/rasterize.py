@@ -69,7 +69,10 @@ class RasterizeOp(Operator):
             renderer.prepare(scene.model if reads_snapshots else scene.model.as_model())
             output = renderer.render(scene.camera, scene.time_s).result()
             # All three are queued before the first is waited for.
-            image, depth, alpha = _displayed(output.image), HostCopy(output.depth), HostCopy(output.alpha)
+            picture = output.image
+            if scene.frame.exposure != (1.0, 1.0, 1.0):
+                picture = picture * picture.new_tensor(scene.frame.exposure)
+            image, depth, alpha = _displayed(picture), HostCopy(output.depth), HostCopy(output.alpha)
             rendered = RenderedFrame(
                 frame=scene.frame,
                 image=image.numpy(),

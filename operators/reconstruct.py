@@ -39,7 +39,7 @@ class ReconstructOp(Operator):
 
     Params:
         make_reconstructor: called in `start()`; what it returns is owned by this operator alone.
-        held_out: frames for which it answers True are passed on with the newest model and never trained on. Damaged frames are too.
+        held_out: frames for which it answers True are passed on with the newest model and never trained on. Damaged and withheld frames are too.
     """
 
     def __init__(
@@ -79,7 +79,8 @@ class ReconstructOp(Operator):
         assert self._reconstructor is not None
         frame = op_input.receive("frame")
         # Without a first frame there is no model that a held-out one could be shown with.
-        train = self.newest is None or not (frame.status is FrameStatus.DAMAGED or self.held_out(frame))
+        kept_out = frame.status is FrameStatus.DAMAGED or frame.withheld is not None or self.held_out(frame)
+        train = self.newest is None or not kept_out
         report = self._reconstructor.observe(frame, train=train)
         # A held-out frame changes no parameter, but the model's time window now reaches it.
         self.newest = self._reconstructor.publish()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
@@ -43,6 +44,16 @@ class Frame:
     status: FrameStatus = FrameStatus.REPLAY
     damage: str | None = None
     """What is wrong with a damaged frame."""
+    arrived_ns: int | None = None
+    """When a live frame came in, in nanoseconds of `time.monotonic_ns`; None where time plays no part."""
+    loss_mask: NDArray[np.uint8] | None = None
+    """[H, W]; 0 = left out of the loss though it may be tissue: highlights, outside of the field of view. None: nothing is left out."""
+    exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """How bright red, green and blue of this picture are beside the scene's own colours, which are those of the stream's first frames."""
+    withheld: str | None = None
+    """Why the frame is kept from training, in a word or two ("blur", "out of body"); None: it may be trained on."""
+    new_scene: str | None = None
+    """Why the scene is another one from this frame on ("cut", "resized"); None: it goes on."""
 
     def __post_init__(self) -> None:
         image = self.image
@@ -55,11 +66,13 @@ class Frame:
             raise InvalidInput(
                 f"frame {self.seq}: right image {list(self.right_image.shape)} differs from left {list(image.shape)}"
             )
-        for name, plane in (("depth", self.depth), ("mask", self.mask)):
+        for name, plane in (("depth", self.depth), ("mask", self.mask), ("loss_mask", self.loss_mask)):
             if plane is not None and plane.shape != size:
                 raise InvalidInput(f"frame {self.seq}: {name} is {list(plane.shape)}, the image is {list(size)}")
         if self.pose is not None and self.pose.shape != (4, 4):
             raise InvalidInput(f"frame {self.seq}: pose must be [4, 4] world-to-camera, got {list(self.pose.shape)}")
+        if not all(math.isfinite(gain) and gain > 0 for gain in self.exposure):
+            raise InvalidInput(f"frame {self.seq}: exposure must be three positive numbers, got {self.exposure}")
 
     @property
     def time_s(self) -> float:

@@ -32,7 +32,7 @@ class Observation:
 
     @staticmethod
     def of(frame: Frame, camera: Camera, device: torch.device | str = "cpu") -> Observation:
-        """A frame seen by `camera`, which has the frame's size; the frame's own pose wins over the camera's.
+        """A frame seen by `camera`, which has the frame's size; the frame's own pose wins over the camera's, and its exposure is taken out.
 
         The copy to another `device` than the CPU is queued on its current stream.
         """
@@ -42,11 +42,16 @@ class Observation:
                 " scale the camera with Camera.scaled"
             )
         mask = np.ones(frame.image.shape[:2], np.uint8) if frame.mask is None else frame.mask
+        if frame.loss_mask is not None:
+            mask = mask & frame.loss_mask
+        image = frame.image
+        if frame.exposure != (1.0, 1.0, 1.0):
+            image = np.rint(np.clip(image / np.array(frame.exposure, np.float32), 0, 255)).astype(np.uint8)
         return Observation(
             seq=frame.seq,
             time_s=frame.time_s,
             camera=camera if frame.pose is None else camera.with_pose(frame.pose),
-            image=tensor_of(frame.image, device),
+            image=tensor_of(image, device),
             mask=tensor_of(mask.astype(np.uint8, copy=False), device),
             depth=None if frame.depth is None else tensor_of(known_depth(frame.depth), device),
         )
