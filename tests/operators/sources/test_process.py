@@ -24,69 +24,10 @@ from operators.sources.source import FrameSource, SourceState
 SOON_S = 30.0
 ROOT = Path(__file__).resolve().parents[3]
 
-STAND_IN = '''
-"""A source that does what its address says, in whatever process it is."""
-import logging, os, signal, sys, time
-import numpy as np
-from gsplat_core.errors import InvalidSetting
-from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
-from operators.sources.live import LiveSource
-from operators.sources.source import SourceDescription
-
-class StandIn(LiveSource):
-    def __init__(self, steps):
-        super().__init__(waiting=64)
-        self.steps = steps
-        self.description = SourceDescription("stand-in", 24, 16, 25.0, Camera.from_focal(30.0, 24, 16), notes=("assumed",))
-
-    def frames(self):
-        seq = 0
-        for step in self.steps:
-            what, _, value = step.partition("=")
-            if what == "frames":
-                for _ in range(int(value)):
-                    yield Frame(seq, seq * 40_000_000, np.full((16, 24, 3), seq % 256, np.uint8))
-                    seq += 1
-            elif what == "size":
-                side = int(value)
-                yield Frame(seq, seq * 40_000_000, np.full((side, side, 3), seq % 256, np.uint8))
-                seq += 1
-            elif what == "crash":
-                time.sleep(0.3)
-                os.kill(os.getpid(), getattr(signal, value))
-            elif what == "once":  # fails the first time only
-                if not os.path.exists(value):
-                    open(value, "w").close()
-                    time.sleep(0.3)
-                    os.kill(os.getpid(), signal.SIGSEGV)
-            elif what == "raise":
-                time.sleep(0.3)
-                raise ValueError(value)
-            elif what == "lost":
-                self.lost(value)
-            elif what == "log":
-                logging.getLogger("stand-in").warning(value)
-            elif what == "block":
-                time.sleep(1000)
-
-def opener(address, options):
-    if address.startswith("refuse"):
-        raise InvalidSetting(address)
-    if address.startswith("break"):
-        raise RuntimeError("out of order")
-    if address.startswith("silent"):
-        time.sleep(1000)
-    if address.startswith("exit"):
-        os._exit(3)
-    return StandIn(address.split(","))
-'''
-
 
 @pytest.fixture
-def stand_in(tmp_path, monkeypatch):
-    (tmp_path / "stand_in_source.py").write_text(STAND_IN)
-    monkeypatch.syspath_prepend(str(tmp_path))
+def stand_in(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
     made = []
 
     def make(address, **more):
@@ -290,8 +231,8 @@ time.sleep(1000)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_when_the_parent_dies_the_process_ends(stand_in, tmp_path, number):
-    env = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
+def test_when_the_parent_dies_the_process_ends(number):
+    env = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{Path(__file__).parent}"}
     with subprocess.Popen(
         [sys.executable, "-c", PARENT], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=env
     ) as parent:
