@@ -35,12 +35,13 @@ from operators.applications.replay import PIXELS_PER_GAUSSIAN, REPORT_RESERVE_BY
 from operators.applications.result import RunOutcome, RunSettings
 from operators.applications.session import Session
 from operators.deform import DeformOp
-from operators.display import DisplayOp, DisplaySettings
+from operators.display import DisplayOp, DisplaySettings, labelled
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.frame_log import FRAMES_FILE, FrameLog
 from operators.graph import Application, MultiThreadScheduler, Operator
 from operators.ingest import SourceOp
 from operators.live_reconstruct import LiveReconstructOp
+from operators.messages import PictureState
 from operators.metrics import ScoredFrame
 from operators.on_screen import OnScreenMetricsOp
 from operators.rasterize import RasterizeOp
@@ -51,7 +52,7 @@ from operators.sources.source import FrameSource
 from operators.storage import StorageReserve
 from operators.tool_mask import RecordedToolMaskOp
 
-SWITCH_INTERVAL_S = 0.0005
+SWITCH_INTERVAL_S = 0.0002
 """How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
 LIVE_WINDOW_FRAMES = 150
 LIVE_BUMP_SPACING_S = 0.1
@@ -167,8 +168,10 @@ class LiveApplication(Application):
         )
         self.metrics = OnScreenMetricsOp(self, name="on_screen", log=FrameLog(out / FRAMES_FILE, reserve))
         self.add_flow(last, self.reconstruct, {("frame", "frame")})
-        self.add_flow(self.reconstruct, deform, {("reconstruction", "reconstruction")}, policy="drop_oldest")
-        self.add_flow(deform, rasterize, {("scene", "scene")}, policy="drop_oldest")
+        self.add_flow(
+            self.reconstruct, deform, {("reconstruction", "reconstruction")}, policy="drop_oldest", capacity=2
+        )
+        self.add_flow(deform, rasterize, {("scene", "scene")}, policy="drop_oldest", capacity=2)
         self.add_flow(rasterize, self.display, {("rendered", "rendered")})
         self.add_flow(last, self.metrics, {("frame", "frame")})
         self.add_flow(self.display, self.metrics, {("shown", "shown")})
@@ -231,7 +234,9 @@ def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
     check_renderer(settings.renderer, settings.device)
     source = open_source(
         settings.source,
-        SourceOptions(settings.scale, settings.max_frames),
+        SourceOptions(
+            settings.scale, settings.max_frames, realtime=True, loop=settings.loop, fps=settings.fps, process=True
+        ),
     )
     check_picture(source.description.camera, settings.scale)
     notes.extend(source.description.notes)
@@ -264,6 +269,7 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> None:
             renderer.prepare(reconstructor.publish())
             renderer.render(camera, seq * 0.033).result()
             reconstructor.rehearse(2)
+    labelled(noise, PictureState.LIVE, 0)
 
 
 @contextmanager

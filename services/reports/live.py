@@ -27,7 +27,7 @@ def live_facts(outcome: RunOutcome) -> LiveFacts | None:
         age_max_ms=round(age.max_ms, 2),
         first_picture_ms=_rounded(screen.first_picture_ms),
         states=screen.states,
-        dropped=outcome.dropped_by_edge,
+        dropped=_passed_over(outcome, training),
         withheld=training.withheld,
         scenes=training.scenes,
         frames_trained=training.frames,
@@ -36,6 +36,13 @@ def live_facts(outcome: RunOutcome) -> LiveFacts | None:
         unscored=scores.unscored,
         not_on_screen=scores.not_on_screen,
     )
+
+
+def _passed_over(outcome: RunOutcome, training: TrainingCounts) -> dict[str, int]:
+    counts = dict(outcome.dropped_by_edge)
+    if training.passed_over:
+        counts["reconstruct"] = training.passed_over
+    return counts
 
 
 def _rounded(value: float | None) -> float | None:

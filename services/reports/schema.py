@@ -144,7 +144,7 @@ class LiveFacts(_Part):
     states: dict[str, Count]
     """How often what was shown went over into each state."""
     dropped: dict[str, Count]
-    """Frames and pictures that gave way to newer ones, by the edge of the graph where they did."""
+    """Frames, pictures and figures that gave way to newer ones, by the edge of the graph, or the operator, where they did."""
     withheld: dict[str, Count]
     """Frames that were shown and not trained on, by reason."""
     scenes: dict[str, Count]
