@@ -117,18 +117,25 @@ ORIGINAL = fused_step.frame_loss, photometric.image_loss
 
 
 @functools.cache
-def frames_of(path: Path, scale: float):  # type: ignore[no-untyped-def]
+def frames_of(path: Path, scale: float, crop: tuple[int, ...] | None):  # type: ignore[no-untyped-def]
     recording = open_recording(path, scale=scale)
-    return recording, list(recording)
+    frames, camera = list(recording), recording.camera
+    if crop:
+        x, y, width, height = crop
+        inside = slice(y, y + height), slice(x, x + width)
+        frames = [f.with_fields(image=f.image[inside], mask=None if f.mask is None else f.mask[inside]) for f in frames]
+        intrinsics = camera.K.copy()
+        intrinsics[:2, 2] -= x, y
+        camera = dataclasses.replace(camera, K=intrinsics, width_px=width, height_px=height)
+    return camera, frames
 
 
 class Run:
-    def __init__(self, options: Options, root: Path, scale: float, device: str) -> None:
+    def __init__(self, options: Options, root: Path, scale: float, device: str, crop=None) -> None:  # type: ignore[no-untyped-def]
         self.options, self.device = options, torch.device(device)
-        recording, frames = frames_of(root / (options.recording or "cutting"), scale)
-        self.camera = recording.camera
-        pixels = recording.width_px * recording.height_px
-        count = round(options.gaussians * (pixels / (640 * 512) if scale < 1 else 1))
+        self.camera, frames = frames_of(root / (options.recording or "cutting"), scale, crop)
+        pixels = self.camera.width_px * self.camera.height_px
+        count = round(options.gaussians * (pixels / (640 * 512) if scale < 1 or crop else 1))
         count = min(count, round(pixels / PIXELS_PER_GAUSSIAN))
         kind_rates = BasisLearningRates if options.field == "basis" else HexPlaneLearningRates
         base, defaults = LearningRates(), kind_rates()
@@ -271,6 +278,7 @@ def main() -> None:
     parser.add_argument("--configs-file")
     parser.add_argument("--recording", default="cutting")
     parser.add_argument("--scale", type=float, default=1.0)
+    parser.add_argument("--crop", type=int, nargs=4, help="x y width height of a part of the picture")
     parser.add_argument("--seconds", type=float)
     parser.add_argument("--steps", type=int)
     parser.add_argument("--device", default="cpu")
@@ -290,7 +298,9 @@ def main() -> None:
         values.setdefault("recording", options.recording)
         values.setdefault("name", line)
         try:
-            run = Run(Options(**values), root, options.scale, options.device)
+            run = Run(
+                Options(**values), root, options.scale, options.device, tuple(options.crop) if options.crop else None
+            )
             run(options.seconds, options.steps, list(options.moments))
             del run
         except Exception as error:
