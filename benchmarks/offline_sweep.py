@@ -73,8 +73,8 @@ class Options:
 
 
 def use_loss(name: str) -> None:
-    """Swap the loss of both step kinds for one in plain torch (l2, huber), or back."""
-    if name == "l1":
+    """Swap the loss of both step kinds for one in plain torch (huber…), or back."""
+    if name in ("l1", "l2"):
         fused_step.frame_loss, photometric.image_loss = ORIGINAL
         return
 
@@ -82,8 +82,6 @@ def use_loss(name: str) -> None:
         inside = (mask > 0)[..., None].to(image.dtype)
         error = (image - target.to(image.dtype) / 255) * inside
         count = 3 * inside.sum().clamp(min=1)
-        if name == "l2":
-            return 50 * error.square().sum() / count, 100 * error / count  # as steep as L1 at 0.01: Adam's epsilon
         delta = float(name.removeprefix("huber"))  # error / sqrt(error² + delta²)
         root = (error.square() + delta**2).sqrt()
         return (root - delta).sum() / count, error / root / count
@@ -145,7 +143,7 @@ class Run:
         of_field = {n: options.field_rates.get(n, v) * options.rate for n, v in vars(defaults).items()}
         config = ReconstructorConfig(
             field=options.field, gaussians=count, max_gaussians=2 * count, bump_spacing_s=options.spacing,
-            ssim_weight=options.ssim, rates=LearningRates(**rates, field=kind_rates(**of_field)),
+            ssim_weight=options.ssim, squared_error=options.loss == "l2", rates=LearningRates(**rates, field=kind_rates(**of_field)),
         )  # fmt: skip
         self.train = [(f, Observation.of(f, self.camera, self.device)) for f in frames if not is_heldout(f.seq)]
         self.held = [Observation.of(f, self.camera, self.device) for f in frames if is_heldout(f.seq)]

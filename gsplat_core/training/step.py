@@ -37,7 +37,7 @@ class TrainingStep:
         self.gaussians = gaussians
         self.field = field
         self._rates = config.rates
-        self._weights = LossWeights(config.ssim_weight, config.depth_weight)
+        self._weights = LossWeights(config.ssim_weight, config.depth_weight, config.squared_error)
         # World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres.
         centre = camera.viewmat.to(gaussians.device)
         distance = (
