@@ -29,8 +29,9 @@ from gsplat_core.deformation.hexplane import HexPlaneField
 from gsplat_core.deformation.hexplane_kind import HexPlaneLearningRates
 from gsplat_core.io.recordings import is_heldout, open_recording
 from gsplat_core.rendering.rasterization import render
-from gsplat_core.training import fused_step, photometric
+from gsplat_core.training import densification, fused_step, photometric
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
+from gsplat_core.training.densification import densify, shares_of
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
@@ -68,6 +69,12 @@ class Options:
     static: float = 0.0
     """Share of the steps at first that leaves the field alone."""
     seed: int = 0
+    densify: int = 0
+    """Rounds of densification."""
+    most: int = 0
+    """Gaussians at its end, at full size."""
+    until: float = 0.5
+    unseen: float = 0.05
     cloned_from: int = 0
     beta2: float = 0.999
 
@@ -147,6 +154,8 @@ class Run:
         )  # fmt: skip
         self.train = [(f, Observation.of(f, self.camera, self.device)) for f in frames if not is_heldout(f.seq)]
         self.held = [Observation.of(f, self.camera, self.device) for f in frames if is_heldout(f.seq)]
+        self.most = round(count * options.most / options.gaussians)
+        self.first_count = count
         self.learning = Reconstructor(config, self.camera, seed=options.seed, device=self.device)
         first, last = self.train[0], self.train[-1]
         if options.field == "hexplane" and options.hexplane:
@@ -210,6 +219,13 @@ class Run:
             torch._foreach_copy_(self.parameters(), now)
         return {name: round(value, 2) for name, value in result.items()}
 
+    def densify(self, random: np.random.Generator, done: float) -> None:
+        chosen = [self.train[i][1] for i in random.permutation(len(self.train))[:16]]
+        count = round(self.first_count + (self.most - self.first_count) * done)
+        densification.UNSEEN_PX = self.options.unseen
+        densify(self.step, shares_of(self.step, chosen), count)
+        self.average = None
+
     def smooth_field(self, rate: float) -> None:
         """Towards the mean of the neighbours in time, and towards zero."""
         if not isinstance(self.step.field, BasisField):
@@ -230,6 +246,8 @@ class Run:
         elapsed, done, share = 0.0, 0, 0.0
         use_loss(options.loss)
         every = 10
+        rounds = [options.until * (k + 1) / options.densify for k in range(options.densify)]
+        total = len(rounds)
         field_rates = self.step._field_rates
         started = time.perf_counter()
         while True:
@@ -243,6 +261,9 @@ class Run:
                 started = time.perf_counter()
             if share >= 1:
                 return
+            if rounds and share >= rounds[0]:
+                rounds.pop(0)
+                self.densify(random, (total - len(rounds)) / total)
             if not order:
                 order = random.permutation(len(self.train)).tolist()
             rate = self.rate_at(share)
