@@ -12,6 +12,7 @@ import argparse
 import json
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 FIGURES = (
@@ -30,6 +31,7 @@ def run_live(name: str, source: str, fps: str | None, arguments: argparse.Namesp
     command += ["--fps", fps] if fps else []
     command += ["--seconds", str(arguments.seconds)] if arguments.seconds else []
     command += ["--loop"] if arguments.loop else []
+    command += ["--out", str(arguments.keep / name)] if arguments.keep else []
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode != 0:
         return {"name": name, "rc": done.returncode, "error": done.stderr[-2000:]}
@@ -49,6 +51,7 @@ def main() -> None:
     parser.add_argument("--budget-ms", default="auto")
     parser.add_argument("--seconds", type=float)
     parser.add_argument("--loop", action="store_true")
+    parser.add_argument("--keep", type=Path, help="keep each run's folder in this one")
     arguments = parser.parse_args()
     for entry in arguments.runs:
         name, _, source = entry.partition("=")
