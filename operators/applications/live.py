@@ -1,7 +1,7 @@
 """Live: a stream is reconstructed and shown beside a clock, without an end.
 
-    source → analysis … → tool_mask ─┬─► reconstruct → deform → rasterize → display ─┬─► sinks
-                                     └───────────────────────► on_screen ◄───────────┘
+    source → sequence → tool_mask → scene ─┬─► reconstruct → deform → rasterize → display ─┬─► sinks
+                                           └───────────────────────► on_screen ◄───────────┘
 
 Each operator has a thread of its own. The newest frame wins wherever one comes too late: into `reconstruct`, into `rasterize` and into
 `display`; every frame that is passed over is counted by the edge. What is shown says how old it is.
@@ -31,6 +31,7 @@ from operators.applications.delivery import Report, delivered
 from operators.applications.device import check_device, seeded
 from operators.applications.finishing import saves_model
 from operators.applications.limits import check_max_frames, check_picture, check_scale, check_seed
+from operators.applications.live_analysis import analysis_operators
 from operators.applications.replay import PIXELS_PER_GAUSSIAN, REPORT_RESERVE_BYTES
 from operators.applications.result import RunOutcome, RunSettings
 from operators.applications.session import Session
@@ -50,7 +51,6 @@ from operators.sinks.keyframes import KeyframesOp
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource
 from operators.storage import StorageReserve
-from operators.tool_mask import RecordedToolMaskOp
 
 SWITCH_INTERVAL_S = 0.0002
 """How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
@@ -79,6 +79,8 @@ class LiveSettings:
     """Play a recording again and again."""
     fps: float | None = None
     """Play a recording at this rate instead of its own."""
+    tool_mask: str = "builtin"
+    """How tools are found in frames that come without a mask (`operators.tool_mask.TOOL_MASKS`)."""
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
     display: DisplaySettings = dataclasses.field(default_factory=DisplaySettings)
     training: LiveTraining = dataclasses.field(default_factory=LiveTraining)
@@ -148,7 +150,7 @@ class LiveApplication(Application):
         reserve = StorageReserve(out, self.room_to_finish)
         self.source_op = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
         last: Operator = self.source_op
-        for operator in self._analysis():
+        for operator in analysis_operators(self, settings.tool_mask):
             self.add_flow(last, operator, {("frame", "frame")})
             last = operator
         self.reconstruct = LiveReconstructOp(
@@ -184,10 +186,6 @@ class LiveApplication(Application):
             report = self._on_scored
             progress = CallbackSinkOp(self, name="progress", callback=lambda scored: report(self, scored))
             self.add_flow(self.metrics, progress, {("scored", "message")}, policy="drop_oldest")
-
-    def _analysis(self) -> list[Operator]:
-        """What looks at each frame before it is trained on, in order."""
-        return [RecordedToolMaskOp(self, name="tool_mask")]
 
     def room_to_finish(self) -> int:
         """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
