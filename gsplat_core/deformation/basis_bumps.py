@@ -101,15 +101,18 @@ class BumpTensors(DeformationField):
         self._columns = replace(self._columns, is_ring=True)
         self._history_s = history_s
 
-    def restart(self, time_s: float) -> bool:
-        """See `DeformationField.restart`; the tensors stay where they are."""
-        spacing = self.spacing_s
-        self._time_window_s = checked_window((time_s, time_s + COLUMNS_AHEAD * spacing))
-        self._columns = replace(self._columns, origin_s=time_s - spacing, count=COLUMNS_AHEAD + 3, oldest=0)
-        with torch.no_grad():
-            for tensor, inert in self._tensors_and_fill():
-                tensor.fill_(inert)
-            self.centers.data[: self.count] = self._columns.laid_out(self.centers.data)
+    def restart(self, time_s: float, count: int) -> bool:
+        """See `DeformationField.restart`; there have to be rows for so many Gaussians."""
+        spare_rows = self.weights.shape[0] - count
+        if spare_rows < 0:
+            return False
+        self._spare_rows = spare_rows
+        self._time_window_s = checked_window((time_s, time_s + COLUMNS_AHEAD * self.spacing_s))
+        origin_s = time_s - self.spacing_s
+        self._columns = replace(self._columns, origin_s=origin_s, count=COLUMNS_AHEAD + 3, oldest=0)
+        for tensor, inert in self._tensors_and_fill():
+            tensor.fill_(inert)
+        self.centers.data[:count] = self._columns.laid_out(self.centers.data)
         return True
 
     def extend(self, time_window_s: tuple[float, float], *, hold_at_s: float | None = None) -> None:

@@ -159,8 +159,8 @@ class DeformationField(torch.nn.Module):
         """Let Gaussians leave: the rows in use stay the first ones."""
         self.select(moves.order)
 
-    def restart(self, time_s: float) -> bool:
-        """Become the untrained field of a stream that starts at `time_s`, in place; False where the field cannot do that."""
+    def restart(self, time_s: float, count: int) -> bool:
+        """Become the untrained field of `count` Gaussians and a stream that starts at `time_s`, in place; False where that cannot be."""
         return False
 
 

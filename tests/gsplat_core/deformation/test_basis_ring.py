@@ -52,14 +52,14 @@ def addresses(field: BasisField) -> list[tuple[int, tuple[int, ...]]]:
 def test_a_ring_is_the_field_that_keeps_everything_within_its_history():
     ring, everything = exact(online(6)), exact(online(6, history_s=None))
     newest = 0.0
-    for frame in range(300):
+    for frame in range(200):
         time_s = frame * FRAME_S
         for field in (ring, everything):
             field.cover(time_s, newest)
             # A gradient that does not depend on the field: training on what it shows would amplify rounding.
             field.adam_step(time_s, wave(6, 2 * time_s).double(), BasisRates(centers=0.0, widths=0.0))
         newest = time_s
-    assert everything.bumps > 90 and ring.bumps == ring.columns.places < 25
+    assert everything.bumps > 60 and ring.bumps == ring.columns.places < 25
     start, end = ring.time_window_s
     assert start <= newest - HISTORY_S and end == everything.time_window_s[1]
     for step in range(41):
@@ -80,7 +80,7 @@ def test_a_ring_goes_on_learning():
 def test_the_gradient_is_that_of_the_field_that_keeps_everything():
     ring, everything = exact(online(4)), exact(online(4, history_s=None))
     newest = 0.0
-    for frame in range(150):
+    for frame in range(110):
         for field in (ring, everything):
             watch(field, frame * FRAME_S, newest)
         newest = frame * FRAME_S
@@ -165,7 +165,7 @@ def test_any_order_of_frames_gaps_and_gaussians_agrees_with_the_field_that_keeps
     ring.reserve(capacity)
     ring.cover(0.0, 0.0), everything.cover(0.0, 0.0)
     at, newest = addresses(ring), 0.0
-    for _ in range(120):
+    for _ in range(70):
         action = chance.choice(["frame"] * 6 + ["gap", "add", "copy", "leave"])
         if action in ("frame", "gap"):
             time_s = newest + (chance.uniform(0.3, 1.5) if action == "gap" else FRAME_S)
@@ -221,9 +221,9 @@ def test_restarting_is_a_new_field_in_the_same_memory():
         watch(field, frame * FRAME_S, newest)
         newest = frame * FRAME_S
     at = addresses(field)
-    field.restart(50.0)
+    assert field.restart(50.0, 3)
     fresh = online(3)
-    fresh.restart(50.0)
+    fresh.restart(50.0, 3)
     assert addresses(field) == at and field.config() == fresh.config()
     assert fresh.time_window_s == online(3, start_s=50.0).time_window_s
     for frame in range(80):
@@ -241,7 +241,7 @@ def test_a_saved_ring_is_its_window(tmp_path, make_gaussians):
         watch(field, frame * FRAME_S, newest)
         newest = frame * FRAME_S
     copied = field.detached_copy()
-    assert [tuple(p.shape) for p in copied.parameters()][0] == (5, field.bumps)
+    assert tuple(copied.centers.shape) == (5, field.bumps)
     window = (field.time_window_s[0], newest)
     save_bundle(Model(1, gaussians, copied, Camera.from_focal(30.0, 32, 24), window), tmp_path / "model")
     loaded = load_bundle(tmp_path / "model").field
