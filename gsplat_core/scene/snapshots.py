@@ -95,8 +95,8 @@ class SnapshotSlot:
         return True
 
     def _replace(self, gaussians: Gaussians, field: DeformationField | None) -> None:
-        wanted = max(self._fewest_rows, 1)
-        if gaussians.count > wanted or self._fewest_rows == 0:
+        wanted: float = self._fewest_rows
+        if gaussians.count > wanted or wanted == 0:
             wanted = max(gaussians.count * ROW_HEADROOM, 1)
         rows = math.ceil(wanted / ROW_STEP) * ROW_STEP
         self._gaussians = inert_gaussians(gaussians, rows)

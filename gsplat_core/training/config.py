@@ -89,7 +89,9 @@ class ReconstructorConfig:
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be positive")
         if self.history_s is not None and not 0 < self.history_s < math.inf:
-            raise InvalidSetting(f"history_s is {self.history_s}; it must be a positive number of seconds, or None for all")
+            raise InvalidSetting(
+                f"history_s is {self.history_s}; it must be a positive number of seconds, or None for all"
+            )
         if not 0 <= self.ssim_weight <= 1:
             raise InvalidSetting(f"ssim_weight is {self.ssim_weight}; it must be between 0 and 1")
         if not 0 <= self.depth_weight < math.inf:

@@ -10,7 +10,8 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.observations import Observation, ObservationWindow
-from gsplat_core.training.reconstructor import ObserveReport, Reconstructor
+from gsplat_core.training.observe_report import ObserveReport
+from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.transfers import HostCopy
 
 REHEARSED_IN_FLIGHT = 2

@@ -55,6 +55,8 @@ SWITCH_INTERVAL_S = 0.0005
 """How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
 LIVE_WINDOW_FRAMES = 150
 LIVE_BUMP_SPACING_S = 0.1
+LIVE_HISTORY_S = 6.0
+"""How much of the past stays deformable: what the window holds at 30 frames a second, and the last 5 s rendered again."""
 LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
 """Beside L1: follows motion better. On a CPU a step takes half as long again with it, and steps are what is short there."""
 
@@ -103,6 +105,8 @@ class LiveSettings:
             field=self.field,
             window_frames=LIVE_WINDOW_FRAMES,
             bump_spacing_s=LIVE_BUMP_SPACING_S,
+            history_s=LIVE_HISTORY_S,
+            preallocate=True,
             ssim_weight=LIVE_SSIM_WEIGHT[self.device],
         )
         most = max(64, pixels // PIXELS_PER_GAUSSIAN)
