@@ -20,6 +20,8 @@ from torch import Tensor
 
 from gsplat_core.deformation.basis_adam import BasisRates, Moments
 from gsplat_core.deformation.basis_columns import INERT, bump_capacity, columns_to_change, laid_out, with_columns
+from gsplat_core.deformation.basis_shift import shifted_bumps_
+from gsplat_core.deformation.continuation import Continuation
 from gsplat_core.deformation.field import DeformationField, checked_window, count_of, ops_for
 from gsplat_core.deformation.field_slots import BasisSlot
 from gsplat_core.errors import InvalidInput
@@ -46,6 +48,7 @@ class BasisField(DeformationField):
 
     kind = "basis"
     slot_type = BasisSlot
+    continues = True
 
     def __init__(
         self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26, spacing_s: float | None = None
@@ -93,7 +96,11 @@ class BasisField(DeformationField):
 
     def deltas(self, time_s: float) -> Tensor:
         """What the field adds at `time_s`: [N, 13] position, rotation, log-scale, colour. Differentiable."""
-        return cast(Tensor, self._ops.basis_field(self.centers, self.log_widths, self.weights, self.tau(time_s)))
+        past = self.continuation
+        bumps_s = time_s if past is None else min(time_s, past.from_s)
+        deltas = cast(Tensor, self._ops.basis_field(self.centers, self.log_widths, self.weights, self.tau(bumps_s)))
+        added = None if past is None else past.added(time_s, self.count)
+        return deltas if added is None else deltas + added[:, :BASIS_CHANNELS]
 
     def displaced(self, gaussians: Gaussians, deltas: Tensor) -> Gaussians:
         """The Gaussians with `deltas` [N, 13] added; differentiable in both."""
@@ -167,7 +174,20 @@ class BasisField(DeformationField):
             parameters = (p.data for p in self._parameters_in_order())
             return cast(Tensor, self._ops.basis_field(*parameters, tau, padded=True))
 
-        return at
+        return at if self.continuation is None else self.continuation.captured(at)
+
+    def continue_with(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
+        """See `DeformationField.continue_with`."""
+        continuation = Continuation(self.count, self.weights.device)
+        continuation.write(velocity, from_s, horizon_s)
+        continuation.set_clock(self.tau, self._spacing_s)
+        self.continuation = continuation
+
+    def move_at(self, time_s: float, change: Tensor) -> bool:
+        """See `DeformationField.move_at`: each bump's weight changes in proportion to its height then, the smallest change that does it."""
+        with torch.no_grad():
+            shifted_bumps_(self.centers.data, self.log_widths.data, self.weights.data, self.tau(time_s), change)
+        return True
 
     def training_tensors(self) -> tuple[Tensor, ...]:
         """Everything that `adam_step_at` changes: parameters, both moments of each, updates per bump. Made where they are not yet.

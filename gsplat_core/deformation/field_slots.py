@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.deformation.basis_columns import INERT, INERT_CENTER, bump_capacity
+from gsplat_core.deformation.continuation import Continuation
 
 if TYPE_CHECKING:
     from gsplat_core.deformation.basis import BasisField
@@ -69,6 +70,8 @@ class BasisSlot:
             self.field = type(source)(rows, source.time_window_s, bumps=bump_capacity(source.bumps))
         self.field.requires_grad_(False)
         self.field.centers.data.fill_(INERT_CENTER)
+        if source.continuation is not None:
+            self.field.continuation = Continuation(rows, source.weights.device)
         self._used = 0, 0
         self._in_use: list[Tensor] = [tensor.data[:0, :0] for tensor in self.field.parameters()]
 
@@ -82,6 +85,8 @@ class BasisSlot:
         """Copy the bumps and the layout of the columns, and make inert what an earlier state had used beyond them."""
         if not isinstance(source, type(self.field)):
             return False
+        if source.continuation is not None and self.field.continuation is None:
+            return False
         count, bumps = source.count, source.bumps
         if count > self.field.count or bumps > self.field.bumps:
             return False
@@ -91,7 +96,19 @@ class BasisSlot:
         copy_each(self._in_use, [values[:, :bumps] for values in theirs])
         for name in ("_time_window_s", "_origin_s", "_spacing_s"):
             setattr(self.field, name, getattr(source, name))
+        self._continue(source.continuation)
         return True
+
+    def _continue(self, source: Continuation | None) -> None:
+        """Continue as `source` does, or not at all."""
+        mine = self.field.continuation
+        if mine is None:
+            return
+        if source is None:
+            mine.stop()
+            return
+        mine.write(source.velocity, source.from_s, source.horizon_s)
+        mine.set_clock(self.field.tau, self.field.spacing_s)
 
     def _use(self, count: int, bumps: int) -> None:
         """Choose the part of every tensor that is written, and make inert what an earlier state had used beyond it."""
@@ -110,4 +127,6 @@ class BasisSlot:
         count, bumps = self._used
         copied = self.field.detached_copy()
         copied._set_parameters(*(p.data[:count, :bumps] for p in copied._parameters_in_order()))
+        if self.field.continuation is not None:
+            copied.continuation = self.field.continuation.of_first(count)
         return copied

@@ -23,6 +23,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.coverage import CapturedCoverage
 from gsplat_core.training.growth import gaussians_for_uncovered_tissue
 from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion_prior
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
@@ -78,6 +79,7 @@ class Reconstructor:
         self._recording_digest = recording_digest
         self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
         self._step: TrainingStep | None = None
+        self._prior: MotionPrior | None = None
         self._coverage: CapturedCoverage | None = None
         self._unsettled: Observation | None = None
         """The frame whose steps are queued; whether their splats fitted the tile lists is not known yet."""
@@ -128,6 +130,10 @@ class Reconstructor:
         self._last_time_s = observation.time_s
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
+        if self._prior is not None:
+            self._prior.observe(
+                frame, observation.time_s, observation.camera, self._step, start_there=self.config.start_from_motion
+            )
         self._window.add(observation)
         if not first:
             self._grow(frame, observation)
@@ -235,7 +241,8 @@ class Reconstructor:
             raise InvalidInput("there is no model yet: observe a frame first")
         self._settle()
         self._version += 1
-        gaussians, field = self._step.copy()
+        with continued(self._step, self._prior):
+            gaussians, field = self._step.copy()
         return Model(
             version=self._version,
             gaussians=gaussians,
@@ -253,14 +260,15 @@ class Reconstructor:
         if self._step is None or self.device.type != "cuda" or not SnapshotSlots.can_hold(self._step.field):
             return self.snapshot()
         self._version += 1
-        return self._slots.publish(
-            self._step.gaussians,
-            self._step.field,
-            version=self._version,
-            camera=self.camera,
-            time_window_s=(self._first_time_s, self._last_time_s),
-            training_digest=self._recording_digest,
-        )
+        with continued(self._step, self._prior):
+            return self._slots.publish(
+                self._step.gaussians,
+                self._step.field,
+                version=self._version,
+                camera=self.camera,
+                time_window_s=(self._first_time_s, self._last_time_s),
+                training_digest=self._recording_digest,
+            )
 
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
         gaussians = gaussians_from_frame(
@@ -278,6 +286,7 @@ class Reconstructor:
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config, self.camera)
+        self._prior = None if end_s is not None else new_motion_prior(self.config.motion_prior, field)
         if self.device.type == "cuda" and SnapshotSlots.can_hold(field):
             self._coverage = CapturedCoverage(self.camera, self.device)
 
