@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -243,14 +244,7 @@ class Reconstructor:
         self._version += 1
         with continued(self._step, self._prior):
             gaussians, field = self._step.copy()
-        return Model(
-            version=self._version,
-            gaussians=gaussians,
-            field=field,
-            camera=self.camera,
-            time_window_s=(self._first_time_s, self._last_time_s),
-            training_digest=self._recording_digest,
-        )
+        return Model(gaussians=gaussians, field=field, **self._facts())
 
     def publish(self) -> Model | Snapshot:
         """The model as it is now, for showing it, with the next version number. As `snapshot`, but on a GPU it is copied into a slot.
@@ -261,14 +255,13 @@ class Reconstructor:
             return self.snapshot()
         self._version += 1
         with continued(self._step, self._prior):
-            return self._slots.publish(
-                self._step.gaussians,
-                self._step.field,
-                version=self._version,
-                camera=self.camera,
-                time_window_s=(self._first_time_s, self._last_time_s),
-                training_digest=self._recording_digest,
-            )
+            return self._slots.publish(self._step.gaussians, self._step.field, **self._facts())
+
+    def _facts(self) -> dict[str, Any]:
+        """What a model or snapshot states beside its tensors."""
+        window_s = self._first_time_s, self._last_time_s
+        digest = self._recording_digest
+        return {"version": self._version, "camera": self.camera, "time_window_s": window_s, "training_digest": digest}
 
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
         gaussians = gaussians_from_frame(
