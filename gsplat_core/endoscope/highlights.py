@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.endoscope.reduced import lowest_and_highest, sampled
 from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
@@ -60,31 +61,28 @@ def without_highlights(image: NDArray[np.uint8], settings: HighlightSettings = D
     """uint8 [H, W], 0 on highlights and 1 elsewhere, of RGB uint8 [H, W, 3]; None where there are none."""
     height, width = image.shape[:2]
     step = -(-max(height, width) // LONG_SIDE_PX)
-    red, green, blue = cv2.split(np.ascontiguousarray(image[::step, ::step]))
-    low = cv2.min(cv2.min(red, green), blue)
-    high = cv2.max(cv2.max(red, green), blue)
+    low, high = lowest_and_highest(sampled(image, step))
     found = (low >= settings.darkest_channel) & (high >= settings.brightest_channel)
     if not found.any():
         return None
-    rows, columns = np.nonzero(found)
-    above = low[rows, columns] - _surroundings(low, high, settings)[rows // SHRINK, columns // SHRINK]
-    kept = above >= settings.above_surroundings
-    if not kept.any() or kept.sum() > settings.most * found.size:
+    least = np.clip(_surroundings(low, high, settings) + settings.above_surroundings, 0, 255).astype(np.uint8)
+    found &= low >= cv2.resize(least, found.shape[::-1])
+    if not 0 < np.count_nonzero(found) <= settings.most * found.size:
         return None
-    highlights = np.zeros(found.shape, np.uint8)
-    highlights[rows[kept], columns[kept]] = 1
+    highlights = found.view(np.uint8)
     grown = max(1, round(settings.grown * max(found.shape)))
-    highlights = cv2.dilate(highlights, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grown + 1, 2 * grown + 1)))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grown + 1, 2 * grown + 1))
+    highlights = np.asarray(cv2.dilate(highlights, disc), np.uint8)
     if step > 1:
-        highlights = cv2.resize(highlights, (width, height), interpolation=cv2.INTER_NEAREST)
-    return np.asarray(highlights ^ 1)
+        highlights = np.asarray(cv2.resize(highlights, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
+    return highlights ^ np.uint8(1)
 
 
 def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8], settings: HighlightSettings) -> NDArray[np.float32]:
     """Mean of the darkest channel around each pixel, SHRINK times smaller (rounded up); what is black does not count."""
     width, height = (-(-side // SHRINK) for side in low.shape[::-1])
-    small, lit = (cv2.resize(plane, (width, height), interpolation=cv2.INTER_AREA) for plane in (low, high))
+    small, lit = (cv2.resize(sampled(plane, 2), (width, height), interpolation=cv2.INTER_AREA) for plane in (low, high))
     weight = (lit >= BLACK).astype(np.float32)
-    side = 2 * int(settings.surroundings * max(small.shape) / 2) + 1
+    side = 2 * int(settings.surroundings * max(width, height) / 2) + 1
     mean = cv2.blur(small * weight, (side, side)) / np.maximum(cv2.blur(weight, (side, side)), 1e-6)
-    return np.asarray(mean)
+    return np.asarray(mean, np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsplat_core.endoscope.field_of_view import FieldOfView, FieldOfViewSettings
@@ -148,6 +148,7 @@ def test_a_dark_surrounding_of_the_tissue_is_no_field(recordings_dir, name):
     assert masks([image] * 3)[-1] is None
 
 
+@settings(deadline=None, max_examples=40)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32))
 def test_no_picture_of_any_size_raises(height, width, seed):
     rng = np.random.default_rng(seed)
