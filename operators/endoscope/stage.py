@@ -24,6 +24,11 @@ class StageCounts:
     found: Mapping[str, int] = field(default_factory=dict)
     """How many frames had what, by reason."""
 
+    @property
+    def name(self) -> str:
+        """The stage's name in reports: that of the class without its ending."""
+        return type(self).__name__.removesuffix("Counts").lower()
+
 
 class Stage:
     """Adds fields to one frame after another; keeps no more state than it needs for that.
