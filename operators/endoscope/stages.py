@@ -8,13 +8,17 @@ from operators.endoscope.cuts import CutStage
 from operators.endoscope.exposure import ExposureStage
 from operators.endoscope.field_of_view import FieldOfViewStage
 from operators.endoscope.highlights import HighlightStage
+from operators.endoscope.interlacing import InterlacingStage
 from operators.endoscope.sequence import MaskAndDepthStage, SequenceStage
 from operators.endoscope.sharpness import SharpnessStage
 from operators.endoscope.stage import Stage
+from operators.endoscope.strip import StripStage
 
 PICTURE_STAGES: dict[str, Callable[[], Stage]] = {
     "sequence": SequenceStage,
+    "interlacing": InterlacingStage,
     "cuts": CutStage,
+    "strip": StripStage,
     "field of view": FieldOfViewStage,
     "highlights": HighlightStage,
     "sharpness": SharpnessStage,
