@@ -206,10 +206,14 @@ class ScoredMean:
         return math.fsum(self._parts) / self.count if self.count else None
 
 
-def frame_quality(seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> FrameQuality:
-    """All measures of one frame, whose images are compared once; arguments as in `psnr_tissue_db`."""
+def frame_quality(
+    seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None, *, similarity: bool = True
+) -> FrameQuality:
+    """All measures of one frame, whose images are compared once; arguments as in `psnr_tissue_db`. Without `similarity` SSIM, which takes
+    longest, is left out."""
     pair = _masked_pair(image, target, mask)
-    return FrameQuality(seq, *pair.psnrs_db(), pair.mean_ssim() if pair.tissue_pixels else math.nan)
+    similar = pair.mean_ssim() if similarity and pair.tissue_pixels else math.nan
+    return FrameQuality(seq, *pair.psnrs_db(), similar)
 
 
 class QualityTracker:
@@ -220,9 +224,11 @@ class QualityTracker:
         """Frames observed, those without tissue among them."""
         self._means = {name: ScoredMean() for name in MEASURES}
 
-    def observe(self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> FrameQuality:
-        """Score one frame and take the result into the means; arguments as in `psnr_tissue_db`."""
-        quality = frame_quality(seq, image, target, mask)
+    def observe(
+        self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None, *, similarity: bool = True
+    ) -> FrameQuality:
+        """Score one frame and take the result into the means; arguments as in `frame_quality`."""
+        quality = frame_quality(seq, image, target, mask, similarity=similarity)
         self.take(quality)
         return quality
 

@@ -117,10 +117,6 @@ def ages_section(report: EvaluationReport) -> str:
     said = f"{live.in_time:,} frames were on the screen before the next one came" + (
         f"; late: {late} frames. " if late else ". "
     )
-    if live.estimated:
-        said += (
-            f"Of {live.estimated:,} late ones the picture was not kept: the raw frame that it showed stands for it. "
-        )
     if live.age_when_shown is not None:
         age_frames = live.age_when_shown.p50_ms * report.recording.fps / 1000
         hold = at_age(report, age_frames)
