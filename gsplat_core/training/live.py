@@ -90,11 +90,18 @@ class LiveReconstructor(Reconstructor):
     def _grow(self, frame: Frame, observation: Observation) -> None:
         pass
 
-    def begin_scene(self, frame: Frame) -> None:
-        """Forget the scene: `frame`, which is observed next, starts another one. The frame may be of another size; versions go on counting."""
+    def forget(self) -> None:
+        """As if no frame had been observed, but for what is known about the device: the memory that was taken, how long a step takes."""
         self._settle()
         self._step = self._coverage = None
+        self._version = 0
         self._window = ObservationWindow(self.config.window_frames, self.config.newest_share, self._seed)
+
+    def begin_scene(self, frame: Frame) -> None:
+        """Forget the scene: `frame`, which is observed next, starts another one. The frame may be of another size; versions go on counting."""
+        version = self._version
+        self.forget()
+        self._version = version
         if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
             self.camera = self.camera.resized(frame.width_px, frame.height_px)
 

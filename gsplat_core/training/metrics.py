@@ -209,11 +209,13 @@ class ScoredMean:
 def frame_quality(
     seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None, *, similarity: bool = True
 ) -> FrameQuality:
-    """All measures of one frame, whose images are compared once; arguments as in `psnr_tissue_db`. Without `similarity` SSIM, which takes
-    longest, is left out."""
+    """All measures of one frame, whose images are compared once; arguments as in `psnr_tissue_db`.
+
+    Without `similarity` SSIM, which takes longest, is left out.
+    """
     pair = _masked_pair(image, target, mask)
-    similar = pair.mean_ssim() if similarity and pair.tissue_pixels else math.nan
-    return FrameQuality(seq, *pair.psnrs_db(), similar)
+    measured = similarity and pair.tissue_pixels
+    return FrameQuality(seq, *pair.psnrs_db(), pair.mean_ssim() if measured else math.nan)
 
 
 class QualityTracker:

@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.evaluation.live import Live, LiveSums
+from gsplat_core.evaluation.live import NOTHING_SHOWN, Live, LiveSums
 from gsplat_core.evaluation.scores import Entry, Record, number
 from gsplat_core.training.metrics import MEASURES, FrameQuality
 from operators.frame_log import read_frames
@@ -48,7 +48,12 @@ def read_live_log(path: Path, record: Record | None = None) -> Live:
     """
     sums = LiveSums(record)
     last_shown: tuple[int, int] | None = None
+    started = False
     for line, following in pairwise(_lines(path)):
+        if not started:
+            for _ in range(line.seq):
+                sums.leave_out(NOTHING_SHOWN)
+            started = True
         shown = line.shown_seq, line.shown_ns
         if shown != last_shown:
             sums.picture(line.age_ms, line.state)

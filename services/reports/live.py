@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from operators.applications.result import RunOutcome
 from operators.display import LiveDisplayResult
+from operators.endoscope.stage import StageCounts
 from operators.live_reconstruct import TrainingCounts
 from operators.on_screen import OnScreenResult
 from services.reports.schema import LiveFacts
@@ -30,6 +31,11 @@ def live_facts(outcome: RunOutcome) -> LiveFacts | None:
         dropped=_passed_over(outcome, training),
         withheld=training.withheld,
         scenes=training.scenes,
+        analysis={
+            part.name: dict(part.found)
+            for part in outcome.parts.values()
+            if isinstance(part, StageCounts) and part.found
+        },
         frames_trained=training.frames,
         steps=training.steps,
         rehearsed_steps=training.rehearsed,

@@ -151,6 +151,8 @@ class LiveFacts(Part):
     """Frames that were shown and not trained on, by reason."""
     scenes: dict[str, Count]
     """How often a new scene began, by reason."""
+    analysis: dict[str, dict[str, Count]] = {}
+    """What was found on frames before they were learned from: by stage and reason."""
     frames_trained: Count
     steps: Count
     """Optimiser steps on the newest frame, before it was shown."""

@@ -7,6 +7,7 @@ import json
 import pytest
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.evaluation.live import NOTHING_SHOWN
 from operators.applications.live_log import NO_FIGURE, NOT_SCORED, is_live_log, read_live_log
 
 MS = 1_000_000
@@ -61,6 +62,11 @@ def test_frames_and_the_pictures_that_were_on_the_screen(log):
 def test_what_has_no_figure_is_counted_by_reason(log):
     found = read_live_log(log(line(0), line(1, None, withheld="blur"), line(2, None), line(7), line(8)))
     assert found.score.left_out == {NO_FIGURE: 1, NOT_SCORED: 4, "withheld": 1} and found.score.frames == 2
+
+
+def test_frames_before_the_first_picture_are_counted(log):
+    found = read_live_log(log(line(4), line(5)))
+    assert found.score.left_out == {NOTHING_SHOWN: 4} and found.score.frames == 1
 
 
 def test_the_first_second_is_left_out_of_the_settled_figures(log):
