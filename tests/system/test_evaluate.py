@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from pathlib import Path
 
 import cv2
@@ -192,3 +193,29 @@ def test_results_go_neither_into_the_run_nor_over_strangers_files(intrasplat, lo
     cv2.imwrite(str(tmp_path / "mine.png"), np.zeros((4, 4, 3), np.uint8))
     assert intrasplat("evaluate", offline, long, "--out", tmp_path).code == 2
     assert [path.name for path in tmp_path.iterdir()] == ["mine.png"]
+
+
+def test_places_are_named_by_their_times(intrasplat, long, offline):
+    report = evaluated(intrasplat, offline, long, "--protocol", "retention", "--place", "0:0.05,0.2:0.3")
+    assert report.retention is not None
+    (place,) = report.retention.places
+    assert (place.again_s, place.first.frames, place.again.frames) == ((0.2, 0.3), 2, 4)
+    for wrong in ("0:1", "a:b,c:d", "0:2,1:3", "0:nan,5:6", "", "0:1:2,3:4"):
+        done = intrasplat("evaluate", offline, long, "--place", wrong)
+        assert done.code == 2 and "such as 0:2,60:62" in done.err, wrong
+
+
+def test_an_interrupted_evaluation_leaves_what_it_reached(long, offline, tmp_path, start):
+    process = start(
+        "evaluate", offline, long, "--protocol", "causal", "--steps-per-frame", 3000, "--out", tmp_path / "out"
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("causal 1/"):
+            break
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    report = EvaluationReport.read(tmp_path / "out" / "evaluation.json")
+    assert report.evaluated.interrupted and any("interrupted" in note for note in report.notes)
+    assert report.causal is not None and report.causal.score.frames < 11
