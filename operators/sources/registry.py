@@ -17,17 +17,20 @@ __all__ = ["SOURCES", "SourceFactory", "SourceOptions", "open_source", "split_ad
 SourceFactory = Callable[[str, SourceOptions], FrameSource]
 """From what follows the scheme, and the options, to a source that is not open yet. Raises a UserError for what cannot be read."""
 
+_URLS = ("rtsp", "rtsps", "rtp", "udp", "tcp", "srt", "rtmp", "rtmps", "http", "https")
+
 SOURCES: Registry[SourceFactory] = Registry(
     "source",
     {
         "recording": "operators.sources.recording:recording_source",
         "realtime": "operators.sources.realtime:realtime_source",
+        **{scheme: f"operators.sources.url:{scheme}_source" for scheme in _URLS},
     },
 )
 
 _OF_PATHS = frozenset({"recording", "realtime", "folder", "v4l2", "pipe", "zmq+ipc"})
 """What follows these schemes is a path, which may begin with a slash."""
-_BLOCKING = frozenset[str]()
+_BLOCKING = frozenset(_URLS)
 """Sources that wait within a library or a driver: they read in a process of their own."""
 
 # Two letters at least: one is a drive. A Path keeps only one of two slashes.
