@@ -24,6 +24,7 @@ SOURCES: Registry[SourceFactory] = Registry(
     {
         "recording": "operators.sources.recording:recording_source",
         "realtime": "operators.sources.realtime:realtime_source",
+        "pipe": "operators.sources.pipe:pipe_source",
         **{scheme: f"operators.sources.url:{scheme}_source" for scheme in _URLS},
     },
 )
