@@ -116,8 +116,6 @@ class SourceOp(Operator):
                 self._states.sentence,
             )
         )
-        for note in self.source.description.notes if isinstance(self.source, ReportingSource) else ():
-            outcome.note(note)
         if counts:
             said = ", ".join(f"{reason} {times}" for reason, times in sorted(counts.items()))
             outcome.note(f"the source {self.source.description.name} dropped or repaired: {said}")

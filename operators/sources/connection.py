@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import av
+import numpy as np
 
 from gsplat_core.io.recordings.decoded import DEPENDS
 from gsplat_core.io.recordings.decoder import PictureConverter, PictureDecoder, captured_log, frame_rate
@@ -105,11 +106,13 @@ class Connection:
                     raise ConnectionFailed(f"a picture of {decoded.width}x{decoded.height} px is too large")
                 arrived_ns = came.get(own, time.monotonic_ns())
                 pts_ns = None if decoded.pts is None else round(decoded.pts * tick * 1_000_000_000)
-                why = damage.of(own)
+                why, image = damage.of(own), self._converter.picture(decoded)
                 yield Frame(
                     seq=seq,
                     pts_ns=arrived_ns if pts_ns is None or abs(pts_ns) > 2**62 else pts_ns,
-                    image=self._converter.picture(decoded),
+                    image=image,
+                    # As in recordings: no pixel of a damaged picture is known to be tissue.
+                    mask=None if why is None else np.zeros(image.shape[:2], np.uint8),
                     arrived_ns=arrived_ns,
                     status=FrameStatus.LIVE if why is None else FrameStatus.DAMAGED,
                     damage=why,
