@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.sessions import SessionInfo, SessionWriter, WriterOptions
-from gsplat_core.io.sessions.records import LostLine
+from gsplat_core.io.sessions.records import MOST_NS, LostLine
 from gsplat_core.io.sessions.schedule import ScheduleLine
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
@@ -180,6 +180,8 @@ class SessionRecorder:
 
     def _lose(self, what: str, seq: int, why: str) -> None:
         self._lost[f"{what}: {why}"] += 1
+        if what == "line" or not 0 <= seq <= MOST_NS:
+            return
         line = LostLine(seq=seq, what=what, why=why)  # type: ignore[arg-type]
         self._put(lambda writer: writer.line(line), "line", seq, 0, 1.0)
 
@@ -228,9 +230,8 @@ class SessionRecorder:
                 self._waiting.popleft()
                 self._waiting_bytes -= size
             self._bytes, self._deleted = writer.bytes, writer.deleted_segments
-            if wrong is None:
-                self._written[what] += 1
-            else:
+            self._written[what] += wrong is None
+            if wrong is not None:
                 self._lose(what, seq, wrong)
 
     def _give_up(self, writer: SessionWriter, why: str) -> None:

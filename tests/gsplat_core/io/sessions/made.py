@@ -26,7 +26,7 @@ def new_frame(seq: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX, **
     pose = np.eye(4)
     pose[:3, 3] = rng.normal(size=3)
     depth = rng.normal(50, 9, size).astype(np.float32)
-    depth[0, :3] = np.nan, np.inf, -0.0
+    depth[0, 0], depth[-1, -1], depth[0, -1] = np.nan, np.inf, -0.0
     known = {
         "seq": seq,
         "pts_ns": seq * 33_333_333 + 5,
