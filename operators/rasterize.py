@@ -73,6 +73,7 @@ class RasterizeOp(Operator):
             if scene.frame.exposure != (1.0, 1.0, 1.0):
                 picture = picture * picture.new_tensor(scene.frame.exposure)
             image, depth, alpha = _displayed(picture), HostCopy(output.depth), HostCopy(output.alpha)
+            made_from = scene.reconstruction
             rendered = RenderedFrame(
                 frame=scene.frame,
                 image=image.numpy(),
@@ -80,6 +81,9 @@ class RasterizeOp(Operator):
                 alpha=alpha.numpy(),
                 model_version=scene.model.version,
                 trained=scene.trained,
+                steps=0 if made_from is None else made_from.steps,
+                content=None if made_from is None else made_from.content,
+                published_ns=None if made_from is None else made_from.published_ns,
             )
         op_output.emit(rendered, "rendered")
 

@@ -100,7 +100,10 @@ class Camera:
         """The same view at another resolution; the intrinsics follow the rounded size exactly."""
         if not factor > 0:
             raise InvalidInput(f"camera: the scale factor must be positive, got {factor}")
-        width_px, height_px = max(1, round(self.width_px * factor)), max(1, round(self.height_px * factor))
+        return self.resized(max(1, round(self.width_px * factor)), max(1, round(self.height_px * factor)))
+
+    def resized(self, width_px: int, height_px: int) -> Camera:
+        """The same view in pictures of another size; where the aspect ratio differs, it is stretched to them."""
         K = self.K.copy()
         K[0] *= width_px / self.width_px
         K[1] *= height_px / self.height_px

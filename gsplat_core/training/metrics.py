@@ -204,15 +204,18 @@ class QualityTracker:
         """Frames observed, those without tissue among them."""
         self._means = {name: ScoredMean() for name in MEASURES}
 
-    def observe(self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> FrameQuality:
-        """Score one frame and take the result into the means; arguments as in `psnr_tissue_db`."""
+    def observe(
+        self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None, *, similarity: bool = True
+    ) -> FrameQuality:
+        """Score one frame and take the result into the means; arguments as in `psnr_tissue_db`. Without `similarity` SSIM, which takes
+        longest, is left out."""
         pair = _masked_pair(image, target, mask)
         squared_error = pair.squared_error()
         quality = FrameQuality(
             seq,
             psnr_tissue_db=_psnr_db(squared_error, pair.tissue_pixels),
             psnr_frame_db=_psnr_db(squared_error, pair.pixels if pair.tissue_pixels else 0),
-            ssim=pair.mean_ssim() if pair.tissue_pixels else math.nan,
+            ssim=pair.mean_ssim() if pair.tissue_pixels and similarity else math.nan,
         )
         self.count += 1
         for name, mean in self._means.items():

@@ -78,6 +78,11 @@ class ObservationWindow:
     def __len__(self) -> int:
         return len(self._frames)
 
+    def draw(self, newest_share: float) -> Observation:
+        """The newest frame with that probability, else any frame of the window."""
+        newest = self._random.random() < newest_share
+        return self._frames[-1 if newest else int(self._random.integers(0, len(self._frames)))]
+
     def schedule(self, steps: int) -> list[Observation]:
         """Observations for the next `steps` steps. The last one is the newest frame, which is about to be shown."""
         if steps < 0:

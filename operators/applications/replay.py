@@ -85,6 +85,11 @@ class ReplaySettings:
         for name in self.sinks:
             SINKS.check(name)
 
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """What the run reads from the disk."""
+        return (Path(self.recording),)
+
     def reconstructor_config(self, pixels: int | None = None) -> ReconstructorConfig:
         """The reconstructor's settings for frames of so many pixels. Raises InvalidSetting."""
         config = ReconstructorConfig(field=self.field)

@@ -11,6 +11,7 @@ from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
     DeviceOption,
     JsonOption,
+    LiveOutOption,
     ModelArgument,
     OutOption,
     RecordingArgument,
@@ -19,6 +20,7 @@ from services.cli.options import (
     RunOptions,
     ScaleOption,
     SeedOption,
+    SourceArgument,
     takes_run_options,
 )
 from services.cli.streams import printable
@@ -108,6 +110,29 @@ def replay(
         **options.settings(),
     )
     return replay_command(settings, as_json=json)
+
+
+@app.command()
+@takes_run_options
+def live(
+    source: SourceArgument,
+    options: RunOptions,
+    out: LiveOutOption = None,
+    budget_ms: Annotated[
+        str, typer.Option(help="Show a frame so many milliseconds after it came: auto, or a number.")
+    ] = "auto",
+    seconds: Annotated[
+        float | None, typer.Option(help="End after so many seconds.", show_default="when the source ends")
+    ] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Play a recording again and again.")] = False,
+    fps: Annotated[float | None, typer.Option(help="Play a recording at this rate.", show_default="its own")] = None,
+    json: JsonOption = False,
+) -> int:
+    """Reconstruct a stream live: show each frame's reconstruction within its time, and say how old it is."""
+    from services.cli.live import live_command, live_settings
+
+    with live_settings(source, out, budget_ms, seconds=seconds, loop=loop, fps=fps, **options.settings()) as settings:
+        return live_command(settings, keep=out is not None, as_json=json)
 
 
 @app.command()

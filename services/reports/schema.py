@@ -124,6 +124,41 @@ class ModelFacts(_Part):
     version: Count
 
 
+class LiveFacts(_Part):
+    """What a live run kept up with, and how old its pictures were."""
+
+    settled_psnr_tissue_db: float | None
+    """Mean after the first second, of what was on the screen when the next frame arrived."""
+    worst_psnr_tissue_db: float | None
+    """The lowest of these."""
+    previous_frame_db: float | None
+    """Mean after the first second of the raw frame before, shown instead."""
+    pictures: Count
+    """New pictures that were shown."""
+    age_p50_ms: float
+    """From a frame's arrival to its picture."""
+    age_p95_ms: float
+    age_p99_ms: float
+    age_max_ms: float
+    first_picture_ms: float | None
+    states: dict[str, Count]
+    """How often what was shown went over into each state."""
+    dropped: dict[str, Count]
+    """Frames and pictures that gave way to newer ones, by the edge of the graph where they did."""
+    withheld: dict[str, Count]
+    """Frames that were shown and not trained on, by reason."""
+    scenes: dict[str, Count]
+    """How often a new scene began, by reason."""
+    frames_trained: Count
+    steps: Count
+    """Optimiser steps on the newest frame, before it was shown."""
+    rehearsed_steps: Count
+    """Optimiser steps on earlier frames."""
+    unscored: Count
+    not_on_screen: Count
+    """Frames whose own picture was not on the screen when the next frame arrived."""
+
+
 class FrameEntry(_Part):
     """One displayed frame."""
 
@@ -135,6 +170,10 @@ class FrameEntry(_Part):
     psnr_frame_db: float | None
     ssim: float | None
     previous_frame_db: float | None
+    age_ms: float | None = None
+    """Live: age of what was on the screen, when it came there."""
+    steps: Count | None = None
+    """Live: optimiser steps before the picture was shown."""
 
 
 class BinEntry(FrameEntry):
@@ -159,6 +198,8 @@ class RunReport(_Part):
     quality: QualityReport
     model: ModelFacts | None
     """Null when the run ended before the first snapshot."""
+    live: LiveFacts | None = None
+    """Null for a run that follows no clock."""
     frames_sha256: Sha256
     notes: list[str] = []
     """Stated fallbacks and what went wrong, in sentences."""
