@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.sessions import WriterOptions
 from gsplat_core.rendering.registry import check_renderer, new_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
@@ -31,6 +32,13 @@ from operators.applications.delivery import Report, delivered
 from operators.applications.device import check_device, seeded
 from operators.applications.finishing import saves_model
 from operators.applications.limits import check_max_frames, check_picture, check_scale, check_seed
+from operators.applications.recording import (
+    new_recorder,
+    record_pictures,
+    recorded_analysis,
+    records_reconstructors,
+    records_schedule,
+)
 from operators.applications.replay import PIXELS_PER_GAUSSIAN, REPORT_RESERVE_BYTES
 from operators.applications.result import RunOutcome, RunSettings
 from operators.applications.session import Session
@@ -78,6 +86,10 @@ class LiveSettings:
     """Play a recording again and again."""
     fps: float | None = None
     """Play a recording at this rate instead of its own."""
+    record: Path | None = None
+    """Record the session into this folder, which is not there yet; None: it is not recorded."""
+    recording: WriterOptions = dataclasses.field(default_factory=WriterOptions)
+    """How it is recorded."""
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
     display: DisplaySettings = dataclasses.field(default_factory=DisplaySettings)
     training: LiveTraining = dataclasses.field(default_factory=LiveTraining)
@@ -146,15 +158,24 @@ class LiveApplication(Application):
         settings, out = self.settings, self.settings.out
         reserve = StorageReserve(out, self.room_to_finish)
         self.source_op = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
+        make_reconstructor = lambda: new_live_reconstructor(settings, self.frame_source)
+        listener, analysis = None, self._analysis()
+        self.recorder = None
+        if settings.record is not None:
+            recorder = new_recorder(settings.record, self.frame_source.description, settings, self.room_to_finish)
+            analysis = recorded_analysis(self, analysis, recorder)
+            make_reconstructor = records_reconstructors(make_reconstructor, settings, recorder)
+            listener, self.recorder = records_schedule(recorder), recorder
         last: Operator = self.source_op
-        for operator in self._analysis():
+        for operator in analysis:
             self.add_flow(last, operator, {("frame", "frame")})
             last = operator
         self.reconstruct = LiveReconstructOp(
             self,
             name="reconstruct",
-            make_reconstructor=lambda: new_live_reconstructor(settings, self.frame_source),
+            make_reconstructor=make_reconstructor,
             clock=self.clock,
+            listener=listener,
         )
         deform = DeformOp(self, name="deform")
         rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
@@ -170,6 +191,8 @@ class LiveApplication(Application):
         self.add_flow(self.reconstruct, deform, {("reconstruction", "reconstruction")}, policy="drop_oldest")
         self.add_flow(deform, rasterize, {("scene", "scene")}, policy="drop_oldest")
         self.add_flow(rasterize, self.display, {("rendered", "rendered")})
+        if self.recorder is not None:
+            record_pictures(self, self.display, self.recorder)
         self.add_flow(last, self.metrics, {("frame", "frame")})
         self.add_flow(self.display, self.metrics, {("shown", "shown")})
         if self._on_shown is not None:

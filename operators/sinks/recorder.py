@@ -1,21 +1,20 @@
-"""The operators that record a session: what came in, and what was shown. `SessionRecorder` writes, in a thread of its own.
+"""The operators that record a session: what came in, what training was given of it, and what was shown. `SessionRecorder` writes, in a
+thread of its own.
 
-    source → out_of_body → recorded_frames → …analysis… → reconstruct → deform → rasterize → display → recorded_pictures
+    source → out_of_body → recorded_frames → analysis … → recorded_preparation → reconstruct → … → display → recorded_pictures
 
-`recorded_frames` stands behind the out-of-body gate, so that nothing that the gate holds back is written. What was trained is handed to the
-same recorder by whoever owns the reconstructor (`SessionRecorder.prepared`, `.line`).
+`recorded_frames` stands behind the out-of-body gate, so that nothing that the gate holds back is written.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
 from operators.graph import Operator, OperatorSpec
-from operators.messages import RenderedFrame
+from operators.messages import ShownPicture
 from operators.outcome import OutcomeBuilder
 from operators.sinks.session_recorder import Recorded, SessionRecorder, stated
 
@@ -63,20 +62,21 @@ class RecordFramesOp(Operator):
         """See `Contributor`."""
         recorded = self.recorder.recorded
         outcome.add(RecordingResult(recorded))
-        if recorded.frames:
-            outcome.output("recording", recorded.folder)
         for sentence in stated(recorded):
             outcome.note(sentence)
 
 
-class RecordPicturesOp(Operator):
-    """Hands each shown picture to the recorder, which was opened elsewhere; never waits.
+class RecordPreparationOp(Operator):
+    """Hands each frame to the recorder as training is about to get it, and passes it on as it is; never waits.
 
     Inputs:
-        rendered: `RenderedFrame`.
+        frame: `Frame`, behind everything that adds to it.
+
+    Outputs:
+        frame: the same.
 
     Params:
-        recorder: where to.
+        recorder: opened by `RecordFramesOp`.
     """
 
     def __init__(self, fragment: Any, *args: Any, recorder: SessionRecorder, **kwargs: Any) -> None:
@@ -84,9 +84,44 @@ class RecordPicturesOp(Operator):
         super().__init__(fragment, *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:
-        spec.input("rendered", type=RenderedFrame)
+        spec.input("frame", type=Frame)
+        spec.output("frame", type=Frame)
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        rendered: RenderedFrame = op_input.receive("rendered")
-        shown_ns = None if rendered.frame.arrived_ns is None else time.monotonic_ns()
-        self.recorder.shown(Shown(rendered.frame, rendered.image, rendered.model_version, shown_ns))
+        frame = op_input.receive("frame")
+        self.recorder.prepared(frame)
+        op_output.emit(frame, "frame")
+
+
+class RecordPicturesOp(Operator):
+    """Hands each shown picture to the recorder; never waits.
+
+    Inputs:
+        shown: `ShownPicture`.
+
+    Params:
+        recorder: opened by `RecordFramesOp`.
+    """
+
+    def __init__(self, fragment: Any, *args: Any, recorder: SessionRecorder, **kwargs: Any) -> None:
+        self.recorder = recorder
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("shown", type=ShownPicture)
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        shown: ShownPicture = op_input.receive("shown")
+        rendered = shown.rendered
+        self.recorder.shown(
+            Shown(
+                frame=rendered.frame,
+                rendered=rendered.image,
+                model_version=rendered.model_version,
+                on_screen=shown.image,
+                new=shown.new,
+                shown_ns=shown.shown_ns,
+                age_ns=shown.age_ns,
+                state=shown.state.value,
+            )
+        )

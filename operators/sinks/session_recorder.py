@@ -129,7 +129,8 @@ class SessionRecorder:
     def shown(self, shown: Shown) -> None:
         """A picture that was shown."""
         with self._changed:
-            self._put(lambda writer: writer.shown(shown), "shown", shown.frame.seq, shown.image.nbytes, SHOWN_SHARE)
+            size = shown.rendered.nbytes if shown.new else 0
+            self._put(lambda writer: writer.shown(shown), "shown", shown.frame.seq, size, SHOWN_SHARE)
 
     @property
     def recorded(self) -> Recorded:
