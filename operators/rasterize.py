@@ -83,6 +83,7 @@ class RasterizeOp(Operator):
                 trained=scene.trained,
                 steps=0 if made_from is None else made_from.steps,
                 content=None if made_from is None else made_from.content,
+                taken_ns=None if made_from is None else made_from.taken_ns,
                 published_ns=None if made_from is None else made_from.published_ns,
             )
         op_output.emit(rendered, "rendered")

@@ -56,8 +56,10 @@ class ReconstructorConfig:
     """Extra steps for a jump, in multiples of the frame's own."""
     bump_spacing_s: float = 0.2
     """The shortest time within which motion changes its course: the time between the basis functions of the basis field."""
+    squared_error: bool = False
+    """Whether colours are compared by the squared error, which PSNR measures, in place of L1."""
     ssim_weight: float = 0.0
-    """Weight of 1 - SSIM beside L1, 0..1."""
+    """Weight of 1 - SSIM beside L1 or the squared error, 0..1."""
     depth_weight: float = 0.02
     """Weight of the inverse-depth term where the recording has depth."""
     default_depth_mm: float = 60.0

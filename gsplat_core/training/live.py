@@ -78,6 +78,18 @@ class LiveReconstructor(Reconstructor):
             self._unsettled = observation
             self._rehearsing.queued()
 
+    def rehearsal_ns(self, steps: int) -> float:
+        """How long so many rehearsal steps usually take, together with those that are still under way; 0 before anything was timed."""
+        return (steps + REHEARSED_IN_FLIGHT) * (self._step_s or 0.0) * 1e9
+
+    def grow(self, frame: Frame) -> None:
+        """Add Gaussians where `frame`, the newest one that was trained on, shows tissue that the model does not cover. `observe` leaves
+        that for the time after the frame was shown."""
+        super()._grow(frame, self._window.newest)
+
+    def _grow(self, frame: Frame, observation: Observation) -> None:
+        pass
+
     def begin_scene(self, frame: Frame) -> None:
         """Forget the scene: `frame`, which is observed next, starts another one. The frame may be of another size; versions go on counting."""
         self._settle()

@@ -75,6 +75,11 @@ class ObservationWindow:
         """Make `observation` the newest; the oldest leaves a full window."""
         self._frames.append(observation)
 
+    @property
+    def newest(self) -> Observation:
+        """The frame that was added last."""
+        return self._frames[-1]
+
     def __len__(self) -> int:
         return len(self._frames)
 

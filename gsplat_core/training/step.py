@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -37,7 +37,7 @@ class TrainingStep:
         self.gaussians = gaussians
         self.field = field
         self._rates = config.rates
-        self._weights = LossWeights(config.ssim_weight, config.depth_weight)
+        self._weights = LossWeights(config.ssim_weight, config.depth_weight, config.squared_error)
         # World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres.
         centre = camera.viewmat.to(gaussians.device)
         distance = (
@@ -102,6 +102,24 @@ class TrainingStep:
         self.gaussians = self.gaussians.append(added)
         self.field.append(added)
         self._adam.append(added.count)
+
+    def split(self, kept: Tensor, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
+        """Keep the Gaussians in `kept` (int64 indices), and put two in the place of each of those at `parents` (indices into `kept`).
+
+        `halves` makes the two; both move as their parent does. The new ones, and their parents' Gaussians, start with fresh moments.
+        """
+        gaussians = self.gaussians.select(kept)
+        first, second = halves(gaussians.select(parents))
+        changed = gaussians.map(Tensor.clone)
+        for name, tensor in changed.tensors().items():
+            tensor[parents] = first.tensors()[name]
+        self.gaussians = changed.append(second)
+        self.field.select(kept)
+        self.field.append(second, parents)
+        self._adam.select(kept)
+        for name in self._adam.first_moments:
+            self._adam.reset(name, parents)
+        self._adam.append(second.count)
 
     def _captured_step(self, captured: FusedStep, observation: Observation, rate_scale: float) -> Tensor:
         if rate_scale != self._scaled_for:

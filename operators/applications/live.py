@@ -1,7 +1,7 @@
 """Live: a stream is reconstructed and shown beside a clock, without an end.
 
-    source → analysis … → tool_mask ─┬─► reconstruct → deform → rasterize → display ─┬─► sinks
-                                     └───────────────────────► on_screen ◄───────────┘
+    source → sequence → tool_mask → scene ─┬─► reconstruct → deform → rasterize → display ─┬─► sinks
+                                           └───────────────────────► on_screen ◄───────────┘
 
 Each operator has a thread of its own. The newest frame wins wherever one comes too late: into `reconstruct`, into `rasterize` and into
 `display`; every frame that is passed over is counted by the edge. What is shown says how old it is.
@@ -32,23 +32,19 @@ from operators.applications.delivery import Report, delivered
 from operators.applications.device import check_device, seeded
 from operators.applications.finishing import saves_model
 from operators.applications.limits import check_max_frames, check_picture, check_scale, check_seed
-from operators.applications.recording import (
-    new_recorder,
-    record_pictures,
-    recorded_analysis,
-    records_reconstructors,
-    records_schedule,
-)
+from operators.applications.live_analysis import analysis_operators
+from operators.applications.recording import RunRecording
 from operators.applications.replay import PIXELS_PER_GAUSSIAN, REPORT_RESERVE_BYTES
 from operators.applications.result import RunOutcome, RunSettings
 from operators.applications.session import Session
 from operators.deform import DeformOp
-from operators.display import DisplayOp, DisplaySettings
+from operators.display import DisplayOp, DisplaySettings, labelled
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.frame_log import FRAMES_FILE, FrameLog
 from operators.graph import Application, MultiThreadScheduler, Operator
 from operators.ingest import SourceOp
 from operators.live_reconstruct import LiveReconstructOp
+from operators.messages import PictureState
 from operators.metrics import ScoredFrame
 from operators.on_screen import OnScreenMetricsOp
 from operators.rasterize import RasterizeOp
@@ -57,9 +53,8 @@ from operators.sinks.keyframes import KeyframesOp
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource
 from operators.storage import StorageReserve
-from operators.tool_mask import RecordedToolMaskOp
 
-SWITCH_INTERVAL_S = 0.0005
+SWITCH_INTERVAL_S = 0.0002
 """How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
 LIVE_WINDOW_FRAMES = 150
 LIVE_BUMP_SPACING_S = 0.1
@@ -90,6 +85,8 @@ class LiveSettings:
     """Record the session into this folder, which is not there yet; None: it is not recorded."""
     recording: WriterOptions = dataclasses.field(default_factory=WriterOptions)
     """How it is recorded."""
+    tool_mask: str = "builtin"
+    """How tools are found in frames that come without a mask (`operators.tool_mask.TOOL_MASKS`)."""
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
     display: DisplaySettings = dataclasses.field(default_factory=DisplaySettings)
     training: LiveTraining = dataclasses.field(default_factory=LiveTraining)
@@ -158,24 +155,17 @@ class LiveApplication(Application):
         settings, out = self.settings, self.settings.out
         reserve = StorageReserve(out, self.room_to_finish)
         self.source_op = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
-        make_reconstructor = lambda: new_live_reconstructor(settings, self.frame_source)
-        listener, analysis = None, self._analysis()
-        self.recorder = None
-        if settings.record is not None:
-            recorder = new_recorder(settings.record, self.frame_source.description, settings, self.room_to_finish)
-            analysis = recorded_analysis(self, analysis, recorder)
-            make_reconstructor = records_reconstructors(make_reconstructor, settings, recorder)
-            listener, self.recorder = records_schedule(recorder), recorder
+        recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
         last: Operator = self.source_op
-        for operator in analysis:
+        for operator in recording.analysis(analysis_operators(self, settings.tool_mask)):
             self.add_flow(last, operator, {("frame", "frame")})
             last = operator
         self.reconstruct = LiveReconstructOp(
             self,
             name="reconstruct",
-            make_reconstructor=make_reconstructor,
+            make_reconstructor=recording.made_by(lambda: new_live_reconstructor(settings, self.frame_source)),
             clock=self.clock,
-            listener=listener,
+            listener=recording.listener,
         )
         deform = DeformOp(self, name="deform")
         rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
@@ -188,11 +178,12 @@ class LiveApplication(Application):
         )
         self.metrics = OnScreenMetricsOp(self, name="on_screen", log=FrameLog(out / FRAMES_FILE, reserve))
         self.add_flow(last, self.reconstruct, {("frame", "frame")})
-        self.add_flow(self.reconstruct, deform, {("reconstruction", "reconstruction")}, policy="drop_oldest")
-        self.add_flow(deform, rasterize, {("scene", "scene")}, policy="drop_oldest")
+        self.add_flow(
+            self.reconstruct, deform, {("reconstruction", "reconstruction")}, policy="drop_oldest", capacity=2
+        )
+        self.add_flow(deform, rasterize, {("scene", "scene")}, policy="drop_oldest", capacity=2)
         self.add_flow(rasterize, self.display, {("rendered", "rendered")})
-        if self.recorder is not None:
-            record_pictures(self, self.display, self.recorder)
+        recording.pictures_of(self.display)
         self.add_flow(last, self.metrics, {("frame", "frame")})
         self.add_flow(self.display, self.metrics, {("shown", "shown")})
         if self._on_shown is not None:
@@ -204,10 +195,6 @@ class LiveApplication(Application):
             report = self._on_scored
             progress = CallbackSinkOp(self, name="progress", callback=lambda scored: report(self, scored))
             self.add_flow(self.metrics, progress, {("scored", "message")}, policy="drop_oldest")
-
-    def _analysis(self) -> list[Operator]:
-        """What looks at each frame before it is trained on, in order."""
-        return [RecordedToolMaskOp(self, name="tool_mask")]
 
     def room_to_finish(self) -> int:
         """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
@@ -254,7 +241,9 @@ def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
     check_renderer(settings.renderer, settings.device)
     source = open_source(
         settings.source,
-        SourceOptions(settings.scale, settings.max_frames),
+        SourceOptions(
+            settings.scale, settings.max_frames, realtime=True, loop=settings.loop, fps=settings.fps, process=True
+        ),
     )
     check_picture(source.description.camera, settings.scale)
     notes.extend(source.description.notes)
@@ -287,6 +276,7 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> None:
             renderer.prepare(reconstructor.publish())
             renderer.render(camera, seq * 0.033).result()
             reconstructor.rehearse(2)
+    labelled(noise, PictureState.LIVE, 0)
 
 
 @contextmanager

@@ -58,59 +58,72 @@ def new_recorder(
     return SessionRecorder(folder, info, settings.recording, reserve=reserve)
 
 
-def recorded_analysis(graph: Application, analysis: list[Operator], recorder: SessionRecorder) -> list[Operator]:
-    """The operators that look at each frame, with those between them that record it: behind the out-of-body gate, and behind all of them."""
-    names = [operator.name for operator in analysis]
-    behind_gate = names.index(GATE) + 1 if GATE in names else 0
-    frames = RecordFramesOp(graph, name="recorded_frames", recorder=recorder)
-    preparation = RecordPreparationOp(graph, name="recorded_preparation", recorder=recorder)
-    return [*analysis[:behind_gate], frames, *analysis[behind_gate:], preparation]
+class RunRecording:
+    """Puts the recording of a live run into its graph. Without a folder to record into it changes nothing."""
 
+    def __init__(
+        self, graph: Application, settings: LiveSettings, source: SourceDescription, room: Callable[[], int]
+    ) -> None:
+        """room: bytes on the disk that finishing the run needs."""
+        self._graph, self._settings = graph, settings
+        self.recorder: SessionRecorder | None = None
+        if settings.record is not None:
+            self.recorder = new_recorder(settings.record, source, settings, room)
 
-def record_pictures(graph: Application, display: Operator, recorder: SessionRecorder) -> None:
-    """Record what `display` shows."""
-    pictures = RecordPicturesOp(graph, name="recorded_pictures", recorder=recorder)
-    graph.add_flow(display, pictures, {("shown", "shown")}, policy="drop_oldest", capacity=8)
+    def analysis(self, operators: list[Operator]) -> list[Operator]:
+        """The operators that look at each frame, with those between them that record it: behind the out-of-body gate, and behind all."""
+        if self.recorder is None:
+            return operators
+        names = [operator.name for operator in operators]
+        behind_gate = names.index(GATE) + 1 if GATE in names else 0
+        frames = RecordFramesOp(self._graph, name="recorded_frames", recorder=self.recorder)
+        preparation = RecordPreparationOp(self._graph, name="recorded_preparation", recorder=self.recorder)
+        return [*operators[:behind_gate], frames, *operators[behind_gate:], preparation]
 
+    def pictures_of(self, display: Operator) -> None:
+        """Record what `display` shows."""
+        if self.recorder is not None:
+            pictures = RecordPicturesOp(self._graph, name="recorded_pictures", recorder=self.recorder)
+            self._graph.add_flow(display, pictures, {("shown", "shown")}, policy="drop_oldest", capacity=8)
 
-def records_schedule(recorder: SessionRecorder) -> ScheduleListener:
-    """Writes every call that changes the model."""
+    @property
+    def listener(self) -> ScheduleListener | None:
+        """Writes every call that changes the model."""
+        if self.recorder is None:
+            return None
+        recorder = self.recorder
+        return lambda event: recorder.line(_line(event))
 
-    def listen(event: ScheduleEvent) -> None:
-        line: ScheduleLine
-        if event.kind == "rehearse":
-            line = Rehearsed(steps=event.steps)
-        elif event.seq is None:
-            return
-        elif event.kind == "begin_scene":
-            line = SceneBegun(seq=event.seq)
-        else:
-            line = Observed(seq=event.seq, steps=event.steps, train=event.train)
-        recorder.line(line)
+    def made_by(self, make: Callable[[], LiveReconstructor]) -> Callable[[], LiveReconstructor]:
+        """`make`, and write what was made."""
+        if self.recorder is None:
+            return make
+        recorder, settings = self.recorder, self._settings
 
-    return listen
-
-
-def records_reconstructors(
-    make: Callable[[], LiveReconstructor], settings: LiveSettings, recorder: SessionRecorder
-) -> Callable[[], LiveReconstructor]:
-    """`make`, and write what was made."""
-
-    def made() -> LiveReconstructor:
-        reconstructor = make()
-        recorder.line(
-            ReconstructorMade(
-                device=settings.device,
-                seed=settings.seed,
-                renderer=settings.renderer,
-                config=_json(reconstructor.config),
-                training=_json(settings.training),
-                camera=camera_record(reconstructor.camera),
+        def made() -> LiveReconstructor:
+            reconstructor = make()
+            recorder.line(
+                ReconstructorMade(
+                    device=settings.device,
+                    seed=settings.seed,
+                    renderer=settings.renderer,
+                    config=_json(reconstructor.config),
+                    training=_json(settings.training),
+                    camera=camera_record(reconstructor.camera),
+                )
             )
-        )
-        return reconstructor
+            return reconstructor
 
-    return made
+        return made
+
+
+def _line(event: ScheduleEvent) -> ScheduleLine:
+    if event.kind == "rehearse":
+        return Rehearsed(steps=event.steps)
+    assert event.seq is not None, f"{event.kind} is of a frame"
+    if event.kind == "begin_scene":
+        return SceneBegun(seq=event.seq)
+    return Observed(seq=event.seq, steps=event.steps, train=event.train)
 
 
 def _json(settings: Any) -> dict[str, Any]:

@@ -235,7 +235,8 @@ def replay(
             inside.stated(online=True),
             command="replay",
             engine=inside.engine,
-            finish=[saves_model(inside.out), measures_baselines(source)],
+            # A session passes frames over, so that what it showed is not the beginning of what it read.
+            finish=[saves_model(inside.out), *([] if followed else [measures_baselines(source)])],
             notes=notes,
             stop_requested=stop_requested,
         ).execute()

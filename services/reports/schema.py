@@ -144,11 +144,13 @@ class LiveFacts(_Part):
     states: dict[str, Count]
     """How often what was shown went over into each state."""
     dropped: dict[str, Count]
-    """Frames and pictures that gave way to newer ones, by the edge of the graph where they did."""
+    """Frames, pictures and figures that gave way to newer ones, by the edge of the graph, or the operator, where they did."""
     withheld: dict[str, Count]
     """Frames that were shown and not trained on, by reason."""
     scenes: dict[str, Count]
     """How often a new scene began, by reason."""
+    analysis: dict[str, dict[str, Count]] = {}
+    """What was found on frames before they were learned from: by stage and reason."""
     frames_trained: Count
     steps: Count
     """Optimiser steps on the newest frame, before it was shown."""

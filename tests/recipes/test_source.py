@@ -95,7 +95,7 @@ def test_what_replay_cannot_use_is_refused_before_anything_is_written(tmp_path):
     for address, options, message in (
         ("pattern://64x48", {}, "pattern has no end; give --max-frames"),
         ("pattern://wide", {"max_frames": 2}, "the size of a pattern is 'wide'"),
-        ("patern://64x48", {"max_frames": 2}, "unknown source 'patern'; known are recording, pattern"),
+        ("patern://64x48", {"max_frames": 2}, "unknown source 'patern'; known are recording, .*pattern"),
     ):
         with pytest.raises(InvalidSetting, match=message):
             replay(ReplaySettings(address, tmp_path / "out", **options))
