@@ -36,7 +36,7 @@ CLOSE_S = 10.0
 """How long `close` waits for what is in the queue."""
 NICENESS = 10
 """How far the thread steps back behind the graph where both want the processor."""
-_SLOW = "the disk is too slow"
+_SLOW = "writing is too slow"
 What = Literal["frame", "prepared", "shown"]
 
 
@@ -139,7 +139,9 @@ class SessionRecorder:
             while self._arrived and next(iter(self._arrived)) <= frame.seq:
                 self._arrived.popitem(last=False)
             # Without `arrived` it is lost, and never written.
-            part = _Part(lambda writer: writer.prepared(frame, arrived or frame), "prepared", frame.seq, _bytes(frame))
+            part = _Part(
+                lambda writer: writer.prepared(frame, arrived or frame), "prepared", frame.seq, _bytes(frame, arrived)
+            )
             if arrived is None:
                 self._lose(part, "the frame itself is not there")
             else:
@@ -267,9 +269,14 @@ class SessionRecorder:
         writer.abandon(why[:1000])
 
 
-def _bytes(frame: Frame) -> int:
-    planes = (frame.image, frame.right_image, frame.depth, frame.mask, frame.loss_mask)
-    return sum(plane.nbytes for plane in planes if plane is not None)
+def _bytes(frame: Frame, arrived: Frame | None = None) -> int:
+    """Of the frame's pictures, but for those that wait already as those of `arrived`."""
+    planes = ("image", "right_image", "depth", "mask", "loss_mask")
+    mine = {id(plane): plane.nbytes for name in planes if (plane := getattr(frame, name)) is not None}
+    others = () if arrived is None else (id(getattr(arrived, name)) for name in planes)
+    for key in others:
+        mine.pop(key, None)
+    return sum(mine.values())
 
 
 def stated(recorded: Recorded) -> list[str]:

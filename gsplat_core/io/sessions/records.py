@@ -129,7 +129,7 @@ class ShownLine(Record):
 
 
 class LostLine(Record):
-    """Something that should stand here and does not, because the disk was too slow for it."""
+    """Something that should stand here and does not, because writing was too slow for it, or because no line can hold it."""
 
     event: Literal["lost"] = "lost"
     seq: Count

@@ -81,7 +81,7 @@ def test_a_slow_disk_loses_frames_says_so_and_makes_nobody_wait(tmp_path, gate):
     assert [frame.seq for frame in frames_of(tmp_path)] == list(range(10))
     lost = [line for _, line in SessionReader(tmp_path / "s").lines() if isinstance(line, LostLine)]
     assert [(line.seq, line.what) for line in lost] == [(seq, "frame") for seq in range(10, 50)]
-    assert recorder.recorded.lost == {"frame: the disk is too slow": 40}
+    assert recorder.recorded.lost == {"frame: writing is too slow": 40}
     assert "40 times" in stated(recorder.recorded)[0]
 
 
@@ -96,7 +96,7 @@ def test_shown_pictures_are_lost_before_frames(tmp_path, gate):
     recorded = recorder.recorded
     assert recorded.frames == 4
     assert recorded.shown < 4
-    assert recorded.lost == {"shown: the disk is too slow": 4 - recorded.shown}
+    assert recorded.lost == {"shown: writing is too slow": 4 - recorded.shown}
 
 
 def test_what_was_prepared_of_a_lost_frame_is_lost_too(tmp_path, gate):
@@ -110,7 +110,7 @@ def test_what_was_prepared_of_a_lost_frame_is_lost_too(tmp_path, gate):
     recorder.close()
     assert [frame.seq for frame in frames_of(tmp_path)] == [0]
     assert recorder.recorded.lost == {
-        "frame: the disk is too slow": 2,
+        "frame: writing is too slow": 2,
         "prepared: the frame itself is not there": 1,
     }
 
