@@ -33,7 +33,9 @@ _FORMAT = "intrasplat-output"
 _COMPLETE, _OLD = ".complete-", ".old-"
 RECORDINGS = "recordings"
 """Holds what runs have recorded, one folder each. It is written as the run goes on, and no later run replaces it."""
-_RESULT = re.compile(r"reconstruction\.mp4|model|frames\.jsonl|report\.json|report\.html|\d{6,}\.png")
+_RESULT = re.compile(
+    r"reconstruction\.mp4|model|frames\.jsonl|report\.json|report\.html|\d{6,}\.png|evaluation\.(?:json|html)|evaluation-\w+\.jsonl"
+)
 """The names of results. In a folder of an earlier version, whose marker lists no files, all of them are ours."""
 
 

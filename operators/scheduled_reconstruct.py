@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from gsplat_core.io.sessions.schedule import Observed, ReconstructorMade, Rehearsed, SceneBegun, ScheduleLine
+from gsplat_core.io.sessions.schedule import Grown, Observed, ReconstructorMade, Rehearsed, SceneBegun, ScheduleLine
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.training.live import LiveReconstructor
 from operators.messages import Reconstruction
@@ -35,16 +35,18 @@ class ScheduledReconstructOp(ReconstructOp):
         self._lines: Iterator[ScheduleLine] = iter(())
         self._due: ScheduleLine | None = None
         self._live: LiveReconstructor | None = None
+        self._observed: Frame | None = None
+        """The frame that was observed last."""
         super().__init__(fragment, *args, make_reconstructor=make_reconstructor, **kwargs)
 
     def start(self) -> None:
-        self.newest = self.missing = self._live = None
+        self.newest = self.missing = self._live = self._observed = None
         self._lines = self.schedule()
         self._due = next(self._lines, None)
 
     def stop(self) -> None:
         super().stop()
-        self._live = None
+        self._live = self._observed = None
         self._lines = iter(())
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
@@ -55,6 +57,7 @@ class ScheduledReconstructOp(ReconstructOp):
         train = observed.train and frame.status is not FrameStatus.DAMAGED
         if self.newest is None and not train:
             return
+        self._observed = frame
         report = self._live.observe(frame, steps=observed.steps, train=train)
         self.newest = self._live.publish()
         op_output.emit(
@@ -78,6 +81,9 @@ class ScheduledReconstructOp(ReconstructOp):
             elif isinstance(line, Rehearsed):
                 if self._live is not None and self._live.gaussians:
                     self._live.rehearse(line.steps)
+            elif isinstance(line, Grown):
+                if self._live is not None and self._observed is not None and line.seq == self._observed.seq:
+                    self._live.grow(self._observed)
             elif line.seq == frame.seq and self._live is not None:
                 self._live.begin_scene(frame)
                 self.newest = None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter
 
 from gsplat_core.io.sessions import SessionInfo
-from gsplat_core.io.sessions.schedule import Observed, ReconstructorMade, Rehearsed, SceneBegun, ScheduleLine
+from gsplat_core.io.sessions.schedule import Grown, Observed, ReconstructorMade, Rehearsed, SceneBegun, ScheduleLine
 from gsplat_core.io.sessions.session_file import camera_record
 from gsplat_core.training.live import LiveReconstructor
 from operators.graph import Application, Operator
@@ -23,7 +23,7 @@ from operators.sources.source import SourceDescription
 from operators.storage import StorageReserve
 
 if TYPE_CHECKING:
-    from operators.applications.live import LiveSettings
+    from operators.applications.live_settings import LiveSettings
 
 GATE = "out_of_body"
 """The operator behind which frames may be recorded."""
@@ -123,6 +123,8 @@ def _line(event: ScheduleEvent) -> ScheduleLine:
     assert event.seq is not None, f"{event.kind} is of a frame"
     if event.kind == "begin_scene":
         return SceneBegun(seq=event.seq)
+    if event.kind == "grow":
+        return Grown(seq=event.seq)
     return Observed(seq=event.seq, steps=event.steps, train=event.train)
 
 

@@ -5,7 +5,7 @@
     lost         something could not be recorded     deleted    an older segment was removed
     note         a sentence                          end        the segment is complete
 
-The lines that say what was trained, `reconstructor`, `observe`, `rehearse` and `begin_scene`, are in `schedule`. A reader leaves out
+The lines that say what was trained, `reconstructor`, `observe`, `grow`, `rehearse` and `begin_scene`, are in `schedule`. A reader leaves out
 lines whose `event` it does not know.
 """
 

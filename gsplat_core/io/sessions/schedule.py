@@ -5,6 +5,7 @@ afterwards. The thread that owns the reconstructor writes a line for each call, 
 
     {"event":"reconstructor","device":"cpu","seed":0,"config":{…},"training":{…},"camera":{…}}   a new one is made
     {"event":"observe","seq":0,"steps":40,"train":true}      observe(frame 0) with so many steps, then publish(): what is shown of it
+    {"event":"grow","seq":0}                                 grow(frame 0): Gaussians where it showed tissue that nothing covers
     {"event":"rehearse","steps":3}                           rehearse(3): further steps on earlier frames
     {"event":"begin_scene","seq":90}                         begin_scene(frame 90), which is observed next
 
@@ -52,6 +53,13 @@ class Observed(Record):
     train: bool
 
 
+class Grown(Record):
+    """`LiveReconstructor.grow` was called with the frame that was observed last."""
+
+    event: Literal["grow"] = "grow"
+    seq: Count
+
+
 class Rehearsed(Record):
     """`LiveReconstructor.rehearse` was called."""
 
@@ -59,5 +67,5 @@ class Rehearsed(Record):
     steps: Steps
 
 
-ScheduleLine = ReconstructorMade | SceneBegun | Observed | Rehearsed
-SCHEDULE_LINES = (ReconstructorMade, SceneBegun, Observed, Rehearsed)
+ScheduleLine = ReconstructorMade | SceneBegun | Observed | Grown | Rehearsed
+SCHEDULE_LINES = (ReconstructorMade, SceneBegun, Observed, Grown, Rehearsed)

@@ -16,7 +16,9 @@ from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.sessions import SessionReader, WriterOptions
 from gsplat_core.io.sessions.schedule import Observed, Rehearsed, SceneBegun
 from gsplat_core.scene.frames import Frame
-from operators.applications.live import LiveApplication, LiveSettings
+from operators.applications.live import LiveApplication
+from operators.applications.live_settings import LiveSettings
+from operators.applications.live_start import warm_up
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.result import RunOutcome
 from operators.applications.session import Session
@@ -70,7 +72,8 @@ def record(folder: Path, change, options: WriterOptions | None = None) -> RunOut
     settings = LiveSettings(
         source="scope", out=folder / "live", record=folder / "session", recording=options or WriterOptions(), seed=3
     )
-    graph = LiveApplication(_Scope(recording, change), settings)
+    source = _Scope(recording, change)
+    graph = LiveApplication(source, settings, warm_up(settings, source))
     return Session(graph, settings.stated(), command="live").execute()
 
 
