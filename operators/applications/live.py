@@ -20,6 +20,7 @@ from operators.applications.limits import check_picture
 from operators.applications.live_analysis import analysis_operators
 from operators.applications.live_settings import LiveSettings
 from operators.applications.live_start import WarmParts, low_latency, warm_up
+from operators.applications.recording import RunRecording
 from operators.applications.replay import REPORT_RESERVE_BYTES
 from operators.applications.result import RunOutcome
 from operators.applications.session import Session
@@ -65,15 +66,17 @@ class LiveApplication(Application):
         settings, out = self.settings, self.settings.out
         reserve = StorageReserve(out, self.room_to_finish)
         self.source_op = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
+        recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
         last: Operator = self.source_op
-        for operator in analysis_operators(self, settings.tool_mask):
+        for operator in recording.analysis(analysis_operators(self, settings.tool_mask)):
             self.add_flow(last, operator, {("frame", "frame")})
             last = operator
         self.reconstruct = LiveReconstructOp(
             self,
             name="reconstruct",
-            make_reconstructor=lambda: self._warm.reconstructor,
+            make_reconstructor=recording.made_by(lambda: self._warm.reconstructor),
             clock=self.clock,
+            listener=recording.listener,
         )
         deform = DeformOp(self, name="deform")
         rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
@@ -92,6 +95,7 @@ class LiveApplication(Application):
         )
         self.add_flow(deform, rasterize, {("scene", "scene")}, policy="drop_oldest", capacity=2)
         self.add_flow(rasterize, self.display, {("rendered", "rendered")})
+        recording.pictures_of(self.display)
         self.add_flow(last, self.metrics, {("frame", "frame")})
         self.add_flow(self.display, self.metrics, {("shown", "shown")})
         if self._on_shown is not None:

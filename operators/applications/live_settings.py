@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.sessions import WriterOptions
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.live import LiveTraining
 from operators.applications.limits import check_max_frames, check_scale, check_seed
@@ -42,6 +43,10 @@ class LiveSettings:
     """Play a recording again and again."""
     fps: float | None = None
     """Play a recording at this rate instead of its own."""
+    record: Path | None = None
+    """Record the session into this folder, which is not there yet; None: it is not recorded."""
+    recording: WriterOptions = dataclasses.field(default_factory=WriterOptions)
+    """How it is recorded."""
     tool_mask: str = "builtin"
     """How tools are found in frames that come without a mask (`operators.tool_mask.TOOL_MASKS`)."""
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
