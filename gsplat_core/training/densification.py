@@ -62,18 +62,18 @@ def densify(step: TrainingStep, shares: Shares, count: int) -> None:
     """Drop the Gaussians that nobody sees, and split those with the largest error until there are `count`."""
     kept = (shares.seen_px >= UNSEEN_PX).nonzero()[:, 0]
     wanted = min(count - len(kept), len(kept))
-    if wanted <= 0:
-        return
-    worst = shares.error[kept].topk(wanted).indices
-    step.split(kept, worst, halves)
+    if wanted > 0:
+        worst = shares.error[kept].argsort(descending=True, stable=True)[:wanted]
+        step.split(kept, worst, halves)
 
 
 def halves(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
     """Two Gaussians in the place of each: apart along the longest axis, smaller, and together about as opaque."""
     longest = parents.log_scales.argmax(1)
-    axis = _turned(parents.quats, torch.nn.functional.one_hot(longest, 3).to(parents.dtype))
+    along = torch.nn.functional.one_hot(longest, 3).to(parents.dtype)
+    axis = _turned(parents.quats, along)
     reach = parents.log_scales.gather(1, longest[:, None]).exp() * APART
-    smaller = parents.log_scales.scatter_add(1, longest[:, None], torch.full_like(reach, -math.log(SHRINK)))
+    smaller = parents.log_scales - math.log(SHRINK) * along
     sides = (replace(parents, means=parents.means + side * reach * axis, log_scales=smaller) for side in (-1, 1))
     first, second = sides
     return first, second
