@@ -18,7 +18,7 @@ from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
 
-UNSEEN_PX = 0.05
+UNSEEN_PX = 0.5
 """A Gaussian whose blending weights add up to less than this in every picture is not seen."""
 SHRINK = 1.6
 """Both halves of a split Gaussian are smaller than it by this factor (Kerbl et al. 2023, section 5.2)."""
