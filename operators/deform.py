@@ -33,4 +33,4 @@ class DeformOp(Operator):
         if model.device.type == "cpu":
             with torch.inference_mode():
                 model.at(frame.time_s)  # a model remembers its last state, so the renderer finds it there
-        op_output.emit(DeformedScene(frame, model, camera, message.trained), "scene")
+        op_output.emit(DeformedScene(frame, model, camera, message.trained, message), "scene")

@@ -15,7 +15,7 @@ FRAMES_FILE = "frames.jsonl"
 MAX_SERIES = 4096
 """Entries of a report's series; a longer run is summed up in bins of equally many frames."""
 
-Value = float | int | bool | None
+Value = float | int | bool | str | None
 Entry = dict[str, Value]
 
 
@@ -100,5 +100,5 @@ def _summed_up(bins: Mapping[bool, list[Entry]]) -> Iterator[Entry]:
 
 
 def _mean(frames: list[Entry], name: str) -> float | None:
-    values = [value for entry in frames if (value := entry[name]) is not None]
+    values = [value for entry in frames if isinstance(value := entry[name], (int, float))]
     return math.fsum(values) / len(values) if values else None

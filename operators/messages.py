@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,12 @@ class Reconstruction:
     """Optimiser steps that the frame was given."""
     arriving_loss: HostCopy | None = None
     """Loss of the last of these steps, which a GPU may not have finished; None when there was none."""
+    content: Frame | None = None
+    """Live: the newest frame that the model has seen, which is what its picture shows; None where the frame itself is meant."""
+    taken_ns: int | None = None
+    """Live: when training took the frame, by `time.monotonic_ns`."""
+    published_ns: int | None = None
+    """Live: when the model was published."""
 
     def __post_init__(self) -> None:
         if self.steps < 0:
@@ -56,6 +63,8 @@ class DeformedScene:
     """Held for as long as this message is: a snapshot's slot is not overwritten meanwhile."""
     camera: Camera
     trained: bool
+    reconstruction: Reconstruction | None = None
+    """What the scene was made from, where that is known."""
 
     def __post_init__(self) -> None:
         if (self.camera.width_px, self.camera.height_px) != (self.frame.width_px, self.frame.height_px):
@@ -88,6 +97,14 @@ class RenderedFrame:
     """Opacity 0..1 [H, W]."""
     model_version: int
     trained: bool
+    steps: int = 0
+    """Optimiser steps that the frame was given."""
+    content: Frame | None = None
+    """See `Reconstruction.content`."""
+    taken_ns: int | None = None
+    """See `Reconstruction.taken_ns`."""
+    published_ns: int | None = None
+    """See `Reconstruction.published_ns`."""
 
     def __post_init__(self) -> None:
         size = self.frame.image.shape
@@ -99,3 +116,32 @@ class RenderedFrame:
         for name, plane in (("depth", self.depth), ("alpha", self.alpha)):
             if plane.shape != size[:2]:
                 raise InvalidInput(f"frame {self.frame.seq}: {name} is {list(plane.shape)}, the image {list(size[:2])}")
+
+
+class PictureState(Enum):
+    """How a shown picture stands to the present."""
+
+    LIVE = "live"
+    """It shows a frame that came just now."""
+    STALE = "stale"
+    """What it shows is older than a live picture may be; newer ones are on their way."""
+    FROZEN = "frozen"
+    """No newer picture has come for long."""
+    SOURCE_LOST = "source lost"
+    """The source gives no frames."""
+
+
+@dataclass(frozen=True)
+class ShownPicture:
+    """What is on the screen from a moment on."""
+
+    rendered: RenderedFrame
+    image: NDArray[np.uint8]
+    """RGB uint8 [H, W, 3]: the rendered picture with its state and age drawn into it."""
+    state: PictureState
+    age_ns: int
+    """Time since the arrival of the newest frame that the picture shows, when it came on the screen."""
+    shown_ns: int
+    """When it came on the screen, by `time.monotonic_ns`."""
+    new: bool
+    """False when the picture was there before, and only its state or its age has changed."""

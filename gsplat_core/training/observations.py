@@ -75,8 +75,23 @@ class ObservationWindow:
         """Make `observation` the newest; the oldest leaves a full window."""
         self._frames.append(observation)
 
+    @property
+    def newest(self) -> Observation:
+        """The frame that was added last."""
+        return self._frames[-1]
+
+    def forget_before(self, time_s: float) -> None:
+        """Drop frames that are older, all but the newest: the field no longer tells their times apart."""
+        while len(self._frames) > 1 and self._frames[0].time_s < time_s:
+            self._frames.popleft()
+
     def __len__(self) -> int:
         return len(self._frames)
+
+    def draw(self, newest_share: float) -> Observation:
+        """The newest frame with that probability, else any frame of the window."""
+        newest = self._random.random() < newest_share
+        return self._frames[-1 if newest else int(self._random.integers(0, len(self._frames)))]
 
     def schedule(self, steps: int) -> list[Observation]:
         """Observations for the next `steps` steps. The last one is the newest frame, which is about to be shown."""

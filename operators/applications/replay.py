@@ -85,6 +85,11 @@ class ReplaySettings:
         for name in self.sinks:
             SINKS.check(name)
 
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """What the run reads from the disk."""
+        return (Path(self.recording),)
+
     def reconstructor_config(self, pixels: int | None = None, *, offline: bool = False) -> ReconstructorConfig:
         """The reconstructor's settings for frames of so many pixels. offline: for `Reconstructor.fit`. Raises InvalidSetting."""
         config = ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig(field=self.field)

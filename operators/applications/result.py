@@ -46,6 +46,8 @@ class RunOutcome:
     interrupted: bool
     dropped: int
     """Messages that edges of the graph dropped."""
+    dropped_by_edge: dict[str, int]
+    """Those edges that dropped any."""
     latency: dict[str, DurationSummary]
     """Per path of the graph."""
     latency_quantiles_ms: dict[str, list[float]]

@@ -103,6 +103,7 @@ class Session:
         graph = self.graph
         tracker = graph.track()
         reason, interrupted = self._ending()
+        dropped = {edge.edge: count for edge in graph.edge_stats() if (count := sum(edge.dropped.values()))}
         return RunOutcome(
             command=self.command,
             settings=self.settings,
@@ -110,7 +111,8 @@ class Session:
             wall_s=self.wall_s,
             stop_reason=reason,
             interrupted=interrupted,
-            dropped=sum(sum(edge.dropped.values()) for edge in graph.edge_stats()),
+            dropped=sum(dropped.values()),
+            dropped_by_edge=dropped,
             latency=tracker.latency(),
             latency_quantiles_ms=tracker.latency_quantiles_ms(PERCENTILES),
             operators=tracker.compute(),

@@ -5,7 +5,7 @@ A condition of your own derives from `Condition` and answers `check`; it runs on
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sized
 from datetime import timedelta
 from enum import Enum, IntEnum
 from typing import Any
@@ -192,6 +192,35 @@ class MessageAvailableCondition(Condition):
     def __init__(self, fragment: Any, *, receiver: str, min_size: int = 1, name: str = "") -> None:
         super().__init__(fragment, name=name)
         self.receiver, self.min_size = receiver, min_size
+
+
+class MessageOrTimeoutCondition(Condition):
+    """Compute when any of the operator's inputs has a message, and at the latest `timeout_ns` after the last compute.
+
+    For an operator whose inputs have no condition of their own (`ConditionType.NONE`) and that has something to do without messages, too.
+    """
+
+    def __init__(self, fragment: Any, timeout_ns: int, *, name: str = "") -> None:
+        super().__init__(fragment, name=name)
+        if timeout_ns <= 0:
+            raise ValueError(f"MessageOrTimeoutCondition: the timeout must be positive, got {timeout_ns} ns")
+        self.timeout_ns = timeout_ns
+        self._edges: tuple[Sized, ...] = ()
+        self._due_ns = 0
+
+    def watch(self, edges: Iterable[Sized]) -> None:
+        """The operator's input edges; called by the graph when they are known."""
+        self._edges = tuple(edges)
+
+    def check(self, timestamp: int) -> Verdict:
+        """READY when there is a message or the time has come."""
+        if timestamp >= self._due_ns or any(len(edge) for edge in self._edges):
+            return _READY
+        return SchedulingStatus.WAIT_TIME, self._due_ns
+
+    def on_execute(self, timestamp: int) -> None:
+        """The timeout begins anew."""
+        self._due_ns = timestamp + self.timeout_ns
 
 
 class DownstreamMessageAffordableCondition(Condition):

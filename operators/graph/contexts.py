@@ -42,6 +42,11 @@ class InputContext:
             return message.value
         return self._receive_batch(name)
 
+    def queued(self, name: str) -> int:
+        """How many messages wait at an input that has one connection; 0 for one that is not connected."""
+        edge = self._single.get(name)
+        return 0 if edge is None else len(edge)
+
     def _receive_batch(self, name: str) -> Any:
         if name not in self._ports:
             raise PortError(f"operator {self._task.name!r} has no input {name!r}; it has {sorted(self._ports)}")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Union, get_args, get_origin
 
 from operators.errors import GraphDeadlock, GraphInvalid, OperatorFailed, OperatorStuck
 from operators.graph.clock import Clock
-from operators.graph.conditions import SchedulingStatus
+from operators.graph.conditions import MessageOrTimeoutCondition, SchedulingStatus
 from operators.graph.faults import Fault, FaultAction
 from operators.graph.queues import Edge, EdgeStats
 from operators.graph.spec import ConditionType, IOSpec, QueuePolicy
@@ -107,6 +107,8 @@ class Graph:
             task.operator._wake = scheduler.wake
             for condition in task.conditions:
                 condition._wake = scheduler.wake
+                if isinstance(condition, MessageOrTimeoutCondition):
+                    condition.watch(task.in_edges)
 
     def _connect(self, flow: Flow) -> None:
         producer, consumer = self.tasks_by_name[flow.producer.name], self.tasks_by_name[flow.consumer.name]

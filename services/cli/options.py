@@ -32,8 +32,24 @@ def _path_option(name: str, help_text: str) -> Any:
 RecordingArgument = Annotated[
     Path, _path_argument("RECORDING", "A video, or a folder with video.mp4, images/ or cameras.json.")
 ]
+SourceArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="SOURCE",
+        help="A recording, which is played in real time, or an address such as rtsp://host/path.",
+        show_default=False,
+    ),
+]
 ModelArgument = Annotated[Path, _path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
 OutOption = Annotated[Path, _path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
+LiveOutOption = Annotated[
+    Path | None, _path_option("--out", "Folder for the report and the model; without it nothing is kept.")
+]
+EvaluatedArgument = Annotated[Path, _path_argument("MODEL|RUN", "A model folder, or the output folder of a run.")]
+EvaluationOutOption = Annotated[
+    Path | None,
+    _path_option("--out", "Folder for evaluation.json and evaluation.html: new, empty, or left by an earlier run."),
+]
 RenderOutOption = Annotated[Path, _path_option("--out", "A video (name.mp4) or a folder of images.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
 RendererOption = Annotated[str, typer.Option(help="How Gaussians become a picture: alpha.")]

@@ -7,9 +7,11 @@ from pathlib import Path
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.training.baselines import Baselines
+from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.training.metrics import QualityTracker
 from operators.applications.result import RunOutcome
+from operators.display import LiveDisplayResult
+from operators.frame_log import Entry
 from operators.ingest import SourceResult
 from operators.metrics import QualityResult
 from operators.reconstruct import ModelResult
@@ -17,6 +19,7 @@ from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult
 from operators.sources.source import SourceDescription
 from services.reports.html import write_html
+from services.reports.live import live_facts
 from services.reports.machine import machine_facts
 from services.reports.pictures import keyframe_pictures
 from services.reports.schema import (
@@ -41,13 +44,13 @@ def build_report(outcome: RunOutcome) -> RunReport:
     source, quality = outcome.find(SourceResult), outcome.find(QualityResult)
     if source is None or quality is None:
         raise InvalidInput(f"a report needs a SourceResult and a QualityResult; the {outcome.command} has none")
-    display, model = outcome.find(DisplayResult), outcome.find(ModelResult)
+    model = outcome.find(ModelResult)
     return RunReport(
         recording=_recording(source.description),
         run=_run(outcome),
         frames=FrameCounts(
             ingested=source.frames,
-            displayed=quality.frames if display is None else display.frames,
+            displayed=_displayed(outcome, quality),
             dropped=outcome.dropped,
             damaged=source.damaged,
         ),
@@ -68,16 +71,25 @@ def build_report(outcome: RunOutcome) -> RunReport:
             sha256=model.model.sha256(),
             version=model.model.version,
         ),
+        live=live_facts(outcome),
         frames_sha256=quality.frames_sha256,
         notes=list(outcome.notes),
         outputs={name: path.name for name, path in outcome.outputs.items()},
         latency_quantiles_ms={path: [_ms(v) for v in curve] for path, curve in outcome.latency_quantiles_ms.items()},
-        series=[
-            (FrameEntry if quality.frames_per_entry == 1 else BinEntry).model_validate(entry)
-            for entry in quality.series
-        ],
+        series=[_entry(entry, FrameEntry if quality.frames_per_entry == 1 else BinEntry) for entry in quality.series],
         series_frames_per_entry=quality.frames_per_entry,
     )
+
+
+def _displayed(outcome: RunOutcome, quality: QualityResult) -> int:
+    video, screen = outcome.find(DisplayResult), outcome.find(LiveDisplayResult)
+    if screen is not None:
+        return screen.pictures
+    return quality.frames if video is None else video.frames
+
+
+def _entry(entry: Entry, kind: type[FrameEntry]) -> FrameEntry:
+    return kind.model_validate({name: value for name, value in entry.items() if name in kind.model_fields})
 
 
 def _recording(description: SourceDescription) -> RecordingFacts:

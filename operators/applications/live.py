@@ -1,0 +1,165 @@
+"""Live: a stream is reconstructed and shown beside a clock, without an end.
+
+    source → sequence → tool_mask → scene ─┬─► reconstruct → deform → rasterize → display ─┬─► sinks
+                                           └───────────────────────► on_screen ◄───────────┘
+
+Each operator has a thread of its own. The newest frame wins wherever one comes too late: into `reconstruct`, into `rasterize` and into
+`display`; every frame that is passed over is counted by the edge. What is shown says how old it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from gsplat_core.rendering.registry import check_renderer
+from operators.applications.delivery import Report, delivered
+from operators.applications.device import check_device
+from operators.applications.finishing import saves_model
+from operators.applications.limits import check_picture
+from operators.applications.live_analysis import analysis_operators
+from operators.applications.live_settings import LiveSettings
+from operators.applications.live_start import WarmParts, low_latency, warm_up
+from operators.applications.replay import REPORT_RESERVE_BYTES
+from operators.applications.result import RunOutcome
+from operators.applications.session import Session
+from operators.deform import DeformOp
+from operators.display import DisplayOp
+from operators.frame_clock import FrameClock
+from operators.frame_log import FRAMES_FILE, FrameLog
+from operators.graph import Application, MultiThreadScheduler, Operator
+from operators.ingest import SourceOp
+from operators.live_reconstruct import LiveReconstructOp
+from operators.metrics import ScoredFrame
+from operators.on_screen import OnScreenMetricsOp
+from operators.rasterize import RasterizeOp
+from operators.sinks.callback import CallbackSinkOp
+from operators.sinks.keyframes import KeyframesOp
+from operators.sources.registry import SourceOptions, open_source
+from operators.sources.source import FrameSource
+from operators.storage import StorageReserve
+
+
+class LiveApplication(Application):
+    """Composes the graph."""
+
+    def __init__(
+        self,
+        source: FrameSource,
+        settings: LiveSettings,
+        warm: WarmParts,
+        *,
+        stop_requested: Callable[[], bool] = lambda: False,
+        on_scored: Callable[[LiveApplication, ScoredFrame], None] | None = None,
+        on_shown: Callable[[Any], None] | None = None,
+    ) -> None:
+        super().__init__(name="live", track=True)
+        self.scheduler(MultiThreadScheduler(self))
+        self.frame_source, self.settings, self._warm = source, settings, warm
+        self.clock = FrameClock(settings.clock, source.description.fps)
+        self._stop_requested = stop_requested
+        self._on_scored, self._on_shown = on_scored, on_shown
+
+    def compose(self) -> None:
+        """Wire the operators; see the module's picture."""
+        settings, out = self.settings, self.settings.out
+        reserve = StorageReserve(out, self.room_to_finish)
+        self.source_op = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
+        last: Operator = self.source_op
+        for operator in analysis_operators(self, settings.tool_mask):
+            self.add_flow(last, operator, {("frame", "frame")})
+            last = operator
+        self.reconstruct = LiveReconstructOp(
+            self,
+            name="reconstruct",
+            make_reconstructor=lambda: self._warm.reconstructor,
+            clock=self.clock,
+        )
+        deform = DeformOp(self, name="deform")
+        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
+        rasterize.adopt(self._warm.renderer, self.frame_source.description.camera, self._warm.reconstructor.device)
+        self.display = DisplayOp(
+            self,
+            name="display",
+            clock=self.clock,
+            source_state=lambda: self.frame_source.state,
+            settings=settings.display,
+        )
+        self.metrics = OnScreenMetricsOp(self, name="on_screen", log=FrameLog(out / FRAMES_FILE, reserve))
+        self.add_flow(last, self.reconstruct, {("frame", "frame")})
+        self.add_flow(
+            self.reconstruct, deform, {("reconstruction", "reconstruction")}, policy="drop_oldest", capacity=2
+        )
+        self.add_flow(deform, rasterize, {("scene", "scene")}, policy="drop_oldest", capacity=2)
+        self.add_flow(rasterize, self.display, {("rendered", "rendered")})
+        self.add_flow(last, self.metrics, {("frame", "frame")})
+        self.add_flow(self.display, self.metrics, {("shown", "shown")})
+        if self._on_shown is not None:
+            shown = CallbackSinkOp(self, name="viewer", callback=self._on_shown)
+            self.add_flow(self.display, shown, {("shown", "message")}, policy="drop_oldest")
+        keyframes = KeyframesOp(self, name="keyframes")
+        self.add_flow(self.metrics, keyframes, {("scored", "scored")}, policy="drop_oldest", capacity=4)
+        if self._on_scored is not None:
+            report = self._on_scored
+            progress = CallbackSinkOp(self, name="progress", callback=lambda scored: report(self, scored))
+            self.add_flow(self.metrics, progress, {("scored", "message")}, policy="drop_oldest")
+
+    def room_to_finish(self) -> int:
+        """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
+        model = self.reconstruct.newest
+        return REPORT_RESERVE_BYTES + (0 if model is None else 4 * model.parameter_count)
+
+
+def live(
+    settings: LiveSettings,
+    *,
+    stop_requested: Callable[[], bool] = lambda: False,
+    on_scored: Callable[[LiveApplication, ScoredFrame], None] | None = None,
+    on_shown: Callable[[Any], None] | None = None,
+    report: Report | None = None,
+) -> RunOutcome:
+    """Reconstruct a source live until it ends, the time is over, or the run is asked to stop; what was reached is written in any case.
+
+    Raises a UserError before anything is written for settings that cannot work, and RunFailed, with the outcome, when a part failed.
+    """
+
+    def run(inside: LiveSettings, notes: list[str]) -> RunOutcome:
+        source = prepare(inside, notes)
+        graph = LiveApplication(
+            source,
+            inside,
+            warm_up(inside, source),
+            stop_requested=stop_requested,
+            on_scored=on_scored,
+            on_shown=on_shown,
+        )
+        with low_latency():
+            return Session(
+                graph,
+                inside.stated(),
+                command="live",
+                finish=[saves_model(inside.out)],
+                notes=notes,
+                stop_requested=stop_requested,
+            ).execute()
+
+    return delivered(settings, "live", run, report)
+
+
+def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
+    """Check everything that can be checked before the first frame; returns the source, and adds what is to be said about it to `notes`.
+
+    Raises as `live` does before anything is written.
+    """
+    check_device(settings.device)
+    check_renderer(settings.renderer, settings.device)
+    source = open_source(
+        settings.source,
+        SourceOptions(
+            settings.scale, settings.max_frames, realtime=True, loop=settings.loop, fps=settings.fps, process=True
+        ),
+    )
+    check_picture(source.description.camera, settings.scale)
+    notes.extend(source.description.notes)
+    StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
+    return source

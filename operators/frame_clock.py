@@ -1,0 +1,131 @@
+"""When a live frame has to be shown, and how much training that leaves room for."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.budget import Budget
+
+INTERVAL_DECAY = 0.1
+"""How fast the usual interval between frames follows the newest ones."""
+DISPLAY_DECAY = 0.2
+"""How fast the usual time from a published model to its shown picture follows the newest ones."""
+
+REHEARSAL_MARGIN_NS = 300_000
+"""Rehearsal ends so long before the next frame is due."""
+SHOWN_WITHIN_S = 0.005
+"""Rehearsal waits so long for a picture to be shown."""
+CATCH_UP_SHARE = 0.8
+"""Frames that take a larger share of the time between them cannot be caught up with."""
+CATCH_UP_INTERVALS = 4.0
+"""A frame that has waited longer is passed over."""
+
+
+@dataclass(frozen=True)
+class ClockSettings:
+    """When frames are shown. Raises InvalidSetting for a value out of its range."""
+
+    budget_ms: float | None = None
+    """A frame is to be shown so long after it has come; None: `auto_share` of the time between frames, at most `auto_most_ms`."""
+    auto_share: float = 0.5
+    auto_most_ms: float = 18.0
+    at_least_steps: int = 5
+    """Steps that every frame gets, though it is shown late: fewer would change nothing that can be seen."""
+    at_most_steps: int = 80
+    """Steps before a frame is shown, though there is time left."""
+    first_ms: float = 150.0
+    """A scene's first frame may take so long, at least `first_at_least_steps`."""
+    first_at_least_steps: int = 10
+    first_at_most_steps: int = 60
+    rehearse_at_most: int = 120
+    """Steps on the window between two frames, though no frame comes."""
+
+    def __post_init__(self) -> None:
+        if self.budget_ms is not None and not 0 < self.budget_ms <= 10_000:
+            raise InvalidSetting(f"budget-ms is {self.budget_ms}; it must be auto, or between 0 and 10000 milliseconds")
+        if not 0 < self.auto_share <= 1:
+            raise InvalidSetting(f"auto_share is {self.auto_share}; it must be in (0, 1]")
+        if not 0 < self.at_least_steps <= self.at_most_steps:
+            raise InvalidSetting(
+                f"at_least_steps is {self.at_least_steps} and at_most_steps {self.at_most_steps}; they must be in order"
+            )
+
+
+class FrameClock:
+    """The time of each frame. `arrived`, `budget` and `may_rehearse` are called by the thread that trains, `shown` by the one that shows."""
+
+    def __init__(self, settings: ClockSettings, fps: float, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        """fps: the source's nominal rate, until the frames themselves say more."""
+        self.settings = settings
+        self.now_ns = now_ns
+        self.interval_ns = 1e9 / fps
+        """Usual time between frames."""
+        self.display_ns = 2e6
+        """Usual time from a published model to its shown picture."""
+        self.training_ns = 0.0
+        """Usual time from taking a frame to its published model."""
+        self._last_arrival_ns: int | None = None
+        self._shown = threading.Event()
+
+    def budget(self, frame: Frame, *, first: bool = False) -> Budget:
+        """The training that a frame may take before it is shown; the `first` one of a scene takes longer."""
+        settings = self.settings
+        arrived_ns = self.now_ns() if frame.arrived_ns is None else frame.arrived_ns
+        self._learn_interval(arrived_ns)
+        show_after_ns = settings.first_ms * 1e6 if first else self.show_after_ns
+        return Budget.until(
+            (arrived_ns + show_after_ns - self.display_ns) * 1e-9,
+            at_least=settings.first_at_least_steps if first else settings.at_least_steps,
+            at_most=settings.first_at_most_steps if first else settings.at_most_steps,
+            clock=lambda: self.now_ns() * 1e-9,
+        )
+
+    @property
+    def show_after_ns(self) -> float:
+        """How long after its arrival a frame is to be shown."""
+        settings = self.settings
+        if settings.budget_ms is not None:
+            return settings.budget_ms * 1e6
+        return min(settings.auto_share * self.interval_ns, settings.auto_most_ms * 1e6)
+
+    def may_rehearse(self, made: int, ahead_ns: float) -> bool:
+        """Whether there is room for more rehearsal: `made` steps were made since the last frame, and those that would be under way take
+        `ahead_ns`. It ends just before the next frame is due, so that the frame finds the device free."""
+        if made >= self.settings.rehearse_at_most or self._last_arrival_ns is None:
+            return False
+        return self.now_ns() + ahead_ns < self._last_arrival_ns + self.interval_ns - REHEARSAL_MARGIN_NS
+
+    def too_late(self, frame: Frame, waiting: int) -> bool:
+        """Whether a frame is passed over for one of the `waiting` newer ones. After a delay frames are caught up with one by one, as long
+        as they usually take less time than there is between them, and none is shown very late."""
+        if not waiting or frame.arrived_ns is None:
+            return False
+        keeps_up = self.training_ns + self.display_ns < CATCH_UP_SHARE * self.interval_ns
+        return not keeps_up or self.now_ns() - frame.arrived_ns > CATCH_UP_INTERVALS * self.interval_ns
+
+    def published(self, taken_ns: int, published_ns: int) -> None:
+        """The model of a frame that was taken then is published now."""
+        self._shown.clear()
+        self.training_ns += DISPLAY_DECAY * (published_ns - taken_ns - self.training_ns)
+
+    def shown(self, published_ns: int, shown_ns: int) -> None:
+        """A picture of the model that was published then is shown now."""
+        self.display_ns += DISPLAY_DECAY * (max(0, shown_ns - published_ns) - self.display_ns)
+        self._shown.set()
+
+    def wait_until_shown(self) -> None:
+        """Wait until the newest published model is shown, but not for long: its picture has the device for itself meanwhile."""
+        self._shown.wait(SHOWN_WITHIN_S)
+
+    def _learn_interval(self, arrived_ns: int) -> None:
+        last, self._last_arrival_ns = self._last_arrival_ns, arrived_ns
+        if last is None:
+            return
+        # A pause is no interval, and neither is a burst after one.
+        seen = min(max(arrived_ns - last, 0.2 * self.interval_ns), 5 * self.interval_ns)
+        self.interval_ns += INTERVAL_DECAY * (seen - self.interval_ns)

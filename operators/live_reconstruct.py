@@ -1,0 +1,191 @@
+"""Online reconstruction beside a clock: each frame is trained on until it has to be shown, and the past until the next frame comes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
+from gsplat_core.training.live import LiveReconstructor
+from operators.frame_clock import FrameClock
+from operators.graph import Operator, OperatorSpec
+from operators.messages import Reconstruction
+from operators.outcome import OutcomeBuilder
+from operators.reconstruct import ModelResult
+from operators.schedule import ScheduleEvent, ScheduleListener
+
+REHEARSED_AT_ONCE = 3
+"""Rehearsal steps between two looks for a new frame, on a GPU; on the CPU, where a step takes long, it is one."""
+WAITING = 5
+"""Frames that may wait to be trained on, where a delay can be caught up with; beyond them the oldest is dropped."""
+
+
+@dataclass
+class TrainingCounts:
+    """What live training did."""
+
+    frames: int = 0
+    """Frames that were trained on."""
+    steps: int = 0
+    """Steps on the newest frame, before it was shown."""
+    passed_over: int = 0
+    """Frames that were given up for newer ones."""
+    rehearsed: int = 0
+    """Steps on the window."""
+    withheld: dict[str, int] = field(default_factory=dict)
+    """Frames that were not trained on, by reason."""
+    scenes: dict[str, int] = field(default_factory=dict)
+    """How often the scene began anew, by reason."""
+
+
+class LiveReconstructOp(Operator):
+    """Trains on each frame until it has to be shown, publishes the model, and rehearses the past until the next frame comes.
+
+    Frames that are withheld or damaged are shown with the model as it stands. A new scene (`Frame.new_scene`, or another size) begins a new
+    model.
+
+    Inputs:
+        frame: `Frame`; the newest one wins.
+
+    Outputs:
+        reconstruction: `Reconstruction`.
+
+    Params:
+        make_reconstructor: called in `start()`; what it returns is owned by this operator alone.
+        clock: when a frame has to be shown.
+        listener: is told every call that changes the model, in order: with these a run can be repeated.
+    """
+
+    def __init__(
+        self,
+        fragment: Any,
+        *args: Any,
+        make_reconstructor: Callable[[], LiveReconstructor],
+        clock: FrameClock,
+        listener: ScheduleListener | None = None,
+        **kwargs: Any,
+    ) -> None:
+        self.make_reconstructor = make_reconstructor
+        self.clock = clock
+        self.listener = listener
+        self.newest: Model | Snapshot | None = None
+        """What was published last."""
+        self.counts = TrainingCounts()
+        self._reconstructor: LiveReconstructor | None = None
+        self._learned: Frame | None = None
+        """The newest frame that the model has seen."""
+        super().__init__(fragment, *args, **kwargs)
+
+    @property
+    def model(self) -> Model | None:
+        """What was published last, as a model in memory of its own; on a GPU it is copied when it is asked for."""
+        return None if self.newest is None else self.newest.as_model()
+
+    @property
+    def newest_gaussians(self) -> int:
+        """How many Gaussians the newest model has."""
+        newest = self.newest
+        if newest is None:
+            return 0
+        return newest.gaussians.count if isinstance(newest, Model) else newest.gaussian_count
+
+    def setup(self, spec: OperatorSpec) -> None:
+        port = spec.input("frame", policy="drop_oldest", type=Frame)
+        port.connector(port.ConnectorType.DEFAULT, capacity=WAITING)
+        spec.output("reconstruction", type=Reconstruction)
+
+    def start(self) -> None:
+        self.counts, self.newest, self._learned = TrainingCounts(), None, None
+        self._reconstructor = self.make_reconstructor()
+
+    def stop(self) -> None:
+        self.newest = self.model
+        self._reconstructor = self._learned = None
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        frame: Frame = op_input.receive("frame")
+        while (waiting := op_input.queued("frame")) and self.clock.too_late(frame, waiting):
+            self.counts.passed_over += 1
+            frame = op_input.receive("frame").carrying_scene_of(frame)
+        reconstruction = self._observe(frame)
+        if reconstruction is not None:
+            op_output.emit(reconstruction, "reconstruction")
+            if not op_input.queued("frame"):
+                self.clock.wait_until_shown()
+            self._rehearse(frame, lambda: bool(op_input.queued("frame")))
+
+    def _observe(self, frame: Frame) -> Reconstruction | None:
+        assert self._reconstructor is not None
+        taken_ns = self.clock.now_ns()
+        reason = self._why_not(frame)
+        if reason is not None:
+            self.counts.withheld[reason] = self.counts.withheld.get(reason, 0) + 1
+        camera = self._reconstructor.camera
+        resized = (frame.width_px, frame.height_px) != (camera.width_px, camera.height_px)
+        if self.newest is None or resized or frame.new_scene is not None:
+            if reason is not None:
+                return None  # nothing can be shown of it, and no scene begins with it
+            if self.newest is not None:
+                self._begin_scene(frame, frame.new_scene or "resized")
+        first = self.newest is None
+        report = self._reconstructor.observe(frame, budget=self.clock.budget(frame, first=first), train=reason is None)
+        if reason is None:
+            self._learned = frame
+            self.counts.frames += 1
+            self.counts.steps += report.steps
+        self._tell(ScheduleEvent("observe", seq=frame.seq, steps=report.steps, train=reason is None))
+        self.newest = self._reconstructor.publish()
+        published_ns = self.clock.now_ns()
+        if not first:
+            self.clock.published(taken_ns, published_ns)
+        return Reconstruction(
+            frame,
+            self.newest,
+            trained=reason is None,
+            steps=report.steps,
+            arriving_loss=report.arriving_loss,
+            content=self._learned,
+            taken_ns=taken_ns,
+            published_ns=published_ns,
+        )
+
+    def _begin_scene(self, frame: Frame, reason: str) -> None:
+        assert self._reconstructor is not None
+        self.counts.scenes[reason] = self.counts.scenes.get(reason, 0) + 1
+        self._reconstructor.begin_scene(frame)
+        self._tell(ScheduleEvent("begin_scene", seq=frame.seq))
+        self.newest = None
+
+    def _rehearse(self, frame: Frame, frame_waits: Callable[[], bool]) -> None:
+        """Train on the window until the next frame waits or is due."""
+        assert self._reconstructor is not None
+        at_once = REHEARSED_AT_ONCE if self._reconstructor.device.type == "cuda" else 1
+        made = 0
+        while not frame_waits() and self.clock.may_rehearse(made, self._reconstructor.rehearsal_ns(at_once)):
+            if made == 0 and frame is self._learned:
+                self._reconstructor.grow(frame)
+                self._tell(ScheduleEvent("grow", seq=frame.seq))
+            self._reconstructor.rehearse(at_once)
+            made += at_once
+        self.counts.rehearsed += made
+        if made:
+            self._tell(ScheduleEvent("rehearse", steps=made))
+
+    def _why_not(self, frame: Frame) -> str | None:
+        if frame.withheld is not None:
+            return frame.withheld
+        return "damaged" if frame.status is FrameStatus.DAMAGED else None
+
+    def _tell(self, event: ScheduleEvent) -> None:
+        if self.listener is not None:
+            self.listener(event)
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        outcome.add(self.counts)
+        model = self.model
+        if model is not None:
+            outcome.add(ModelResult(model))

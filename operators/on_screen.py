@@ -1,0 +1,216 @@
+"""How good a live stream's pictures were: what was on the screen when the next frame arrived, against the frame before it."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.training.metrics import FrameQuality, QualityTracker, ScoredMean, psnr_tissue_db
+from operators.frame_log import MAX_SERIES, Entry, FrameLog, Value, frames_per_entry, read_frames, series
+from operators.graph import ConditionType, MessageOrTimeoutCondition, Operator, OperatorSpec
+from operators.messages import ShownPicture
+from operators.metrics import QualityResult, ScoredFrame
+from operators.outcome import OutcomeBuilder
+
+LOOK_NS = 500_000_000
+WAITING = 8
+"""Frames and pictures that may wait to be scored; beyond them the oldest go unscored and are counted."""
+SIMILARITY_EVERY = 8
+"""SSIM takes several times as long as PSNR: it is measured on every so many frames."""
+SETTLING_S = 1.0
+"""Figures of a stream that has settled leave out its first second, in which the model begins."""
+
+
+@dataclass(frozen=True)
+class OnScreenResult:
+    """Figures of a live stream, besides the means of `QualityResult`."""
+
+    settled_db: float | None
+    """Mean tissue PSNR after the first second."""
+    worst_db: float | None
+    """Lowest tissue PSNR of a frame after the first second."""
+    worst_seq: int | None
+    previous_frame_db: float | None
+    """Mean tissue PSNR of the raw frame before, shown instead."""
+    frames: int
+    """Frames that were scored."""
+    not_on_screen: int
+    """Frames that were never on the screen themselves: when the next frame arrived, an older picture was still there."""
+    unscored: int
+    """Frames that arrived faster than they could be scored."""
+
+
+class OnScreenMetricsOp(Operator):
+    """Scores each frame by what was on the screen when the next frame arrived: the picture of this frame, or, where that came too late, the
+    older one that was still there. State and age are drawn into what is shown, and not into what is scored.
+
+    Inputs:
+        frame: `Frame`, each one as it goes into reconstruction.
+        shown: `ShownPicture`.
+
+    Outputs:
+        scored: `ScoredFrame`.
+
+    Params:
+        log: where each frame's figures are written; without one there is no series.
+    """
+
+    def __init__(self, fragment: Any, *args: Any, log: FrameLog | None = None, **kwargs: Any) -> None:
+        self.log = log
+        self._reset()
+        super().__init__(fragment, MessageOrTimeoutCondition(fragment, LOOK_NS), *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        for name, kind in (("frame", Frame), ("shown", ShownPicture)):
+            port = spec.input(name, policy="drop_oldest", type=kind).condition(ConditionType.NONE)
+            port.connector(port.ConnectorType.DEFAULT, capacity=WAITING)
+        spec.output("scored", type=ScoredFrame).condition(ConditionType.NONE)
+
+    def start(self) -> None:
+        self._reset()
+        if self.log is not None:
+            self.log.open()
+
+    def stop(self) -> None:
+        if self._frames:
+            # The last frame has no next one: what is on the screen at the end counts.
+            self._frames.append(None)
+            self._score_waiting(waiting=0)
+        self._frames.clear()
+        self._shown.clear()
+        if self.log is not None:
+            self.log.close()
+
+    def _reset(self) -> None:
+        self.quality = QualityTracker()
+        """Every frame that was scored."""
+        self.settled, self.before = ScoredMean(), ScoredMean()
+        self.worst: tuple[float, int] | None = None
+        self.frames = self.not_on_screen = self.unscored = 0
+        self._digest = hashlib.sha256()
+        self._frames: deque[Frame | None] = deque()
+        self._shown: deque[ShownPicture] = deque()
+        self._on_screen: ShownPicture | None = None
+        self._previous: Frame | None = None
+        self._first_s: float | None = None
+        self._last_seq: int | None = None
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        shown: ShownPicture | None
+        while (shown := op_input.receive("shown")) is not None:
+            if shown.new:
+                self._shown.append(shown)
+        frame: Frame | None
+        while (frame := op_input.receive("frame")) is not None:
+            self._frames.append(frame)
+        # Pictures come by another way than frames: a frame is scored when the one after the next is there.
+        for scored in self._score_waiting(waiting=2):
+            op_output.emit(scored, "scored")
+        while len(self._shown) > 4 * WAITING:
+            self._show(self._shown.popleft())
+
+    def _score_waiting(self, waiting: int) -> list[ScoredFrame]:
+        """Score frames until so many are left besides the oldest, and return the scores."""
+        scores = []
+        while len(self._frames) > max(1, waiting):
+            frame, following = self._frames[0], self._frames[1]
+            self._frames.popleft()
+            if frame is not None and (scored := self._score(frame, following)) is not None:
+                scores.append(scored)
+        return scores
+
+    def _show(self, picture: ShownPicture) -> None:
+        self._on_screen = picture
+        frame = picture.rendered.frame
+        self._digest.update(f"{frame.seq} {frame.width_px} {frame.height_px}\n".encode())
+        self._digest.update(np.ascontiguousarray(picture.rendered.image).data)
+
+    def _score(self, frame: Frame, following: Frame | None) -> ScoredFrame | None:
+        until_ns = math.inf if following is None or following.arrived_ns is None else following.arrived_ns
+        while self._shown and self._shown[0].shown_ns <= until_ns:
+            self._show(self._shown.popleft())
+        if self._last_seq is not None:
+            self.unscored += max(0, frame.seq - self._last_seq - 1)
+        self._last_seq = frame.seq
+        previous, self._previous = self._previous, frame
+        on_screen = self._on_screen
+        if on_screen is None or on_screen.rendered.image.shape != frame.image.shape:
+            return None
+        self.frames += 1
+        before_db = math.nan
+        scorable = frame.status is not FrameStatus.DAMAGED and frame.withheld is None
+        if scorable:
+            quality = self.quality.observe(
+                frame.seq, on_screen.rendered.image, frame.image, frame.mask,
+                similarity=self.frames % SIMILARITY_EVERY == 1,
+            )  # fmt: skip
+            if previous is not None and previous.image.shape == frame.image.shape:
+                before_db = psnr_tissue_db(previous.image, frame.image, frame.mask)
+        else:
+            quality = FrameQuality(frame.seq, math.nan, math.nan, math.nan)
+        self._count(frame, on_screen, quality, before_db)
+        scored = ScoredFrame(on_screen.rendered, quality, before_db)
+        if self.log is not None:
+            self.log.write(_entry(scored, frame, on_screen, until_ns))
+        return scored
+
+    def _count(self, frame: Frame, on_screen: ShownPicture, quality: FrameQuality, before_db: float) -> None:
+        if on_screen.rendered.frame.seq != frame.seq:
+            self.not_on_screen += 1
+        if self._first_s is None:
+            self._first_s = frame.time_s
+        if frame.time_s - self._first_s < SETTLING_S:
+            return
+        value = quality.psnr_tissue_db
+        self.settled.add(value)
+        self.before.add(before_db)
+        if math.isfinite(value) and (self.worst is None or value < self.worst[0]):
+            self.worst = value, frame.seq
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        entries: tuple[Entry, ...] = ()
+        per_entry = frames_per_entry(self.frames, MAX_SERIES)
+        if self.log is not None and self.frames:
+            entries = tuple(series(read_frames(self.log.path), per_entry))
+            outcome.output("frames", self.log.path)
+        sha256 = self._digest.hexdigest()
+        outcome.add(QualityResult(self.quality, QualityTracker(), entries, per_entry, sha256, self.frames))
+        worst_db, worst_seq = self.worst or (None, None)
+        outcome.add(
+            OnScreenResult(
+                self.settled.mean, worst_db, worst_seq, self.before.mean, self.frames, self.not_on_screen, self.unscored
+            )
+        )
+
+
+def _entry(scored: ScoredFrame, frame: Frame, on_screen: ShownPicture, until_ns: float) -> Mapping[str, Value]:
+    """One line of the log: the frame's figures, and what was on the screen."""
+    rendered = on_screen.rendered
+    arrived_ns = (rendered.content or rendered.frame).arrived_ns
+    return {
+        **scored.as_json(),
+        "seq": frame.seq,
+        "time_s": frame.time_s,
+        "arrived_ns": frame.arrived_ns,
+        "shown_seq": rendered.frame.seq,
+        "shown_ns": on_screen.shown_ns,
+        "age_ms": round(on_screen.age_ns * 1e-6, 3),
+        "state": on_screen.state.value,
+        "taken_ms": _since(arrived_ns, rendered.taken_ns),
+        "published_ms": _since(arrived_ns, rendered.published_ns),
+        "steps": rendered.steps,
+        "withheld": frame.withheld,
+    }
+
+
+def _since(arrived_ns: int | None, now_ns: int | None) -> float | None:
+    """Milliseconds from the arrival of a frame."""
+    return None if arrived_ns is None or now_ns is None else round((now_ns - arrived_ns) * 1e-6, 3)

@@ -1,0 +1,23 @@
+"""What was done to a model beside a live stream, call by call: with the same frames and the same calls its pictures come out again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class ScheduleEvent:
+    """One call of the reconstructor."""
+
+    kind: Literal["begin_scene", "observe", "grow", "rehearse"]
+    seq: int | None = None
+    """The frame that it was called with; None for rehearsal."""
+    steps: int = 0
+    """Steps on the newest frame (`observe`) or on the window (`rehearse`)."""
+    train: bool = True
+    """False for a frame that was shown and not trained on."""
+
+
+ScheduleListener = Callable[[ScheduleEvent], None]

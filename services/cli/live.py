@@ -1,0 +1,138 @@
+"""`intrasplat live`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any
+
+import typer
+
+from gsplat_core.errors import InvalidSetting
+from operators.applications.live import LiveApplication, live
+from operators.applications.live_settings import LiveSettings
+from operators.applications.result import RunOutcome
+from operators.frame_clock import ClockSettings
+from operators.metrics import ScoredFrame
+from services.cli.exit_codes import INTERRUPTED, OK
+from services.cli.interrupt import InterruptRequest
+from services.cli.streams import printable
+from services.reports.build import write_reports
+from services.reports.schema import LiveFacts, RunReport
+
+STATUS_PERIOD_S = 1.0
+PLAIN_PERIOD_S = 5.0
+
+
+class LiveStatus:
+    """One line about what is on the screen: renewed on a terminal, printed now and then anywhere else; always on stderr."""
+
+    def __init__(self, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._terminal = not quiet and sys.stderr.isatty()
+        self._period_s = STATUS_PERIOD_S if self._terminal else PLAIN_PERIOD_S
+        self._printed_s = 0.0
+        self._frames = 0
+        self._written = False
+
+    def __enter__(self) -> LiveStatus:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._terminal and self._written:
+            print(file=sys.stderr)  # noqa: T201 - leaves the renewed line
+
+    def __call__(self, graph: LiveApplication, scored: ScoredFrame) -> None:
+        """Take one scored frame."""
+        now_s = time.monotonic()
+        if self._quiet or now_s - self._printed_s < self._period_s:
+            return
+        frames, since_s = graph.display.pictures, now_s - self._printed_s
+        rate = (frames - self._frames) / since_s if self._written else 0.0
+        self._printed_s, self._frames = now_s, frames
+        state = "" if graph.display.state is None else graph.display.state.value
+        line = (
+            f"{state:<11} {rate:5.1f} pictures/s  age {graph.display.age_p50_ms:5.1f} ms"
+            f"  {scored.quality.psnr_tissue_db:5.2f} dB  {graph.reconstruct.newest_gaussians} Gaussians"
+        )
+        print(f"\r{line}" if self._terminal else line, end="" if self._terminal else "\n", file=sys.stderr, flush=True)  # noqa: T201
+        self._written = True
+
+
+@contextmanager
+def live_settings(source: str, out: Path | None, budget_ms: str, **settings: Any) -> Iterator[LiveSettings]:
+    """The settings of a run; without `out` its results are written into a folder that goes with the context.
+
+    Raises InvalidSetting.
+    """
+    if budget_ms == "auto":
+        clock = ClockSettings()
+    else:
+        try:
+            clock = ClockSettings(budget_ms=float(budget_ms))
+        except ValueError:
+            raise InvalidSetting(f"budget-ms is {budget_ms!r}; give auto, or a number of milliseconds") from None
+    if out is not None:
+        yield LiveSettings(source=source, out=out, clock=clock, **settings)
+        return
+    with TemporaryDirectory(prefix="intrasplat-live-") as folder:
+        yield LiveSettings(source=source, out=Path(folder) / "out", clock=clock, **settings)
+
+
+def live_command(settings: LiveSettings, *, keep: bool, as_json: bool) -> int:
+    """Run live, write the reports whatever the end, print the result; returns the exit code. Without `keep` nothing stays on the disk."""
+    written: list[RunReport] = []
+
+    def report(outcome: RunOutcome, folder: Path) -> None:
+        written.append(write_reports(outcome, folder))
+
+    with InterruptRequest() as interrupt, LiveStatus(quiet=as_json) as status:
+        live(settings, stop_requested=interrupt, on_scored=status, report=report)
+    if not written:
+        typer.echo("ended before there was anything to show", err=True)
+        return INTERRUPTED if interrupt.requested else OK
+    print_live(written[0], settings.out if keep else None, as_json=as_json)
+    # A stream has no end of its own: to interrupt it is how it is ended.
+    return OK
+
+
+def print_live(report: RunReport, out: Path | None, *, as_json: bool) -> None:
+    """The report as JSON, or its main figures in a few lines and where the page is."""
+    if as_json:
+        typer.echo(report.model_dump_json(indent=2))
+        return
+    for note in report.notes:
+        typer.echo(f"note: {printable(note)}", err=True)
+    if report.live is not None:
+        typer.echo(_summary(report, report.live))
+    if out is not None:
+        typer.echo(str(out / "report.html"))
+
+
+def _summary(report: RunReport, facts: LiveFacts) -> str:
+    lines = [
+        f"{report.frames.ingested} frames in {report.run.wall_s:.1f} s, {facts.pictures} pictures shown,"
+        f" {sum(facts.dropped.values())} passed over; ended: {printable(report.run.stop_reason)}",
+        f"age of what was shown: p50 {facts.age_p50_ms:.1f} ms, p99 {facts.age_p99_ms:.1f} ms, most {facts.age_max_ms:.1f} ms",
+    ]
+    if facts.settled_psnr_tissue_db is not None:
+        beside = (
+            ""
+            if facts.previous_frame_db is None
+            else f" (previous frame shown instead: {facts.previous_frame_db:.2f} dB)"
+        )
+        lines.append(
+            f"live tissue PSNR after the first second {facts.settled_psnr_tissue_db:.2f} dB,"
+            f" worst {facts.worst_psnr_tissue_db:.2f} dB{beside}"
+        )
+    for name, counts in (("not trained on", facts.withheld), ("new scenes", facts.scenes), ("states", facts.states)):
+        if counts:
+            lines.append(f"{name}: " + ", ".join(f"{count} x {reason}" for reason, count in counts.items()))
+    return "\n".join(lines)
