@@ -60,11 +60,13 @@ def shares_of(step: TrainingStep, observations: Sequence[Observation]) -> Shares
 @torch.no_grad()
 def densify(step: TrainingStep, shares: Shares, count: int) -> None:
     """Drop the Gaussians that nobody sees, and split those with the largest error until there are `count`."""
-    kept = (shares.seen_px >= UNSEEN_PX).nonzero()[:, 0]
-    wanted = min(count - len(kept), len(kept))
-    if wanted > 0:
-        worst = shares.error[kept].argsort(descending=True, stable=True)[:wanted]
-        step.split(kept, worst, halves)
+    unseen = shares.seen_px < UNSEEN_PX
+    left = step.gaussians.count - int(torch.count_nonzero(unseen))
+    wanted = min(count - left, left)
+    if wanted <= 0:
+        return
+    order = step.remove(unseen).order
+    step.split(shares.error[order].argsort(descending=True, stable=True)[:wanted], halves)
 
 
 def halves(parents: Gaussians) -> tuple[Gaussians, Gaussians]:

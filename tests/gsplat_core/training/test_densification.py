@@ -16,10 +16,12 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
 
 
-@pytest.fixture
-def step(make_frame, camera):
+@pytest.fixture(params=[False, True], ids=["exact", "preallocated"])
+def step(make_frame, camera, request):
     gaussians = gaussians_from_frame(make_frame(), camera, 120, sh_degree=0, default_depth_mm=60.0)
-    config = ReconstructorConfig(field="basis", gaussians=120, squared_error=True)
+    config = ReconstructorConfig(
+        field="basis", gaussians=120, max_gaussians=300, squared_error=True, preallocate=request.param
+    )
     return TrainingStep(gaussians, BasisField(gaussians.count, (0.0, 1.0), bumps=6), config, camera)
 
 
@@ -56,13 +58,13 @@ def test_gaussians_that_nobody_sees_go_and_those_with_the_largest_error_are_spli
     error[[3, 11]] = torch.tensor([1.0, 2.0])
     before = step.gaussians.means.clone()
     densify(step, Shares(seen, error), count + 1)
-    kept = [index for index in range(count) if index != 7]
-    changed = [kept.index(3), kept.index(11)]
-    still = [index for index in range(count - 1) if index not in changed]
-    assert step.gaussians.count == step.field.count == step.field.weights.shape[0] == count + 1
-    assert torch.equal(step.gaussians.means[still], before[kept][still])
+    assert step.gaussians.count == step.field.count == count + 1
+    after = step.gaussians.means
     parents = before[[11, 3]]  # the worst first
-    torch.testing.assert_close((step.gaussians.means[changed[::-1]] + step.gaussians.means[-2:]) / 2, parents)
+    untouched = [index for index in range(count) if index not in (3, 7, 11)]
+    assert all((after == before[index]).all(dim=1).any() for index in untouched)
+    assert not any((after == before[index]).all(dim=1).any() for index in (3, 7, 11))
+    torch.testing.assert_close((after[[11, 3]] + after[-2:]) / 2, parents)
     assert (step.gaussians.means[-2:] - parents).norm(dim=1).min() > 0
     step(Observation.of(make_frame(1), camera))  # optimiser and field fit the new number
 
@@ -87,7 +89,7 @@ def test_both_halves_move_as_their_parent_did(step, make_frame, camera):
         step.field.weights.normal_(std=0.3, generator=torch.Generator().manual_seed(0))
     count = step.gaussians.count
     moved = step.field.deltas(0.4).detach()
-    step.split(torch.arange(count), torch.tensor([5, 9]), halves)
+    step.split(torch.tensor([5, 9]), halves)
     deltas = step.field.deltas(0.4).detach()
     assert torch.equal(deltas[:count], moved)
     assert torch.equal(deltas[count:], moved[[5, 9]])
