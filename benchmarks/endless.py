@@ -28,7 +28,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
-from operators.applications.live import LiveSettings
+from operators.applications.live_settings import LiveSettings
 
 SCORED_EVERY = 10
 RETAINED_S = 5.0
@@ -85,6 +85,7 @@ class Stream:
             self.reconstructor.observe(frame, budget=self.steps)
             self.renderer.prepare(self.reconstructor.publish())
             image = self.show(frame)
+            self.reconstructor.grow(frame)
             if self.rehearse:
                 self.reconstructor.rehearse(self.rehearse)
             if self.device == "cuda":

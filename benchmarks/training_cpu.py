@@ -83,7 +83,7 @@ def parts(
     field = step.field
     assert isinstance(field, BasisField)
     gaussians, _ = step.copy()
-    weights = LossWeights(config.ssim_weight, config.depth_weight)
+    weights = LossWeights(config.ssim_weight, config.depth_weight, config.squared_error)
     deformed = step.at(1.0)
     _, gradients = loss_and_gradients(deformed, observation, weights)
     deltas = torch.cat([gradients["means"], gradients["quats"], gradients["log_scales"], gradients["sh"][:, 0]], 1)

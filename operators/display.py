@@ -22,6 +22,8 @@ LOOK_NS = 50_000_000
 """How often the state is looked at while no picture comes."""
 REPEAT_NS = 200_000_000
 """How often a picture that is not live is sent again, with its age."""
+WAITING = 4
+"""Pictures that may wait to be shown after a delay."""
 COLOURS = {
     PictureState.LIVE: (40, 200, 80),
     PictureState.STALE: (255, 190, 0),
@@ -105,7 +107,8 @@ class DisplayOp(Operator):
         super().__init__(fragment, MessageOrTimeoutCondition(fragment, LOOK_NS), *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:
-        spec.input("rendered", policy="drop_oldest", type=RenderedFrame).condition(ConditionType.NONE)
+        port = spec.input("rendered", policy="drop_oldest", type=RenderedFrame).condition(ConditionType.NONE)
+        port.connector(port.ConnectorType.DEFAULT, capacity=WAITING)
         spec.output("shown", type=ShownPicture).condition(ConditionType.NONE)
 
     def start(self) -> None:

@@ -13,6 +13,9 @@ OperatorsError
 ├── EngineError (UserError)
 │   ├── EngineMissing                      the engine's package is not installed or cannot be loaded
 │   └── EngineUnsupported                  the engine cannot run this graph faithfully
+├── SourceError (UserError)                a source of frames cannot be used
+│   ├── SourceUnavailable                  it cannot be opened
+│   └── SourceLost                         it gave frames and is gone for good
 ├── OutputError (UserError)                what a run writes cannot be written
 │   ├── OutputFolderInUse                  the folder holds something that is not ours, or another run writes into it
 │   └── StorageFull                        the disk has no room left
@@ -97,6 +100,18 @@ class EngineMissing(EngineError):
 
 class EngineUnsupported(EngineError):
     """The engine cannot run this graph faithfully."""
+
+
+class SourceError(OperatorsError, UserError):
+    """A source of frames cannot be used."""
+
+
+class SourceUnavailable(SourceError):
+    """A source cannot be opened: nothing answers there, or what answers gives no pictures."""
+
+
+class SourceLost(SourceError):
+    """A source that gave frames is gone for good."""
 
 
 class OutputError(OperatorsError, UserError):

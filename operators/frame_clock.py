@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +16,15 @@ INTERVAL_DECAY = 0.1
 DISPLAY_DECAY = 0.2
 """How fast the usual time from a published model to its shown picture follows the newest ones."""
 
+REHEARSAL_MARGIN_NS = 300_000
+"""Rehearsal ends so long before the next frame is due."""
+SHOWN_WITHIN_S = 0.005
+"""Rehearsal waits so long for a picture to be shown."""
+CATCH_UP_SHARE = 0.8
+"""Frames that take a larger share of the time between them cannot be caught up with."""
+CATCH_UP_INTERVALS = 4.0
+"""A frame that has waited longer is passed over."""
+
 
 @dataclass(frozen=True)
 class ClockSettings:
@@ -22,7 +32,7 @@ class ClockSettings:
 
     budget_ms: float | None = None
     """A frame is to be shown so long after it has come; None: `auto_share` of the time between frames, at most `auto_most_ms`."""
-    auto_share: float = 0.45
+    auto_share: float = 0.5
     auto_most_ms: float = 18.0
     at_least_steps: int = 5
     """Steps that every frame gets, though it is shown late: fewer would change nothing that can be seen."""
@@ -57,7 +67,10 @@ class FrameClock:
         """Usual time between frames."""
         self.display_ns = 2e6
         """Usual time from a published model to its shown picture."""
+        self.training_ns = 0.0
+        """Usual time from taking a frame to its published model."""
         self._last_arrival_ns: int | None = None
+        self._shown = threading.Event()
 
     def budget(self, frame: Frame, *, first: bool = False) -> Budget:
         """The training that a frame may take before it is shown; the `first` one of a scene takes longer."""
@@ -80,13 +93,34 @@ class FrameClock:
             return settings.budget_ms * 1e6
         return min(settings.auto_share * self.interval_ns, settings.auto_most_ms * 1e6)
 
-    def may_rehearse(self, made: int) -> bool:
-        """Whether there is room for rehearsal, of which `made` steps were made since the last frame."""
-        return made < self.settings.rehearse_at_most
+    def may_rehearse(self, made: int, ahead_ns: float) -> bool:
+        """Whether there is room for more rehearsal: `made` steps were made since the last frame, and those that would be under way take
+        `ahead_ns`. It ends just before the next frame is due, so that the frame finds the device free."""
+        if made >= self.settings.rehearse_at_most or self._last_arrival_ns is None:
+            return False
+        return self.now_ns() + ahead_ns < self._last_arrival_ns + self.interval_ns - REHEARSAL_MARGIN_NS
+
+    def too_late(self, frame: Frame, waiting: int) -> bool:
+        """Whether a frame is passed over for one of the `waiting` newer ones. After a delay frames are caught up with one by one, as long
+        as they usually take less time than there is between them, and none is shown very late."""
+        if not waiting or frame.arrived_ns is None:
+            return False
+        keeps_up = self.training_ns + self.display_ns < CATCH_UP_SHARE * self.interval_ns
+        return not keeps_up or self.now_ns() - frame.arrived_ns > CATCH_UP_INTERVALS * self.interval_ns
+
+    def published(self, taken_ns: int, published_ns: int) -> None:
+        """The model of a frame that was taken then is published now."""
+        self._shown.clear()
+        self.training_ns += DISPLAY_DECAY * (published_ns - taken_ns - self.training_ns)
 
     def shown(self, published_ns: int, shown_ns: int) -> None:
         """A picture of the model that was published then is shown now."""
         self.display_ns += DISPLAY_DECAY * (max(0, shown_ns - published_ns) - self.display_ns)
+        self._shown.set()
+
+    def wait_until_shown(self) -> None:
+        """Wait until the newest published model is shown, but not for long: its picture has the device for itself meanwhile."""
+        self._shown.wait(SHOWN_WITHIN_S)
 
     def _learn_interval(self, arrived_ns: int) -> None:
         last, self._last_arrival_ns = self._last_arrival_ns, arrived_ns

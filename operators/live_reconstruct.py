@@ -17,8 +17,10 @@ from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ModelResult
 from operators.schedule import ScheduleEvent, ScheduleListener
 
-REHEARSED_AT_ONCE = 4
+REHEARSED_AT_ONCE = 3
 """Rehearsal steps between two looks for a new frame, on a GPU; on the CPU, where a step takes long, it is one."""
+WAITING = 5
+"""Frames that may wait to be trained on, where a delay can be caught up with; beyond them the oldest is dropped."""
 
 
 @dataclass
@@ -29,6 +31,8 @@ class TrainingCounts:
     """Frames that were trained on."""
     steps: int = 0
     """Steps on the newest frame, before it was shown."""
+    passed_over: int = 0
+    """Frames that were given up for newer ones."""
     rehearsed: int = 0
     """Steps on the window."""
     withheld: dict[str, int] = field(default_factory=dict)
@@ -89,7 +93,8 @@ class LiveReconstructOp(Operator):
         return newest.gaussians.count if isinstance(newest, Model) else newest.gaussian_count
 
     def setup(self, spec: OperatorSpec) -> None:
-        spec.input("frame", policy="drop_oldest", type=Frame)
+        port = spec.input("frame", policy="drop_oldest", type=Frame)
+        port.connector(port.ConnectorType.DEFAULT, capacity=WAITING)
         spec.output("reconstruction", type=Reconstruction)
 
     def start(self) -> None:
@@ -102,13 +107,19 @@ class LiveReconstructOp(Operator):
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         frame: Frame = op_input.receive("frame")
+        while (waiting := op_input.queued("frame")) and self.clock.too_late(frame, waiting):
+            self.counts.passed_over += 1
+            frame = op_input.receive("frame").carrying_scene_of(frame)
         reconstruction = self._observe(frame)
         if reconstruction is not None:
             op_output.emit(reconstruction, "reconstruction")
-            self._rehearse(lambda: bool(op_input.queued("frame")))
+            if not op_input.queued("frame"):
+                self.clock.wait_until_shown()
+            self._rehearse(frame, lambda: bool(op_input.queued("frame")))
 
     def _observe(self, frame: Frame) -> Reconstruction | None:
         assert self._reconstructor is not None
+        taken_ns = self.clock.now_ns()
         reason = self._why_not(frame)
         if reason is not None:
             self.counts.withheld[reason] = self.counts.withheld.get(reason, 0) + 1
@@ -119,15 +130,17 @@ class LiveReconstructOp(Operator):
                 return None  # nothing can be shown of it, and no scene begins with it
             if self.newest is not None:
                 self._begin_scene(frame, frame.new_scene or "resized")
-        report = self._reconstructor.observe(
-            frame, budget=self.clock.budget(frame, first=self.newest is None), train=reason is None
-        )
+        first = self.newest is None
+        report = self._reconstructor.observe(frame, budget=self.clock.budget(frame, first=first), train=reason is None)
         if reason is None:
             self._learned = frame
             self.counts.frames += 1
             self.counts.steps += report.steps
         self._tell(ScheduleEvent("observe", seq=frame.seq, steps=report.steps, train=reason is None))
         self.newest = self._reconstructor.publish()
+        published_ns = self.clock.now_ns()
+        if not first:
+            self.clock.published(taken_ns, published_ns)
         return Reconstruction(
             frame,
             self.newest,
@@ -135,7 +148,8 @@ class LiveReconstructOp(Operator):
             steps=report.steps,
             arriving_loss=report.arriving_loss,
             content=self._learned,
-            published_ns=self.clock.now_ns(),
+            taken_ns=taken_ns,
+            published_ns=published_ns,
         )
 
     def _begin_scene(self, frame: Frame, reason: str) -> None:
@@ -145,12 +159,15 @@ class LiveReconstructOp(Operator):
         self._tell(ScheduleEvent("begin_scene", seq=frame.seq))
         self.newest = None
 
-    def _rehearse(self, frame_waits: Callable[[], bool]) -> None:
-        """Train on the window until the next frame waits, but not longer than the clock allows."""
+    def _rehearse(self, frame: Frame, frame_waits: Callable[[], bool]) -> None:
+        """Train on the window until the next frame waits or is due."""
         assert self._reconstructor is not None
         at_once = REHEARSED_AT_ONCE if self._reconstructor.device.type == "cuda" else 1
         made = 0
-        while not frame_waits() and self.clock.may_rehearse(made) and not self._finish:
+        while not frame_waits() and self.clock.may_rehearse(made, self._reconstructor.rehearsal_ns(at_once)):
+            if made == 0 and frame is self._learned:
+                self._reconstructor.grow(frame)
+                self._tell(ScheduleEvent("grow", seq=frame.seq))
             self._reconstructor.rehearse(at_once)
             made += at_once
         self.counts.rehearsed += made

@@ -32,8 +32,10 @@ class Reconstruction:
     """Loss of the last of these steps, which a GPU may not have finished; None when there was none."""
     content: Frame | None = None
     """Live: the newest frame that the model has seen, which is what its picture shows; None where the frame itself is meant."""
+    taken_ns: int | None = None
+    """Live: when training took the frame, by `time.monotonic_ns`."""
     published_ns: int | None = None
-    """Live: when the model was published, by `time.monotonic_ns`."""
+    """Live: when the model was published."""
 
     def __post_init__(self) -> None:
         if self.steps < 0:
@@ -99,6 +101,8 @@ class RenderedFrame:
     """Optimiser steps that the frame was given."""
     content: Frame | None = None
     """See `Reconstruction.content`."""
+    taken_ns: int | None = None
+    """See `Reconstruction.taken_ns`."""
     published_ns: int | None = None
     """See `Reconstruction.published_ns`."""
 

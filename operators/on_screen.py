@@ -193,15 +193,24 @@ class OnScreenMetricsOp(Operator):
 
 def _entry(scored: ScoredFrame, frame: Frame, on_screen: ShownPicture, until_ns: float) -> Mapping[str, Value]:
     """One line of the log: the frame's figures, and what was on the screen."""
+    rendered = on_screen.rendered
+    arrived_ns = (rendered.content or rendered.frame).arrived_ns
     return {
         **scored.as_json(),
         "seq": frame.seq,
         "time_s": frame.time_s,
         "arrived_ns": frame.arrived_ns,
-        "shown_seq": on_screen.rendered.frame.seq,
+        "shown_seq": rendered.frame.seq,
         "shown_ns": on_screen.shown_ns,
         "age_ms": round(on_screen.age_ns * 1e-6, 3),
         "state": on_screen.state.value,
-        "steps": on_screen.rendered.steps,
+        "taken_ms": _since(arrived_ns, rendered.taken_ns),
+        "published_ms": _since(arrived_ns, rendered.published_ns),
+        "steps": rendered.steps,
         "withheld": frame.withheld,
     }
+
+
+def _since(arrived_ns: int | None, now_ns: int | None) -> float | None:
+    """Milliseconds from the arrival of a frame."""
+    return None if arrived_ns is None or now_ns is None else round((now_ns - arrived_ns) * 1e-6, 3)

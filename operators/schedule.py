@@ -11,7 +11,7 @@ from typing import Literal
 class ScheduleEvent:
     """One call of the reconstructor."""
 
-    kind: Literal["begin_scene", "observe", "rehearse"]
+    kind: Literal["begin_scene", "observe", "grow", "rehearse"]
     seq: int | None = None
     """The frame that it was called with; None for rehearsal."""
     steps: int = 0

@@ -1,17 +1,49 @@
-"""Which pixels are tissue: the masks that came with the recording."""
+"""Which pixels are tissue: the masks that came with the frames, those that are found in them, or none."""
 
 from __future__ import annotations
 
 import logging
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from gsplat_core.endoscope.tools import ToolFinder
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.registry import Registry
 from gsplat_core.scene.frames import Frame
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
 
 log = logging.getLogger(__name__)
+
+
+class MaskFinder(Protocol):
+    """Finds tools in the frames of one stream, in order."""
+
+    def find(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The mask of a picture: RGB uint8 [H, W, 3] to uint8 [H, W], 1 = tissue, 0 = tool."""
+        ...
+
+    def reset(self) -> None:
+        """Forget the stream."""
+        ...
+
+
+@dataclass(frozen=True)
+class FoundMasks:
+    """What an operator that finds tools did."""
+
+    method: str
+    """A name in `TOOL_MASKS`."""
+    found: int
+    """Frames whose mask was found."""
+    recorded: int
+    """Frames that came with a mask, which they kept."""
+    tool_share: float
+    """Share of tool pixels, the mean over the frames whose mask was found."""
 
 
 class RecordedToolMaskOp(Operator):
@@ -41,10 +73,133 @@ class RecordedToolMaskOp(Operator):
             if self.without_mask == 0:
                 log.warning("frame %d has no tool mask: every pixel counts as tissue", frame.seq)
             self.without_mask += 1
-            frame = frame.with_fields(mask=np.ones(frame.image.shape[:2], np.uint8))
+            frame = frame.with_fields(mask=all_tissue(frame))
         op_output.emit(frame, "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
         if self.without_mask:
             outcome.note(f"{self.without_mask} frames had no tool mask; all of their pixels counted as tissue")
+
+
+class FoundToolMaskOp(Operator):
+    """Finds the tools in each frame that comes without a mask; a frame that has one keeps it.
+
+    Where a frame says that the scene is another one from here on, the finder forgets the stream.
+
+    Inputs:
+        frame: `Frame`.
+
+    Outputs:
+        frame: `Frame` whose `mask` is set (1 = tissue, 0 = tool).
+
+    Params:
+        make_finder: called by `start()`.
+        method: its name in `FoundMasks`.
+    """
+
+    def __init__(
+        self, fragment: Any, *args: Any, make_finder: Callable[[], MaskFinder], method: str, **kwargs: Any
+    ) -> None:
+        self.make_finder = make_finder
+        self.method = method
+        self._finder: MaskFinder | None = None
+        self._found = self._recorded = 0
+        self._tool_shares = 0.0
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("frame", type=Frame)
+        spec.output("frame", type=Frame)
+
+    def start(self) -> None:
+        self._finder = self.make_finder()
+        self._found = self._recorded = 0
+        self._tool_shares = 0.0
+
+    def stop(self) -> None:
+        self._finder = None
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        frame = op_input.receive("frame")
+        assert self._finder is not None
+        if frame.new_scene is not None:
+            self._finder.reset()
+        if frame.mask is None:
+            mask = self._finder.find(frame.image)
+            self._found += 1
+            self._tool_shares += 1 - np.count_nonzero(mask) / mask.size
+            frame = frame.with_fields(mask=mask)
+        else:
+            self._recorded += 1
+        op_output.emit(frame, "frame")
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        share = self._tool_shares / self._found if self._found else 0.0
+        outcome.add(FoundMasks(self.method, self._found, self._recorded, share))
+
+
+class BuiltInToolMaskOp(FoundToolMaskOp):
+    """Finds tools by colour, edges and consistency in time (`ToolFinder`)."""
+
+    def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
+        super().__init__(fragment, *args, make_finder=ToolFinder, method="builtin", **kwargs)
+
+
+class NoToolMaskOp(Operator):
+    """Emits each frame with every pixel as tissue, whatever mask it came with.
+
+    Inputs:
+        frame: `Frame`.
+
+    Outputs:
+        frame: `Frame` whose `mask` is 1 everywhere.
+    """
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("frame", type=Frame)
+        spec.output("frame", type=Frame)
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        frame = op_input.receive("frame")
+        op_output.emit(frame.with_fields(mask=all_tissue(frame)), "frame")
+
+
+def all_tissue(frame: Frame) -> NDArray[np.uint8]:
+    """A mask without tools for a frame."""
+    return np.ones(frame.image.shape[:2], np.uint8)
+
+
+ToolMaskFactory = Callable[[Any, str, str], Operator]
+"""From the fragment, the operator's name and what followed the method's name after a colon ("" where nothing did) to an operator with one
+input and one output `frame`. Raises a UserError for what it cannot use."""
+
+
+def _plain(kind: type[Operator], method: str) -> ToolMaskFactory:
+    def make(fragment: Any, name: str, argument: str) -> Operator:
+        if argument:
+            raise InvalidSetting(f"tool mask {method!r} takes nothing after its name, got {argument!r}")
+        return kind(fragment, name=name)
+
+    return make
+
+
+TOOL_MASKS: Registry[ToolMaskFactory] = Registry(
+    "tool mask",
+    {
+        "recorded": _plain(RecordedToolMaskOp, "recorded"),
+        "builtin": _plain(BuiltInToolMaskOp, "builtin"),
+        "none": _plain(NoToolMaskOp, "none"),
+    },
+)
+"""Ways to get tool masks, by name."""
+
+
+def new_tool_mask(fragment: Any, choice: str, name: str = "tool_mask") -> Operator:
+    """The operator that `choice` names: a name in `TOOL_MASKS`, for some followed by a colon and an argument ("onnx:model.onnx").
+
+    Raises InvalidSetting for a name that is not known, and as the factory.
+    """
+    method, _, argument = choice.partition(":")
+    return TOOL_MASKS[method](fragment, name, argument)

@@ -123,16 +123,17 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
   m.def("ssim_map_backward(Tensor gradient, Tensor image, Tensor target) -> Tensor");
 
-  // Loss over tissue and its gradients in one go: (loss, [l1, 1 - ssim, inverse-depth l1], dL/dimage, dL/ddepth or empty).
+  // Loss over tissue and its gradients in one go: (loss, [l1 or squared error, 1 - ssim, inverse-depth l1], dL/dimage, dL/ddepth
+  // or empty).
   m.def(
       "image_loss(Tensor image, Tensor target, Tensor? mask, Tensor? depth, Tensor? target_depth, float ssim_weight, "
-      "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
+      "float depth_weight, bool squared=False) -> (Tensor, Tensor, Tensor, Tensor)");
 
   // The same of the frame path: image [H, W, 4] with colours and the sum of weight times z, alphas [H, W]; (loss, terms,
   // dL/dimage, dL/dalphas).
   m.def(
       "frame_loss(Tensor image, Tensor alphas, Tensor target, Tensor? mask, Tensor? target_depth, float ssim_weight, "
-      "float depth_weight) -> (Tensor, Tensor, Tensor, Tensor)");
+      "float depth_weight, bool squared=False) -> (Tensor, Tensor, Tensor, Tensor)");
 
   // Writes up to 64 values, which travel with the launch.
   m.def("store_scalars_(Tensor(a!) to, float[] values) -> ()");

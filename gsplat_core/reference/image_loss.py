@@ -12,6 +12,9 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.image_loss.result import ImageLoss
 from gsplat_core.reference.ssim import ssim_map
 
+STEEP_AS_L1 = 0.01
+"""The difference at which the squared error is as steep as L1."""
+
 
 def _mean_where(values: Tensor, keep: Tensor) -> Tensor:
     """Mean of the kept values; 0 when none is kept. What is not kept may be NaN: neither value nor gradient sees it."""
@@ -45,6 +48,15 @@ def masked_l1(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tens
     # The difference is formed of masked images: a NaN under the tool would reach the gradient through abs.
     zero = torch.zeros_like(image)
     return _mean_where((torch.where(keep, image, zero) - torch.where(keep, target, zero)).abs(), keep)
+
+
+def masked_squared_error(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean of d² / (2 STEEP_AS_L1) over tissue pixels and channels; arguments as in `masked_l1`."""
+    _same_shape(image, target, "image and target")
+    keep = _tissue(mask, image)
+    zero = torch.zeros_like(image)
+    difference = torch.where(keep, image, zero) - torch.where(keep, target, zero)
+    return _mean_where(difference.square() / (2 * STEEP_AS_L1), keep)
 
 
 def masked_ssim_loss(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -88,6 +100,7 @@ def image_loss(
     target_depth: Tensor | None = None,
     ssim_weight: float = 0.0,
     depth_weight: float = 0.0,
+    squared: bool = False,
 ) -> ImageLoss:
     """As `gsplat_core.ops.image_loss.image_loss`, which documents it; here image and depth may be of any floating type."""
     if target.dtype == torch.uint8:
@@ -96,13 +109,13 @@ def image_loss(
         x = image if image.requires_grad else image.detach().requires_grad_()
         z = depth if depth is None or depth.requires_grad else depth.detach().requires_grad_()
         zero = image.new_zeros(())
-        l1 = masked_l1(x, target, mask)
+        colour = (masked_squared_error if squared else masked_l1)(x, target, mask)
         ssim = masked_ssim_loss(x, target, mask) if ssim_weight else zero
         inverse_depth = inverse_depth_l1(z, target_depth, mask) if z is not None and target_depth is not None else zero
-        loss = (1 - ssim_weight) * l1 + ssim_weight * ssim + depth_weight * inverse_depth
+        loss = (1 - ssim_weight) * colour + ssim_weight * ssim + depth_weight * inverse_depth
         wanted = [x] if z is None else [x, z]
         gradients = torch.autograd.grad(loss, wanted, retain_graph=True, materialize_grads=True)
-    terms = torch.stack([l1, ssim, inverse_depth]).detach()
+    terms = torch.stack([colour, ssim, inverse_depth]).detach()
     differentiable = image.requires_grad or (depth is not None and depth.requires_grad)
     return ImageLoss(
         loss if differentiable else loss.detach(), terms, gradients[0], gradients[1] if z is not None else None
@@ -117,11 +130,12 @@ def frame_loss(
     target_depth: Tensor | None = None,
     ssim_weight: float = 0.0,
     depth_weight: float = 0.0,
+    squared: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """As `gsplat_core.ops.image_loss.frame_loss`, which documents it: loss, terms, dL/dimage and dL/dalphas, of any floating type."""
     with torch.enable_grad():
         x, alpha = image.detach().requires_grad_(), alphas.detach().requires_grad_()
         depth = None if target_depth is None else x[..., 3] / alpha.clamp(min=1e-10)
-        result = image_loss(x[..., :3], target, mask, depth, target_depth, ssim_weight, depth_weight)
+        result = image_loss(x[..., :3], target, mask, depth, target_depth, ssim_weight, depth_weight, squared)
         v_image, v_alphas = torch.autograd.grad(result.loss, [x, alpha], materialize_grads=True)
     return result.loss.detach(), result.terms, v_image, v_alphas

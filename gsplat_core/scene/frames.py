@@ -89,6 +89,12 @@ class Frame:
         """Width of the image."""
         return int(self.image.shape[1])
 
+    def carrying_scene_of(self, earlier: Frame) -> Frame:
+        """This frame in place of an `earlier` one that is passed over: a scene that began with that one begins with this one."""
+        if earlier.new_scene is None or self.new_scene is not None:
+            return self
+        return replace(self, new_scene=earlier.new_scene)
+
     def with_fields(self, **fields: Any) -> Frame:
         """A copy with more fields known."""
         return replace(self, **fields)

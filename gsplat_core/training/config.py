@@ -60,8 +60,10 @@ class ReconstructorConfig:
     """How much of the past stays deformable online, with the basis field; None: all of it, in memory that grows with the stream."""
     preallocate: bool = False
     """Take the memory for `max_gaussians` at once, so that nothing is captured again when Gaussians join or leave."""
+    squared_error: bool = False
+    """Whether colours are compared by the squared error, which PSNR measures, in place of L1."""
     ssim_weight: float = 0.0
-    """Weight of 1 - SSIM beside L1, 0..1."""
+    """Weight of 1 - SSIM beside L1 or the squared error, 0..1."""
     depth_weight: float = 0.02
     """Weight of the inverse-depth term where the recording has depth."""
     default_depth_mm: float = 60.0

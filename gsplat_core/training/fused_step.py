@@ -143,8 +143,9 @@ class FusedStep:
         view = View(controls.viewmat, controls.intrinsics, camera.width_px, camera.height_px, camera_model=camera.model)
         frame = render_frame(gaussians, deltas, view, self._capacity, FrameMode.TRAINING)
         loss = frame_loss(
-            frame.image, frame.alphas, self._image, self._mask, self._depth, self._weights.ssim, self._weights.depth
-        )
+            frame.image, frame.alphas, self._image, self._mask, self._depth,
+            self._weights.ssim, self._weights.depth, self._weights.squared,
+        )  # fmt: skip
         fits = accumulate_status_(frame.status, self._totals, self._step)
         adam = GaussianAdam(
             *self._moments(), in_frame, self._step, self._skipped, betas=self._adam.betas, epsilon=self._adam.epsilon

@@ -84,11 +84,30 @@ class LiveReconstructor(Reconstructor):
             self._unsettled = observation
             self._rehearsing.queued()
 
-    def begin_scene(self, frame: Frame) -> None:
-        """Forget the scene: `frame`, which is observed next, starts another one. The frame may be of another size; versions go on counting."""
+    def rehearsal_ns(self, steps: int) -> float:
+        """How long so many rehearsal steps usually take, together with those that are still under way; 0 before anything was timed."""
+        return (steps + REHEARSED_IN_FLIGHT) * (self._step_s or 0.0) * 1e9
+
+    def grow(self, frame: Frame) -> None:
+        """Add Gaussians where `frame`, the newest one that was trained on, shows tissue that the model does not cover. `observe` leaves
+        that for the time after the frame was shown."""
+        super()._grow(frame, self._window.newest)
+
+    def _grow(self, frame: Frame, observation: Observation) -> None:
+        pass
+
+    def forget(self) -> None:
+        """As if no frame had been observed, but for what is known about the device: the memory that was taken, how long a step takes."""
         self._settle()
         self._step = self._coverage = None
+        self._version = 0
         self._window = ObservationWindow(self.config.window_frames, self.config.newest_share, self._seed)
+
+    def begin_scene(self, frame: Frame) -> None:
+        """Forget the scene: `frame`, which is observed next, starts another one. The frame may be of another size; versions go on counting."""
+        version = self._version
+        self.forget()
+        self._version = version
         if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
             self.camera = self.camera.resized(frame.width_px, frame.height_px)
 

@@ -80,6 +80,11 @@ class ObservationWindow:
         while len(self._frames) > 1 and self._frames[0].time_s < time_s:
             self._frames.popleft()
 
+    @property
+    def newest(self) -> Observation:
+        """The frame that was added last."""
+        return self._frames[-1]
+
     def __len__(self) -> int:
         return len(self._frames)
 

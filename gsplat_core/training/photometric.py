@@ -24,6 +24,8 @@ class LossWeights:
 
     ssim: float = 0.0
     depth: float = 0.0
+    squared: bool = False
+    """The squared error in place of L1, see `image_loss`."""
 
 
 @torch.no_grad()
@@ -80,7 +82,7 @@ def _loss_of_picture(
     expected = picture[0, ..., 3] / alpha.clamp(min=1e-10) if use_depth else None
     result = image_loss(
         image, observation.image, observation.mask, expected, observation.depth if use_depth else None,
-        weights.ssim, weights.depth,
+        weights.ssim, weights.depth, weights.squared,
     )  # fmt: skip
     v_picture, v_alphas = result.grad_image, torch.zeros_like(alphas)
     if expected is not None and result.grad_depth is not None:

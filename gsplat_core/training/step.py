@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -44,7 +44,7 @@ class TrainingStep:
     ) -> None:
         self.field = field
         self._rates = config.rates
-        self._weights = LossWeights(config.ssim_weight, config.depth_weight)
+        self._weights = LossWeights(config.ssim_weight, config.depth_weight, config.squared_error)
         self._mm_per_px = mm_per_px(gaussians, camera)
         self._adam = FusedAdam(gaussians.tensors())
         self._rows: GaussianRows | None = None
@@ -147,6 +147,25 @@ class TrainingStep:
     @property
     def _all_rows(self) -> Gaussians:
         return self.gaussians if self._rows is None else self._rows.all
+
+    def split(self, kept: Tensor, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
+        """Keep the Gaussians in `kept` (int64 indices), and put two in the place of each of those at `parents` (indices into `kept`).
+
+        `halves` makes the two; both move as their parent does. The new ones, and their parents' Gaussians, start with fresh moments.
+        """
+        self._rows = None  # the tensors are replaced by others in any case
+        gaussians = self.gaussians.select(kept)
+        first, second = halves(gaussians.select(parents))
+        changed = gaussians.map(Tensor.clone)
+        for name, tensor in changed.tensors().items():
+            tensor[parents] = first.tensors()[name]
+        self.gaussians = changed.append(second)
+        self.field.select(kept)
+        self.field.append(second, parents)
+        self._adam.select(kept)
+        for name in self._adam.first_moments:
+            self._adam.reset(name, parents)
+        self._adam.append(second.count)
 
     def _captured_step(self, captured: FusedStep, observation: Observation, rate_scale: float) -> Tensor:
         if rate_scale != self._scaled_for:

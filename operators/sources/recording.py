@@ -7,8 +7,9 @@ from functools import cached_property
 
 from gsplat_core.io.recordings import Recording, open_recording
 from gsplat_core.scene.frames import Frame
-from operators.sources.registry import SourceOptions
-from operators.sources.source import SourceDescription
+from operators.sources.options import SourceOptions
+from operators.sources.realtime import play
+from operators.sources.source import FrameSource, SourceDescription
 from operators.sources.threaded import ThreadedSource
 
 
@@ -43,6 +44,8 @@ class RecordingSource(ThreadedSource):
         return iter(self.recording)
 
 
-def recording_source(address: str, options: SourceOptions) -> RecordingSource:
-    """A recording on disk, by its path. Raises as `open_recording`."""
+def recording_source(address: str, options: SourceOptions) -> FrameSource:
+    """A recording on disk, by its path, by the clock where that is asked for. Raises as `open_recording`."""
+    if options.realtime:
+        return play(address, options)
     return RecordingSource(open_recording(address, scale=options.scale, max_frames=options.max_frames))

@@ -10,8 +10,11 @@ import typer
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
     DeviceOption,
+    EvaluatedArgument,
+    EvaluationOutOption,
     JsonOption,
     LiveOutOption,
+    MaxFramesOption,
     ModelArgument,
     OutOption,
     RecordingArgument,
@@ -124,6 +127,9 @@ def live(
     seconds: Annotated[
         float | None, typer.Option(help="End after so many seconds.", show_default="when the source ends")
     ] = None,
+    tool_mask: Annotated[
+        str, typer.Option(help="Tools in frames without a mask: builtin, none, or another way to find them.")
+    ] = "builtin",
     loop: Annotated[bool, typer.Option("--loop", help="Play a recording again and again.")] = False,
     fps: Annotated[float | None, typer.Option(help="Play a recording at this rate.", show_default="its own")] = None,
     json: JsonOption = False,
@@ -131,7 +137,9 @@ def live(
     """Reconstruct a stream live: show each frame's reconstruction within its time, and say how old it is."""
     from services.cli.live import live_command, live_settings
 
-    with live_settings(source, out, budget_ms, seconds=seconds, loop=loop, fps=fps, **options.settings()) as settings:
+    with live_settings(
+        source, out, budget_ms, seconds=seconds, loop=loop, fps=fps, tool_mask=tool_mask, **options.settings()
+    ) as settings:
         return live_command(settings, keep=out is not None, as_json=json)
 
 
@@ -169,6 +177,45 @@ def render(
     return render_command(
         model, out, fps, scale=scale, device=device, renderer=renderer, overwrite=overwrite, as_json=json
     )
+
+
+@app.command()
+def evaluate(
+    model: EvaluatedArgument,
+    recording: RecordingArgument,
+    out: EvaluationOutOption = None,
+    protocol: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="heldout, live, retention or causal (which learns from the recording again); more than once for several.",
+            show_default="all but causal",
+        ),
+    ] = None,
+    device: DeviceOption = "cpu",
+    renderer: RendererOption = "alpha",
+    scale: Annotated[
+        float | None, typer.Option(help="Resize the frames by this factor.", show_default="the model's")
+    ] = None,
+    max_frames: MaxFramesOption = None,
+    steps_per_frame: Annotated[
+        int | None, typer.Option(help="Optimiser steps per frame of causal.", show_default="the run's")
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Measure a model or a run on a recording, beside what doing nothing scores."""
+    from operators.applications.evaluation import EvaluationSettings
+    from services.cli.evaluate import evaluate_command
+
+    settings = EvaluationSettings(
+        recording,
+        tuple(protocol or ()),
+        device=device,
+        renderer=renderer,
+        scale=scale,
+        max_frames=max_frames,
+        steps_per_frame=steps_per_frame,
+    )
+    return evaluate_command(model, settings, out, as_json=json)
 
 
 @app.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from operators.applications.result import RunOutcome
 from operators.display import LiveDisplayResult
+from operators.endoscope.stage import StageCounts
 from operators.live_reconstruct import TrainingCounts
 from operators.on_screen import OnScreenResult
 from services.reports.schema import LiveFacts
@@ -27,15 +28,27 @@ def live_facts(outcome: RunOutcome) -> LiveFacts | None:
         age_max_ms=round(age.max_ms, 2),
         first_picture_ms=_rounded(screen.first_picture_ms),
         states=screen.states,
-        dropped=outcome.dropped_by_edge,
+        dropped=_passed_over(outcome, training),
         withheld=training.withheld,
         scenes=training.scenes,
+        analysis={
+            part.name: dict(part.found)
+            for part in outcome.parts.values()
+            if isinstance(part, StageCounts) and part.found
+        },
         frames_trained=training.frames,
         steps=training.steps,
         rehearsed_steps=training.rehearsed,
         unscored=scores.unscored,
         not_on_screen=scores.not_on_screen,
     )
+
+
+def _passed_over(outcome: RunOutcome, training: TrainingCounts) -> dict[str, int]:
+    counts = dict(outcome.dropped_by_edge)
+    if training.passed_over:
+        counts["reconstruct"] = training.passed_over
+    return counts
 
 
 def _rounded(value: float | None) -> float | None:

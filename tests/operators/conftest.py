@@ -27,6 +27,53 @@ class FakeInput:
     def receive(self, name: str) -> Any:
         return self.messages.pop(name)
 
+    def queued(self, name: str) -> int:
+        return int(name in self.messages)
+
+
+class QueuedInput:
+    """Inputs with queues, by name."""
+
+    def __init__(self, **queues: Any) -> None:
+        self.queues = {name: list(messages) for name, messages in queues.items()}
+
+    def receive(self, name: str) -> Any:
+        queue = self.queues.get(name)
+        return queue.pop(0) if queue else None
+
+    def queued(self, name: str) -> int:
+        return len(self.queues.get(name, []))
+
+
+def run_queued(operator: Any, **queues: Any) -> list[Any]:
+    """One compute with these queues of messages at the inputs; what it emitted."""
+    output = FakeOutput()
+    operator.compute(QueuedInput(**queues), output, None)
+    return [value for _, value in output.emitted]
+
+
+@pytest.fixture
+def compute_queued() -> Callable[..., list[Any]]:
+    return run_queued
+
+
+class FakeTime:
+    """A monotonic clock that moves when it is told to."""
+
+    def __init__(self) -> None:
+        self.ns = 1_000_000_000
+
+    def __call__(self) -> int:
+        return self.ns
+
+    def pass_ms(self, ms: float) -> None:
+        self.ns += round(ms * 1e6)
+
+
+@pytest.fixture
+def fake_time() -> FakeTime:
+    return FakeTime()
+
 
 @dataclass
 class FakeOutput:

@@ -1,13 +1,15 @@
-"""Recorded masks stay with their frames; a frame without one is all tissue, and that is said."""
+"""Masks are recorded, found or left out; what a frame came with and what was done is said."""
 
 from __future__ import annotations
 
 import logging
 
 import numpy as np
+import pytest
 
+from gsplat_core.errors import InvalidSetting
 from operators.outcome import OutcomeBuilder
-from operators.tool_mask import RecordedToolMaskOp
+from operators.tool_mask import TOOL_MASKS, FoundMasks, FoundToolMaskOp, RecordedToolMaskOp, new_tool_mask
 
 
 def notes(operator):
@@ -34,3 +36,85 @@ def test_without_a_mask_every_pixel_is_tissue_and_it_is_stated_once(frame, compu
             assert passed.mask.shape == (16, 24) and passed.mask.all()
     assert len(caplog.records) == 1 and "frame 0 has no tool mask" in caplog.text
     assert notes(operator) == ("3 frames had no tool mask; all of their pixels counted as tissue",)
+
+
+class FakeFinder:
+    """Finds the whole upper half, and says what it was asked."""
+
+    def __init__(self) -> None:
+        self.calls: list[object] = []
+
+    def find(self, image):
+        self.calls.append(image)
+        mask = np.ones(image.shape[:2], np.uint8)
+        mask[: len(mask) // 2] = 0
+        return mask
+
+    def reset(self):
+        self.calls.append("reset")
+
+
+def found_masks(operator):
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    return outcome.find(FoundMasks)
+
+
+def test_a_frame_that_comes_with_a_mask_keeps_it_and_others_get_what_is_found(frame, compute):
+    finder = FakeFinder()
+    operator = FoundToolMaskOp(None, make_finder=lambda: finder, method="fake")
+    operator.start()
+    recorded = np.zeros((16, 24), np.uint8)
+    (kept,) = compute(operator, frame=frame(0, mask=recorded))
+    assert kept.mask is recorded and finder.calls == []
+    source = frame(1)
+    (found,) = compute(operator, frame=source)
+    assert found.mask.mean() == 0.5 and found.image is source.image
+    assert found_masks(operator) == FoundMasks("fake", found=1, recorded=1, tool_share=0.5)
+
+
+def test_the_stream_is_forgotten_where_another_scene_begins_and_at_each_start(frame, compute):
+    finder = FakeFinder()
+    operator = FoundToolMaskOp(None, make_finder=lambda: finder, method="fake")
+    operator.start()
+    compute(operator, frame=frame(0))
+    compute(operator, frame=frame(1, new_scene="cut", mask=np.ones((16, 24), np.uint8)))
+    assert finder.calls[1:] == ["reset"]
+    operator.start()
+    assert found_masks(operator) == FoundMasks("fake", 0, 0, 0.0)
+
+
+def test_without_masks_every_pixel_is_tissue_whatever_was_recorded(frame, compute):
+    (passed,) = compute(new_tool_mask(None, "none"), frame=frame(0, mask=np.zeros((16, 24), np.uint8)))
+    assert passed.mask.all()
+
+
+def test_the_built_in_mask_finds_a_grey_tool(frame, compute):
+    image = np.full((128, 160, 3), (190, 90, 70), np.uint8)
+    image[50:90, 60:] = (120, 124, 128)
+    operator = new_tool_mask(None, "builtin")
+    operator.start()
+    (found,) = compute(operator, frame=frame(0, image=image))
+    assert found.mask[55:85, 65:].max() == 0 and found.mask[:40].min() == 1
+    assert found_masks(operator).method == "builtin"
+
+
+@pytest.mark.parametrize(
+    ("choice", "sentence"),
+    [
+        ("magic", "unknown tool mask 'magic'; known are recorded, builtin, none"),
+        ("", "unknown tool mask ''"),
+        ("builtin:fast", "tool mask 'builtin' takes nothing after its name, got 'fast'"),
+    ],
+)
+def test_a_choice_that_names_nothing_is_refused(choice, sentence):
+    with pytest.raises(InvalidSetting, match=sentence):
+        new_tool_mask(None, choice)
+
+
+def test_each_way_is_an_operator_of_frames():
+    for choice in TOOL_MASKS:
+        if choice != "onnx":
+            operator = new_tool_mask(None, choice, "mask")
+            assert operator.name == "mask"
+            assert list(operator.spec.inputs) == list(operator.spec.outputs) == ["frame"]

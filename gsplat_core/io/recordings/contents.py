@@ -144,17 +144,22 @@ class Contents:
         return sorted({*self.other_files, *(path for part in parts if part for path in part.files)})
 
     def digest(self) -> str:
-        """sha256 over the input files: for each in order of name, its name, its length and its bytes. Raises RecordingInvalid."""
-        digest = hashlib.sha256()
-        for path in self.files():
-            name = path.relative_to(self.root).as_posix() if path != self.root else path.name
-            try:
-                with open_plain(path) as stream:
-                    digest.update(os.fsencode(name) + f"\0{os.fstat(stream.fileno()).st_size}\0".encode())
-                    while block := stream.read(1 << 20):
-                        digest.update(block)
-            except (UnreadableFile, OSError) as error:
-                raise RecordingInvalid(
-                    f"{printable(path)}: {error}. Leave the recording alone while it is read."
-                ) from error
-        return digest.hexdigest()
+        """As `digest_of` all its files."""
+        return digest_of(self.root, self.files())
+
+
+def digest_of(root: Path, files: Sequence[Path]) -> str:
+    """sha256 over files: for each in order, its name inside `root`, its length and its bytes. Raises RecordingInvalid."""
+    digest = hashlib.sha256()
+    for path in files:
+        name = path.relative_to(root).as_posix() if path != root else path.name
+        try:
+            with open_plain(path) as stream:
+                digest.update(os.fsencode(name) + f"\0{os.fstat(stream.fileno()).st_size}\0".encode())
+                while block := stream.read(1 << 20):
+                    digest.update(block)
+        except (UnreadableFile, OSError) as error:
+            raise RecordingInvalid(
+                f"{printable(path)}: {error}. Leave the recording alone while it is read."
+            ) from error
+    return digest.hexdigest()

@@ -6,6 +6,7 @@
 | `cameras.json`                                    | `cameras`  | the images it names, K, camera_to_world, `valid_mask` |
 | `images/`                                         | `endonerf` | `masks/ depth/ images_right/ poses_bounds.npy`        |
 | image files                                       | `images`   | a stated default camera                               |
+| `session.json`                                    | `session`  | what came in during a live session, with its own times |
 
 The sidecars mean the same in every layout and each is optional. `recording.json`, which `synthesize` writes, adds what
 the layouts cannot say: frame rate, camera, unit of depth, stereo baseline.
@@ -16,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gsplat_core.io.recordings.calibration import Calibration, default_calibration
 from gsplat_core.io.recordings.cameras_json import read_cameras_json
@@ -28,11 +30,14 @@ from gsplat_core.io.recordings.plain_files import all_stay_inside, stays_inside
 from gsplat_core.io.recordings.sidecars import Beside
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES, open_video
 
+if TYPE_CHECKING:
+    from gsplat_core.io.sessions.contents import SessionContents
+
 DEFAULT_FPS = 30.0
 _LAYOUTS = "a video, a folder with video.mp4, with images/ (EndoNeRF), with images and cameras.json, or with images"
 
 
-def inspect(path: Path, findings: Findings) -> Contents | None:
+def inspect(path: Path, findings: Findings) -> Contents | SessionContents | None:
     """Recognise the layout and make every check that needs no decoding of all frames; None where there is a problem."""
     try:
         is_file, is_folder = path.is_file(), path.is_dir()
@@ -51,8 +56,13 @@ def inspect(path: Path, findings: Findings) -> Contents | None:
         return None
 
 
-def _inspect_folder(path: Path, findings: Findings) -> Contents | None:
+def _inspect_folder(path: Path, findings: Findings) -> Contents | SessionContents | None:
     names = sorted(entry.name for entry in path.iterdir())
+    if "session.json" in names:
+        # Only now: most recordings are none, and what checks a session's log takes a while to load.
+        from gsplat_core.io.sessions.contents import session_contents
+
+        return session_contents(path, findings)
     videos = [path / name for name in names if Path(name).suffix.lower() in VIDEO_SUFFIXES and name[0] != "."]
     if "cameras.json" in names:
         if not stays_inside(path, path / "cameras.json", findings):

@@ -7,12 +7,16 @@ cluster, some seconds of video, as the cluster's first element; FFmpeg does not 
 from __future__ import annotations
 
 import zlib
-from typing import BinaryIO
+from collections.abc import Iterator
+from typing import BinaryIO, NamedTuple
 
 _SEGMENT = 0x18538067
 _CLUSTER = 0x1F43B675
 _CRC32 = 0xBF
+_TIMESTAMP = 0xE7
 _BLOCK = 1 << 20
+_MOST_OTHERS = 10_000
+"""Elements beside clusters: a file of nothing but empty ones would take minutes to walk."""
 _MAX_ID_BYTES, _MAX_LENGTH_BYTES = 4, 8
 
 
@@ -35,6 +39,55 @@ def check_matroska(stream: BinaryIO, size: int) -> tuple[int | None, list[tuple[
             damaged.append((at, body + length))
         at = body + length
     return segment_end, damaged
+
+
+class Cluster(NamedTuple):
+    """A cluster that is there from its first byte to its last."""
+
+    end: int
+    """The byte behind it."""
+    time: int
+    """Its timestamp, in the file's unit, which FFmpeg makes a millisecond."""
+
+
+def intact_clusters(stream: BinaryIO, size: int, *, check_sums: bool) -> Iterator[Cluster]:
+    """The clusters of a file's first `size` bytes, up to the first one that is cut off, has no timestamp, or, where `check_sums`, whose
+    CRC-32 is wrong. Without `check_sums` only a few bytes of each are read."""
+    at = others = 0
+    while at < size and others < _MOST_OTHERS:
+        element = _element(stream, at)
+        if element is None:
+            return
+        identifier, body, length = element
+        others += identifier != _CLUSTER
+        if identifier == _SEGMENT:
+            at = body
+            continue
+        if length is None or body + length > size:
+            return
+        at = body + length
+        if identifier == _CLUSTER:
+            time = _timestamp(stream, body, at)
+            if time is None or (check_sums and not _crc_holds(stream, body, length)):
+                return
+            yield Cluster(at, time)
+
+
+def _timestamp(stream: BinaryIO, body: int, end: int) -> int | None:
+    """The timestamp of the cluster whose body is [body, end): its first element, or the second one behind a CRC-32."""
+    at = body
+    for _ in range(2):
+        element = _element(stream, at)
+        if element is None:
+            return None
+        identifier, value, length = element
+        if length is None or value + length > end:
+            return None
+        if identifier == _TIMESTAMP and length <= _MAX_LENGTH_BYTES:
+            stream.seek(value)
+            return int.from_bytes(stream.read(length), "big")
+        at = value + length
+    return None
 
 
 def _element(stream: BinaryIO, at: int) -> tuple[int, int, int | None] | None:

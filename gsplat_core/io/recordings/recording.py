@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from gsplat_core.io.recordings.image_files import MAX_PIXELS
 from gsplat_core.io.recordings.layouts import inspect
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
+
+if TYPE_CHECKING:
+    from gsplat_core.io.sessions.contents import SessionContents
 
 MAX_REPORTED_PROBLEMS = 100
 _DAMAGE_ADVICE = "Damaged frames are shown, but neither trained on nor scored; copy the file again from its source"
@@ -61,7 +64,9 @@ class Recording(Protocol):
 class FileRecording:
     """A recording on disk, seen at a scale. Holds a few frames at a time, whatever its length."""
 
-    def __init__(self, contents: Contents, scale: float, max_frames: int | None, notes: tuple[str, ...]) -> None:
+    def __init__(
+        self, contents: Contents | SessionContents, scale: float, max_frames: int | None, notes: tuple[str, ...]
+    ) -> None:
         self._contents = contents
         # A relative path such as `.` has no name of its own.
         self.name = printable(contents.root.name or contents.root.resolve().name)
@@ -103,6 +108,7 @@ class FileRecording:
             right_image=None if frame.right_image is None else resize_area(frame.right_image, *size),
             depth=None if frame.depth is None else resize_nearest(frame.depth, *size),
             mask=None if frame.mask is None else resize_nearest(frame.mask, *size),
+            loss_mask=None if frame.loss_mask is None else resize_nearest(frame.loss_mask, *size),
         )
 
 

@@ -17,7 +17,7 @@ class FrameLoss(NamedTuple):
     loss: Tensor
     """Scalar."""
     terms: Tensor
-    """[3]: L1, 1 - SSIM (0 when its weight is 0) and inverse-depth L1, each before its weight."""
+    """[3]: L1 or squared error, 1 - SSIM (0 when its weight is 0) and inverse-depth L1, each before its weight."""
     grad_image: Tensor
     """dL/dimage [H, W, 4]."""
     grad_alphas: Tensor
@@ -32,6 +32,7 @@ def frame_loss(
     target_depth: Tensor | None = None,
     ssim_weight: float = 0.0,
     depth_weight: float = 0.0,
+    squared: bool = False,
 ) -> FrameLoss:
     """`image_loss` of colours and expected depth as `render_frame` returns them in FrameMode.TRAINING, without a wait for the device.
 
@@ -45,6 +46,7 @@ def frame_loss(
         target_depth: [H, W] float32 in mm, 0 = unknown; None = no depth term.
         ssim_weight: 0..1. With 0 the SSIM is not computed at all.
         depth_weight: at least 0.
+        squared: as in `image_loss`.
 
     Raises:
         InvalidInput: shapes, types, device or weights are not as said; `gsplat_core.reference.frame_loss` takes any device and float64.
@@ -68,7 +70,7 @@ def frame_loss(
             f"ssim_weight must be in 0..1 and depth_weight at least 0, got {ssim_weight} and {depth_weight}"
         )
     return FrameLoss(
-        *torch.ops.gsplat_core.frame_loss(image, alphas, target, mask, target_depth, ssim_weight, depth_weight)
+        *torch.ops.gsplat_core.frame_loss(image, alphas, target, mask, target_depth, ssim_weight, depth_weight, squared)
     )
 
 
@@ -81,5 +83,6 @@ def _(
     target_depth: Tensor | None,
     ssim_weight: float,
     depth_weight: float,
+    squared: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return image.new_empty(()), image.new_empty(3), image.new_empty(image.shape), image.new_empty(image.shape[:2])

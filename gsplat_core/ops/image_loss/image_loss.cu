@@ -76,6 +76,11 @@ __device__ inline Difference difference(float d, float slope) {
   return {fabsf(d), d > 0 ? slope : d < 0 ? -slope : d == d ? 0 : d};
 }
 
+// d² / (2 kSteepAsL1) and its derivative times `slope`.
+__device__ inline Difference squared_difference(float d, float slope) {
+  return {d * d * (0.5f / kSteepAsL1), slope * (d / kSteepAsL1)};
+}
+
 __global__ void __launch_bounds__(kThreads) differences(DeviceImageLoss in, const int64_t* counts, double* block_sums) {
   const double values = double(counts[kTissue]) * in.channels, known = double(counts[kKnownDepth]);
   const float slope = values > 0 ? float((1 - double(in.ssim_weight)) / values) : 0;
@@ -88,7 +93,8 @@ __global__ void __launch_bounds__(kThreads) differences(DeviceImageLoss in, cons
       if (tissue) {
         const int64_t value = i * in.channels + c;
         const float y = in.target_bytes != nullptr ? float(in.target_bytes[value]) / 255.0f : in.target[value];
-        d = difference(in.image[i * in.stride + c] - y, slope);
+        const float off = in.image[i * in.stride + c] - y;
+        d = in.squared ? squared_difference(off, slope) : difference(off, slope);
       }
       in.v_image[i * in.stride + c] = d.slope;
       sums[kColour] += double(d.value);

@@ -1,4 +1,4 @@
-// The image loss: masked L1, structural similarity (../ssim) and inverse-depth L1, with their gradients.
+// The image loss: masked L1 or squared error, structural similarity (../ssim) and inverse-depth L1, with their gradients.
 #pragma once
 
 #include <cstdint>
@@ -10,17 +10,22 @@ class CudaScratch;
 
 namespace gsplat::image_loss {
 
-// CPU: L1 and inverse depth, row by row.
-struct L1Task {
+// The squared error of a difference d is d² / (2 kSteepAsL1): as steep as |d| at d = kSteepAsL1. That is about what a trained
+// picture is off by, so learning rates, and Adam's epsilon beside the gradient, suit both.
+constexpr float kSteepAsL1 = 0.01f;
+
+// CPU: colours and inverse depth, row by row.
+struct ColourTask {
   const float* image;           // [H, W, C]
   const float* target;          // [H, W, C], or null with target_bytes
   const uint8_t* target_bytes;  // [H, W, C], value / 255
   const uint8_t* mask;          // [H, W], non-zero = tissue; null = all
   float* gradient;              // [H, W, C], written
-  float scale;                  // dL/d|difference|
-  double* sums;                 // [H]: |difference| summed over tissue
+  float scale;                  // what the gradient has of a difference's sign, or with `squared` of the difference
+  double* sums;                 // [H]: |difference|, or its square, summed over tissue
   int64_t width;
   int channels;
+  bool squared;
 };
 
 struct DepthTask {
@@ -35,7 +40,7 @@ struct DepthTask {
 };
 
 struct Kernels {
-  void (*l1_rows)(const L1Task& task, int64_t row_begin, int64_t row_end);
+  void (*colour_rows)(const ColourTask& task, int64_t row_begin, int64_t row_end);
   void (*count_depth_rows)(const DepthTask& task, int64_t row_begin, int64_t row_end);
   void (*depth_rows)(const DepthTask& task, int64_t row_begin, int64_t row_end);
   int64_t (*count_tissue)(const uint8_t* mask, int64_t pixels);
@@ -54,12 +59,13 @@ struct DeviceImageLoss {
   const float* target_depth;
   float ssim_weight, depth_weight;
   int32_t height, width, channels, stride;
+  bool squared;  // the squared error in place of L1
 
   float* v_image;
   float* v_depth;   // [H, W], with depth
   float* v_alphas;  // [H, W], with alphas
   float* loss;      // [1]
-  float* terms;     // [3]: L1, 1 - SSIM, inverse-depth L1
+  float* terms;     // [3]: L1 or squared error, 1 - SSIM, inverse-depth L1
 
   int64_t pixels;  // height times width
 };

@@ -1,4 +1,4 @@
-"""The training loss of one frame and its gradients in one fused op: masked L1, SSIM and inverse-depth L1 over tissue."""
+"""The training loss of one frame and its gradients in one fused op: masked L1 or squared error, SSIM and inverse-depth L1 over tissue."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ def image_loss(
     target_depth: Tensor | None = None,
     ssim_weight: float = 0.0,
     depth_weight: float = 0.0,
+    squared: bool = False,
 ) -> ImageLoss:
     """(1 - ssim_weight) L1 + ssim_weight (1 - SSIM) + depth_weight |1/depth - 1/target_depth|, each a mean over tissue.
 
@@ -35,6 +36,7 @@ def image_loss(
         target_depth: [H, W] float32 in mm, 0 = unknown; needed with depth.
         ssim_weight: 0..1. With 0 the SSIM is not computed at all.
         depth_weight: at least 0.
+        squared: d² / 0.02 of every difference d in place of its L1 |d|: as steep as L1 at d = 0.01, about what a trained picture is off by.
 
     Raises:
         InvalidInput: shapes, types or weights are not as said; `gsplat_core.reference.image_loss` takes float64.
@@ -63,7 +65,7 @@ def image_loss(
     if mask is not None and mask.dtype != torch.uint8:
         mask = (mask != 0).view(torch.uint8)
     loss, terms, grad_image, grad_depth = torch.ops.gsplat_core.image_loss(
-        image, target, mask, depth, target_depth, ssim_weight, depth_weight
+        image, target, mask, depth, target_depth, ssim_weight, depth_weight, squared
     )
     return ImageLoss(loss, terms, grad_image, None if depth is None else grad_depth)
 
@@ -77,6 +79,7 @@ def _(
     target_depth: Tensor | None,
     ssim_weight: float,
     depth_weight: float,
+    squared: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     grad_depth = image.new_empty(0 if depth is None else depth.shape)
     return image.new_empty(()), image.new_empty(3), image.new_empty(image.shape), grad_depth
@@ -93,13 +96,14 @@ def _save(
 
 def _backward(
     ctx: torch.autograd.function.FunctionCtx, grad_loss: Tensor, *_: Tensor
-) -> tuple[Tensor | None, None, None, Tensor | None, None, None, None]:
+) -> tuple[Tensor | None, None, None, Tensor | None, None, None, None, None]:
     grad_image, grad_depth = ctx.saved_tensors  # type: ignore[attr-defined]
     return (
         grad_loss * grad_image,
         None,
         None,
         grad_loss * grad_depth if ctx.has_depth else None,  # type: ignore[attr-defined]
+        None,
         None,
         None,
         None,

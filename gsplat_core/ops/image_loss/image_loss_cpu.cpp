@@ -30,25 +30,30 @@ GSPLAT_INLINE vfloat load_target(const uint8_t* p) {
   return __builtin_convertvector(bytes, vfloat) / 255.0f;
 }
 
-// |x - y| over tissue, and its derivative; a NaN under the tool is not seen, one in tissue is passed on.
+// |x - y| over tissue, or its square, and the derivative; a NaN under the tool is not seen, one in tissue is passed on.
+template <bool kSquared>
 GSPLAT_INLINE vfloat difference_of(vfloat x, vfloat y, vfloat tissue, float scale, float* gradient) {
   const vfloat d = select(tissue > 0, x - y, vfloat{});
+  if (kSquared) {
+    store(gradient, scale * d);
+    return d * d;
+  }
   vfloat g = select(d > 0, splat(scale), select(d < 0, splat(-scale), vfloat{}));
   store(gradient, select(d == d, g, d));
   return select(d < 0, -d, d);
 }
 
-template <typename Target>
-static double l1_block(const float* x, const Target* y, const float* tissue, float* gradient, float scale, int n) {
+template <bool kSquared, typename Target>
+static double colour_block(const float* x, const Target* y, const float* tissue, float* gradient, float scale, int n) {
   vfloat sums{};
   int i = 0;
   for (; i + kLanes <= n; i += kLanes)
-    sums += difference_of(load(x + i), load_target(y + i), load(tissue + i), scale, gradient + i);
+    sums += difference_of<kSquared>(load(x + i), load_target(y + i), load(tissue + i), scale, gradient + i);
   if (i < n) {  // the last few floats, in padded copies
     float xs[kLanes] = {}, ms[kLanes] = {}, gs[kLanes];
     Target ys[kLanes] = {};
     for (int lane = 0; i + lane < n; ++lane) xs[lane] = x[i + lane], ys[lane] = y[i + lane], ms[lane] = tissue[i + lane];
-    sums += difference_of(load(xs), load_target(ys), load(ms), scale, gs);
+    sums += difference_of<kSquared>(load(xs), load_target(ys), load(ms), scale, gs);
     for (int lane = 0; i + lane < n; ++lane) gradient[i + lane] = gs[lane];
   }
   double total = 0;
@@ -56,8 +61,8 @@ static double l1_block(const float* x, const Target* y, const float* tissue, flo
   return total;
 }
 
-template <typename Target>
-static void l1_rows_of(const L1Task& task, const Target* target, int64_t row_begin, int64_t row_end) {
+template <bool kSquared, typename Target>
+static void colour_rows_of(const ColourTask& task, const Target* target, int64_t row_begin, int64_t row_end) {
   const int c = task.channels;
   const int64_t block_px = kBlock / c;
   float tissue[kBlock];
@@ -67,18 +72,26 @@ static void l1_rows_of(const L1Task& task, const Target* target, int64_t row_beg
     for (int64_t px = 0; px < task.width; px += block_px) {
       const int64_t pixels = task.width - px < block_px ? task.width - px : block_px, first = row * task.width + px;
       if (task.mask) expand_mask(tissue, task.mask + first, pixels, c);
-      total +=
-          l1_block(task.image + first * c, target + first * c, tissue, task.gradient + first * c, task.scale, int(pixels * c));
+      total += colour_block<kSquared>(task.image + first * c, target + first * c, tissue, task.gradient + first * c, task.scale,
+                                      int(pixels * c));
     }
     task.sums[row] = total;
   }
 }
 
-static void l1_rows(const L1Task& task, int64_t row_begin, int64_t row_end) {
-  if (task.target_bytes)
-    l1_rows_of(task, task.target_bytes, row_begin, row_end);
+template <typename Target>
+static void colour_rows_to(const ColourTask& task, const Target* target, int64_t row_begin, int64_t row_end) {
+  if (task.squared)
+    colour_rows_of<true>(task, target, row_begin, row_end);
   else
-    l1_rows_of(task, task.target, row_begin, row_end);
+    colour_rows_of<false>(task, target, row_begin, row_end);
+}
+
+static void colour_rows(const ColourTask& task, int64_t row_begin, int64_t row_end) {
+  if (task.target_bytes)
+    colour_rows_to(task, task.target_bytes, row_begin, row_end);
+  else
+    colour_rows_to(task, task.target, row_begin, row_end);
 }
 
 // Where both depths are known and the mask is tissue, for kLanes pixels.
@@ -154,6 +167,6 @@ static int64_t count_tissue(const uint8_t* mask, int64_t pixels) {
   return count;
 }
 
-extern const Kernels kernels = {l1_rows, count_depth_rows, depth_rows, count_tissue};
+extern const Kernels kernels = {colour_rows, count_depth_rows, depth_rows, count_tissue};
 
 }  // namespace GSPLAT_ISA::image_loss

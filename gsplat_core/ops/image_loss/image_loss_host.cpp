@@ -49,6 +49,7 @@ struct Images {
 
 struct Weights {
   double ssim, depth;
+  bool squared;
 };
 
 // What a call returns.
@@ -67,6 +68,7 @@ DeviceImageLoss device_loss(const Images& in, const Weights& weights, const Resu
   loss.ssim_weight = float(weights.ssim), loss.depth_weight = float(weights.depth);
   loss.height = int32_t(in.height), loss.width = int32_t(in.width), loss.pixels = in.pixels;
   loss.channels = int32_t(in.channels), loss.stride = int32_t(in.image.size(2));
+  loss.squared = weights.squared;
   loss.loss = mutable_data(out.loss), loss.terms = mutable_data(out.terms), loss.v_image = mutable_data(out.v_image);
   return loss;
 }
@@ -106,44 +108,50 @@ double depth_term(const Images& in, double weight, float* gradient) {
 void run(Call&, const Images& in, const Weights& weights, const Results& out) {
   const double values = double(in.channels * (in.tissue ? kernels().count_tissue(in.tissue, in.pixels) : in.pixels));
   std::vector<double> sums(size_t(in.height));
-  const L1Task l1 = {data(in.image),
-                     in.target_values,
-                     in.target_bytes,
-                     in.tissue,
-                     mutable_data(out.v_image),
-                     values > 0 ? float((1 - weights.ssim) / values) : 0,
-                     sums.data(),
-                     in.width,
-                     int(in.channels)};
-  torch::stable::parallel_for(0, in.height, kRows, [&](int64_t begin, int64_t end) { kernels().l1_rows(l1, begin, end); });
-  const double l1_term = values > 0 ? total(sums) / values : 0;
+  const double steepness = weights.squared ? 1 / double(kSteepAsL1) : 1;
+  const ColourTask colours = {data(in.image),
+                              in.target_values,
+                              in.target_bytes,
+                              in.tissue,
+                              mutable_data(out.v_image),
+                              values > 0 ? float((1 - weights.ssim) * steepness / values) : 0,
+                              sums.data(),
+                              in.width,
+                              int(in.channels),
+                              weights.squared};
+  torch::stable::parallel_for(0, in.height, kRows,
+                              [&](int64_t begin, int64_t end) { kernels().colour_rows(colours, begin, end); });
+  const double colour_sum = weights.squared ? total(sums) * steepness / 2 : total(sums);
+  const double colour_term = values > 0 ? colour_sum / values : 0;
 
   double ssim_term = 0;
   if (weights.ssim != 0 && values > 0) {
     std::vector<double> strips(size_t(in.height * ssim::ssim_strips(in.width, int(in.channels))));
     ssim::SsimTask task = {};
-    task.image = l1.image, task.target = l1.target, task.target_bytes = l1.target_bytes, task.mask = in.tissue;
+    task.image = colours.image, task.target = colours.target, task.target_bytes = colours.target_bytes, task.mask = in.tissue;
     task.scale = float(-weights.ssim / values);
-    task.gradient = l1.gradient, task.sums = strips.data();
+    task.gradient = colours.gradient, task.sums = strips.data();
     task.height = in.height, task.width = in.width, task.channels = int(in.channels);
     ssim::run_ssim(task);
     ssim_term = total(strips) / values;
   }
   const double inverse_depth_term = in.depth.has_value() ? depth_term(in, weights.depth, mutable_data(out.v_depth)) : 0;
-  *mutable_data(out.loss) = float((1 - weights.ssim) * l1_term + weights.ssim * ssim_term + weights.depth * inverse_depth_term);
+  *mutable_data(out.loss) =
+      float((1 - weights.ssim) * colour_term + weights.ssim * ssim_term + weights.depth * inverse_depth_term);
   float* const terms = mutable_data(out.terms);
-  terms[0] = float(l1_term), terms[1] = float(ssim_term), terms[2] = float(inverse_depth_term);
+  terms[0] = float(colour_term), terms[1] = float(ssim_term), terms[2] = float(inverse_depth_term);
 }
 
 #endif
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> image_loss(Tensor image, Tensor target, OptionalTensor mask, OptionalTensor depth,
-                                                      OptionalTensor target_depth, double ssim_weight, double depth_weight) {
+                                                      OptionalTensor target_depth, double ssim_weight, double depth_weight,
+                                                      bool squared) {
   Call call(image);
   const Images in(call, image, target, mask, depth, depth.has_value() ? target_depth : std::nullopt, 0);
   const Results out = {call.empty({}), call.empty({3}), call.empty({in.height, in.width, in.channels}),
                        depth.has_value() ? call.empty({in.height, in.width}) : call.empty({0})};
-  run(call, in, {ssim_weight, depth_weight}, out);
+  run(call, in, {ssim_weight, depth_weight, squared}, out);
   call.finish("image_loss");
   return {out.loss, out.terms, out.v_image, out.v_depth};
 }
@@ -152,14 +160,15 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> image_loss(Tensor image, Tensor targe
 
 // Of the frame path: the image has the sum of weight times z as a fourth channel, and the depth is that divided by alpha.
 std::tuple<Tensor, Tensor, Tensor, Tensor> frame_loss(Tensor image, Tensor alphas, Tensor target, OptionalTensor mask,
-                                                      OptionalTensor target_depth, double ssim_weight, double depth_weight) {
+                                                      OptionalTensor target_depth, double ssim_weight, double depth_weight,
+                                                      bool squared) {
   Call call(image);
   const Images in(call, image, target, mask, std::nullopt, target_depth, 1);
   check(in.channels == 3 && in.target_bytes != nullptr, "frame_loss takes an image [H, W, 4] and a target uint8 [H, W, 3]");
   const Tensor opacity = call.floats(alphas, "alphas");
   in.check_plane(opacity, "alphas");
   const Results out = {call.empty({}), call.empty({3}), call.empty({in.height, in.width, 4}), call.empty({in.height, in.width})};
-  DeviceImageLoss loss = device_loss(in, {ssim_weight, depth_weight}, out);
+  DeviceImageLoss loss = device_loss(in, {ssim_weight, depth_weight, squared}, out);
   loss.alphas = data(opacity), loss.v_alphas = mutable_data(out.v_depth);
   image_loss_on_device(loss, call, call.stream);
   call.finish("frame_loss");

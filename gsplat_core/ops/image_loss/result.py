@@ -13,7 +13,7 @@ class ImageLoss(NamedTuple):
     loss: Tensor
     """Scalar; differentiable in image and depth."""
     terms: Tensor
-    """[3]: L1, 1 - SSIM (0 when its weight is 0) and inverse-depth L1, each before its weight. Not differentiable."""
+    """[3]: L1 or squared error, 1 - SSIM (0 when its weight is 0) and inverse-depth L1, each before its weight. Not differentiable."""
     grad_image: Tensor
     """dL/dimage [H, W, C]. Not differentiable."""
     grad_depth: Tensor | None

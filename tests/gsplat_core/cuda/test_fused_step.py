@@ -61,7 +61,7 @@ def train(
     return losses, adam
 
 
-@pytest.mark.parametrize("weights", [LossWeights(), LossWeights(ssim=0.2, depth=0.5)])
+@pytest.mark.parametrize("weights", [LossWeights(), LossWeights(ssim=0.2, depth=0.5), LossWeights(squared=True)])
 def test_it_learns_as_the_cpu_does(make_gaussians, observation, weights):
     from gsplat_core.training.photometric import loss_and_gradients
 

@@ -56,7 +56,7 @@ def assert_same(ours, expected):
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
 def test_equals_the_reference(shape, ssim_weight):
     image, target, mask, depth, target_depth = scene(shape)
-    for masked, deep, as_bytes in itertools.product((True, False), repeat=3):
+    for masked, deep, as_bytes, squared in itertools.product((True, False), repeat=4):
         tensors = (
             image,
             target if as_bytes else target.float() / 255,
@@ -64,18 +64,20 @@ def test_equals_the_reference(shape, ssim_weight):
             *((depth, target_depth) if deep else (None, None)),
         )
         assert_same(
-            image_loss(*tensors, ssim_weight, 0.5), reference.image_loss(*map(double, tensors), ssim_weight, 0.5)
+            image_loss(*tensors, ssim_weight, 0.5, squared),
+            reference.image_loss(*map(double, tensors), ssim_weight, 0.5, squared),
         )
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (7, 5), (64, 64), (101, 150)])
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
 def test_a_frame_equals_the_reference(shape, ssim_weight):
-    for masked, deep in itertools.product((True, False), repeat=2):
+    for masked, deep, squared in itertools.product((True, False), repeat=3):
         image, alphas, target, mask, target_depth = frame(shape)
         tensors = (image, alphas, target, mask if masked else None, target_depth if deep else None)
         assert_same(
-            frame_loss(*tensors, ssim_weight, 0.5), reference.frame_loss(*map(double, tensors), ssim_weight, 0.5)
+            frame_loss(*tensors, ssim_weight, 0.5, squared),
+            reference.frame_loss(*map(double, tensors), ssim_weight, 0.5, squared),
         )
 
 
@@ -143,6 +145,7 @@ def test_opcheck():
     image.requires_grad_()
     torch.library.opcheck(torch.ops.gsplat_core.image_loss, (image, target, mask, depth, target_depth, 0.2, 0.5))
     torch.library.opcheck(torch.ops.gsplat_core.frame_loss, (*frame((12, 9)), 0.2, 0.5))
+    torch.library.opcheck(torch.ops.gsplat_core.frame_loss, (*frame((12, 9)), 0.2, 0.5, True))
 
 
 def test_what_it_cannot_take_is_refused():

@@ -26,11 +26,11 @@ def scene(shape, seed=0, keep=0.7):
     return image, target, mask, depth, target_depth
 
 
-def assert_equals_reference(image, target, mask, depth, target_depth, ssim_weight, depth_weight):
+def assert_equals_reference(image, target, mask, depth, target_depth, ssim_weight, depth_weight, squared=False):
     double = lambda t: t if t is None or t.dtype == torch.uint8 else t.double()
-    ours = image_loss(image, target, mask, depth, target_depth, ssim_weight, depth_weight)
+    ours = image_loss(image, target, mask, depth, target_depth, ssim_weight, depth_weight, squared)
     expected = reference_image_loss(
-        image.double(), double(target), mask, double(depth), double(target_depth), ssim_weight, depth_weight
+        image.double(), double(target), mask, double(depth), double(target_depth), ssim_weight, depth_weight, squared
     )
     torch.testing.assert_close(ours.loss.double(), expected.loss, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(ours.terms.double(), expected.terms, rtol=1e-5, atol=1e-6)
@@ -45,10 +45,19 @@ def assert_equals_reference(image, target, mask, depth, target_depth, ssim_weigh
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
 def test_equals_the_reference(shape, ssim_weight):
-    for masked, deep in itertools.product((True, False), repeat=2):
+    for masked, deep, squared in itertools.product((True, False), repeat=3):
         image, target, mask, depth, target_depth = scene(shape)
         depths = (depth, target_depth) if deep else (None, None)
-        assert_equals_reference(image, target, mask if masked else None, *depths, ssim_weight, 0.5)
+        assert_equals_reference(image, target, mask if masked else None, *depths, ssim_weight, 0.5, squared)
+
+
+def test_the_squared_error_takes_floats_as_targets_and_is_as_steep_as_l1_at_a_hundredth():
+    image, target, mask, *_ = scene((18, 700, 3))
+    assert_equals_reference(image, target.float() / 255, mask, None, None, 0.2, 0.0, squared=True)
+    off_by_a_hundredth = target.double() / 255 + 0.01
+    squared = image_loss(off_by_a_hundredth.float(), target, mask, squared=True).grad_image
+    l1 = image_loss(off_by_a_hundredth.float(), target, mask).grad_image
+    torch.testing.assert_close(squared, l1, rtol=1e-4, atol=0)
 
 
 @settings(max_examples=20, deadline=None)
@@ -96,9 +105,9 @@ def test_a_nan_is_unseen_under_the_tool_and_shown_in_tissue():
     assert torch.equal(image_loss(hidden, target, mask, ssim_weight=0.2).grad_image, clean.grad_image)
     shown = image.clone()
     shown[25, 3] = torch.nan
-    result = image_loss(shown, target, mask)
-    assert torch.isnan(result.loss)
-    assert torch.isnan(result.grad_image).all(dim=2).sum() == 1
+    for result in (image_loss(shown, target, mask), image_loss(shown, target, mask, squared=True)):
+        assert torch.isnan(result.loss)
+        assert torch.isnan(result.grad_image).all(dim=2).sum() == 1
 
 
 def test_backward_gives_the_gradients_that_it_returns():
@@ -130,14 +139,18 @@ def test_opcheck(deep):
     image, target, mask, depth, target_depth = scene((12, 9, 3))
     image.requires_grad_()
     depths = (depth.requires_grad_(), target_depth) if deep else (None, None)
-    torch.library.opcheck(torch.ops.gsplat_core.image_loss, (image, target, mask, *depths, 0.2, 0.5))
+    for squared in (False, True):
+        torch.library.opcheck(torch.ops.gsplat_core.image_loss, (image, target, mask, *depths, 0.2, 0.5, squared))
 
 
 def test_gradcheck_of_the_reference():
     image, target, mask, depth, target_depth = scene((6, 7, 3))
     image, depth = image.double().requires_grad_(), depth.double().requires_grad_()
-    loss = lambda x, z: reference_image_loss(x, target, mask, z, target_depth.double(), 0.3, 5.0).loss
-    assert torch.autograd.gradcheck(loss, (image, depth))
+    for squared in (False, True):
+        loss = lambda x, z, squared=squared: (
+            reference_image_loss(x, target, mask, z, target_depth.double(), 0.3, 5.0, squared).loss
+        )
+        assert torch.autograd.gradcheck(loss, (image, depth))
 
 
 def test_what_it_cannot_take_is_refused():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.reference.image_loss import inverse_depth_l1, masked_l1, masked_ssim_loss
+from gsplat_core.reference.image_loss import inverse_depth_l1, masked_l1, masked_squared_error, masked_ssim_loss
 
 
 def images(height=9, width=13, dtype=torch.float64, seed=0):
@@ -27,6 +27,13 @@ def test_masked_l1_averages_over_tissue_only():
     assert masked_l1(image, target).item() == pytest.approx(3.3 / 6)
 
 
+def test_masked_squared_error_averages_over_tissue_only():
+    image = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]])
+    target = torch.tensor([[[0.3, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+    assert masked_squared_error(image, target, torch.tensor([[1, 0]])).item() == pytest.approx(0.09 / 0.02 / 3)
+    assert masked_squared_error(image, target).item() == pytest.approx(3.09 / 0.02 / 6)
+
+
 def test_ssim_loss_is_zero_for_equal_images_and_blind_under_the_tool():
     image, _, mask = images()
     assert masked_ssim_loss(image, image.detach(), mask).item() == pytest.approx(0, abs=1e-12)
@@ -34,7 +41,7 @@ def test_ssim_loss_is_zero_for_equal_images_and_blind_under_the_tool():
     assert masked_ssim_loss(changed, image.detach(), mask).item() == pytest.approx(0, abs=1e-12)
 
 
-@pytest.mark.parametrize("loss", [masked_l1, masked_ssim_loss])
+@pytest.mark.parametrize("loss", [masked_l1, masked_squared_error, masked_ssim_loss])
 def test_image_losses_pass_gradcheck(loss):
     image, target, mask = images(6, 7)
     assert torch.autograd.gradcheck(lambda x: loss(x, target, mask), (image,))

@@ -51,6 +51,7 @@ def by_autograd(gaussians, seen, weights):
         seen.depth if use_depth else None,
         weights.ssim,
         weights.depth,
+        weights.squared,
     ).loss
     loss.backward()
     return float(loss.detach()), {name: tensor.grad for name, tensor in leaves.tensors().items()}
@@ -58,7 +59,8 @@ def by_autograd(gaussians, seen, weights):
 
 @pytest.mark.parametrize("sh_degree", [0, 3])
 @pytest.mark.parametrize(
-    "weights", [LossWeights(), LossWeights(ssim=0.3), LossWeights(depth=5.0), LossWeights(0.2, 5.0)]
+    "weights",
+    [LossWeights(), LossWeights(ssim=0.3), LossWeights(depth=5.0), LossWeights(0.2, 5.0), LossWeights(squared=True)],
 )
 @pytest.mark.parametrize(("model", "pose"), [("pinhole", None), ("pinhole", MOVED), ("fisheye", MOVED)])
 def test_equals_render_loss_and_backward(make_gaussians, assert_near, sh_degree, weights, model, pose):

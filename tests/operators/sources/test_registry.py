@@ -57,8 +57,8 @@ def test_a_recording_may_be_named_by_its_scheme(folder):
 
 
 def test_an_unknown_scheme_is_refused_by_its_name():
-    with pytest.raises(InvalidSetting, match="unknown source 'rtsp'; known are recording"):
-        open_source("rtsp://camera/1")
+    with pytest.raises(InvalidSetting, match="unknown source 'tapes'; known are recording, realtime"):
+        open_source("tapes://studio/1")
 
 
 def test_a_path_that_exists_is_a_path_whatever_it_looks_like(folder, tmp_path, monkeypatch):

@@ -1,0 +1,142 @@
+"""Pictures that are none, or not new: black, one colour, noise, the same again, part of the one before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.endoscope.reduced import luma
+from gsplat_core.endoscope.setting_ranges import check_settings
+from gsplat_core.value_ranges import IntegerIn, NumberIn
+
+ROWS = 128
+"""About how many rows of a picture are looked at; in each of them about as many pixels."""
+SMALLEST_FOR_NOISE_PX = 32
+"""In narrower pictures neighbouring pixels differ without being noise."""
+
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """When a picture is not usable. Differences are in levels of 0 to 255. Raises InvalidSetting out of range."""
+
+    black_level: int = 20
+    """A picture is black when all but `odd_share` of it is darker than this."""
+    one_colour_levels: int = 3
+    """A picture is of one colour when all but `odd_share` of it is within this of its median colour."""
+    odd_share: float = 0.03
+    """Share that may be otherwise: a line of text, a logo."""
+    noise_share: float = 0.5
+    """Noise: neighbouring pixels differ by this share of what unrelated pixels would. Tissue has 0.01 to 0.04."""
+    same_levels: int = 2
+    """Pixels that differ by no more are the same; a picture that is encoded again differs so much."""
+    same_share: float = 0.9995
+    """A picture is the same as the one before when this share of its pixels is."""
+    frozen_s: float = 0.25
+    """Without a new picture for so long the stream is frozen; before, a frame is a duplicate."""
+    frozen_frames: int = 8
+    """So many same pictures in a row are frozen as well, whatever their times."""
+    torn_share: float = 0.08
+    """A picture is torn when at least this share of its rows, up to its lower edge, is that of the picture before."""
+    moving_share: float = 0.9
+    """Rows are compared for that only if they changed in at least this share of the frames: not a black border or a recorder's strip."""
+
+    def __post_init__(self) -> None:
+        share = NumberIn(0.0, 1.0)
+        check_settings(
+            self,
+            black_level=IntegerIn(0, 255),
+            one_colour_levels=IntegerIn(0, 255),
+            odd_share=share,
+            noise_share=NumberIn(0.01, 10.0),
+            same_levels=IntegerIn(0, 255),
+            same_share=share,
+            frozen_s=NumberIn(0.0, 3600.0),
+            frozen_frames=IntegerIn(1, 100_000),
+            torn_share=NumberIn(0.01, 1.0),
+            moving_share=share,
+        )
+
+
+class SequenceCheck:
+    """Looks at each picture of a stream beside the one before; it keeps one small picture and a number for each row of it."""
+
+    def __init__(self, settings: SequenceSettings | None = None) -> None:
+        self.settings = settings or SequenceSettings()
+        self._previous: NDArray[np.uint8] | None = None
+        self._shape: tuple[int, ...] = ()
+        self._new_since_ns = 0
+        self._same_run = 0
+        self._row_moves: NDArray[np.float64] = np.zeros(0)
+        """How often each row has changed lately, 0..1."""
+        self._frames_seen = 0
+
+    def fault(self, image: NDArray[np.uint8], pts_ns: int) -> str | None:
+        """What is wrong with the picture, RGB uint8 [H, W, 3], shown at `pts_ns`; None if nothing is.
+
+        One of "black", "one colour", "noise", "duplicate", "frozen" and "torn".
+        """
+        step_y, step_x = (max(1, size // ROWS) for size in image.shape[:2])
+        sampled = np.ascontiguousarray(image[::step_y, ::step_x])
+        previous, self._previous = self._previous, sampled
+        if previous is None or self._shape != image.shape:
+            self._shape, self._frames_seen, self._same_run = image.shape, 0, 0
+            self._row_moves = np.zeros(len(sampled))
+            self._new_since_ns = pts_ns
+            return self._unusable(image, sampled)
+        differs = cv2.absdiff(sampled, previous).max(axis=2) > self.settings.same_levels
+        if differs.mean() <= 1 - self.settings.same_share:
+            return self._unusable(image, sampled) or self._repeated(pts_ns)
+        self._new_since_ns, self._same_run = pts_ns, 0
+        changed = differs.mean(axis=1) > 0.01
+        torn = self._torn(sampled, changed)
+        if not torn:
+            # Quick at first, then over about the last 50 frames.
+            self._frames_seen += 1
+            self._row_moves += (changed - self._row_moves) / min(self._frames_seen, 50)
+        return self._unusable(image, sampled) or ("torn" if torn else None)
+
+    def _unusable(self, image: NDArray[np.uint8], sampled: NDArray[np.uint8]) -> str | None:
+        settings = self.settings
+        grey = luma(sampled)
+        if (grey >= settings.black_level).mean() <= settings.odd_share:
+            return "black"
+        middle = np.median(sampled[::2, ::2].reshape(-1, 3), axis=0).astype(np.int16)
+        away = np.abs(sampled.astype(np.int16) - middle).max(axis=2) > settings.one_colour_levels
+        if away.mean() <= settings.odd_share:
+            return "one colour"
+        if min(image.shape[:2]) >= SMALLEST_FOR_NOISE_PX and _roughness(image) > settings.noise_share:
+            return "noise"
+        return None
+
+    def _repeated(self, pts_ns: int) -> str:
+        self._same_run += 1
+        without_new_s = (pts_ns - self._new_since_ns) * 1e-9
+        long = self._same_run >= 2 and without_new_s >= self.settings.frozen_s
+        return "frozen" if long or self._same_run >= self.settings.frozen_frames else "duplicate"
+
+    def _torn(self, sampled: NDArray[np.uint8], changed: NDArray[np.bool_]) -> bool:
+        """Whether the lowest rows are the ones of the picture before, or of one colour, while what is above moved as usual."""
+        if self._frames_seen < 5:
+            return False
+        moving = self._row_moves >= self.settings.moving_share
+        flat = np.ptp(sampled[:, ::4].astype(np.int16), axis=1).max(axis=1) <= 2 * self.settings.one_colour_levels
+        least = max(3, round(self.settings.torn_share * len(sampled)))
+        for stale in (~changed, flat & changed):
+            # From the lowest row that moves, upwards: all rows that move must be stale.
+            rows = np.flatnonzero(moving)[::-1]
+            fresh = np.flatnonzero(~stale[rows])
+            below = len(rows) if len(fresh) == 0 else int(fresh[0])
+            above = rows[below:]
+            if below >= least and len(above) >= least and changed[above].mean() > 0.5 and not flat[above].all():
+                return True
+        return False
+
+
+def _roughness(image: NDArray[np.uint8]) -> float:
+    """Mean squared difference of neighbours in a row, over that of unrelated pixels (twice the variance): 0 smooth, 1 noise."""
+    rows = image[:: max(1, image.shape[0] // 32), :, 1].astype(np.float32)
+    variance = float(rows.var())
+    return float(np.square(rows[:, 1:] - rows[:, :-1]).mean()) / (2 * variance) if variance > 0 else 0.0

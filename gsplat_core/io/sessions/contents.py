@@ -1,0 +1,132 @@
+"""A session's recording as a recording: the frames that came in, which replay, evaluate and validate read like any others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import RecordingInvalid
+from gsplat_core.io.recordings.calibration import Calibration, default_calibration
+from gsplat_core.io.recordings.contents import digest_of
+from gsplat_core.io.recordings.decoder import NO_PICTURE
+from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.sessions.reader import SessionReader
+from gsplat_core.io.sessions.records import FrameLine
+from gsplat_core.io.sessions.session_file import SESSION_FILE, camera_of
+from gsplat_core.scene.frames import Frame, FrameStatus
+
+_ADVICE = "What can be read is played"
+
+
+@dataclass(frozen=True)
+class SessionImages:
+    """How many frames there are, of which size."""
+
+    frame_count: int
+    width_px: int
+    height_px: int
+
+
+@dataclass(frozen=True)
+class SessionContents:
+    """What `Contents` is for other layouts. A recording has one size: frames of another one than the first are left out."""
+
+    root: Path
+    reader: SessionReader
+    images: SessionImages
+    calibration: Calibration
+    fps: float
+    fields: frozenset[str]
+    layout: str = "session"
+    tool_share: float | None = None
+    stereo_baseline_mm: float | None = None
+
+    def frames(self, findings: Findings, limit: int | None = None) -> Iterator[Frame | None]:
+        """Frame after frame, with the numbers and times that they had in the session."""
+        return islice(self._frames(findings), limit)
+
+    def _frames(self, findings: Findings) -> Iterator[Frame | None]:
+        last: Frame | None = None
+        for line, decoded in self.reader.frames():
+            if not self._fits(line):
+                continue
+            frame = decoded
+            if frame is None and last is not None:
+                nothing = np.zeros(last.image.shape[:2], np.uint8)
+                frame = last.with_fields(
+                    seq=line.seq, pts_ns=line.pts_ns, status=FrameStatus.DAMAGED, damage=NO_PICTURE, mask=nothing
+                )
+            if frame is None:
+                findings.problem(
+                    self.root, f"the image of frame {line.seq} cannot be decoded", "Copy the session again"
+                )
+            else:
+                last = frame
+            yield frame
+
+    def files(self) -> list[Path]:
+        """Every file that is read."""
+        return self.reader.files()
+
+    def digest(self) -> str:
+        """As `digest_of` all its files."""
+        return digest_of(self.root, self.files())
+
+    def _fits(self, line: FrameLine) -> bool:
+        return (line.width_px, line.height_px) == (self.images.width_px, self.images.height_px)
+
+
+def session_contents(path: Path, findings: Findings) -> SessionContents | None:
+    """Open the recording of a session; None where there is a problem."""
+    try:
+        reader = SessionReader(path)
+    except RecordingInvalid as error:
+        findings.problem(path / SESSION_FILE, str(error), "Copy the session again")
+        return None
+    for note in reader.notes:
+        findings.warn(path, note, _ADVICE)
+    first = reader.first
+    if first is None:
+        findings.problem(path, "no frame of the session can be read", "Copy it again from its source")
+        return None
+    size = first.width_px, first.height_px
+    count, others, poses = _of_size(reader, size)
+    if others:
+        findings.warn(
+            path,
+            f"{others} of {count + others} frames have another size than the first one, {size[0]}x{size[1]} px",
+            "They are left out",
+        )
+    camera = camera_of(reader.info.camera)
+    calibration = Calibration(camera, None, SESSION_FILE)
+    if (camera.width_px, camera.height_px) != size:
+        calibration = default_calibration(path, *size, findings)
+    if poses is not None:
+        calibration = replace(calibration, poses=poses, camera=calibration.camera.with_pose(poses[0]))
+    return SessionContents(
+        root=path,
+        reader=reader,
+        images=SessionImages(count, *size),
+        calibration=calibration,
+        fps=reader.info.fps,
+        fields=frozenset(reader.fields),
+    )
+
+
+def _of_size(reader: SessionReader, size: tuple[int, int]) -> tuple[int, int, NDArray[np.float64] | None]:
+    """How many frames have this size, how many another one, and the poses of the former where all of them have one."""
+    poses: list[NDArray[np.float64]] = []
+    count = others = 0
+    for line in reader.frame_lines():
+        if (line.width_px, line.height_px) != size:
+            others += 1
+            continue
+        count += 1
+        if line.pose is not None:
+            poses.append(np.array(line.pose).reshape(4, 4))
+    return count, others, np.stack(poses) if len(poses) == count else None

@@ -1,0 +1,178 @@
+"""Reading a session's recording: its lines in order, and the frames that came in."""
+
+from __future__ import annotations
+
+import re
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidInput, RecordingInvalid
+from gsplat_core.io.recordings.findings import printable
+from gsplat_core.io.sessions.log import Line
+from gsplat_core.io.sessions.records import FrameLine, PreparedLine
+from gsplat_core.io.sessions.segment_reader import SegmentPictures, SegmentReader, fits, mask_of_nothing
+from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SESSION_FILE, read_session_file
+from gsplat_core.scene.frames import Frame, FrameStatus
+
+_SEGMENT = re.compile(r"\d{6,9}")
+
+
+def is_session(folder: Path) -> bool:
+    """Whether a folder holds the recording of a session."""
+    return (folder / SESSION_FILE).is_file()
+
+
+class SessionReader:
+    """A session's recording as far as it can be read: a file that is cut ends what is read of its segment there.
+
+    Opening reads all logs and looks where the pictures lie; it decodes nothing. Raises RecordingInvalid where `session.json` is not one.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.info = read_session_file(folder)
+        self.segments = [SegmentReader(path) for path in _segment_folders(folder)]
+        self.notes: list[str] = []
+        """What is missing, in sentences."""
+        self.fields: set[str] = {"right_image", "mask", "depth", "pose"}
+        """Which of these every frame that can be read has."""
+        self.first: FrameLine | None = None
+        """The line of the first frame that can be read."""
+        self._there: list[array] = []
+        last = -1
+        for segment in self.segments:
+            seqs = array("q")
+            for line in segment.lines():
+                if isinstance(line, FrameLine) and line.seq > last and fits(line.tracks, line.height_px, line.width_px):
+                    if not segment.there(line):
+                        break  # it plays up to there; what was written later is not whole either
+                    seqs.append(line.seq)
+                    last = line.seq
+                    self.first = self.first or line
+                    self.fields &= {*line.tracks, *(["pose"] if line.pose is not None else [])}
+            self._there.append(seqs)
+        self._take_notes()
+
+    @property
+    def frame_count(self) -> int:
+        """How many frames can be read."""
+        return sum(len(seqs) for seqs in self._there)
+
+    def lines(self) -> Iterator[tuple[SegmentReader, Line]]:
+        """Every line of every segment, in order, with its segment."""
+        for segment in self.segments:
+            for line in segment.lines():
+                yield segment, line
+
+    def frame_lines(self) -> Iterator[FrameLine]:
+        """The lines of the frames that can be read."""
+        for segment, seqs in zip(self.segments, self._there, strict=True):
+            yield from _of(segment, seqs)
+
+    def frames(self) -> Iterator[tuple[FrameLine, Frame | None]]:
+        """The frames that came in, in order, each with its line. A frame that turns out to be damaged says so in its status; None in its
+        place: its image cannot be decoded at all."""
+        for segment, seqs in zip(self.segments, self._there, strict=True):
+            with segment.open() as pictures:
+                for line in _of(segment, seqs):
+                    yield line, frame_of(line, pictures)
+
+    def present(self, segment: SegmentReader) -> set[int]:
+        """The numbers of the frames of one segment that can be read."""
+        return set(self._there[self.segments.index(segment)])
+
+    def files(self) -> list[Path]:
+        """Every file that is read, sorted."""
+        return [self.folder / SESSION_FILE, *(path for segment in self.segments for path in segment.files())]
+
+    def _take_notes(self) -> None:
+        if not self.segments:
+            self.notes.append("the session has no segment: nothing was recorded")
+        for segment, seqs in zip(self.segments, self._there, strict=True):
+            name = printable(segment.folder.name)
+            if segment.begins is None:
+                self.notes.append(f"segment {name} cannot be read: its log is cut off at its beginning")
+            elif len(seqs) < segment.named:
+                self.notes.append(
+                    f"segment {name} is cut off: {len(seqs)} of the {segment.named} frames that it names are there"
+                )
+            elif segment.ends is None:
+                self.notes.append(
+                    f"segment {name} has no end: the program that recorded it was ended; it has {len(seqs)} frames"
+                )
+        first = self.segments[0] if self.segments else None
+        if first is not None and first.folder.name != "000000":
+            self.notes.append(f"the recording begins with segment {first.folder.name}: those before it were removed")
+
+
+def _of(segment: SegmentReader, seqs: array) -> Iterator[FrameLine]:
+    """The lines of those frames of a segment; numbers rise, and a line that repeats one is not ours."""
+    wanted = iter(seqs)
+    due = next(wanted, None)
+    for line in segment.lines():
+        if isinstance(line, FrameLine) and line.seq == due:
+            yield line
+            due = next(wanted, None)
+
+
+def frame_of(line: FrameLine, pictures: SegmentPictures) -> Frame | None:
+    """The frame of a line, damaged where a part of it cannot be decoded; None where its image cannot be decoded at all."""
+    planes, damage = pictures.of(line)
+    return _frame(line, planes, line.damage or damage)
+
+
+def prepared_of(line: PreparedLine, arrived: Frame, pictures: SegmentPictures) -> Frame | None:
+    """What training was given of a frame; None where it cannot be decoded."""
+    planes, damage = pictures.of(line)
+    for track in line.same:
+        plane = getattr(arrived, track, None)
+        if plane is not None:
+            planes[track] = plane
+    return None if damage is not None else _frame(line, planes, line.damage)
+
+
+def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], damage: str | None) -> Frame | None:
+    image = planes.get("image")
+    if image is None:
+        return None
+    status = FrameStatus.REPLAY if line.status == "live" else FrameStatus(line.status)
+    if damage is not None and damage != line.damage:
+        # What the file says was lost since: no pixel of it is known to be tissue.
+        status, planes = FrameStatus.DAMAGED, {**planes, "mask": mask_of_nothing(*image.shape[:2])}
+    try:
+        return Frame(
+            seq=line.seq,
+            pts_ns=line.pts_ns,
+            image=image,
+            right_image=planes.get("right_image"),
+            depth=planes.get("depth"),
+            mask=planes.get("mask"),
+            loss_mask=planes.get("loss_mask"),
+            pose=None if line.pose is None else np.array(line.pose).reshape(4, 4),
+            status=status,
+            damage=damage,
+            exposure=line.exposure or (1.0, 1.0, 1.0),
+            withheld=line.withheld,
+            new_scene=line.new_scene,
+        )
+    except InvalidInput as error:
+        raise RecordingInvalid(f"frame {line.seq} of the session cannot be one: {error}") from error
+
+
+def _segment_folders(folder: Path) -> list[Path]:
+    """The folders of the segments, in order; links are none of them."""
+    segments = folder / SEGMENTS_FOLDER
+    if not segments.is_dir() or segments.is_symlink():
+        return []
+    try:
+        found = [path for path in segments.iterdir() if _SEGMENT.fullmatch(path.name)]
+    except OSError as error:
+        raise RecordingInvalid(
+            f"{printable(segments)}: it cannot be read: {error.strerror}. Check its permissions."
+        ) from error
+    return sorted((path for path in found if path.is_dir() and not path.is_symlink()), key=lambda path: int(path.name))

@@ -1,0 +1,44 @@
+"""Stage: where another scene begins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsplat_core.endoscope.cuts import CutDetector, CutSettings
+from gsplat_core.scene.frames import Frame, FrameStatus
+from operators.endoscope.stage import Stage, StageCounts
+
+IN_DOUBT = "cut in doubt"
+
+
+@dataclass(frozen=True)
+class CutCounts(StageCounts):
+    """New scenes by reason (cut, returned, resized, frame rate), and frames that were withheld until the next one told."""
+
+
+class CutStage(Stage):
+    """Sets `Frame.new_scene`, which a withheld or damaged frame never has; they say nothing about the scene.
+
+    It comes after everything that withholds pictures. A frame that may be a cut is withheld; the one after it tells.
+    """
+
+    counts_type = CutCounts
+
+    def __init__(self, settings: CutSettings | None = None) -> None:
+        self.settings = settings or CutSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._detector = CutDetector(self.settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        if frame.withheld is not None or frame.status is FrameStatus.DAMAGED:
+            self._detector.skip()
+            return frame
+        verdict = self._detector.observe(frame.image, frame.seq, frame.pts_ns)
+        if verdict.in_doubt:
+            return self.withhold(frame, IN_DOUBT)
+        if verdict.new_scene is None:
+            return frame
+        self.found[verdict.new_scene] += 1
+        return frame if frame.new_scene is not None else frame.with_fields(new_scene=verdict.new_scene)

@@ -1,0 +1,42 @@
+"""Stage: exposure and white balance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsplat_core.endoscope.exposure import UNCHANGED, ExposureEstimator, ExposureSettings
+from gsplat_core.scene.frames import Frame, FrameStatus
+from operators.endoscope.stage import Stage, StageCounts, tissue_of
+
+
+@dataclass(frozen=True)
+class ExposureCounts(StageCounts):
+    """Frames whose exposure differs from the scene's own, and those in which it was changing."""
+
+
+class ExposureStage(Stage):
+    """Sets `Frame.exposure`. A new scene has its own colours; withheld and damaged frames keep the exposure of the one before.
+
+    It comes after the tool mask, the masks of the loss and the cuts.
+    """
+
+    counts_type = ExposureCounts
+
+    def __init__(self, settings: ExposureSettings | None = None) -> None:
+        self.settings = settings or ExposureSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._estimator = ExposureEstimator(self.settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        if frame.new_scene is not None:
+            self._estimator.start_scene()
+        if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
+            self._estimator.observe(frame.image, tissue_of(frame), frame.pts_ns)
+            self.found["changing"] += self._estimator.following
+        gains = self._estimator.gains
+        if gains == UNCHANGED:
+            return frame
+        self.found["other than the scene's"] += 1
+        return frame.with_fields(exposure=gains)

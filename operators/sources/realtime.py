@@ -1,0 +1,138 @@
+"""A recording played as if it were a camera: each frame at its time, over and over where it is asked for."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Generator, Iterator
+from contextlib import closing
+from dataclasses import replace
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.recordings import Recording, open_recording
+from gsplat_core.io.recordings.ahead import read_ahead
+from gsplat_core.scene.frames import Frame
+from operators.sources.address import Address
+from operators.sources.live import LiveSource
+from operators.sources.options import MAX_FPS, MAX_SPEED, SourceOptions
+from operators.sources.source import SourceDescription
+
+DECODED_AHEAD = 4
+"""Frames that are decoded and wait for their time."""
+REMEMBERED_BYTES = 512 * 2**20
+"""A looped recording whose frames take no more is decoded once."""
+GIVEN_UP_S = 0.5
+"""When a frame is ready so long after its time, the clock starts again from there: nobody catches up by hurrying through what is over."""
+
+
+class RealtimeSource(LiveSource):
+    """Plays `recording` on the monotonic clock, with the masks, poses and depth that it has.
+
+    A frame is released when its time has come, whether or not somebody reads. Looped, its numbers and times go on: the first frame of a
+    round comes one frame's duration after the last one of the round before. `too_late` counts the frames that nobody took in time,
+    `decoded_late` those that were not ready at their time.
+    """
+
+    def __init__(self, recording: Recording, options: SourceOptions | None = None) -> None:
+        """options: `loop`, `speed` (`math.inf`: each frame as soon as the one before it is taken, none dropped), `fps` in place of the
+        recording's own rate, `max_frames` over all rounds, `waiting`. Raises InvalidSetting."""
+        options = options or SourceOptions()
+        super().__init__(waiting=options.waiting, drops=math.isfinite(options.speed))
+        self.recording, self.options = recording, options
+        fps = options.fps or recording.fps
+        self._stretch = recording.fps / fps
+        self._period_ns = round(1e9 / fps)
+        count = None if options.loop else recording.frame_count
+        self.description = SourceDescription(
+            name=recording.name,
+            width_px=recording.width_px,
+            height_px=recording.height_px,
+            fps=fps,
+            camera=recording.camera,
+            fields=recording.fields,
+            # A looped one has an end only where it is asked for.
+            frame_count=options.max_frames if count is None else min(count, options.max_frames or count),
+            notes=recording.notes,
+        )
+
+    def frames(self) -> Iterator[Frame]:
+        """Each frame at its time."""
+        speed = self.options.speed
+        start_ns = time.monotonic_ns()
+        with closing(read_ahead(self._numbered(), f"decode {self.description.name}", DECODED_AHEAD)) as decoded:
+            for frame in decoded:
+                if math.isfinite(speed):
+                    due_ns = start_ns + round(frame.pts_ns / speed)
+                    late_ns = time.monotonic_ns() - due_ns
+                    if late_ns < 0 and self.wait(-late_ns * 1e-9):
+                        return
+                    if late_ns > self._period_ns / speed:
+                        self.count("decoded_late")
+                    if late_ns > GIVEN_UP_S * 1e9:
+                        self.count("clock_restarts")
+                        start_ns += late_ns
+                yield frame
+
+    def _numbered(self) -> Generator[Frame, None, None]:
+        """The frames of all rounds, with numbers and times that go on."""
+        most = self.description.frame_count or math.inf
+        seq, pts_ns = 0, 0
+        for frames in self._rounds():
+            began_ns = None
+            end_ns = pts_ns
+            for frame in frames:
+                own_ns = round(frame.pts_ns * self._stretch)
+                began_ns = own_ns if began_ns is None else began_ns
+                at_ns = pts_ns + own_ns - began_ns
+                yield replace(frame, seq=seq, pts_ns=at_ns)
+                end_ns = at_ns + self._period_ns
+                seq += 1
+                if seq >= most:
+                    return
+            pts_ns = end_ns
+
+    def _rounds(self) -> Iterator[Iterator[Frame]]:
+        """Round after round; from the second one on out of memory, where the frames fit."""
+        if not self.options.loop:
+            yield iter(self.recording)
+            return
+        remembered: list[Frame] = []
+        yield self._remembering(remembered)
+        while True:
+            yield iter(remembered or self.recording)
+
+    def _remembering(self, remembered: list[Frame]) -> Iterator[Frame]:
+        """The frames of the first round; `remembered` has them afterwards, unless they are too large."""
+        size = 0
+        fits = True
+        for frame in self.recording:
+            size += sum(
+                plane.nbytes for plane in (frame.image, frame.right_image, frame.depth, frame.mask) if plane is not None
+            )
+            fits = fits and size <= REMEMBERED_BYTES
+            if fits:
+                remembered.append(frame)
+            else:
+                remembered.clear()
+            yield frame
+
+
+def realtime_source(rest: str, options: SourceOptions) -> RealtimeSource:
+    """`realtime:PATH?loop=1&speed=2&fps=60`. Raises as `open_recording`, and InvalidSetting for options that are wrong."""
+    address = Address.parse("realtime", rest)
+    options = replace(
+        options,
+        loop=address.flag("loop", options.loop),
+        speed=math.inf if address.text("speed") == "max" else address.number("speed", options.speed, 0.01, MAX_SPEED),
+        fps=address.number("fps", options.fps, 0.01, MAX_FPS),
+    )
+    address.refuse_others()
+    return play(address.place, options)
+
+
+def play(path: str, options: SourceOptions) -> RealtimeSource:
+    """A recording on disk in real time."""
+    recording = open_recording(path, scale=options.scale, max_frames=None if options.loop else options.max_frames)
+    if recording.frame_count < 1:
+        raise InvalidSetting(f"{recording.name} has no frames")
+    return RealtimeSource(recording, options)

@@ -1,0 +1,126 @@
+"""What a source in a process of its own and its reader say to each other: JSON, and frames' arrays in shared memory."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame, FrameStatus
+from operators.sources.options import SourceOptions
+from operators.sources.shared_memory import PLANES, BadHeader
+from operators.sources.source import SourceDescription
+
+MOST_BYTES = 1 << 20
+"""Of one message."""
+
+
+def message(kind: str, **content: Any) -> bytes:
+    """A message as bytes."""
+    return json.dumps({"kind": kind, **content}).encode()
+
+
+def parsed(data: bytes) -> dict[str, Any]:
+    """A message from its bytes. Raises BadHeader."""
+    try:
+        content = json.loads(data)
+    except ValueError as error:
+        raise BadHeader(f"{data[:40]!r} is not JSON: {error}") from error
+    if not isinstance(content, dict) or not isinstance(content.get("kind"), str):
+        raise BadHeader(f"{data[:40]!r} is not a message")
+    return content
+
+
+def options_to(options: SourceOptions) -> dict[str, Any]:
+    """Options as JSON."""
+    return asdict(options)
+
+
+def options_from(content: dict[str, Any]) -> SourceOptions:
+    """Options from JSON."""
+    return SourceOptions(**content)
+
+
+def description_to(about: SourceDescription) -> dict[str, Any]:
+    """A description as JSON."""
+    camera = about.camera
+    return {
+        "name": about.name,
+        "width_px": about.width_px,
+        "height_px": about.height_px,
+        "fps": about.fps,
+        "camera": {
+            "K": camera.K.tolist(),
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            "world_to_camera": camera.world_to_camera.tolist(),
+            "model": camera.model,
+        },
+        "fields": sorted(about.fields),
+        "frame_count": about.frame_count,
+        "notes": list(about.notes),
+    }
+
+
+def description_from(content: dict[str, Any]) -> SourceDescription:
+    """A description from JSON. Raises BadHeader."""
+    try:
+        camera = Camera(**content["camera"])
+        fields, notes = frozenset(content["fields"]), tuple(content["notes"])
+        return SourceDescription(**{**content, "camera": camera, "fields": fields, "notes": notes})
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadHeader(f"this describes no source: {error}") from error
+
+
+def planes_of(frame: Frame) -> dict[str, NDArray]:
+    """The arrays of a frame, by field."""
+    planes = {name: getattr(frame, name) for name in PLANES}
+    return {name: plane for name, plane in planes.items() if plane is not None}
+
+
+def frame_header(frame: Frame) -> dict[str, Any]:
+    """What a frame has beside its arrays, as JSON."""
+    return {
+        "seq": frame.seq,
+        "pts_ns": frame.pts_ns,
+        "arrived_ns": frame.arrived_ns,
+        "status": frame.status.value,
+        "damage": frame.damage,
+    }
+
+
+def frame_from(header: Mapping[str, Any], planes: Mapping[str, Any]) -> Frame:
+    """A frame from its header and its arrays. Raises BadHeader."""
+    try:
+        seq, pts_ns, arrived_ns, damage = (header[name] for name in ("seq", "pts_ns", "arrived_ns", "damage"))
+        whole = all(type(value) is int and abs(value) < 2**62 for value in (seq, pts_ns))
+        if not whole or not isinstance(damage, str | None) or type(arrived_ns) not in (int, type(None)):
+            raise BadHeader(f"a frame cannot have the number {seq!r:.30} and the time {pts_ns!r:.30}")
+        return Frame(
+            seq=seq,
+            pts_ns=pts_ns,
+            arrived_ns=arrived_ns,
+            status=FrameStatus(header["status"]),
+            damage=damage,
+            **planes,
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadHeader(f"this is no frame: {error}") from error
+
+
+def finite_counts(content: Any) -> dict[str, int]:
+    """Counts by reason, from JSON."""
+    if not isinstance(content, dict):
+        return {}
+    return {str(name): int(times) for name, times in content.items() if isinstance(times, int) and math.isfinite(times)}
+
+
+def as_contiguous(planes: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """The arrays without gaps."""
+    return {name: np.ascontiguousarray(plane) for name, plane in planes.items()}

@@ -1,0 +1,144 @@
+"""Another scene is found with its second frame; what happens within one scene is never another one."""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsplat_core.endoscope.cuts import CutDetector, CutSettings, FrameRate
+from gsplat_core.errors import InvalidSetting
+from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, brightened, clip, resized, texture
+
+OTHERS = list(itertools.permutations(PLACES, 2))
+
+
+def verdicts(images, withheld=()):
+    """What was reported, by the index of the frame."""
+    detector, found = CutDetector(), {}
+    for k, image in enumerate(images):
+        if k in withheld:
+            detector.skip()
+            continue
+        verdict = detector.observe(image, k, k * FRAME_NS)
+        if verdict.new_scene or verdict.in_doubt:
+            found[k] = verdict.new_scene or "in doubt"
+    return found
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", PLACES)
+@pytest.mark.parametrize("every", [1, 4, 8])
+def test_no_recording_has_a_cut_even_with_frames_left_out(recordings_dir, name, every):
+    assert verdicts(clip(recordings_dir, name)[::every]) == {}
+
+
+def tool_sweeps_in(images):
+    swept = []
+    for k, image in enumerate(images):
+        image, columns = image.copy(), int(image.shape[1] * 0.75 * np.clip((k - 8) / 6, 0, 1))
+        image[:, :columns] = (122, 126, 131)
+        swept.append(image)
+    return swept
+
+
+def view_jumps(images):
+    height, width = images[0].shape[:2]
+    shift = np.array([[1, 0, 0.25 * width], [0, 1, -0.15 * height]], np.float32)
+    moved = [cv2.warpAffine(image, shift, (width, height), borderMode=cv2.BORDER_REFLECT) for image in images[10:]]
+    return [*images[:10], *moved]
+
+
+EVENTS = {
+    "the exposure and the white balance jump": lambda images: [
+        *images[:10],
+        *(brightened(image, (1.7, 1.3, 2.0)) for image in images[10:]),
+    ],
+    "it becomes dark": lambda images: [*images[:10], *(brightened(image, 0.35) for image in images[10:])],
+    "a tool covers three quarters within six frames": tool_sweeps_in,
+    "the view jumps by a quarter of the picture": view_jumps,
+    "it is out of focus": lambda images: [*images[:10], *(cv2.GaussianBlur(image, (0, 0), 8) for image in images[10:])],
+    "the recording begins again": lambda images: [*images, *images],
+}
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", PLACES)
+@pytest.mark.parametrize("event", EVENTS)
+def test_what_happens_in_a_scene_is_no_cut(recordings_dir, name, event):
+    assert verdicts(EVENTS[event](clip(recordings_dir, name)[:24])) == {}
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("first, second", OTHERS)
+def test_a_splice_is_a_cut_and_the_way_back_is_a_return(recordings_dir, first, second):
+    before = list(clip(recordings_dir, first)[:20])
+    between = resized(clip(recordings_dir, second)[5:20], before[0])
+    found = verdicts([*before, *between, *before[10:]])
+    assert found == {20: "in doubt", 21: "cut", 35: "in doubt", 36: "returned"}
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("first, second", OTHERS)
+def test_another_scene_after_withheld_frames_is_a_cut_and_the_same_one_is_not(recordings_dir, first, second):
+    before = list(clip(recordings_dir, first))
+    other = resized(clip(recordings_dir, second)[5:20], before[0])
+    assert verdicts([*before[:20], *other], range(15, 24)) == {24: "in doubt", 25: "cut"}
+    assert verdicts(before[:35], range(8, 24)) == {}
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", PLACES)
+def test_one_odd_frame_is_no_cut(recordings_dir, name):
+    images, noise = list(clip(recordings_dir, name)[:20]), np.random.default_rng(0)
+    images[10] = noise.integers(0, 256, images[10].shape, np.uint8)
+    assert verdicts(images) == {10: "in doubt"}
+
+
+def test_scenes_that_change_with_every_frame_are_cut_after_a_while():
+    rng = np.random.default_rng(0)
+    unrelated = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(7)]
+    assert list(verdicts([*texture(1, 5, 64, 48), *unrelated]).values()) == ["in doubt"] * 6 + ["cut"]
+
+
+def test_another_size_is_a_new_scene_at_once():
+    assert verdicts([*texture(1, 5), *texture(1, 5, 120, 90)]) == {5: "resized"}
+
+
+def test_another_frame_rate_is_a_new_scene_and_lost_frames_are_not():
+    rate = FrameRate(1.4, 15)
+    every = [rate.changed(k, k * 40) for k in range(60)]
+    lossy = [rate.changed(60 + 3 * k, 2400 + 120 * k) for k in range(40)]
+    assert not any(every) and not any(lossy)
+    later = [rate.changed(200 + k, 9000 + 20 * k) for k in range(60)]
+    assert sum(later) == 1
+
+
+def test_an_unsteady_clock_is_no_other_frame_rate():
+    rate, rng, now = FrameRate(1.4, 15), np.random.default_rng(0), 0
+    found = []
+    for k in range(500):
+        now += int(rng.choice([10, 40, 40, 80]))
+        found.append(rate.changed(k, now))
+    assert not any(found)
+
+
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32))
+def test_no_picture_of_any_size_raises(height, width, seed):
+    rng = np.random.default_rng(seed)
+    shapes = [(height, width, 3), (width, height, 3)]
+    images = [rng.integers(0, rng.integers(1, 257), shapes[k // 4], np.uint8) for k in range(8)]
+    detector = CutDetector()
+    for k, image in enumerate(images):
+        detector.observe(image, int(rng.integers(0, 9)), int(rng.integers(-9, 9)))
+        if k % 3 == 0:
+            detector.skip()
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(InvalidSetting, match="same_moved"):
+        CutSettings(same_moved=1.2)

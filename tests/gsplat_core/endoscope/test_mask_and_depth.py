@@ -1,0 +1,86 @@
+"""Masks that cannot be one are found; depth that is none is taken out, and the rest is kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsplat_core.endoscope.mask_and_depth import DepthCheck, MaskAndDepthSettings, MaskCheck
+from gsplat_core.errors import InvalidSetting
+
+
+def mask(tool_columns, size=40):
+    plane = np.ones((size, size), np.uint8)
+    plane[:, :tool_columns] = 0
+    return plane
+
+
+def test_a_frame_full_of_tool_has_no_tissue():
+    check = MaskCheck()
+    assert [check.fault(mask(columns)) for columns in (8, 40, 8)] == [None, "no tissue", None]
+
+
+def test_a_tool_that_is_gone_at_once_is_a_lost_mask_but_not_for_ever():
+    check = MaskCheck()
+    found = [check.fault(mask(columns)) for columns in (12, 12, *[0] * 8, 12)]
+    assert found == [None, None] + ["tool mask lost"] * 5 + [None] * 4
+
+
+def test_a_tool_that_leaves_over_some_frames_is_no_fault():
+    check = MaskCheck()
+    assert {check.fault(mask(columns, 160)) for columns in (48, 36, 20, 4, 0, 0)} == {None}
+
+
+def plane(value=60.0):
+    return np.full((40, 40), value, np.float32)
+
+
+def test_good_depth_is_passed_on_as_it_is():
+    depth = plane()
+    depth[:10] = 0
+    assert DepthCheck().checked(depth).depth is depth
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, -5.0, 1e6])
+def test_some_wrong_values_become_unknown(wrong):
+    depth = plane()
+    depth[4:8, 4:8] = wrong
+    found = DepthCheck().checked(depth)
+    assert found.finding == "depth repaired"
+    assert (found.depth[4:8, 4:8] == 0).all() and (found.depth[20:] == 60).all() and found.depth.dtype == np.float32
+
+
+@pytest.mark.parametrize("wrong", [np.nan, -5.0, 1e6])
+def test_depth_that_is_mostly_wrong_is_left_out(wrong):
+    assert DepthCheck().checked(plane(wrong)).depth is None
+
+
+def test_another_scale_is_left_out_until_it_stays():
+    check = DepthCheck()
+    found = [check.checked(plane(value)).finding for value in (60, 62, *[0.06] * 12, 60)]
+    assert found == [None, None] + ["depth at another scale"] * 10 + [None, None] + ["depth at another scale"]
+
+
+def test_a_scope_that_comes_closer_is_no_other_scale():
+    check = DepthCheck()
+    assert {check.checked(plane(value)).finding for value in np.geomspace(80, 5, 60)} == {None}
+
+
+@given(
+    st.integers(1, 20), st.integers(1, 20), st.sampled_from([np.float16, np.float32, np.float64]), st.integers(0, 2**32)
+)
+def test_nothing_raises(height, width, dtype, seed):
+    rng = np.random.default_rng(seed)
+    with np.errstate(all="ignore"):
+        depth = np.array(rng.normal(size=(height, width)) * 10.0 ** rng.integers(-5, 5), dtype)
+    depth[rng.random((height, width)) < 0.2] = np.nan
+    found = DepthCheck().checked(depth)
+    assert found.depth is None or np.isfinite(found.depth).all()
+    MaskCheck().fault(rng.integers(0, 2, (height, width), np.uint8))
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(InvalidSetting, match="usual_depth_ratio"):
+        MaskAndDepthSettings(usual_depth_ratio=1.0)

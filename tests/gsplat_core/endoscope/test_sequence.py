@@ -1,0 +1,139 @@
+"""Pictures that are none, or not new, are found; ordinary video never is one of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsplat_core.endoscope.sequence import SequenceCheck, SequenceSettings
+from gsplat_core.errors import InvalidSetting
+from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, brightened, clip, texture
+
+
+def faults(images, settings=None):
+    check = SequenceCheck(settings)
+    return [check.fault(image, k * FRAME_NS) for k, image in enumerate(images)]
+
+
+def with_changed(images, index, change):
+    """The pictures, one of them changed: `change` has the picture and the one before it."""
+    changed = list(images)
+    changed[index] = change(images[index].copy(), images[index - 1])
+    return changed
+
+
+def lower_part_of_the_one_before(share):
+    def change(image, before):
+        image[round(len(image) * share) :] = before[round(len(image) * share) :]
+        return image
+
+    return change
+
+
+def grey_below(image, before):
+    image[len(image) // 2 :] = 128
+    return image
+
+
+def no_signal_screen(image, before):
+    image[:] = (0, 0, 190)
+    image[10:14, 20:60] = 255
+    return image
+
+
+CHANGES = {
+    "black": lambda image, before: image // 25,
+    "one colour": no_signal_screen,
+    "noise": lambda image, before: np.random.default_rng(0).integers(0, 256, image.shape, np.uint8),
+    "duplicate": lambda image, before: before,
+    "torn": lower_part_of_the_one_before(0.6),
+}
+
+
+@pytest.mark.parametrize("fault", CHANGES)
+def test_one_bad_picture_is_found_and_the_next_one_is_good(fault):
+    images = with_changed(texture(1, 20), 12, CHANGES[fault])
+    assert faults(images) == [None] * 12 + [fault] + [None] * 7
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", PLACES)
+def test_ordinary_frames_of_a_recording_are_not_withheld(recordings_dir, name):
+    assert set(faults(clip(recordings_dir, name))) == {None}
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", PLACES)
+@pytest.mark.parametrize(
+    "fault, change",
+    [
+        *CHANGES.items(),
+        ("torn", lower_part_of_the_one_before(0.2)),
+        ("torn", lower_part_of_the_one_before(0.85)),
+        ("torn", grey_below),
+    ],
+)
+def test_a_bad_picture_in_a_recording_is_found(recordings_dir, name, fault, change):
+    images = clip(recordings_dir, name)[:24]
+    assert faults(with_changed(images, 15, change)) == [None] * 15 + [fault] + [None] * 8
+
+
+def test_a_picture_again_and_again_is_frozen_from_a_quarter_of_a_second_on():
+    images = texture(2, 12)
+    found = faults([*images, *[images[-1]] * 20, *texture(2, 20)[12:]])
+    assert found[12:32] == ["duplicate"] * 7 + ["frozen"] * 13
+    assert found[32:] == [None] * 8
+
+
+def test_a_frozen_picture_that_is_encoded_again_is_frozen():
+    images, rng = texture(2, 12), np.random.default_rng(0)
+    again = [np.clip(images[-1] + rng.integers(-1, 2, images[-1].shape), 0, 255).astype(np.uint8) for _ in range(12)]
+    assert faults([*images, *again])[-1] == "frozen"
+
+
+def test_every_picture_twice_is_duplicates_and_not_frozen():
+    twice = [image for image in texture(3, 20) for _ in range(2)]
+    assert faults(twice) == [None, "duplicate"] * 20
+
+
+def test_a_still_scene_in_which_a_small_thing_moves_is_not_frozen():
+    still = texture(4, 1)[0]
+    images = [still.copy() for _ in range(30)]
+    for k, image in enumerate(images):
+        image[40:48, 3 * k : 3 * k + 8] = 200
+    assert set(faults(images)) == {None}
+
+
+def test_a_border_and_a_strip_that_never_change_are_no_tear():
+    images = [image.copy() for image in texture(5, 30)]
+    for image in images:
+        image[:12], image[-30:] = 0, 90
+        image[-20:-10, 20:60] = 220
+    assert set(faults(images)) == {None}
+
+
+def test_a_dark_picture_is_not_black():
+    assert set(faults([brightened(image, 0.3) for image in texture(6, 10)])) == {None}
+
+
+def test_another_size_begins_anew():
+    assert set(faults([*texture(7, 10), *texture(7, 10, 96, 80)])) == {None}
+
+
+@given(st.integers(1, 70), st.integers(1, 70), st.integers(0, 2**32), st.booleans())
+def test_no_picture_of_any_size_raises(height, width, seed, flat):
+    rng = np.random.default_rng(seed)
+    images = [np.full((height, width, 3), rng.integers(0, 256), np.uint8)] * 3
+    images += [] if flat else [rng.integers(0, 256, (height, width, 3), np.uint8) for _ in range(8)]
+    assert len(faults(images + images[::-1])) == 2 * len(images)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"noise_share": 0}, {"odd_share": 1.5}, {"frozen_frames": 0}, {"frozen_s": float("nan")}, {"black_level": "2"}],
+)
+def test_settings_out_of_range_are_refused_by_name(wrong):
+    with pytest.raises(InvalidSetting, match=next(iter(wrong))):
+        SequenceSettings(**wrong)

@@ -1,0 +1,75 @@
+"""Times go forward: late frames are said to be late, jumps of the clock are taken out, true gaps stay."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsplat_core.endoscope.stream_clock import ClockSettings, StreamClock
+from gsplat_core.errors import InvalidSetting
+
+STEP = 40_000_000
+S = 1_000_000_000
+
+
+def run(times, arrivals=None):
+    clock = StreamClock()
+    found = [clock.observe(time, None if arrivals is None else arrivals[k]) for k, time in enumerate(times)]
+    return [timing.pts_ns for timing in found], [timing.finding for timing in found]
+
+
+def test_an_even_stream_keeps_its_times():
+    times = [5 * S + k * STEP for k in range(50)]
+    assert run(times) == (times, [None] * 50)
+
+
+@pytest.mark.parametrize("jump", [3600 * S, -3600 * S, 15 * S])
+def test_a_jump_of_the_clock_is_taken_out_for_good(jump):
+    times = [k * STEP for k in range(20)]
+    shown, findings = run([time + (jump if k >= 10 else 0) for k, time in enumerate(times)])
+    late = 3 if jump < 0 else 0
+    assert findings == [None] * 10 + ["out of order"] * late + ["clock jump"] + [None] * (9 - late)
+    assert shown[:10] == times[:10] and shown[10:] == [9 * STEP] * late + [(10 + k) * STEP for k in range(10 - late)]
+
+
+def test_a_frame_that_comes_late_gets_the_newest_time_and_the_stream_goes_on():
+    shown, findings = run([0, 1 * STEP, 3 * STEP, 2 * STEP, 4 * STEP])
+    assert shown == [0, 1 * STEP, 3 * STEP, 3 * STEP, 4 * STEP]
+    assert findings == [None, None, None, "out of order", None]
+
+
+def test_a_gap_in_which_time_went_on_stays():
+    times = [k * STEP for k in range(10)] + [5 * S + k * STEP for k in range(10)]
+    shown, findings = run(times)
+    assert shown == times and findings[10] == "gap" and findings.count(None) == 19
+
+
+def test_a_source_that_was_gone_for_a_minute_has_a_gap_and_no_jump():
+    times = [k * STEP for k in range(10)] + [60 * S + k * STEP for k in range(10)]
+    shown, findings = run(times, [7 * S + time for time in times])
+    assert shown == times and findings[10] == "gap"
+
+
+def test_a_jump_that_the_arrivals_do_not_show_is_taken_out():
+    times = [k * STEP for k in range(20)]
+    shown, findings = run(
+        [time + (3 * S if k >= 10 else 0) for k, time in enumerate(times)], [9 * S + time for time in times]
+    )
+    assert shown == times and findings[10] == "clock jump"
+
+
+def test_equal_times_are_counted():
+    assert run([0, STEP, STEP, 2 * STEP]) == ([0, STEP, STEP, 2 * STEP], [None, None, "repeated time", None])
+
+
+@given(st.lists(st.tuples(st.integers(-(2**62), 2**62), st.one_of(st.none(), st.integers(0, 2**62))), max_size=40))
+def test_whatever_the_clocks_say_times_do_not_go_back(steps):
+    clock = StreamClock()
+    shown = [clock.observe(pts_ns, arrived_ns).pts_ns for pts_ns, arrived_ns in steps]
+    assert shown == sorted(shown)
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(InvalidSetting, match="late_frames"):
+        ClockSettings(late_frames=0)

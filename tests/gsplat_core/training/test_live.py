@@ -1,0 +1,127 @@
+"""Training beside a live stream: repeatable by its numbers of steps, steps only on what it says, another scene at any time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.budget import Budget
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
+from gsplat_core.training.metrics import psnr_tissue_db
+
+WIDTH, HEIGHT = 48, 40
+
+
+def frame_at(k, width=WIDTH, height=HEIGHT):
+    x = np.linspace(0, 3, width)[None, :] + 0.05 * k
+    y = np.linspace(0, 2, height)[:, None]
+    planes = np.stack([np.sin(x + y), np.cos(x - y), np.sin(2 * x) * np.cos(y)], -1)
+    return Frame(k, k * 33_000_000, ((planes + 1) * 95 + 10).astype(np.uint8))
+
+
+def reconstructor(**live):
+    config = ReconstructorConfig(gaussians=120, max_gaussians=240, window_frames=8)
+    return LiveReconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT), live=LiveTraining(**live))
+
+
+def run(made, steps=((10, 4), (3, 0), (5, 7))):
+    for k, (observed, rehearsed) in enumerate(steps):
+        made.observe(frame_at(k), budget=Budget.of_steps(observed))
+        made.rehearse(rehearsed)
+    return made.snapshot()
+
+
+def test_the_same_numbers_of_steps_give_the_same_model():
+    assert run(reconstructor()).sha256() == run(reconstructor()).sha256()
+
+
+def test_how_rehearsal_was_cut_into_calls_does_not_matter():
+    whole, cut = reconstructor(), reconstructor()
+    for made, pieces in ((whole, [6]), (cut, [1, 3, 2])):
+        made.observe(frame_at(0), budget=Budget.of_steps(4))
+        made.observe(frame_at(1), budget=Budget.of_steps(4))
+        for steps in pieces:
+            made.rehearse(steps)
+    assert whole.snapshot().sha256() == cut.snapshot().sha256()
+
+
+def test_a_deadline_and_its_count_of_steps_give_the_same_model():
+    clock = iter(range(10**6))
+    timed, counted = reconstructor(), reconstructor()
+    reports = [
+        timed.observe(frame_at(k), budget=Budget.until(10**9, at_least=2, at_most=6 + k, clock=lambda: next(clock)))
+        for k in range(3)
+    ]
+    for k, report in enumerate(reports):
+        counted.observe(frame_at(k), budget=Budget.of_steps(report.steps))
+    assert [report.steps for report in reports] == [6, 7, 8]
+    assert timed.snapshot().sha256() == counted.snapshot().sha256()
+
+
+def test_a_deadline_that_is_over_still_gives_the_least_steps():
+    made = reconstructor()
+    made.observe(frame_at(0), budget=Budget.of_steps(2))
+    report = made.observe(frame_at(1), budget=Budget.until(0.0, at_least=3, at_most=50, clock=lambda: 1.0))
+    assert (report.steps, report.ending) == (3, "deadline")
+
+
+def test_rehearsal_before_the_first_frame_is_refused():
+    with pytest.raises(InvalidInput, match="observe a frame first"):
+        reconstructor().rehearse(1)
+
+
+def test_rehearsal_keeps_the_past():
+    forgetful, keeping = reconstructor(), reconstructor(recent_share=0.0)
+    for k in range(6):
+        forgetful.observe(frame_at(6 * k), budget=Budget.of_steps(20))
+        keeping.observe(frame_at(6 * k), budget=Budget.of_steps(20))
+        keeping.rehearse(20)
+
+    def past_db(made):
+        model = made.snapshot()
+        return np.mean(
+            [psnr_tissue_db(model.render(frame_at(6 * k).time_s).image, frame_at(6 * k).image) for k in range(5)]
+        )
+
+    assert past_db(keeping) > past_db(forgetful) + 1
+
+
+def test_another_scene_of_another_size_begins_in_the_middle():
+    made = reconstructor()
+    run(made)
+    wide = frame_at(50, width=64, height=32)
+    made.begin_scene(wide)
+    made.observe(wide, budget=Budget.of_steps(30))
+    model = made.snapshot()
+    assert (model.camera.width_px, model.camera.height_px) == (64, 32)
+    assert model.version == 2
+    assert psnr_tissue_db(model.render(wide.time_s).image, wide.image) > 20
+
+
+def test_a_frame_that_is_not_trained_on_changes_no_parameter():
+    made = reconstructor()
+    before = run(made)
+    made.observe(frame_at(3), budget=Budget.of_steps(5), train=False)
+    after = made.snapshot()
+    assert torch.equal(before.gaussians.means, after.gaussians.means)
+
+
+def test_rates_go_from_the_first_to_the_last():
+    training = LiveTraining(first_rate=2.0, last_rate=0.5, rate_steps=5)
+    rates = [training.rate_at(k) for k in range(8)]
+    assert rates[0] == 2.0
+    assert rates[4:] == pytest.approx([0.5] * 4)
+    assert rates == sorted(rates, reverse=True)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"first_rate": 0.0}, {"last_rate": float("nan")}, {"rate_steps": 0}, {"recent_share": 1.5}]
+)
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(InvalidSetting):
+        LiveTraining(**wrong)

@@ -1,0 +1,150 @@
+"""A source that follows the clock: newest wins, states, counts, closing."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.frames import FrameStatus
+from operators.sources.live import LiveSource
+from operators.sources.order import FrameOrder
+from operators.sources.source import FrameSource, SourceDescription, SourceState
+
+SOON_S = 10.0
+"""Longer than anything here takes."""
+
+
+class Scripted(LiveSource):
+    """Gives what a list says: frames, sentences about a lost connection, errors to raise, events to wait for."""
+
+    def __init__(self, script, camera, **options):
+        super().__init__(**options)
+        self.script, self.reached = script, threading.Event()
+        self.description = SourceDescription("camera 1", camera.width_px, camera.height_px, 25.0, camera)
+
+    def frames(self):
+        for step in self.script:
+            if isinstance(step, BaseException):
+                raise step
+            if isinstance(step, str):
+                self.lost(step)
+                self.reached.set()
+            elif isinstance(step, threading.Event):
+                self.reached.set()
+                assert step.wait(SOON_S)
+            else:
+                yield step
+        self.reached.set()
+
+
+def opened(source):
+    source.open()
+    assert source.reached.wait(SOON_S)
+    return source
+
+
+def all_of(source):
+    seqs = []
+    while (frame := source.read(SOON_S)) is not None:
+        seqs.append(frame.seq)
+    return seqs
+
+
+def test_whoever_is_late_gets_the_newest_frames_and_what_was_dropped_is_counted(camera, frame):
+    hold = threading.Event()
+    source = opened(Scripted([*(frame(k) for k in range(10)), hold], camera, waiting=2))
+    assert isinstance(source, FrameSource) and source.state is SourceState.LIVE
+    hold.set()
+    assert all_of(source) == [8, 9]
+    assert source.counts() == {"too_late": 8}
+    source.close()
+
+
+def test_a_source_that_does_not_drop_waits_for_its_reader(camera, frame):
+    source = Scripted([frame(k) for k in range(50)], camera, waiting=1, drops=False)
+    source.open()
+    assert all_of(source) == list(range(50)) and source.counts() == {}
+    source.close()
+
+
+def test_frames_are_live_and_say_when_they_arrived(camera, frame):
+    before = time.monotonic_ns()
+    given = [frame(0), frame(1, arrived_ns=7), frame(2, status=FrameStatus.DAMAGED)]
+    source = opened(Scripted(given, camera, waiting=3))
+    first, second, third = (source.read(SOON_S) for _ in range(3))
+    assert before <= first.arrived_ns <= time.monotonic_ns() and second.arrived_ns == 7
+    assert [first.status, second.status, third.status] == [FrameStatus.LIVE, FrameStatus.LIVE, FrameStatus.DAMAGED]
+    source.close()
+
+
+def test_a_stall_is_a_state_with_a_sentence_and_is_counted_when_it_is_over(camera, frame):
+    hold = threading.Event()
+    source = opened(Scripted([frame(0), hold, frame(1)], camera, stalled_after_s=0.0))
+    assert source.read(SOON_S).seq == 0
+    assert source.state is SourceState.STALLED and source.state_sentence.startswith("camera 1 has given no frame for")
+    hold.set()
+    assert source.read(SOON_S).seq == 1
+    assert source.counts()["stalls"] >= 1
+    source.close()
+    assert source.state is SourceState.ENDED and source.state_sentence == "camera 1 is not open"
+
+
+def test_a_lost_connection_is_a_state_until_the_next_frame_and_numbers_go_on(camera, frame):
+    hold, end = threading.Event(), threading.Event()
+    script = [frame(5), frame(6), "camera 1 does not answer", "still not", hold, frame(0), frame(1), end]
+    source = Scripted(script, camera, waiting=5, order=FrameOrder())
+    opened(source)
+    assert [source.read(SOON_S).seq for _ in range(2)] == [0, 1]
+    while source.state_sentence != "still not":
+        time.sleep(0.001)
+    assert source.state is SourceState.RECONNECTING
+    hold.set()
+    later = [source.read(SOON_S) for _ in range(2)]
+    assert [each.seq for each in later] == [2, 3] and source.state is SourceState.LIVE
+    assert later[0].pts_ns > 40_000_000, "the time that the connection was lost has passed"
+    assert source.counts() == {"reconnections": 1}
+    end.set()
+    source.close()
+
+
+def test_an_error_comes_after_the_frames_before_it_and_once(camera, frame):
+    source = Scripted([frame(0), ValueError("broken here")], camera)
+    source.open()
+    assert source.read(SOON_S).seq == 0
+    with pytest.raises(ValueError, match="broken here"):
+        source.read(SOON_S)
+    assert source.read(0) is None and source.state is SourceState.ENDED and source.state_sentence == "broken here"
+    source.close()
+
+
+def test_a_reader_that_is_left_behind_changes_nothing_in_a_later_reading(camera, frame, monkeypatch):
+    monkeypatch.setattr("operators.sources.live.CLOSE_TIMEOUT_S", 0.01)
+    hold = threading.Event()
+    source = opened(Scripted([frame(0), hold, "gone", frame(99)], camera))
+    left = source._thread
+    source.close()
+    source.script = [frame(1)]
+    source.open()
+    hold.set()
+    left.join(SOON_S)
+    assert all_of(source) == [1] and source.counts() == {}
+    source.close()
+
+
+def test_opening_again_begins_again(camera, frame):
+    source = Scripted([frame(k) for k in range(3)], camera, waiting=1, order=FrameOrder())
+    for _ in range(2):
+        opened(source)
+        source.close()
+    opened(source)
+    assert all_of(source) == [2] and source.counts() == {"too_late": 2}
+    source.close()
+    source.close()
+
+
+def test_room_for_no_frame_is_refused(camera):
+    with pytest.raises(InvalidInput, match="waiting is 0"):
+        Scripted([], camera, waiting=0)

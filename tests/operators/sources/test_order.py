@@ -1,0 +1,142 @@
+"""Numbers and times of senders that are in disorder."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+
+from operators.sources.order import FrameOrder
+
+MS = 1_000_000
+
+
+class Sender:
+    """Frames with any number and time, on a clock of ours that the test moves."""
+
+    def __init__(self, frame):
+        self.frame, self.order, self.now_ns = frame, FrameOrder(), 1_000 * MS
+
+    def send(self, seq, pts_ms, *, after_ms=40.0, picture=None):
+        """What comes out: (seq, pts in ms), or None."""
+        self.now_ns += round(after_ms * MS)
+        shown = self.frame(seq if picture is None else picture)
+        out = self.order.take(self.frame(seq, pts_ns=round(pts_ms * MS), image=shown.image), self.now_ns)
+        return None if out is None else (out.seq, out.pts_ns / MS)
+
+    def counts(self):
+        return {reason: times for reason, times in self.order.counts.items() if times}
+
+
+@pytest.fixture
+def sender(frame):
+    return Sender(frame)
+
+
+def test_what_is_in_order_passes_with_numbers_from_nought(sender):
+    assert [sender.send(k, 40 * k) for k in (7, 8, 9)] == [(0, 280), (1, 320), (2, 360)]
+    assert sender.counts() == {}
+
+
+def test_missing_numbers_stay_missing_and_are_counted(sender):
+    assert [sender.send(k, 40 * k) for k in (0, 1, 5)] == [(0, 0), (1, 40), (5, 200)]
+    assert sender.counts() == {"missing": 3}
+
+
+def test_a_frame_that_comes_twice_is_dropped_by_its_number_or_by_its_time_and_picture(sender):
+    assert sender.send(0, 0) and sender.send(1, 40)
+    assert sender.send(1, 40) is None and sender.send(2, 40, picture=1) is None
+    assert sender.send(2, 40, picture=2) == (2, 40 + 1e-6), "another picture with the same time"
+    assert sender.counts() == {"duplicates": 2, "repaired_times": 1}
+
+
+def test_a_frame_after_its_time_is_dropped(sender):
+    assert [sender.send(k, 40 * k) for k in (0, 1, 3, 2, 4)] == [(0, 0), (1, 40), (3, 120), None, (4, 160)]
+    assert sender.counts() == {"missing": 1, "out_of_order": 1}
+
+
+@pytest.mark.parametrize("back_ms", [5_000, 90_000, 10**9])
+def test_a_clock_that_is_set_back_goes_on(sender, back_ms):
+    sender.send(0, 10**9)
+    assert sender.send(1, 10**9 + 40) == (1, 10**9 + 40)
+    assert sender.send(2, 10**9 + 80 - back_ms) == (2, 10**9 + 80)
+    assert sender.send(3, 10**9 + 120 - back_ms) == (3, 10**9 + 120)
+    assert sender.counts() == {"clock_resets": 1}
+
+
+def test_a_clock_that_is_set_forward_goes_on(sender):
+    sender.send(0, 0)
+    assert sender.send(1, 3_600_000) == (1, 40) and sender.send(2, 3_600_040) == (2, 80)
+    assert sender.counts() == {"clock_jumps": 1}
+
+
+def test_a_long_pause_is_no_jump(sender):
+    sender.send(0, 0)
+    assert sender.send(1, 60_000, after_ms=60_000) == (1, 60_000)
+    assert sender.counts() == {}
+
+
+def test_frames_that_come_in_a_bundle_keep_their_times(sender):
+    sender.send(0, 0)
+    assert [sender.send(k, 40 * k, after_ms=0.1) for k in range(1, 20)] == [(k, 40 * k) for k in range(1, 20)]
+    assert sender.counts() == {}
+
+
+def test_a_sender_that_begins_again_is_followed(sender):
+    for k in range(10):
+        sender.send(k, 40 * k)
+    given = [sender.send(k, 40 * k) for k in range(5)]
+    assert given[:2] == [None, None], "these might be late"
+    assert [seq for seq, _ in given[2:]] == [10, 11, 12]
+    times = [pts for _, pts in given[2:]]
+    assert times == [360 + 3 * 40, 360 + 4 * 40, 360 + 5 * 40]
+    assert sender.counts() == {"out_of_order": 2, "clock_resets": 1}
+
+
+def test_numbers_far_away_are_another_way_of_counting(sender):
+    sender.send(0, 0)
+    assert sender.send(2**40, 40) == (1, 40) and sender.send(2**40 + 1, 80) == (2, 80)
+    assert sender.counts() == {"clock_resets": 1}
+
+
+def test_after_a_restart_anything_goes_on(sender):
+    sender.send(3, 500)
+    sender.order.restart()
+    assert sender.send(3, 2, after_ms=5_000) == (1, 5_500) and sender.send(4, 42) == (2, 5_540)
+    assert sender.counts() == {}
+
+
+def test_beginning_anew_forgets(sender):
+    sender.send(3, 500)
+    sender.order.begin()
+    assert sender.send(9, 1) == (0, 1)
+
+
+def test_a_trusted_sender_keeps_its_own_numbers_and_time_until_it_restarts(frame):
+    order = FrameOrder(trusted=True)
+    pts = [order.take(frame(k, pts_ns=k * 10**10), k).pts_ns for k in (0, 1, 2)]
+    assert pts == [0, 10**10, 2 * 10**10], "faster than any clock of ours"
+    order.restart()
+    after = order.take(frame(0, pts_ns=0), 50)
+    assert (after.seq, after.pts_ns) == (3, 2 * 10**10 + 48)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_whatever_a_sender_does_numbers_increase_and_time_rises(frame, seed):
+    rng, order, now_ns = random.Random(seed), FrameOrder(), 0
+    seq, pts_ns, last = 0, 0, None
+    taken = 0
+    for step in range(300):
+        now_ns += rng.choice([0, 1, 40 * MS, 10_000 * MS])
+        seq += rng.choice([1, 1, 1, 0, -1, 2, -50, 10**9, -(10**9)])
+        pts_ns += rng.choice([40 * MS, 40 * MS, 0, -40 * MS, -(2**50), 2**50, 1])
+        if rng.random() < 0.02:
+            order.restart()
+        image = np.full((16, 24, 3), step % 251, np.uint8)
+        out = order.take(frame(seq, pts_ns=pts_ns, image=image), now_ns)
+        if out is not None:
+            taken += 1
+            assert last is None or (out.seq > last.seq and out.pts_ns > last.pts_ns)
+            last = out
+    assert taken > 60, "most of it is of use"

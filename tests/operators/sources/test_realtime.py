@@ -1,0 +1,183 @@
+"""A recording played by the clock. The clock here is the test's own, so nothing depends on how fast this machine is."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidSetting, RecordingMissing
+from gsplat_core.io.recordings import open_recording, synthesize
+from gsplat_core.scene.frames import FrameStatus
+from operators.sources import realtime
+from operators.sources.options import SourceOptions
+from operators.sources.realtime import RealtimeSource
+from operators.sources.recording import RecordingSource
+from operators.sources.registry import open_source
+from operators.sources.source import FrameSource, SourceState
+
+SOON_S = 10.0
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time in ns; `wait` moves it."""
+    now = SimpleNamespace(ns=5_000_000_000)
+    monkeypatch.setattr(realtime, "time", SimpleNamespace(monotonic_ns=lambda: now.ns))
+
+    def wait(self, seconds):
+        now.ns += round(seconds * 1e9)
+        return False
+
+    monkeypatch.setattr(RealtimeSource, "wait", wait)
+    return now
+
+
+def released(source, clock, most=math.inf):
+    """(seq, pts in ms, ms after the start at which it was released)."""
+    start, found = clock.ns, []
+    for frame in source.frames():
+        found.append((frame.seq, frame.pts_ns / 1e6, (clock.ns - start) / 1e6))
+        if len(found) >= most:
+            break
+    return found
+
+
+def test_each_frame_is_released_at_its_time(recording, clock):
+    source = RealtimeSource(recording)
+    assert isinstance(source, FrameSource)
+    assert released(source, clock) == [(k, 40 * k, 40 * k) for k in range(5)]
+    about = source.description
+    assert (about.name, about.fps, about.frame_count, about.digest) == ("fake", 25, 5, None)
+
+
+def test_looped_it_goes_on_without_a_gap_or_a_repeated_number(recording, clock):
+    source = RealtimeSource(recording, SourceOptions(loop=True))
+    assert source.description.frame_count is None
+    assert released(source, clock, 23) == [(k, 40 * k, 40 * k) for k in range(23)]
+    assert recording.opened == 1, "later rounds come out of memory"
+
+
+def test_what_is_too_large_to_remember_is_decoded_again(recording, clock, monkeypatch):
+    monkeypatch.setattr(realtime, "REMEMBERED_BYTES", 2000)
+    assert len(released(RealtimeSource(recording, SourceOptions(loop=True)), clock, 12)) == 12
+    assert recording.opened >= 3
+
+
+def test_times_that_are_uneven_stay_uneven(recording, clock, frame):
+    recording.frames[:] = [frame(k, pts_ns=pts * 10**6) for k, pts in enumerate((7, 47, 167))]
+    source = RealtimeSource(recording, SourceOptions(loop=True))
+    assert [pts for _, pts, _ in released(source, clock, 6)] == [0, 40, 160, 200, 240, 360]
+
+
+@pytest.mark.parametrize(
+    ("options", "pts_ms", "at_ms"),
+    [
+        (SourceOptions(speed=2), 40, 20),
+        (SourceOptions(speed=0.5), 40, 80),
+        (SourceOptions(fps=50), 20, 20),
+        (SourceOptions(fps=50, speed=4), 20, 5),
+        (SourceOptions(speed=math.inf), 40, 0),
+    ],
+)
+def test_speed_moves_the_clock_and_the_frame_rate_moves_the_frames(recording, clock, options, pts_ms, at_ms):
+    assert released(RealtimeSource(recording, options), clock) == [(k, pts_ms * k, at_ms * k) for k in range(5)]
+
+
+def test_as_fast_as_they_are_taken_drops_nothing(recording):
+    source = RealtimeSource(recording, SourceOptions(loop=True, speed=math.inf, max_frames=200, waiting=1))
+    source.open()
+    seqs = []
+    while (frame := source.read(SOON_S)) is not None:
+        seqs.append(frame.seq)
+    assert seqs == list(range(200)) and source.counts() == {}
+    assert source.state is SourceState.ENDED
+    source.close()
+
+
+def test_a_frame_that_is_decoded_late_is_counted_and_the_others_keep_their_times(recording, clock, monkeypatch):
+    source = RealtimeSource(recording)
+    frames = iter(recording)
+
+    def slow():
+        for k, frame in enumerate(frames):
+            clock.ns += 90_000_000 if k == 2 else 0
+            yield frame
+
+    monkeypatch.setattr(source, "_numbered", slow)
+    monkeypatch.setattr(realtime, "read_ahead", lambda items, *_: items)
+    assert [at for _, _, at in released(source, clock)] == [0, 40, 130, 130, 160]
+    assert source.counts() == {"decoded_late": 1}
+
+
+def test_after_a_long_pause_of_the_machine_the_clock_starts_again(recording, clock, monkeypatch):
+    source = RealtimeSource(recording)
+    frames = iter(recording)
+
+    def suspended():
+        for k, frame in enumerate(frames):
+            clock.ns += 60_000_000_000 if k == 2 else 0
+            yield frame
+
+    monkeypatch.setattr(source, "_numbered", suspended)
+    monkeypatch.setattr(realtime, "read_ahead", lambda items, *_: items)
+    assert [at for _, _, at in released(source, clock)] == [0, 40, 60_040, 60_080, 60_120]
+    assert source.counts() == {"decoded_late": 1, "clock_restarts": 1}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return synthesize(tmp_path_factory.mktemp("recordings") / "tiny", frames=4, width_px=64, height_px=48, stereo=True)
+
+
+def test_a_path_is_played_in_real_time_with_what_lies_beside_the_images(folder):
+    assert isinstance(open_source(folder), RecordingSource), "only where it is asked for"
+    source = open_source(folder, SourceOptions(realtime=True, loop=True, speed=1000, scale=0.5, waiting=64))
+    assert isinstance(source, RealtimeSource) and source.description.width_px == 32
+    expected = list(open_recording(folder, scale=0.5))
+    source.open()
+    for k in range(9):
+        frame, same = source.read(SOON_S), expected[k % 4]
+        assert (frame.seq, frame.status) == (k, FrameStatus.LIVE) and frame.arrived_ns > 0
+        for name in ("image", "right_image", "mask", "depth", "pose"):
+            np.testing.assert_array_equal(getattr(frame, name), getattr(same, name))
+    source.close()
+
+
+def test_its_address_says_how_it_is_played(folder):
+    source = open_source(f"realtime:{folder}?loop=1&speed=2.5&fps=60")
+    assert (source.options.loop, source.options.speed, source.options.fps) == (True, 2.5, 60)
+    assert open_source(f"realtime://{folder}?speed=max").drops is False
+    assert open_source(f"realtime:{folder}", SourceOptions(max_frames=3)).description.frame_count == 3
+
+
+@pytest.mark.parametrize(
+    ("query", "what"),
+    [
+        ("speed=0", "speed is '0'"),
+        ("speed=nan", "speed is 'nan'"),
+        ("speed=-1", "speed is '-1'"),
+        ("fps=1e9", "fps is '1e9'"),
+        ("loop=perhaps", "loop is 'perhaps'"),
+        ("loops=1", "unknown option 'loops'; known are fps, loop, speed"),
+        ("loop=1&loop=0", "'loop' is there twice"),
+    ],
+)
+def test_options_that_are_wrong_are_named(folder, query, what):
+    with pytest.raises(InvalidSetting, match=what):
+        open_source(f"realtime:{folder}?{query}")
+
+
+def test_a_recording_that_is_not_there_is_a_sentence():
+    with pytest.raises(RecordingMissing):
+        open_source("realtime:/nowhere/at/all")
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"speed": 0}, {"speed": math.nan}, {"fps": 0.0}, {"waiting": 0}, {"stereo": "both"}, {"speed": 10**6}]
+)
+def test_options_out_of_range_are_refused(wrong):
+    with pytest.raises(InvalidSetting, match=next(iter(wrong))):
+        SourceOptions(**wrong)

@@ -1,0 +1,136 @@
+"""What is on the screen says how old it is and what that means."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from operators.display import DisplayOp, DisplaySettings, LiveDisplayResult, labelled
+from operators.frame_clock import ClockSettings, FrameClock
+from operators.messages import PictureState
+from operators.outcome import OutcomeBuilder
+from operators.sources.source import SourceState
+
+
+class Screen:
+    """A display on a clock that is moved by hand."""
+
+    def __init__(self, fake_time, **settings):
+        self.time = fake_time
+        self.source = SourceState.LIVE
+        clock = FrameClock(ClockSettings(), 30.0, fake_time)
+        self.operator = DisplayOp(
+            None, clock=clock, source_state=lambda: self.source, settings=DisplaySettings(**settings)
+        )
+        self.operator.start()
+
+
+@pytest.fixture
+def screen(fake_time):
+    return Screen(fake_time)
+
+
+def arrived(rendered, frame, fake_time, seq=0, age_ms=10.0):
+    """A picture of a frame that came so long ago."""
+    return rendered(seq, frame=frame(seq, arrived_ns=fake_time.ns - round(age_ms * 1e6)))
+
+
+def test_a_new_picture_is_shown_with_its_age(screen, rendered, frame, fake_time, compute_queued):
+    (shown,) = compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time)])
+    assert shown.state is PictureState.LIVE
+    assert shown.new
+    assert shown.age_ns == 10_000_000
+
+
+def test_the_age_is_that_of_the_content_and_not_of_the_frame(screen, rendered, frame, fake_time, compute_queued):
+    old = frame(0, arrived_ns=fake_time.ns - 500_000_000)
+    picture = rendered(5, frame=frame(5, arrived_ns=fake_time.ns), content=old)
+    (shown,) = compute_queued(screen.operator, rendered=[picture])
+    assert shown.age_ns == 500_000_000
+    assert shown.state is PictureState.STALE
+
+
+def test_a_picture_that_is_not_renewed_becomes_stale_and_then_frozen(
+    screen, rendered, frame, fake_time, compute_queued
+):
+    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time)])
+    states = []
+    for _ in range(30):
+        fake_time.pass_ms(50)
+        states += [shown.state for shown in compute_queued(screen.operator) if not shown.new]
+    changes = [state for k, state in enumerate(states) if k == 0 or states[k - 1] is not state]
+    assert changes == [PictureState.STALE, PictureState.FROZEN]
+
+
+def test_a_lost_source_is_said_at_once_and_a_picture_that_comes_back_is_live(
+    screen, rendered, frame, fake_time, compute_queued
+):
+    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time)])
+    screen.source = SourceState.RECONNECTING
+    (shown,) = compute_queued(screen.operator)
+    assert (shown.state, shown.new) == (PictureState.SOURCE_LOST, False)
+    screen.source = SourceState.LIVE
+    (shown,) = compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, seq=1)])
+    assert shown.state is PictureState.LIVE
+
+
+def test_an_unchanged_live_picture_is_not_sent_again(screen, rendered, frame, fake_time, compute_queued):
+    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time)])
+    fake_time.pass_ms(20)
+    assert compute_queued(screen.operator) == []
+
+
+def test_nothing_is_shown_before_the_first_picture(screen, compute_queued):
+    screen.source = SourceState.STALLED
+    assert compute_queued(screen.operator) == []
+
+
+def test_a_slow_camera_is_not_stale(fake_time):
+    settings = DisplaySettings()
+    assert settings.state(300e6, interval_ns=200e6, source=SourceState.LIVE) is PictureState.LIVE
+    assert settings.state(300e6, interval_ns=33e6, source=SourceState.LIVE) is PictureState.STALE
+
+
+def test_a_picture_that_is_not_live_is_labelled_even_where_labels_are_off(fake_time, rendered, frame, compute_queued):
+    screen = Screen(fake_time, label=False)
+    picture = arrived(rendered, frame, fake_time)
+    (live,) = compute_queued(screen.operator, rendered=[picture])
+    assert live.image is picture.image
+    screen.source = SourceState.STALLED
+    (lost,) = compute_queued(screen.operator)
+    assert (lost.image != picture.image).any()
+
+
+def test_the_label_is_drawn_into_a_copy(rng):
+    image = rng.integers(0, 256, (64, 96, 3), np.uint8)
+    before = image.copy()
+    for state in PictureState:
+        drawn = labelled(image, state, 12e6)
+        assert drawn.shape == image.shape
+        assert (drawn != image).any()
+    assert np.array_equal(image, before)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (7, 5)])
+def test_tiny_pictures_can_be_labelled(size):
+    assert labelled(np.zeros((*size, 3), np.uint8), PictureState.FROZEN, 3e9).shape == (*size, 3)
+
+
+def test_the_outcome_counts_states_and_ages(screen, rendered, frame, fake_time, compute_queued):
+    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, age_ms=40)])
+    fake_time.pass_ms(100)
+    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, seq=1, age_ms=10)])
+    outcome = OutcomeBuilder()
+    screen.operator.contribute(outcome)
+    result = outcome.find(LiveDisplayResult)
+    assert (result.pictures, result.states, result.first_picture_ms) == (2, {"live": 1}, 40.0)
+    assert result.age.max_ms == 40.0
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"stale_after_ms": 0}, {"stale_after_ms": 2000.0}, {"frozen_after_ms": 1e9}, {"stale_after_intervals": 0}]
+)
+def test_thresholds_out_of_range_are_refused(wrong):
+    with pytest.raises(InvalidSetting):
+        DisplaySettings(**wrong)

@@ -1,0 +1,96 @@
+"""When a live frame is to be shown, what that leaves for training, and which frames are passed over."""
+
+from __future__ import annotations
+
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from operators.frame_clock import ClockSettings, FrameClock
+
+
+@pytest.fixture
+def clock(fake_time):
+    return FrameClock(ClockSettings(), 30.0, fake_time)
+
+
+def test_training_ends_early_enough_to_show_the_picture_in_time(clock, frame, fake_time):
+    clock.display_ns = 3e6
+    budget = clock.budget(frame(0, arrived_ns=fake_time.ns))
+    assert budget.deadline_s == pytest.approx((fake_time.ns + clock.show_after_ns - 3e6) * 1e-9)
+    assert (budget.at_least, budget.at_most) == (clock.settings.at_least_steps, clock.settings.at_most_steps)
+
+
+def test_the_budget_of_a_late_frame_is_already_over(clock, frame, fake_time):
+    arrived_ns = fake_time.ns
+    fake_time.pass_ms(200)
+    assert clock.budget(frame(0, arrived_ns=arrived_ns)).deadline_s < fake_time.ns * 1e-9
+
+
+def test_a_fixed_budget_does_not_depend_on_the_rate(fake_time):
+    clock = FrameClock(ClockSettings(budget_ms=12.0), 5.0, fake_time)
+    assert clock.show_after_ns == 12e6
+
+
+def test_the_interval_follows_the_frames_and_not_a_pause(clock, frame, fake_time):
+    for k in range(60):
+        fake_time.pass_ms(20)
+        clock.budget(frame(k, arrived_ns=fake_time.ns))
+    assert clock.interval_ns == pytest.approx(20e6, rel=0.05)
+    fake_time.pass_ms(60_000)
+    clock.budget(frame(60, arrived_ns=fake_time.ns))
+    assert clock.interval_ns < 30e6
+
+
+def test_frames_that_come_at_once_do_not_make_the_interval_zero(clock, frame, fake_time):
+    for k in range(500):
+        clock.budget(frame(k, arrived_ns=fake_time.ns))
+    assert clock.interval_ns > 0
+
+
+def test_rehearsal_ends_before_the_next_frame_is_due(clock, frame, fake_time):
+    clock.budget(frame(0, arrived_ns=fake_time.ns))
+    assert clock.may_rehearse(0, 1e6)
+    fake_time.pass_ms(clock.interval_ns * 1e-6 - 1)
+    assert not clock.may_rehearse(0, 1e6)
+
+
+def test_rehearsal_ends_when_no_frame_comes(clock, frame, fake_time):
+    clock.budget(frame(0, arrived_ns=fake_time.ns))
+    assert not clock.may_rehearse(clock.settings.rehearse_at_most, 0)
+
+
+def test_frames_are_caught_up_with_one_by_one_where_training_keeps_up(clock, frame, fake_time):
+    clock.training_ns = 10e6
+    arrived_ns = fake_time.ns
+    fake_time.pass_ms(60)
+    assert not clock.too_late(frame(0, arrived_ns=arrived_ns), waiting=1)
+    fake_time.pass_ms(200)
+    assert clock.too_late(frame(0, arrived_ns=arrived_ns), waiting=1)
+
+
+def test_the_newest_frame_wins_where_training_does_not_keep_up(clock, frame, fake_time):
+    clock.training_ns = 60e6
+    assert clock.too_late(frame(0, arrived_ns=fake_time.ns), waiting=1)
+
+
+def test_the_only_frame_is_never_passed_over(clock, frame, fake_time):
+    clock.training_ns = 60e6
+    arrived_ns = fake_time.ns
+    fake_time.pass_ms(10_000)
+    assert not clock.too_late(frame(0, arrived_ns=arrived_ns), waiting=0)
+
+
+def test_waiting_for_a_picture_ends_when_it_is_shown_or_does_not_come(clock):
+    clock.published(0, 10)
+    clock.wait_until_shown()  # returns though nothing is shown
+    clock.shown(0, 20)
+    clock.wait_until_shown()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"budget_ms": 0.0}, {"budget_ms": float("nan")}, {"auto_share": 0.0}, {"at_least_steps": 0}, {"at_most_steps": 1}],
+)
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(InvalidSetting):
+        ClockSettings(**wrong)
