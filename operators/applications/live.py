@@ -1,7 +1,7 @@
 """Live: a stream is reconstructed and shown beside a clock, without an end.
 
-    source → sequence → tool_mask → scene ─┬─► reconstruct → deform → rasterize → display ─┬─► sinks
-                                           └───────────────────────► on_screen ◄───────────┘
+    source → out_of_body → picture → tool_mask → tissue ─┬─► reconstruct → deform → rasterize → display ─┬─► sinks
+                                                         └───────────────────────► on_screen ◄───────────┘
 
 Each operator has a thread of its own. The newest frame wins wherever one comes too late: into `reconstruct`, into `rasterize` and into
 `display`; every frame that is passed over is counted by the edge. What is shown says how old it is.
@@ -68,7 +68,7 @@ class LiveApplication(Application):
         self.source_op = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
         recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
         last: Operator = self.source_op
-        for operator in recording.analysis(analysis_operators(self, settings.tool_mask)):
+        for operator in recording.analysis(analysis_operators(self, settings.tool_mask, settings.out_of_body)):
             self.add_flow(last, operator, {("frame", "frame")})
             last = operator
         self.reconstruct = LiveReconstructOp(
