@@ -120,6 +120,8 @@ class LiveReconstructor(Reconstructor):
             gaussians = self._first_gaussians(frame, observation)
             if kept.restart(gaussians, observation.time_s, self.camera):
                 self._step = kept
+                if self._prior is not None:
+                    self._prior.forget()
                 return
         self._coverage = None
         super()._start(frame, observation, end_s)
