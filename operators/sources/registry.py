@@ -27,6 +27,8 @@ SOURCES: Registry[SourceFactory] = Registry(
         "recording": "operators.sources.recording:recording_source",
         "realtime": "operators.sources.realtime:realtime_source",
         "pipe": "operators.sources.pipe:pipe_source",
+        "zmq+tcp": "operators.sources.zeromq:tcp_source",
+        "zmq+ipc": "operators.sources.zeromq:ipc_source",
         "synthetic": "operators.sources.synthetic:synthetic_source",
         **{scheme: f"operators.sources.url:{scheme}_source" for scheme in _URLS},
     },
