@@ -29,6 +29,7 @@ SOURCES: Registry[SourceFactory] = Registry(
         "pipe": "operators.sources.pipe:pipe_source",
         "zmq+tcp": "operators.sources.zeromq:tcp_source",
         "zmq+ipc": "operators.sources.zeromq:ipc_source",
+        "folder": "operators.sources.folder:folder_source",
         "synthetic": "operators.sources.synthetic:synthetic_source",
         **{scheme: f"operators.sources.url:{scheme}_source" for scheme in _URLS},
     },
