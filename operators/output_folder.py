@@ -31,7 +31,9 @@ from operators.storage import STAGING_PREFIX, storage_errors, write_whole
 
 _FORMAT = "intrasplat-output"
 _COMPLETE, _OLD = ".complete-", ".old-"
-_RESULT = re.compile(r"reconstruction\.mp4|model|frames\.jsonl|report\.json|report\.html|\d{6,}\.png")
+_RESULT = re.compile(
+    r"reconstruction\.mp4|model|frames\.jsonl|report\.json|report\.html|\d{6,}\.png|evaluation\.(?:json|html)|evaluation-\w+\.jsonl"
+)
 """The names of results. In a folder of an earlier version, whose marker lists no files, all of them are ours."""
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.rendering.registry import RENDERERS, new_renderer
 from gsplat_core.rendering.renderer import Renderer
+from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.transfers import HostCopy
@@ -56,6 +57,11 @@ class RasterizeOp(Operator):
         spec.input("scene", type=DeformedScene)
         spec.output("rendered", type=RenderedFrame)
         spec.param("renderer", "alpha")
+
+    def adopt(self, renderer: Renderer, camera: Camera, device: torch.device) -> None:
+        """Use a renderer of this operator's kind that was made for such a camera on such a device, instead of making one."""
+        self._made = renderer
+        self._made_for = camera.width_px, camera.height_px, camera.model, device
 
     def stop(self) -> None:
         # It holds the last model and, on a GPU, memory.

@@ -58,9 +58,14 @@ class _MaskedPair:
         # Summed in float64: a frame has a million terms.
         return float(error.mul_(error).sum(dtype=torch.float64))
 
+    def psnrs_db(self) -> tuple[float, float]:
+        """Over tissue, and over the whole frame; NaN where there is no tissue."""
+        error = self.squared_error()
+        return _psnr_db(error, self.tissue_pixels), _psnr_db(error, self.pixels if self.tissue_pixels else 0)
+
     def mean_ssim(self) -> float:
         """Mean of the similarity of every pixel and channel."""
-        image, target = (torch.from_numpy(_unit(values)) for values in (self.image, self.target))
+        image, target = (torch.from_numpy(unit_image(values)) for values in (self.image, self.target))
         # OpenCV sums in float64 as it reads; torch first makes a float64 copy of the map, for many times as long.
         return sum(cv2.mean(ssim_map(image, target).numpy())[:3]) / 3
 
@@ -79,7 +84,7 @@ def _host_array(values: ImageLike) -> NDArray[Any]:
     return np.ascontiguousarray(values.detach().cpu().numpy() if isinstance(values, Tensor) else values)
 
 
-def _unit(image: NDArray[Any]) -> NDArray[np.float32]:
+def unit_image(image: NDArray[Any]) -> NDArray[np.float32]:
     """The image as float32 in 0..1."""
     if image.dtype == np.uint8:
         return np.asarray(cv2.LUT(image, _UNIT_OF_BYTE), dtype=np.float32)
@@ -91,7 +96,7 @@ def _masked_pair(image: ImageLike, target: ImageLike, mask: ImageLike | None) ->
     if x.shape != y.shape:
         raise InvalidInput(f"image {list(x.shape)} and target {list(y.shape)} must have one size")
     if x.dtype != np.uint8 or y.dtype != np.uint8:
-        x, y = _unit(x), _unit(y)
+        x, y = unit_image(x), unit_image(y)
     if mask is None:
         return _MaskedPair(x, y, x.shape[0] * x.shape[1])
     tissue = _host_array(mask)
@@ -137,6 +142,11 @@ def psnr_frame_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = 
     """
     pair = _masked_pair(image, target, mask)
     return _psnr_db(pair.squared_error(), pair.pixels if pair.tissue_pixels else 0)
+
+
+def psnrs_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> tuple[float, float]:
+    """`psnr_tissue_db` and `psnr_frame_db` of one pair of images, which are compared once."""
+    return _masked_pair(image, target, mask).psnrs_db()
 
 
 def ssim(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
@@ -196,6 +206,18 @@ class ScoredMean:
         return math.fsum(self._parts) / self.count if self.count else None
 
 
+def frame_quality(
+    seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None, *, similarity: bool = True
+) -> FrameQuality:
+    """All measures of one frame, whose images are compared once; arguments as in `psnr_tissue_db`.
+
+    Without `similarity` SSIM, which takes longest, is left out.
+    """
+    pair = _masked_pair(image, target, mask)
+    measured = similarity and pair.tissue_pixels
+    return FrameQuality(seq, *pair.psnrs_db(), pair.mean_ssim() if measured else math.nan)
+
+
 class QualityTracker:
     """Means over the frames that were displayed, in memory of fixed size."""
 
@@ -207,20 +229,16 @@ class QualityTracker:
     def observe(
         self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None, *, similarity: bool = True
     ) -> FrameQuality:
-        """Score one frame and take the result into the means; arguments as in `psnr_tissue_db`. Without `similarity` SSIM, which takes
-        longest, is left out."""
-        pair = _masked_pair(image, target, mask)
-        squared_error = pair.squared_error()
-        quality = FrameQuality(
-            seq,
-            psnr_tissue_db=_psnr_db(squared_error, pair.tissue_pixels),
-            psnr_frame_db=_psnr_db(squared_error, pair.pixels if pair.tissue_pixels else 0),
-            ssim=pair.mean_ssim() if pair.tissue_pixels and similarity else math.nan,
-        )
+        """Score one frame and take the result into the means; arguments as in `frame_quality`."""
+        quality = frame_quality(seq, image, target, mask, similarity=similarity)
+        self.take(quality)
+        return quality
+
+    def take(self, quality: FrameQuality) -> None:
+        """Take a frame's measures into the means; those that are not finite are left out."""
         self.count += 1
         for name, mean in self._means.items():
             mean.add(getattr(quality, name))
-        return quality
 
     def means(self) -> dict[str, float | None]:
         """Mean of each measure over the frames that have one (PSNR averaged in dB, as the field does); None without any."""

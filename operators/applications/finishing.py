@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsplat_core.evaluation.baselines import measure_baselines
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
-from gsplat_core.training.baselines import measure_baselines
 from operators.applications.session import Session
 from operators.ingest import LOOK_S
 from operators.metrics import QualityResult

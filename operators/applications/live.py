@@ -9,40 +9,27 @@ Each operator has a thread of its own. The newest frame wins wherever one comes 
 
 from __future__ import annotations
 
-import dataclasses
-import gc
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
-from gsplat_core.errors import InvalidSetting
-from gsplat_core.rendering.registry import check_renderer, new_renderer
-from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
-from gsplat_core.training.budget import Budget
-from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
+from gsplat_core.rendering.registry import check_renderer
 from operators.applications.delivery import Report, delivered
-from operators.applications.device import check_device, seeded
+from operators.applications.device import check_device
 from operators.applications.finishing import saves_model
-from operators.applications.limits import check_max_frames, check_picture, check_scale, check_seed
+from operators.applications.limits import check_picture
 from operators.applications.live_analysis import analysis_operators
-from operators.applications.replay import PIXELS_PER_GAUSSIAN, REPORT_RESERVE_BYTES
-from operators.applications.result import RunOutcome, RunSettings
+from operators.applications.live_settings import LiveSettings
+from operators.applications.live_start import WarmParts, low_latency, warm_up
+from operators.applications.replay import REPORT_RESERVE_BYTES
+from operators.applications.result import RunOutcome
 from operators.applications.session import Session
 from operators.deform import DeformOp
-from operators.display import DisplayOp, DisplaySettings, labelled
-from operators.frame_clock import ClockSettings, FrameClock
+from operators.display import DisplayOp
+from operators.frame_clock import FrameClock
 from operators.frame_log import FRAMES_FILE, FrameLog
 from operators.graph import Application, MultiThreadScheduler, Operator
 from operators.ingest import SourceOp
 from operators.live_reconstruct import LiveReconstructOp
-from operators.messages import PictureState
 from operators.metrics import ScoredFrame
 from operators.on_screen import OnScreenMetricsOp
 from operators.rasterize import RasterizeOp
@@ -52,78 +39,6 @@ from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource
 from operators.storage import StorageReserve
 
-SWITCH_INTERVAL_S = 0.0002
-"""How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
-LIVE_WINDOW_FRAMES = 150
-LIVE_BUMP_SPACING_S = 0.1
-LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
-"""Beside L1: follows motion better. On a CPU a step takes half as long again with it, and steps are what is short there."""
-
-
-@dataclass(frozen=True)
-class LiveSettings:
-    """What to reconstruct live, how, and where the results go. Raises InvalidSetting for a value out of its range."""
-
-    source: str
-    """An address (see `open_source`)."""
-    out: Path
-    device: str = "cpu"
-    field: str = "auto"
-    renderer: str = "alpha"
-    seed: int = 0
-    scale: float = 1.0
-    max_frames: int | None = None
-    seconds: float | None = None
-    """End after so long; None: when the source ends or the run is interrupted."""
-    loop: bool = False
-    """Play a recording again and again."""
-    fps: float | None = None
-    """Play a recording at this rate instead of its own."""
-    tool_mask: str = "builtin"
-    """How tools are found in frames that come without a mask (`operators.tool_mask.TOOL_MASKS`)."""
-    clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
-    display: DisplaySettings = dataclasses.field(default_factory=DisplaySettings)
-    training: LiveTraining = dataclasses.field(default_factory=LiveTraining)
-
-    def __post_init__(self) -> None:
-        check_seed(self.seed)
-        check_scale(self.scale)
-        check_max_frames(self.max_frames)
-        if self.seconds is not None and not 0 < self.seconds < 1e9:
-            raise InvalidSetting(f"seconds is {self.seconds:g}; it must be positive")
-        if self.fps is not None and not 0 < self.fps <= 1000:
-            raise InvalidSetting(f"fps is {self.fps:g}; it must be above 0 and at most 1000")
-
-    @property
-    def inputs(self) -> tuple[Path, ...]:
-        """What the run reads from the disk."""
-        path = Path(self.source)
-        return (path,) if path.exists() else ()
-
-    def reconstructor_config(self, pixels: int) -> ReconstructorConfig:
-        """The reconstructor's settings for frames of so many pixels. Raises InvalidSetting."""
-        config = ReconstructorConfig(
-            field=self.field,
-            window_frames=LIVE_WINDOW_FRAMES,
-            bump_spacing_s=LIVE_BUMP_SPACING_S,
-            ssim_weight=LIVE_SSIM_WEIGHT[self.device],
-        )
-        most = max(64, pixels // PIXELS_PER_GAUSSIAN)
-        return replace(config, gaussians=min(config.gaussians, most), max_gaussians=min(config.max_gaussians, 2 * most))
-
-    def stated(self) -> RunSettings:
-        """What the report says about them."""
-        return RunSettings(
-            device=self.device,
-            engine="embedded",
-            field=ReconstructorConfig(field=self.field).chosen_field,
-            renderer=self.renderer,
-            seed=self.seed,
-            scale=self.scale,
-            steps_per_frame=None,
-            heldout=False,
-        )
-
 
 class LiveApplication(Application):
     """Composes the graph."""
@@ -132,6 +47,7 @@ class LiveApplication(Application):
         self,
         source: FrameSource,
         settings: LiveSettings,
+        warm: WarmParts,
         *,
         stop_requested: Callable[[], bool] = lambda: False,
         on_scored: Callable[[LiveApplication, ScoredFrame], None] | None = None,
@@ -139,7 +55,7 @@ class LiveApplication(Application):
     ) -> None:
         super().__init__(name="live", track=True)
         self.scheduler(MultiThreadScheduler(self))
-        self.frame_source, self.settings = source, settings
+        self.frame_source, self.settings, self._warm = source, settings, warm
         self.clock = FrameClock(settings.clock, source.description.fps)
         self._stop_requested = stop_requested
         self._on_scored, self._on_shown = on_scored, on_shown
@@ -156,11 +72,12 @@ class LiveApplication(Application):
         self.reconstruct = LiveReconstructOp(
             self,
             name="reconstruct",
-            make_reconstructor=lambda: new_live_reconstructor(settings, self.frame_source),
+            make_reconstructor=lambda: self._warm.reconstructor,
             clock=self.clock,
         )
         deform = DeformOp(self, name="deform")
         rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
+        rasterize.adopt(self._warm.renderer, self.frame_source.description.camera, self._warm.reconstructor.device)
         self.display = DisplayOp(
             self,
             name="display",
@@ -208,8 +125,14 @@ def live(
 
     def run(inside: LiveSettings, notes: list[str]) -> RunOutcome:
         source = prepare(inside, notes)
-        graph = LiveApplication(source, inside, stop_requested=stop_requested, on_scored=on_scored, on_shown=on_shown)
-        warm_up(inside, source)
+        graph = LiveApplication(
+            source,
+            inside,
+            warm_up(inside, source),
+            stop_requested=stop_requested,
+            on_scored=on_scored,
+            on_shown=on_shown,
+        )
         with low_latency():
             return Session(
                 graph,
@@ -240,45 +163,3 @@ def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
     notes.extend(source.description.notes)
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
     return source
-
-
-def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveReconstructor:
-    """A reconstructor for the frames of a source."""
-    camera = source.description.camera
-    return LiveReconstructor(
-        settings.reconstructor_config(camera.width_px * camera.height_px),
-        camera,
-        live=settings.training,
-        seed=settings.seed,
-        device=settings.device,
-    )
-
-
-def warm_up(settings: LiveSettings, source: FrameSource) -> None:
-    """Do everything once that takes long the first time: kernels are loaded, memory is taken, threads are started. The stream's first
-    frame then has to wait for none of it."""
-    camera: Camera = source.description.camera
-    noise = np.random.default_rng(0).integers(0, 256, (camera.height_px, camera.width_px, 3), np.uint8)
-    with seeded(settings.seed, settings.device):
-        reconstructor = new_live_reconstructor(settings, source)
-        renderer = new_renderer(settings.renderer, camera, reconstructor.device)
-        for seq in range(3):
-            reconstructor.observe(Frame(seq, seq * 33_000_000, noise), budget=Budget.of_steps(3))
-            renderer.prepare(reconstructor.publish())
-            renderer.render(camera, seq * 0.033).result()
-            reconstructor.rehearse(2)
-    labelled(noise, PictureState.LIVE, 0)
-
-
-@contextmanager
-def low_latency() -> Iterator[None]:
-    """Inside, threads take turns often, and what exists already is never searched for garbage again."""
-    interval_s = sys.getswitchinterval()
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-        sys.setswitchinterval(interval_s)

@@ -14,7 +14,8 @@ from typing import Any
 import typer
 
 from gsplat_core.errors import InvalidSetting
-from operators.applications.live import LiveApplication, LiveSettings, live
+from operators.applications.live import LiveApplication, live
+from operators.applications.live_settings import LiveSettings
 from operators.applications.result import RunOutcome
 from operators.frame_clock import ClockSettings
 from operators.metrics import ScoredFrame

@@ -45,6 +45,11 @@ OutOption = Annotated[Path, _path_option("--out", "Folder for the results: new, 
 LiveOutOption = Annotated[
     Path | None, _path_option("--out", "Folder for the report and the model; without it nothing is kept.")
 ]
+EvaluatedArgument = Annotated[Path, _path_argument("MODEL|RUN", "A model folder, or the output folder of a run.")]
+EvaluationOutOption = Annotated[
+    Path | None,
+    _path_option("--out", "Folder for evaluation.json and evaluation.html: new, empty, or left by an earlier run."),
+]
 RenderOutOption = Annotated[Path, _path_option("--out", "A video (name.mp4) or a folder of images.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
 RendererOption = Annotated[str, typer.Option(help="How Gaussians become a picture: alpha.")]

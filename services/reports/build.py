@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.training.baselines import Baselines
+from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.training.metrics import QualityTracker
 from operators.applications.result import RunOutcome
 from operators.display import LiveDisplayResult

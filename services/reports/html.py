@@ -24,7 +24,7 @@ from services.reports.sections import (
 from services.reports.video import video_section
 
 # Nothing may be fetched but the video beside the page, whatever a later edit writes into it.
-_POLICY = "default-src 'none'; img-src data:; media-src 'self'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+POLICY = "default-src 'none'; img-src data:; media-src 'self'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
 def write_html(
@@ -57,11 +57,11 @@ def render_html(report: RunReport, keyframes: Sequence[KeyframePictures], worst_
 <html lang="en">
 <head>
 <meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
+<meta http-equiv="Content-Security-Policy" content="{POLICY}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="referrer" content="no-referrer">
 <title>{escape(title)}</title>
-<style>{_style()}</style>
+<style>{style()}</style>
 </head>
 <body>
 <main>
@@ -77,5 +77,6 @@ def render_html(report: RunReport, keyframes: Sequence[KeyframePictures], worst_
 
 
 @cache
-def _style() -> str:
+def style() -> str:
+    """The style sheet of all pages."""
     return files("services.reports").joinpath("style.css").read_text(encoding="utf-8")

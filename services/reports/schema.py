@@ -18,11 +18,13 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Count = Annotated[int, Field(ge=0)]
 
 
-class _Part(BaseModel):
+class Part(BaseModel):
+    """A part of a report."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class RecordingFacts(_Part):
+class RecordingFacts(Part):
     """The recording as it was read: after `--scale` and `--max-frames`."""
 
     name: str
@@ -35,7 +37,7 @@ class RecordingFacts(_Part):
     """SHA-256 over the recording's files."""
 
 
-class RunFacts(_Part):
+class RunFacts(Part):
     """How the run was made, and how it ended."""
 
     device: str
@@ -61,7 +63,7 @@ class RunFacts(_Part):
     """Processor, instruction set, versions of Python and torch."""
 
 
-class FrameCounts(_Part):
+class FrameCounts(Part):
     ingested: Count
     displayed: Count
     dropped: Count
@@ -69,7 +71,7 @@ class FrameCounts(_Part):
     """Of the ingested ones: repaired, guessed or skipped by the decoder; shown, neither trained on nor scored."""
 
 
-class Latency(_Part):
+class Latency(Part):
     """Milliseconds from a root operator's emission to the end of a leaf operator's work on it."""
 
     p50: float
@@ -78,7 +80,7 @@ class Latency(_Part):
     max: float
 
 
-class OperatorTimes(_Part):
+class OperatorTimes(Part):
     """How often an operator ran and how long a run of it took."""
 
     calls: Count
@@ -86,7 +88,7 @@ class OperatorTimes(_Part):
     p99_ms: float
 
 
-class Quality(_Part):
+class Quality(Part):
     """Means over frames; PSNR is averaged in decibels."""
 
     psnr_tissue_db: float | None
@@ -95,7 +97,7 @@ class Quality(_Part):
     frames: Count
 
 
-class BaselineQuality(_Part):
+class BaselineQuality(Part):
     """Tissue PSNR of doing nothing, on the same recording."""
 
     previous_frame_db: float | None
@@ -107,7 +109,7 @@ class BaselineQuality(_Part):
     """Mean of the frames before and after; it sees the future."""
 
 
-class QualityReport(_Part):
+class QualityReport(Part):
     live: Quality | None
     """Each displayed frame right after its own training steps; null for an offline reconstruction."""
     heldout: Quality | None
@@ -117,14 +119,14 @@ class QualityReport(_Part):
     """Training frames after all of the training; null for a replay."""
 
 
-class ModelFacts(_Part):
+class ModelFacts(Part):
     gaussians: Count
     parameters: Count
     sha256: Sha256
     version: Count
 
 
-class LiveFacts(_Part):
+class LiveFacts(Part):
     """What a live run kept up with, and how old its pictures were."""
 
     settled_psnr_tissue_db: float | None
@@ -161,7 +163,7 @@ class LiveFacts(_Part):
     """Frames whose own picture was not on the screen when the next frame arrived."""
 
 
-class FrameEntry(_Part):
+class FrameEntry(Part):
     """One displayed frame."""
 
     seq: Count
@@ -187,7 +189,7 @@ class BinEntry(FrameEntry):
     """The worst of them."""
 
 
-class RunReport(_Part):
+class RunReport(Part):
     """Everything `report.json` holds."""
 
     format_version: Literal[1] = 1

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gsplat_core.training.baselines import Baselines
+from gsplat_core.evaluation.baselines import Baselines
 from operators.applications.replay import ReplaySettings, replay
 from operators.ingest import SourceResult
 from operators.metrics import QualityResult

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.baselines import Baselines
 from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings, replay
 from operators.ingest import SourceResult

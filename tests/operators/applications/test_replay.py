@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidSetting, RecordingMissing
+from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.io.bundle import load_bundle
-from gsplat_core.training.baselines import Baselines
 from operators.applications import replay as replay_module
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.result import RunOutcome

@@ -1,0 +1,10 @@
+"""How good a reconstruction is, by the protocols that its figures are compared under; one module a protocol.
+
+* `baselines`: what doing nothing scores; stands beside every other figure.
+* `heldout`: the field's split, rendered from a finished model.
+* `causal`: predict the next frame, then learn from it.
+* `live`: what was on the screen when the next frame arrived.
+* `retention`: what a model still knows of earlier frames and of places that it saw before.
+
+Each takes frames one at a time, keeps sums of fixed size and hands every frame's figures to a callback. `docs/evaluation.md` defines them.
+"""

@@ -1,0 +1,264 @@
+"""What doing nothing scores: the trivial baselines that every table of reconstruction quality needs beside it.
+
+A copy of the previous frame is a strong baseline in slow endoscopy; a reconstruction that scores below it shows nothing that a frozen
+video would not. Two passes over the recording, ten frames and one sum in memory, however long the recording. Frames are held out by
+their number, `Frame.seq`; a damaged or withheld frame is neither scored nor part of a mean. Where numbers are missing, "the frame before"
+is the one that came before.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from os import cpu_count
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.evaluation.flow import half_velocity, half_way
+from gsplat_core.evaluation.scores import Entry, Record, finite, why_left_out
+from gsplat_core.io.recordings.split import is_heldout
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.metrics import ImageLike, ScoredMean, psnr_tissue_db, psnrs_db
+
+AGES = (1, 2, 3, 5, 8)
+"""How many frames old the copies of the frame-hold curve are."""
+PREVIOUS_FRAME, NEIGHBOUR_MEAN, TRAIN_MEAN = "previous_frame", "neighbour_mean", "train_mean"
+HALF_VELOCITY, HALF_WAY = "half_velocity_flow", "half_way_flow"
+SEES_THE_FUTURE = frozenset({NEIGHBOUR_MEAN, HALF_WAY})
+"""Baselines that need the frame after the one that they are scored on, which a live system does not have."""
+_MAX_THREADS = 4
+
+
+@dataclass(frozen=True)
+class BaselineScore:
+    """What one baseline scores: means in decibels over `frames` frames; None where no frame has the measure."""
+
+    psnr_tissue_db: float | None = None
+    psnr_frame_db: float | None = None
+    frames: int = 0
+    psnr_both_db: float | None = None
+    """Of copies: over the pixels that are tissue in the frame and in its copy. The published frame-hold curves are measured so; what a tool
+    had hidden in the copy does not count against it."""
+
+
+@dataclass(frozen=True)
+class Baselines:
+    """Each baseline, against the tissue pixels of the frame that is scored."""
+
+    copies: Mapping[int, BaselineScore] = field(default_factory=dict)
+    """By age: the frame that came so many frames before, shown for every frame that has one."""
+    every: Mapping[str, BaselineScore] = field(default_factory=dict)
+    """By name, over every frame that has it: `half_velocity_flow`."""
+    heldout: Mapping[str, BaselineScore] = field(default_factory=dict)
+    """By name, over the held-out frames: the previous frame, the neighbours' mean and the half-way flow (both see the future), the mean of
+    all training frames (tools and all, as the field computes it)."""
+    left_out: Mapping[str, int] = field(default_factory=dict)
+    """Frames that were not scored, by reason."""
+
+    @property
+    def previous_frame_db(self) -> float | None:
+        """Frame i-1 shown for frame i, over all frames from the second on: the comparison for live quality."""
+        return self.copies.get(1, _NOTHING).psnr_tissue_db
+
+    @property
+    def heldout_previous_frame_db(self) -> float | None:
+        """Frame i-1 shown for held-out frame i."""
+        return self.heldout.get(PREVIOUS_FRAME, _NOTHING).psnr_tissue_db
+
+    @property
+    def heldout_neighbour_mean_db(self) -> float | None:
+        """Mean of frames i-1 and i+1 shown for held-out frame i. It sees the future, which a live system cannot."""
+        return self.heldout.get(NEIGHBOUR_MEAN, _NOTHING).psnr_tissue_db
+
+    @property
+    def heldout_train_mean_db(self) -> float | None:
+        """Mean of all training frames shown for every held-out frame."""
+        return self.heldout.get(TRAIN_MEAN, _NOTHING).psnr_tissue_db
+
+
+_NOTHING = BaselineScore()
+
+
+def measure_baselines(
+    recording: Iterable[Frame], *, ages: Sequence[int] = (1,), flow: bool = False, record: Record | None = None
+) -> Baselines:
+    """Score the trivial baselines on a recording; reads it twice.
+
+    Args:
+        recording: anything that gives the frames in order each time it is iterated. Frames need not have a mask.
+        ages: of the copies, in frames; 1 is always among them.
+        flow: whether the two baselines that need optical flow are measured too; they take some 50 ms a frame of 640x512.
+        record: given each frame's figures but those of the mean, in order.
+
+    Raises:
+        InvalidInput: the recording can be iterated only once, its frames differ in size, or an age is below 1.
+    """
+    if isinstance(recording, Iterator):
+        raise InvalidInput(
+            "measure_baselines reads the frames twice: pass the recording itself, not an iterator over it"
+        )
+    ages = sorted({1, *ages})
+    if ages[0] < 1:
+        raise InvalidInput(f"ages are {list(ages)}; a copy is at least one frame old")
+    sums = _Sums()
+    train_mean = _TrainMean()
+    left_out: Counter[str] = Counter()
+    with _Pool() as pool:
+        for frame, before, after in _neighbourhoods(recording, max(2, ages[-1])):
+            reason = why_left_out(frame)
+            if reason is not None:
+                left_out[reason] += 1
+            if not is_heldout(frame.seq) and reason in (None, "no tissue"):
+                train_mean.add(frame.image)
+            if reason is None and before:
+                pool.put(_compare, (frame, before, after, ages, flow), lambda values: sums.add(values, record))
+    mean_image = train_mean.image()
+    for frame in recording if mean_image is not None else ():
+        if is_heldout(frame.seq) and why_left_out(frame) is None:
+            sums.take(("heldout", TRAIN_MEAN), *psnrs_db(mean_image, frame.image, frame.mask))  # type: ignore[arg-type]
+    return sums.baselines(ages, left_out)
+
+
+@dataclass(frozen=True)
+class _Values:
+    """What the baselines score on one frame, by group and name: tissue, whole frame, tissue in both."""
+
+    frame: Frame
+    by_key: dict[tuple[str, object], tuple[float, ...]]
+
+    def entry(self) -> Entry:
+        """For a log; the copy of the previous frame is what the other figures are compared with."""
+        named = {f"{name}_db": finite(values[0]) for (group, name), values in self.by_key.items() if group != "copies"}
+        copies = {
+            f"copy_{age}_db": finite(values[0]) for (group, age), values in self.by_key.items() if group == "copies"
+        }
+        own = {"seq": self.frame.seq, "time_s": self.frame.time_s, "trained": False, "model_version": 0}
+        return {**own, "psnr_tissue_db": copies["copy_1_db"], **named, **copies}
+
+
+def _compare(frame: Frame, before: Sequence[Frame], after: Frame | None, ages: Sequence[int], flow: bool) -> _Values:
+    """Score one frame's baselines. before: the frames that came before, newest first."""
+    found: dict[tuple[str, object], tuple[float, ...]] = {}
+
+    def score(group: str, name: object, picture: ImageLike | None) -> None:
+        if picture is not None:
+            found[group, name] = psnrs_db(picture, frame.image, frame.mask)
+
+    for age in ages:
+        if age <= len(before):
+            old = before[age - 1]
+            score("copies", age, old.image)
+            found["copies", age] += (psnr_tissue_db(old.image, frame.image, _tissue_in_both(frame, old)),)
+    if flow and len(before) > 1:
+        score("every", HALF_VELOCITY, half_velocity(before[1].image, before[0].image))
+    if is_heldout(frame.seq):
+        score("heldout", PREVIOUS_FRAME, before[0].image)
+        if after is not None:
+            score("heldout", NEIGHBOUR_MEAN, (before[0].image.astype(np.float32) + after.image) / np.float32(2 * 255))
+            if flow:
+                score("heldout", HALF_WAY, half_way(before[0].image, after.image))
+    return _Values(frame, found)
+
+
+def _tissue_in_both(frame: Frame, other: Frame) -> NDArray[np.uint8] | None:
+    if frame.mask is None or other.mask is None:
+        return other.mask if frame.mask is None else frame.mask
+    return ((frame.mask != 0) & (other.mask != 0)).astype(np.uint8)
+
+
+def _neighbourhoods(recording: Iterable[Frame], most: int) -> Iterator[tuple[Frame, list[Frame], Frame | None]]:
+    """Each frame with up to `most` frames that came before it, newest first, and the one that came after it."""
+    window: deque[Frame] = deque(maxlen=most + 2)
+    for frame in recording:
+        if window and window[-1].image.shape != frame.image.shape:
+            raise InvalidInput(
+                f"frame {frame.seq} is {list(frame.image.shape)}, the one before it {list(window[-1].image.shape)}; they must be equal"
+            )
+        window.append(frame)
+        if len(window) > 1:
+            yield window[-2], list(window)[-3::-1], frame
+    if window:
+        yield window[-1], list(window)[-2::-1][:most], None
+
+
+class _Sums:
+    """A mean for each measure of each baseline."""
+
+    def __init__(self) -> None:
+        self._means: dict[tuple[str, object], tuple[ScoredMean, ...]] = {}
+
+    def take(self, key: tuple[str, object], *values: float) -> None:
+        for mean, value in zip(
+            self._means.setdefault(key, (ScoredMean(), ScoredMean(), ScoredMean())), values, strict=False
+        ):
+            mean.add(value)
+
+    def add(self, values: _Values, record: Record | None) -> None:
+        for key, measured in values.by_key.items():
+            self.take(key, *measured)
+        if record is not None:
+            record(values.entry())
+
+    def baselines(self, ages: Sequence[int], left_out: Mapping[str, int]) -> Baselines:
+        scores: dict[str, dict[Any, BaselineScore]] = {"copies": {age: _NOTHING for age in ages}}
+        for (group, name), (tissue, frame, both) in self._means.items():
+            score = BaselineScore(tissue.mean, frame.mean, tissue.count, both.mean)
+            scores.setdefault(group, {})[name] = score
+        return Baselines(
+            scores["copies"], scores.get("every", {}), scores.get("heldout", {}), dict(sorted(left_out.items()))
+        )
+
+
+class _Pool:
+    """Compares frames in a few threads, a bounded number at a time; results are taken in order. OpenCV and torch work without the
+    interpreter's lock."""
+
+    def __init__(self) -> None:
+        self._threads = min(_MAX_THREADS, cpu_count() or 1)
+        self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="baselines")
+        self._pending: deque[tuple[Future[Any], Callable[[Any], None]]] = deque()
+
+    def __enter__(self) -> _Pool:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            while kind is None and self._pending:
+                self._take()
+        finally:
+            self._pool.shutdown(cancel_futures=True)
+
+    def put(self, work: Callable[..., Any], arguments: tuple[Any, ...], done: Callable[[Any], None]) -> None:
+        """Have `work(*arguments)` done; `done` gets its result, in the order of the calls."""
+        self._pending.append((self._pool.submit(work, *arguments), done))
+        if len(self._pending) > 2 * self._threads:
+            self._take()
+
+    def _take(self) -> None:
+        future, done = self._pending.popleft()
+        done(future.result())
+
+
+class _TrainMean:
+    """Running mean of images, exact in integers: 2^24 frames fit."""
+
+    def __init__(self) -> None:
+        self._sum: NDArray[np.uint32] | None = None
+        self._count = 0
+
+    def add(self, image: NDArray[np.uint8]) -> None:
+        if self._sum is None:
+            self._sum = np.zeros(image.shape, np.uint32)
+        self._sum += image
+        self._count += 1
+
+    def image(self) -> NDArray[np.float32] | None:
+        """The mean in 0..1; None without any image."""
+        if self._sum is None:
+            return None
+        return (self._sum / (255.0 * self._count)).astype(np.float32)

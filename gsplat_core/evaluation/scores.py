@@ -1,0 +1,97 @@
+"""Sums of fixed size over the frames that a protocol scores, and why the others are left out."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.training.metrics import MEASURES, FrameQuality, ImageLike, QualityTracker, frame_quality
+
+Entry = dict[str, float | int | bool | str | None]
+"""The figures of one frame by name; None where a measure does not exist."""
+Record = Callable[[Entry], None]
+"""Takes each frame's figures, in order."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """What the frames of one protocol score: means over frames, PSNR averaged in decibels; None where no frame has the measure."""
+
+    psnr_tissue_db: float | None
+    psnr_frame_db: float | None
+    ssim: float | None
+    frames: int
+    """How many frames were scored."""
+    worst_db: float | None
+    """The lowest tissue PSNR of a frame."""
+    worst_seq: int | None
+    """Which frame that was."""
+    left_out: Mapping[str, int]
+    """Frames that were not scored, by reason."""
+
+
+def why_left_out(frame: Frame) -> str | None:
+    """Why nothing is measured against a frame; None where it is.
+
+    A damaged frame is in part the decoder's guess, a withheld one is blurred, smoky or outside of the body, and where there is no tissue
+    there is nothing to compare.
+    """
+    if frame.status is FrameStatus.DAMAGED:
+        return "damaged"
+    if frame.withheld is not None:
+        return "withheld"
+    if frame.mask is not None and not frame.mask.any():
+        return "no tissue"
+    return None
+
+
+class ScoreSums:
+    """Takes frames one at a time; `score` is what they come to."""
+
+    def __init__(self) -> None:
+        self._quality = QualityTracker()
+        self._left_out: Counter[str] = Counter()
+        self._worst = math.inf
+        self._worst_seq: int | None = None
+
+    def add(self, frame: Frame, picture: ImageLike) -> FrameQuality:
+        """Compare a picture, [H, W, 3] uint8 or floats in 0..1, with the frame that it stands for. Raises InvalidInput for another size."""
+        quality = frame_quality(frame.seq, picture, frame.image, frame.mask)
+        self.take(quality)
+        return quality
+
+    def take(self, quality: FrameQuality) -> None:
+        """Take the measures of a frame that was compared elsewhere; one that is not finite is not known."""
+        self._quality.take(quality)
+        if quality.psnr_tissue_db < self._worst:
+            self._worst, self._worst_seq = quality.psnr_tissue_db, quality.seq
+
+    def leave_out(self, reason: str) -> None:
+        """Count a frame that is not scored."""
+        self._left_out[reason] += 1
+
+    @property
+    def score(self) -> Score:
+        """What the frames so far come to."""
+        worst = None if self._worst_seq is None else self._worst
+        means = self._quality.means()
+        return Score(
+            **means,
+            frames=self._quality.count,
+            worst_db=worst,
+            worst_seq=self._worst_seq,
+            left_out=dict(sorted(self._left_out.items())),
+        )
+
+
+def measures(quality: FrameQuality) -> Entry:
+    """The measures of a frame by name, for a log."""
+    return {name: finite(getattr(quality, name)) for name in MEASURES}
+
+
+def finite(value: float | None) -> float | None:
+    """The value; None where it is not a finite number."""
+    return value if value is not None and math.isfinite(value) else None

@@ -1,0 +1,240 @@
+"""Evaluate a finished model, or the run that made it, on a recording: by several protocols, beside the trivial baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from time import perf_counter
+
+from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.evaluation.baselines import AGES, measure_baselines
+from gsplat_core.evaluation.causal import evaluate_causal
+from gsplat_core.evaluation.heldout import HeldOut, evaluate_heldout
+from gsplat_core.evaluation.live import Live, evaluate_live
+from gsplat_core.evaluation.pictures import PictureMaker
+from gsplat_core.evaluation.retention import Retention, Return, evaluate_retention, find_places, returns
+from gsplat_core.evaluation.scores import Record
+from gsplat_core.rendering.registry import check_renderer
+from gsplat_core.scene.model import Model
+from operators.applications.device import check_device, seeded
+from operators.applications.evaluated import EvaluatedRun, SeenFrames, fitting_source, frame_tolerance_s
+from operators.applications.evaluation import PROTOCOLS, WITHOUT_LEARNING, CausalRun, Evaluation, EvaluationSettings
+from operators.applications.limits import check_picture
+from operators.applications.live_log import is_live_log, live_frames, shown_pictures
+from operators.applications.memory import render_bytes, replay_bytes, require_memory
+from operators.applications.progress import Progress, ProgressCallback
+from operators.applications.replay import ReplaySettings, new_reconstructor
+from operators.frame_log import FRAMES_FILE, FrameLog, read_frames
+from operators.sources.source import FrameSource
+
+
+def evaluate(
+    model: Model,
+    run: EvaluatedRun | None,
+    settings: EvaluationSettings,
+    folder: Path,
+    progress: ProgressCallback | None = None,
+    stop_requested: Callable[[], bool] = lambda: False,
+) -> Evaluation:
+    """Measure the baselines and the protocols; each frame's figures go to files in `folder`.
+
+    run: how the model was made, where that is known. When `stop_requested` answers True, what was measured so far is the result.
+
+    Raises InvalidSetting where the model does not fit the recording or a protocol that was asked for cannot be measured; DeviceMissing,
+    MemoryTooSmall, RecordingError, StorageFull.
+    """
+    check_device(settings.device)
+    check_renderer(settings.renderer, settings.device)
+    scale = settings.scale if settings.scale is not None or run is None else run.scale
+    source, scale, notes = fitting_source(settings.recording, model, scale, settings.max_frames)
+    check_picture(source.description.camera, scale)
+    work = _Work(model, run, settings, source, scale, folder, progress, stop_requested)
+    work.notes += [*source.description.notes, *notes]
+    return work.done()
+
+
+class _Work:
+    """One evaluation while it is made."""
+
+    def __init__(
+        self,
+        model: Model,
+        run: EvaluatedRun | None,
+        settings: EvaluationSettings,
+        source: FrameSource,
+        scale: float,
+        folder: Path,
+        progress: ProgressCallback | None,
+        stop_requested: Callable[[], bool],
+    ) -> None:
+        self.model, self.run, self.settings, self.source = model, run, settings, source
+        self.scale, self.folder, self.progress, self.stop_requested = scale, folder, progress, stop_requested
+        self.notes: list[str] = []
+        self.logs: dict[str, Path] = {}
+        description = source.description
+        self.camera = description.camera
+        tolerance_s = frame_tolerance_s(description.fps)
+        self.window_s = model.time_window_s[0] - tolerance_s, model.time_window_s[1] + tolerance_s
+
+    def done(self) -> Evaluation:
+        """Measure everything."""
+        started_at, started_s = datetime.now(UTC), perf_counter()
+        wanted = [name for name in PROTOCOLS if self._is_wanted(name)]
+        with self._log("baselines") as record:
+            baselines = measure_baselines(self._frames("baselines"), ages=AGES, flow=True, record=record)
+        measured: dict[str, object] = {}
+        for name in wanted:
+            if not self.stop_requested():
+                measured[name] = getattr(self, f"_{name}")()
+        interrupted = self.stop_requested()
+        if interrupted:
+            self.notes.append("interrupted: the figures cover the frames that were reached")
+        return Evaluation(
+            description=self.source.description,
+            scale=self.scale,
+            started_at=started_at,
+            wall_s=perf_counter() - started_s,
+            interrupted=interrupted,
+            baselines=baselines,
+            notes=tuple(self.notes),
+            returns=self._returns(measured.get("retention")),
+            logs=self.logs,
+            **measured,  # type: ignore[arg-type]
+        )
+
+    def _is_wanted(self, name: str) -> bool:
+        """Whether a protocol is to be measured. Raises InvalidSetting for one that was asked for and cannot be."""
+        asked = name in self.settings.protocols
+        if not asked and (self.settings.protocols or name not in WITHOUT_LEARNING):
+            return False
+        reason = self._why_not(name)
+        if reason is None:
+            return True
+        if asked:
+            raise InvalidSetting(f"protocol {name} cannot be measured: {reason}")
+        self.notes.append(f"{name} was not measured: {reason}")
+        return False
+
+    def _why_not(self, name: str) -> str | None:
+        if name == "heldout":
+            if self.run is None:
+                self.notes.append("nothing says whether the held-out frames were kept from the model's training")
+            elif not self.run.heldout:
+                return "the run trained on the held-out frames; make it with --heldout, or by reconstruct"
+        if name == "live":
+            if self.run is None:
+                return "it needs the folder of a live run, not a model alone"
+            if not is_live_log(self.run.folder / FRAMES_FILE):
+                return f"{self.run.folder} has no log of when pictures were shown; it was not a live run"
+        return None
+
+    def _heldout(self) -> HeldOut:
+        with self._log("heldout") as record:
+            return evaluate_heldout(
+                self._frames("heldout"), self._of_final_model(), window_s=self.window_s, record=record
+            )
+
+    def _retention(self) -> Retention:
+        places = self.settings.places
+        if places is None:
+            poses = "pose" in self.source.description.fields
+            places = tuple(find_places(self._frames("places"))) if poses else ()
+        with self._log("retention") as record:
+            return evaluate_retention(
+                self._frames("retention"),
+                self._of_final_model(),
+                window_s=(self.model.time_window_s[0], min(self.model.time_window_s[1], self._last_time_s())),
+                last_s=self.settings.last_s,
+                places=places,
+                record=record,
+            )
+
+    def _causal(self) -> CausalRun:
+        settings = self._learning_settings()
+        description = self.source.description
+        config = settings.reconstructor_config(description.width_px * description.height_px)
+        if settings.device == "cpu":
+            require_memory(replay_bytes(description, config), "the causal protocol", "give a smaller --scale")
+        pictures = PictureMaker(self.camera, settings.device, self.settings.renderer)
+        with self._log("causal") as record, seeded(settings.seed, settings.device):
+            score = evaluate_causal(
+                self._frames("causal"), new_reconstructor(settings, self.source), pictures, record=record
+            )
+        return CausalRun(score, config.chosen_field, config.steps_per_frame, settings.seed)
+
+    def _learning_settings(self) -> ReplaySettings:
+        """How the causal protocol learns: as the run did."""
+        run, steps = self.run, self.settings.steps_per_frame
+        if run is None:
+            self.notes.append(
+                "the causal protocol learned with the default settings: nothing says how the model was made"
+            )
+        elif run.steps_per_frame is None and steps is None:
+            self.notes.append(
+                "the causal protocol learned with the default steps per frame: the run did not train frame by frame"
+            )
+        if steps is None and run is not None:
+            steps = run.steps_per_frame
+        return ReplaySettings(
+            recording=self.settings.recording,
+            out=self.folder,
+            device=self.settings.device,
+            field="auto" if run is None else run.field,
+            seed=0 if run is None else run.seed,
+            steps_per_frame=steps,
+            scale=self.scale,
+        )
+
+    def _live(self) -> Live:
+        assert self.run is not None
+        log = self.run.folder / FRAMES_FILE
+        frames = SeenFrames(self.source, float("inf"), self.stop_requested, self._progress("live"))
+        with self._log("live") as record:
+            try:
+                return evaluate_live(live_frames(frames, log), shown_pictures(log), record=record)
+            except InvalidInput as error:  # the log comes from a file, which anyone may have changed
+                raise InvalidSetting(f"{log} cannot be evaluated: {error}") from error
+
+    def _returns(self, retention: object) -> dict[str, tuple[Return, ...]]:
+        if not isinstance(retention, Retention) or not retention.places:
+            return {}
+        places = [place.visits for place in retention.places]
+        return {
+            name: tuple(returns(read_frames(path), places))
+            for name, path in self.logs.items()
+            if name in ("live", "causal")
+        }
+
+    def _of_final_model(self):  # type: ignore[no-untyped-def]
+        """What the final model shows for a frame."""
+        settings, camera = self.settings, self.camera
+        if settings.device == "cpu":
+            needed = render_bytes(camera.width_px, camera.height_px, self.model.parameter_count)
+            require_memory(needed, f"a picture of {camera.width_px}x{camera.height_px} px", "give a smaller --scale")
+        model = self.model.to(settings.device)
+        pictures = PictureMaker(camera, settings.device, settings.renderer)
+        return lambda frame: pictures(model, frame)
+
+    def _last_time_s(self) -> float:
+        description = self.source.description
+        assert description.frame_count is not None
+        return (description.frame_count - 1) / description.fps
+
+    def _frames(self, stage: str) -> SeenFrames:
+        return SeenFrames(self.source, self.window_s[1], self.stop_requested, self._progress(stage))
+
+    def _progress(self, stage: str) -> Callable[[int], None]:
+        total = self.source.description.frame_count or 0
+        return lambda done: None if self.progress is None else self.progress(Progress(stage, done, total))
+
+    @contextmanager
+    def _log(self, name: str) -> Iterator[Record]:
+        log = FrameLog(self.folder / f"evaluation-{name}.jsonl")
+        log.open()
+        try:
+            yield log.write
+        finally:
+            log.close()
+        self.logs[name] = log.path

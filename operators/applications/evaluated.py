@@ -1,0 +1,138 @@
+"""A finished model beside a recording: whether the one fits the other, and which frames the two have in common."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.model import Model
+from operators.applications.finishing import FirstFrames
+from operators.sources.registry import SourceOptions, open_source
+from operators.sources.source import FrameSource
+
+SAME_CAMERA = 1e-3
+"""How far focal lengths and principal points may be apart, as a share of the picture's width."""
+
+
+@dataclass(frozen=True)
+class EvaluatedRun:
+    """How a model was made, as far as the report beside it says."""
+
+    folder: Path
+    command: str
+    field: str
+    seed: int
+    steps_per_frame: int | None
+    scale: float
+    heldout: bool
+    """Whether the protocol's held-out frames were kept from training."""
+
+
+@dataclass(frozen=True)
+class SeenFrames:
+    """The frames of a source up to the end of a model's time, and one frame more; read from the beginning each time they are iterated."""
+
+    source: FrameSource
+    until_s: float
+    stop_requested: Callable[[], bool] = lambda: False
+    progress: Callable[[int], None] = lambda done: None
+
+    def __iter__(self) -> Iterator[Frame]:
+        count = self.source.description.frame_count
+        for done, frame in enumerate(FirstFrames(self.source, count or 2**62), start=1):
+            if self.stop_requested() or frame.time_s > self.until_s:
+                return
+            yield frame
+            self.progress(done)
+
+
+def frame_tolerance_s(fps: float) -> float:
+    """A frame right after the last one that was trained on is still within a model's time: the split holds out the last frame of some
+    recordings."""
+    return 1.01 / fps
+
+
+def fitting_source(
+    address: Path | str, model: Model, scale: float | None, max_frames: int | None
+) -> tuple[FrameSource, float, list[str]]:
+    """The recording at the model's size; returns it, its scale, and in sentences what a reader of the figures must know.
+
+    scale: of the frames; None takes the one that the model was made at.
+
+    Raises InvalidSetting where the model cannot have been made from such a recording: another camera, another shape of the picture, or
+    times that have nothing in common; and as `open_source`.
+    """
+    notes: list[str] = []
+    source = open_source(address, SourceOptions(scale or 1.0, max_frames))
+    made = model.camera
+    if scale is None:
+        scale = made.width_px / source.description.width_px
+        if scale != 1:
+            source = open_source(address, SourceOptions(scale, max_frames))
+            notes.append(f"evaluated at the model's size of {made.width_px}x{made.height_px} px, scale {scale:.4g}")
+    description = source.description
+    _check_camera(made, description.camera, description.name)
+    if (made.width_px, made.height_px) != (description.width_px, description.height_px):
+        notes.append(
+            f"the model was made from frames of {made.width_px}x{made.height_px} px and is evaluated at"
+            f" {description.width_px}x{description.height_px} px, as --scale says"
+        )
+    if description.frame_count is None or description.digest is None:
+        raise InvalidSetting(f"{description.name} can be read only once; evaluate needs a recording")
+    if model.training_digest is None:
+        notes.append("the model does not say which recording it was made from")
+    elif model.training_digest != description.digest:
+        notes.append(
+            "the model was made from other files than these: the figures say how well it shows a recording that it was not made from,"
+            " unless only files beside the pictures have changed"
+        )
+    return source, scale, [*notes, *_about_time(model, source)]
+
+
+def _check_camera(made: Camera, seen: Camera, name: str) -> None:
+    """Raises InvalidSetting unless both cameras see the same, up to the size of the picture."""
+    if made.model != seen.model:
+        raise InvalidSetting(
+            f"the model was made with a {made.model} camera, and {name} has a {seen.model} one; give the recording that it was made from"
+        )
+    ratio = seen.width_px / made.width_px
+    if abs(seen.height_px - made.height_px * ratio) > 1:
+        raise InvalidSetting(
+            f"the model's pictures have {made.width_px}x{made.height_px} px, those of {name} {seen.width_px}x{seen.height_px} px, which is"
+            " another shape; give the recording that it was made from"
+        )
+    # The height is rounded on its own, so that rows are scaled by a little more or less than columns.
+    wanted = made.scaled(ratio).K if ratio != 1 else made.K
+    apart = float(np.abs(wanted - seen.K).max()) / seen.width_px
+    if apart > SAME_CAMERA + 1.0 / seen.height_px * (ratio != 1):
+        raise InvalidSetting(
+            f"the model's camera has a focal length of {wanted[0, 0]:.2f} px and its axis at ({wanted[0, 2]:.1f}, {wanted[1, 2]:.1f}), that of"
+            f" {name} {seen.K[0, 0]:.2f} px and ({seen.K[0, 2]:.1f}, {seen.K[1, 2]:.1f}); give the recording that it was made from"
+        )
+
+
+def _about_time(model: Model, source: FrameSource) -> list[str]:
+    """What to say about the frames that lie outside of the model's time. Raises InvalidSetting when all do."""
+    description = source.description
+    assert description.frame_count is not None
+    start_s, end_s = model.time_window_s
+    length_s = (description.frame_count - 1) / description.fps
+    tolerance_s = frame_tolerance_s(description.fps)
+    if start_s > length_s + tolerance_s:
+        raise InvalidSetting(
+            f"the model has seen {start_s:.2f} to {end_s:.2f} s, and {description.name} ends at {length_s:.2f} s; they have no time in common"
+        )
+    notes = []
+    seen = math.floor((end_s + tolerance_s) * description.fps) + 1
+    if seen < description.frame_count:
+        notes.append(
+            f"the model has seen {start_s:.2f} to {end_s:.2f} s: the first {seen} of the {description.frame_count} frames are evaluated"
+        )
+    return notes

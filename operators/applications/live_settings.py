@@ -1,0 +1,90 @@
+"""What a live run is asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import LiveTraining
+from operators.applications.limits import check_max_frames, check_scale, check_seed
+from operators.applications.replay import PIXELS_PER_GAUSSIAN
+from operators.applications.result import RunSettings
+from operators.display import DisplaySettings
+from operators.frame_clock import ClockSettings
+
+LIVE_WINDOW_FRAMES = 150
+LIVE_BUMP_SPACING_S = 0.1
+LIVE_HISTORY_S = 6.0
+"""How much of the past stays deformable: what the window holds at 30 frames a second, and the last 5 s rendered again."""
+LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
+"""Beside L1: follows motion better. On a CPU a step takes half as long again with it, and steps are what is short there."""
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """What to reconstruct live, how, and where the results go. Raises InvalidSetting for a value out of its range."""
+
+    source: str
+    """An address (see `open_source`)."""
+    out: Path
+    device: str = "cpu"
+    field: str = "auto"
+    renderer: str = "alpha"
+    seed: int = 0
+    scale: float = 1.0
+    max_frames: int | None = None
+    seconds: float | None = None
+    """End after so long; None: when the source ends or the run is interrupted."""
+    loop: bool = False
+    """Play a recording again and again."""
+    fps: float | None = None
+    """Play a recording at this rate instead of its own."""
+    tool_mask: str = "builtin"
+    """How tools are found in frames that come without a mask (`operators.tool_mask.TOOL_MASKS`)."""
+    clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
+    display: DisplaySettings = dataclasses.field(default_factory=DisplaySettings)
+    training: LiveTraining = dataclasses.field(default_factory=LiveTraining)
+
+    def __post_init__(self) -> None:
+        check_seed(self.seed)
+        check_scale(self.scale)
+        check_max_frames(self.max_frames)
+        if self.seconds is not None and not 0 < self.seconds < 1e9:
+            raise InvalidSetting(f"seconds is {self.seconds:g}; it must be positive")
+        if self.fps is not None and not 0 < self.fps <= 1000:
+            raise InvalidSetting(f"fps is {self.fps:g}; it must be above 0 and at most 1000")
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """What the run reads from the disk."""
+        path = Path(self.source)
+        return (path,) if path.exists() else ()
+
+    def reconstructor_config(self, pixels: int) -> ReconstructorConfig:
+        """The reconstructor's settings for frames of so many pixels. Raises InvalidSetting."""
+        config = ReconstructorConfig(
+            field=self.field,
+            window_frames=LIVE_WINDOW_FRAMES,
+            bump_spacing_s=LIVE_BUMP_SPACING_S,
+            history_s=LIVE_HISTORY_S,
+            preallocate=True,
+            ssim_weight=LIVE_SSIM_WEIGHT[self.device],
+        )
+        most = max(64, pixels // PIXELS_PER_GAUSSIAN)
+        return replace(config, gaussians=min(config.gaussians, most), max_gaussians=min(config.max_gaussians, 2 * most))
+
+    def stated(self) -> RunSettings:
+        """What the report says about them."""
+        return RunSettings(
+            device=self.device,
+            engine="embedded",
+            field=ReconstructorConfig(field=self.field).chosen_field,
+            renderer=self.renderer,
+            seed=self.seed,
+            scale=self.scale,
+            steps_per_frame=None,
+            heldout=False,
+        )

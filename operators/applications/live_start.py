@@ -1,0 +1,84 @@
+"""What is done before a live stream's first frame, so that no frame has to wait for it."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsplat_core.rendering.registry import new_renderer
+from gsplat_core.rendering.renderer import Renderer
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.budget import Budget
+from gsplat_core.training.live import LiveReconstructor
+from operators.applications.device import seeded
+from operators.applications.live_settings import LiveSettings
+from operators.display import labelled
+from operators.messages import PictureState
+from operators.sources.source import FrameSource
+
+SWITCH_INTERVAL_S = 0.0002
+"""How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
+WARM_FRAMES = 3
+WARM_STEPS = {"cpu": 3, "cuda": 40}
+"""Optimiser steps on each picture before the first frame."""
+
+
+def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveReconstructor:
+    """A reconstructor for the frames of a source."""
+    camera = source.description.camera
+    return LiveReconstructor(
+        settings.reconstructor_config(camera.width_px * camera.height_px),
+        camera,
+        live=settings.training,
+        seed=settings.seed,
+        device=settings.device,
+    )
+
+
+@dataclass(frozen=True)
+class WarmParts:
+    """What a live run works with, used once already."""
+
+    reconstructor: LiveReconstructor
+    renderer: Renderer
+
+
+def warm_up(settings: LiveSettings, source: FrameSource) -> WarmParts:
+    """Do everything once that takes long the first time: kernels are loaded, graphs captured, memory is taken, threads are started. The
+    stream's first frame then has to wait for none of it."""
+    camera = source.description.camera
+    noise = np.random.default_rng(0).integers(0, 256, (camera.height_px, camera.width_px, 3), np.uint8)
+    with seeded(settings.seed, settings.device):
+        reconstructor = new_live_reconstructor(settings, source)
+        renderer = new_renderer(settings.renderer, camera, reconstructor.device)
+        published = []
+        for seq in range(WARM_FRAMES):
+            # Budgets in time, so that the length of a step is known. All snapshots are held: every slot that a run needs is made.
+            budget = Budget.until(0.0, at_least=WARM_STEPS[settings.device])
+            reconstructor.observe(Frame(seq, seq * 33_000_000, noise), budget=budget)
+            published.append(reconstructor.publish())
+            renderer.prepare(published[-1])
+            renderer.render(camera, seq * 0.033).result()
+            reconstructor.rehearse(2)
+        reconstructor.forget()
+    labelled(noise, PictureState.LIVE, 0)
+    return WarmParts(reconstructor, renderer)
+
+
+@contextmanager
+def low_latency() -> Iterator[None]:
+    """Inside, threads take turns often, and what exists already is never searched for garbage again."""
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        sys.setswitchinterval(interval_s)

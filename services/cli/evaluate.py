@@ -1,0 +1,90 @@
+"""`intrasplat evaluate`."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import typer
+
+from operators.applications.evaluate import evaluate
+from operators.applications.evaluation import EvaluationSettings
+from operators.output_folder import OutputFolder
+from services.cli.exit_codes import INTERRUPTED, OK
+from services.cli.interrupt import InterruptRequest
+from services.cli.progress import ProgressPrinter
+from services.cli.streams import printable
+from services.reports.evaluated import load_evaluated
+from services.reports.evaluation_build import build_evaluation, write_evaluation
+from services.reports.evaluation_rows import decibels, future, measured
+from services.reports.evaluation_schema import EvaluationReport
+
+
+def evaluate_command(path: Path, settings: EvaluationSettings, out: Path | None, *, as_json: bool) -> int:
+    """Evaluate, write the reports where they are wanted, print the result; returns the exit code."""
+    model, run = load_evaluated(path)
+
+    def measure(folder: Path) -> EvaluationReport:
+        with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as progress:
+            evaluation = evaluate(model, run, settings, folder, progress, interrupt)
+        return build_evaluation(path, model, run, settings, evaluation)
+
+    if out is None:
+        with tempfile.TemporaryDirectory(prefix="intrasplat-") as folder:
+            report = measure(Path(folder)).model_copy(update={"outputs": {}})
+    else:
+        inputs = [path if run is None else run.folder, Path(settings.recording)]
+        with OutputFolder(out, "evaluate", inputs) as output:
+            report = write_evaluation(measure(output.path), output.path)
+            output.publish()
+    print_evaluation(report, out, as_json=as_json)
+    return INTERRUPTED if report.evaluated.interrupted else OK
+
+
+def print_evaluation(report: EvaluationReport, out: Path | None, *, as_json: bool) -> None:
+    """The report as JSON, or its table in plain text and where the page is."""
+    if as_json:
+        typer.echo(report.model_dump_json(indent=2))
+        return
+    for note in report.notes:
+        typer.echo(f"note: {printable(note)}", err=True)
+    typer.echo("\n".join(table(report)))
+    if out is not None:
+        typer.echo(str(out / "evaluation.html"))
+
+
+def table(report: EvaluationReport) -> list[str]:
+    """Lines of equal columns: each protocol, its baselines indented below it."""
+    rows = [("", "frames", "tissue dB", "frame dB", "SSIM", "worst dB")]
+    found = measured(report)
+    for each in found:
+        score = each.score
+        ssim = "–" if score.ssim is None else f"{score.ssim:.4f}"
+        values = decibels(score.psnr_tissue_db), decibels(score.psnr_frame_db), ssim, decibels(score.worst_db)
+        rows.append((f"{each.name}: {each.what}", str(score.frames), *values))
+        rows += [_baseline(future(b), b.frames, b.psnr_tissue_db, b.psnr_frame_db) for b in each.baselines]
+    if not found:
+        rows += [_baseline(future(b), b.frames, b.psnr_tissue_db, b.psnr_frame_db) for b in report.baselines]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = [
+        "  ".join(
+            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        ).rstrip()
+        for row in rows
+    ]
+    copies = [each for each in report.baselines if each.age_frames is not None]
+    if copies:
+        curve = ", ".join(f"{each.age_frames}: {decibels(each.psnr_tissue_db)}" for each in copies)
+        lines.append(f"a raw frame shown k frames late scores, in tissue dB: {curve}")
+    if report.live is not None and report.live.age_when_shown is not None:
+        ages = report.live.age_when_shown
+        lines.append(
+            f"age when shown: p50 {ages.p50_ms:.1f}, p95 {ages.p95_ms:.1f}, p99 {ages.p99_ms:.1f}, max {ages.max_ms:.1f} ms"
+        )
+    return lines
+
+
+def _baseline(
+    label: str, frames: int, tissue_db: float | None, frame_db: float | None
+) -> tuple[str, str, str, str, str, str]:
+    return f"  {label}", str(frames), decibels(tissue_db), decibels(frame_db), "", ""

@@ -1,0 +1,67 @@
+"""What lies at a path that is to be evaluated: a model bundle, or the folder of a run with its report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.bundle import load_bundle
+from gsplat_core.scene.model import Model
+from operators.applications.evaluated import EvaluatedRun
+from services.reports.schema import RunReport
+
+REPORT, MODEL = "report.json", "model"
+_MOST_BYTES = 256 * 2**20
+
+
+def load_evaluated(path: Path) -> tuple[Model, EvaluatedRun | None]:
+    """The model at `path`, and how it was made where a report says so: that of the run's folder, or the one beside a bundle when it is about
+    this very model.
+
+    Raises InvalidSetting for a run without a model or with a report that cannot be read; BundleError.
+    """
+    if (path / REPORT).is_file():
+        report = _read(path / REPORT)
+        if not (path / MODEL).is_dir():
+            raise InvalidSetting(f"{path} is a run that left no model; give another run, or a model folder")
+        model = load_bundle(path / MODEL)
+        if report.model is not None and report.model.sha256 != model.sha256():
+            raise InvalidSetting(
+                f"{path / MODEL} is not the model that {path / REPORT} is about (SHA-256 {report.model.sha256[:12]}...); give the model's"
+                " folder to evaluate it alone"
+            )
+        return model, _run(path, report)
+    model = load_bundle(path)
+    beside = path.absolute().parent / REPORT
+    if path.absolute().name == MODEL and beside.is_file():
+        report = _read(beside)
+        if report.model is not None and report.model.sha256 == model.sha256():
+            return model, _run(beside.parent, report)
+    return model, None
+
+
+def _read(path: Path) -> RunReport:
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise InvalidSetting(f"{path} is larger than {_MOST_BYTES // 2**20} MiB; it is not a run's report")
+        return RunReport.read(path)
+    except (ValidationError, UnicodeDecodeError) as error:
+        said = str(error).splitlines()
+        raise InvalidSetting(
+            f"{path} is not a report of this version ({' '.join(said[:2])}); give the model's folder to evaluate it alone"
+        ) from error
+
+
+def _run(folder: Path, report: RunReport) -> EvaluatedRun:
+    run = report.run
+    return EvaluatedRun(
+        folder=folder,
+        command=run.command,
+        field=run.field,
+        seed=run.seed,
+        steps_per_frame=run.steps_per_frame,
+        scale=run.scale,
+        heldout=report.quality.heldout is not None,
+    )

@@ -1,0 +1,105 @@
+"""The protocols of an evaluation, each with the baselines that belong to it: for the page's table and for the terminal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+from services.reports.evaluation_schema import BaselineFacts, EvaluationReport, ScoreFacts
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One protocol's figures beside its baselines, the one to compare with first."""
+
+    key: str
+    name: str
+    what: str
+    """What is shown, in a few words."""
+    score: ScoreFacts
+    baselines: tuple[BaselineFacts, ...]
+
+    @property
+    def versus(self) -> tuple[float, BaselineFacts] | None:
+        """Gain in decibels over the first baseline."""
+        for baseline in self.baselines:
+            if baseline.psnr_tissue_db is not None and self.score.psnr_tissue_db is not None:
+                return self.score.psnr_tissue_db - baseline.psnr_tissue_db, baseline
+        return None
+
+
+def measured(report: EvaluationReport) -> list[Measured]:
+    """The protocols that were measured, in the order of the page."""
+
+    def named(frames_of: str, *names: str) -> tuple[BaselineFacts, ...]:
+        by_name = {each.name: each for each in report.baselines if each.frames_of == frames_of}
+        return tuple(by_name[name] for name in names if name in by_name)
+
+    found = []
+    if report.live is not None:
+        found.append(
+            Measured(
+                "live",
+                "Live",
+                "what was on the screen when the next frame came",
+                report.live.score,
+                named("every", "previous_frame"),
+            )
+        )
+    if report.causal is not None:
+        found.append(
+            Measured(
+                "causal",
+                "Causal",
+                "the next frame, predicted before it was seen",
+                report.causal.score,
+                named("every", "half_velocity_flow", "previous_frame"),
+            )
+        )
+    if report.heldout is not None:
+        found.append(
+            Measured(
+                "heldout",
+                "Held out",
+                "frames that training never saw",
+                report.heldout.score,
+                named("heldout", "half_way_flow", "neighbour_mean", "previous_frame", "train_mean"),
+            )
+        )
+    if report.retention is not None:
+        start_s, end_s = report.retention.last_range_s
+        found.append(
+            Measured(
+                "retention",
+                "Retention",
+                f"the last {end_s - start_s:.3g} s again, by the final model",
+                report.retention.last,
+                named("last", "last_frame"),
+            )
+        )
+    return found
+
+
+def future(baseline: BaselineFacts) -> str:
+    """The baseline's label, saying where it sees the future."""
+    return f"{baseline.label} (sees the future)" if baseline.sees_future else baseline.label
+
+
+def decibels(value: float | None) -> str:
+    """Two digits after the point; a dash for what was not measured."""
+    return "–" if value is None else f"{value:.2f}"
+
+
+def at_age(report: EvaluationReport, age_frames: float) -> float | None:
+    """The frame-hold curve at an age, on a straight line between the measured ones; None outside of them. Below one frame it is that of
+    one: a picture that stands until the next frame comes is as good as a copy of the frame before for the next one."""
+    copies = sorted(
+        (each.age_frames, each.psnr_tissue_db)
+        for each in report.baselines
+        if each.age_frames is not None and each.psnr_tissue_db is not None
+    )
+    age_frames = max(1.0, age_frames)
+    for (low, low_db), (high, high_db) in pairwise(copies):
+        if low <= age_frames <= high:
+            return low_db + (high_db - low_db) * (age_frames - low) / (high - low)
+    return copies[0][1] if copies and age_frames == copies[0][0] else None

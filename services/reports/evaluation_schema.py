@@ -1,0 +1,165 @@
+"""The shape of `evaluation.json`: one model that writes it, reads it back and gives its JSON schema.
+
+Fields are added, never renamed or removed, as long as `format_version` stays. A measure that does not exist is null, never NaN.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from operators.storage import write_whole
+from services.reports.schema import NOTICE, Count, ModelFacts, Part, RecordingFacts
+
+Decibels = float | None
+Seconds = tuple[float, float]
+"""First and last time of a range."""
+
+
+class ScoreFacts(Part):
+    """Means over frames; PSNR is averaged in decibels."""
+
+    psnr_tissue_db: Decibels
+    psnr_frame_db: Decibels
+    ssim: float | None
+    frames: Count
+    worst_db: Decibels
+    worst_seq: int | None
+    left_out: dict[str, Count]
+    """Frames that were not scored, by reason."""
+
+
+class BaselineFacts(Part):
+    """What one trivial baseline scores on the same recording."""
+
+    name: str
+    label: str
+    frames_of: Literal["every", "heldout", "last"]
+    """Which frames it is scored on: every one that has it, the held-out ones, the last seconds."""
+    psnr_tissue_db: Decibels
+    psnr_frame_db: Decibels
+    frames: Count
+    age_frames: int | None = None
+    """Of copies: how many frames old they are."""
+    psnr_both_db: Decibels = None
+    """Of copies: over pixels that are tissue in the frame and in the copy."""
+    sees_future: bool = False
+    """It needs the frame after the one that is shown, which a live system does not have."""
+
+
+class DepthFacts(Part):
+    mae_mm: float
+    rmse_mm: float
+    relative: float
+    scaled_rmse_mm: float
+    covered: float
+    frames: Count
+
+
+class HeldOutFacts(Part):
+    score: ScoreFacts
+    unrounded_db: Decibels
+    """Mean tissue PSNR of the pictures before they are rounded to 8 bits."""
+    depth: DepthFacts | None
+
+
+class CausalFacts(Part):
+    score: ScoreFacts
+    field: str
+    steps_per_frame: int
+    seed: int
+
+
+class AgeFacts(Part):
+    count: Count
+    p50_ms: float
+    p95_ms: float
+    p99_ms: float
+    max_ms: float
+
+
+class LiveFacts(Part):
+    score: ScoreFacts
+    age_when_shown: AgeFacts | None
+    age_on_screen: AgeFacts | None
+    in_time: Count
+    behind: dict[int, Count]
+    estimated: Count
+    states: dict[str, Count]
+
+
+class PlaceFacts(Part):
+    first_s: Seconds
+    again_s: Seconds
+    first: ScoreFacts
+    again: ScoreFacts
+
+
+class RetentionFacts(Part):
+    last: ScoreFacts
+    last_range_s: Seconds
+    places: list[PlaceFacts]
+
+
+class ReturnFacts(Part):
+    """How soon a place was found again."""
+
+    again_s: Seconds
+    first_db: list[Decibels]
+    frames_until_found: int | None
+
+
+class EvaluatedFacts(Part):
+    """What was evaluated, and how."""
+
+    path: str
+    """As it was given."""
+    command: str | None
+    """What made the model; null where nothing says so."""
+    model: ModelFacts
+    time_window_s: Seconds
+    scale: float
+    device: str
+    renderer: str
+    version: str
+    started_at: str
+    wall_s: float
+    interrupted: bool
+    machine: dict[str, str]
+
+
+class EvaluationReport(Part):
+    """Everything `evaluation.json` holds; null for a protocol that was not measured."""
+
+    format_version: Literal[1] = 1
+    notice: str = NOTICE
+    recording: RecordingFacts
+    evaluated: EvaluatedFacts
+    heldout: HeldOutFacts | None
+    causal: CausalFacts | None
+    live: LiveFacts | None
+    retention: RetentionFacts | None
+    returns: dict[str, list[ReturnFacts]]
+    """By protocol."""
+    baselines: list[BaselineFacts]
+    left_out: dict[str, Count]
+    """Frames that no baseline was scored on, by reason."""
+    notes: list[str]
+    outputs: dict[str, str]
+    """What was written, as paths relative to this file."""
+    series: dict[str, list[dict[str, float | int | bool | str | None]]]
+    """By protocol, one entry for each scored frame; of more than 4096 frames, one for each `series_frames_per_entry` of them."""
+    series_frames_per_entry: dict[str, Annotated[int, Field(ge=1)]]
+
+    def write(self, path: Path) -> None:
+        """Write JSON; the file is whole or not there."""
+        text = json.dumps(self.model_dump(mode="json"), indent=2, allow_nan=False)
+        write_whole(path, (text + "\n").encode())
+
+    @classmethod
+    def read(cls, path: Path) -> EvaluationReport:
+        """Read a report back; raises pydantic.ValidationError where it does not fit."""
+        return cls.model_validate_json(path.read_text(encoding="utf-8"))

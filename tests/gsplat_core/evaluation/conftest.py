@@ -1,0 +1,42 @@
+"""Small videos whose figures are known by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsplat_core.evaluation.pictures import Picture
+from gsplat_core.scene.frames import Frame
+
+HEIGHT, WIDTH = 16, 20
+
+
+def make_frame(seq: int, level: int = 100, **fields: Any) -> Frame:
+    """One grey level all over; 25 frames a second."""
+    return Frame(seq, seq * 40_000_000, np.full((HEIGHT, WIDTH, 3), level, np.uint8), **fields)
+
+
+def make_picture(level: float, version: int = 1, depth: float = 0.0) -> Picture:
+    """A rendered picture of one grey level, which may lie between two of 8 bits."""
+    unrounded = np.full((HEIGHT, WIDTH, 3), level / 255, np.float32)
+    image = np.rint(unrounded * 255).astype(np.uint8)
+    return Picture(image, unrounded, np.full((HEIGHT, WIDTH), depth, np.float32), version)
+
+
+@pytest.fixture
+def frame() -> Callable[..., Frame]:
+    return make_frame
+
+
+@pytest.fixture
+def picture() -> Callable[..., Picture]:
+    return make_picture
+
+
+@pytest.fixture
+def decibels() -> Callable[[float], float]:
+    """PSNR of a picture that differs by so many grey levels everywhere."""
+    return lambda difference: float(-20 * np.log10(difference / 255))

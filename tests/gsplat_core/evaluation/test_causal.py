@@ -1,0 +1,94 @@
+"""The causal protocol: what a learner knows when it predicts, and what it scores."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.evaluation.causal import evaluate_causal
+from gsplat_core.scene.frames import FrameStatus
+
+
+class Holding:
+    """Shows what it saw last, and remembers what it was given."""
+
+    def __init__(self):
+        self.level, self.trained, self.moved = 0, [], []
+
+    def observe(self, frame, *, train=True):
+        if train:
+            self.level = int(frame.image[0, 0, 0])
+            self.trained.append(frame.seq)
+        else:
+            self.moved.append((frame.seq, int(frame.image.max()), frame.mask, frame.depth))
+
+    def publish(self):
+        return self.level
+
+
+def evaluate(frames, picture, learner=None, **options):
+    shown = []
+
+    def picture_of(level, frame):
+        shown.append(frame.seq)
+        assert not frame.image.any(), "what renders the prediction does not see the frame either"
+        return picture(level)
+
+    return evaluate_causal(frames, learner or Holding(), picture_of, **options), shown
+
+
+def test_a_model_that_holds_scores_the_copy_of_the_previous_frame(frame, picture, decibels):
+    log = []
+    score, shown = evaluate([frame(0, 100), frame(1, 110), frame(2, 150)], picture, record=log.append)
+    assert score.psnr_tissue_db == pytest.approx((decibels(10) + decibels(40)) / 2, abs=1e-6)
+    assert (score.frames, score.worst_seq, shown) == (2, 2, [1, 2])
+    assert score.left_out == {"before the first prediction": 1}
+    assert [entry["seq"] for entry in log] == [1, 2] and not any(entry["trained"] for entry in log)
+
+
+def test_a_frame_is_learned_from_only_after_it_was_predicted_and_nothing_of_it_is_seen_before(frame, picture):
+    learner = Holding()
+    mask, depth = np.ones((16, 20), np.uint8), np.ones((16, 20), np.float32)
+    evaluate([frame(k, 100, mask=mask, depth=depth) for k in range(3)], picture, learner)
+    assert learner.trained == [0, 1, 2]
+    assert learner.moved == [(1, 0, None, None), (2, 0, None, None)]
+
+
+def test_the_exposure_of_the_frame_before_stands_for_the_unknown_one(frame, picture):
+    seen = []
+
+    def picture_of(level, shown):
+        seen.append(shown.exposure)
+        return picture(level)
+
+    gains = [(1.0, 1.0, 1.0), (1.5, 1.0, 1.0), (2.0, 1.0, 1.0)]
+    evaluate_causal([frame(k, exposure=gain) for k, gain in enumerate(gains)], Holding(), picture_of)
+    assert seen == gains[:2]
+
+
+def test_damaged_and_withheld_frames_are_neither_scored_nor_learned_from(frame, picture, decibels):
+    learner = Holding()
+    nothing = np.zeros((16, 20), np.uint8)
+    frames = [
+        frame(0, 7, status=FrameStatus.DAMAGED),
+        frame(1, 100),
+        frame(2, 9, withheld="smoke"),
+        frame(3, 9, status=FrameStatus.DAMAGED),
+        frame(4, 110, mask=nothing),
+        frame(5, 120),
+    ]
+    score, shown = evaluate(frames, picture, learner)
+    assert learner.trained == [1, 4, 5] and shown == [5]
+    assert score.left_out == {"before the first prediction": 1, "damaged": 2, "no tissue": 1, "withheld": 1}
+    assert score.psnr_tissue_db == pytest.approx(decibels(10), abs=1e-6)
+
+
+def test_one_frame_has_no_prediction(frame, picture):
+    score, shown = evaluate([frame(0)], picture)
+    assert score.psnr_tissue_db is None and shown == []
+
+
+def test_another_way_to_predict(frame, picture):
+    always = lambda learner, unseen: 105
+    score, _ = evaluate([frame(0, 100), frame(1, 105)], picture, predict=always)
+    assert score.psnr_tissue_db == 100.0

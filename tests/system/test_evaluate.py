@@ -1,0 +1,229 @@
+"""`intrasplat evaluate` on small recordings: figures that agree with the run's own, reports, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.io.recordings import synthesize
+from services.cli.app import run
+from services.reports.evaluation_schema import EvaluationReport
+from services.reports.schema import RunReport
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory) -> Path:
+    """Twelve synthetic frames of 64x48 px, with depth."""
+    return synthesize(
+        tmp_path_factory.mktemp("recordings") / "long", frames=12, width_px=64, height_px=48, stereo=False
+    )
+
+
+@pytest.fixture(scope="module")
+def offline(long, tmp_path_factory) -> Path:
+    """An offline reconstruction of it."""
+    out = tmp_path_factory.mktemp("outputs") / "offline"
+    assert run(["reconstruct", str(long), "--out", str(out), "--steps", "30"]) == 0
+    return out
+
+
+def evaluated(intrasplat, *arguments) -> EvaluationReport:
+    done = intrasplat("evaluate", *arguments, "--json")
+    assert done.code == 0, done.err
+    return EvaluationReport.model_validate_json(done.out)
+
+
+def test_the_held_out_figures_are_those_of_the_run(intrasplat, long, offline):
+    report = evaluated(intrasplat, offline, long, "--protocol", "heldout")
+    own = RunReport.read(offline / "report.json")
+    assert report.heldout is not None and own.quality.heldout is not None
+    for name in ("psnr_tissue_db", "psnr_frame_db", "ssim", "frames"):
+        assert getattr(report.heldout.score, name) == pytest.approx(getattr(own.quality.heldout, name), abs=1e-4)
+    by_name = {each.name: each.psnr_tissue_db for each in report.baselines if each.frames_of == "heldout"}
+    assert by_name["neighbour_mean"] == own.quality.baselines.heldout_neighbour_mean_db
+    assert by_name["train_mean"] == own.quality.baselines.train_mean_db
+    assert report.heldout.depth is not None and report.heldout.depth.covered > 0.9
+    assert report.evaluated.command == "reconstruct" and report.causal is report.live is report.retention is None
+
+
+def test_a_model_alone_is_evaluated_and_what_is_not_known_about_it_is_said(intrasplat, long, offline, tmp_path):
+    shutil.copytree(offline / "model", tmp_path / "elsewhere")
+    report = evaluated(intrasplat, tmp_path / "elsewhere", long)
+    assert report.heldout is not None and report.retention is not None and report.live is None
+    assert any("nothing says whether the held-out frames" in note for note in report.notes)
+    assert any("live was not measured" in note for note in report.notes)
+    beside = evaluated(intrasplat, offline / "model", long)
+    assert beside.evaluated.command == "reconstruct" and not any("nothing says" in note for note in beside.notes)
+
+
+def test_reports_are_written_and_the_table_is_printed(intrasplat, long, offline, tmp_path):
+    out = tmp_path / "out"
+    done = intrasplat(
+        "evaluate",
+        offline,
+        long,
+        "--out",
+        out,
+        "--protocol",
+        "causal",
+        "--protocol",
+        "retention",
+        "--steps-per-frame",
+        1,
+    )
+    assert done.code == 0, done.err
+    assert done.out.splitlines()[-1] == str(out / "evaluation.html")
+    for said in (
+        "Causal:",
+        "Retention:",
+        "Half of a constant-velocity optical flow",
+        "Previous frame shown instead",
+        "tissue dB",
+        "frame dB",
+    ):
+        assert said in done.out
+    report = EvaluationReport.read(out / "evaluation.json")
+    assert report.causal is not None and report.causal.score.frames == 11
+    assert (report.causal.steps_per_frame, report.causal.field) == (1, "basis")
+    assert [len(report.series[name]) for name in ("baselines", "causal", "retention")] == [11, 11, 12]
+    names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
+    assert names == {
+        "evaluation.json",
+        "evaluation.html",
+        *(f"evaluation-{n}.jsonl" for n in ("baselines", "causal", "retention")),
+    }
+    assert names == set(report.outputs.values())
+    assert intrasplat("evaluate", offline, long, "--out", out, "--protocol", "heldout").code == 0
+    assert not (out / "evaluation-causal.jsonl").exists(), "a new evaluation replaces the earlier one whole"
+
+
+def test_a_prediction_depends_on_nothing_that_comes_later(intrasplat, long, offline, tmp_path):
+    whole = evaluated(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2)
+    start = evaluated(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2, "--max-frames", 6)
+    assert start.series["causal"] == whole.series["causal"][:5]
+
+
+def test_a_live_run_is_scored_by_its_log(intrasplat, long, offline, tmp_path):
+    folder = tmp_path / "live"
+    shutil.copytree(offline, folder)
+    lines = []
+    for k in range(12):
+        arrived_ns = 10**9 + k * 40_000_000
+        late = 48_000_000 if k == 5 else 9_000_000
+        lines.append(
+            {
+                "seq": k,
+                "time_s": k / 25,
+                "arrived_ns": arrived_ns,
+                "shown_ns": arrived_ns + late,
+                "psnr_tissue_db": 30.0,
+                "state": "live",
+            }
+        )
+    del lines[8]  # dropped: its arrival lies between those of its neighbours
+    (folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    report = evaluated(intrasplat, folder, long, "--protocol", "live")
+    assert report.live is not None and report.live.age_when_shown is not None
+    assert report.live.age_when_shown.max_ms == pytest.approx(48)
+    assert report.live.age_when_shown.p50_ms == pytest.approx(9, rel=0.02)
+    assert report.live.behind == {0: 9, 1: 2} and report.live.estimated == 2
+    assert report.live.score.frames == 11 and report.live.states == {"live": 11}
+    (folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines[::-1]))
+    done = intrasplat("evaluate", folder, long, "--protocol", "live")
+    assert done.code == 2 and "frames.jsonl" in done.err and "Traceback" not in done.err
+    (folder / "frames.jsonl").write_text(
+        json.dumps({"seq": 0, "arrived_ns": 1, "shown_ns": "now", "psnr_tissue_db": 1.0}) + "\n"
+    )
+    done = intrasplat("evaluate", folder, long, "--protocol", "live")
+    assert done.code == 2 and "whole number" in done.err and "Traceback" not in done.err
+
+
+def test_a_run_that_trained_on_every_frame_has_no_held_out_figures(intrasplat, tiny, tmp_path):
+    assert intrasplat("replay", tiny, "--out", tmp_path / "run", "--steps-per-frame", 1).code == 0
+    done = intrasplat("evaluate", tmp_path / "run", tiny, "--protocol", "heldout")
+    assert done.code == 2 and "trained on the held-out frames" in done.err
+    report = evaluated(intrasplat, tmp_path / "run", tiny)
+    assert report.heldout is None and any("trained on the held-out frames" in note for note in report.notes)
+    done = intrasplat("evaluate", tmp_path / "run", tiny, "--protocol", "live")
+    assert done.code == 2 and "not a live run" in done.err
+
+
+def test_another_recording_is_named_or_refused(intrasplat, long, offline, tiny, tmp_path):
+    report = evaluated(intrasplat, offline, tiny, "--protocol", "retention")
+    assert any("made from other files" in note for note in report.notes)
+    other = synthesize(tmp_path / "wide", frames=3, width_px=96, height_px=48, stereo=False)
+    done = intrasplat("evaluate", offline, other)
+    assert done.code == 2 and "another shape" in done.err
+    shutil.copytree(tiny, tmp_path / "zoomed")
+    described = json.loads((tmp_path / "zoomed" / "recording.json").read_text())
+    described["camera"]["fx"] *= 1.5
+    (tmp_path / "zoomed" / "recording.json").write_text(json.dumps(described))
+    done = intrasplat("evaluate", offline, tmp_path / "zoomed")
+    assert done.code == 2 and "focal length" in done.err
+
+
+def test_a_part_of_the_time_is_said(intrasplat, long, tmp_path):
+    assert intrasplat("reconstruct", long, "--out", tmp_path / "run", "--steps", 5, "--max-frames", 4).code == 0
+    report = evaluated(intrasplat, tmp_path / "run", long)
+    assert any("the first 5 of the 12 frames" in note for note in report.notes)
+    assert {each.frames for each in report.baselines if each.age_frames == 1} == {4}
+
+
+def test_the_size_of_the_model_is_taken_unless_another_one_is_asked_for(intrasplat, long, tmp_path):
+    assert intrasplat("reconstruct", long, "--out", tmp_path / "run", "--steps", 5, "--scale", 0.5).code == 0
+    report = evaluated(intrasplat, tmp_path / "run", long, "--protocol", "heldout")
+    assert (report.recording.width_px, report.evaluated.scale) == (32, 0.5)
+    alone = evaluated(
+        intrasplat, shutil.copytree(tmp_path / "run" / "model", tmp_path / "m"), long, "--protocol", "heldout"
+    )
+    assert alone.evaluated.scale == 0.5 and any("model's size of 32x24" in note for note in alone.notes)
+    full = evaluated(intrasplat, tmp_path / "run", long, "--protocol", "heldout", "--scale", 1)
+    assert full.recording.width_px == 64 and any("as --scale says" in note for note in full.notes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--protocol", "magic"], "choose among heldout, live, retention, causal"),
+        (["--scale", "0"], "scale must be a positive number"),
+        (["--steps-per-frame", "0"], "steps_per_frame"),
+        (["--max-frames", "0"], "max_frames"),
+        (["--device", "abacus"], "is not known"),
+        (["--renderer", "crayon"], "crayon"),
+    ],
+)
+def test_a_wrong_option_is_one_sentence(intrasplat, long, offline, arguments, said):
+    done = intrasplat("evaluate", offline, long, *arguments)
+    assert done.code == 2 and said in done.err and done.err.count("\n") <= 2
+
+
+def test_what_is_no_model_or_run_is_refused(intrasplat, long, offline, tmp_path):
+    for path in (tmp_path / "missing", tmp_path):
+        done = intrasplat("evaluate", path, long)
+        assert done.code == 2 and done.err.startswith("error: "), done.err
+    (tmp_path / "report.json").write_text("{}")
+    assert "not a report of this version" in intrasplat("evaluate", tmp_path, long).err
+    folder = shutil.copytree(offline, tmp_path / "without")
+    shutil.rmtree(folder / "model")
+    assert "left no model" in intrasplat("evaluate", folder, long).err
+    other = shutil.copytree(offline, tmp_path / "swapped")
+    content = json.loads((other / "report.json").read_text())
+    content["model"]["sha256"] = "ab" * 32
+    (other / "report.json").write_text(json.dumps(content))
+    assert "is not the model" in intrasplat("evaluate", other, long).err
+    assert "report.json" not in intrasplat("evaluate", other / "model", long, "--protocol", "heldout").err
+
+
+def test_results_go_neither_into_the_run_nor_over_strangers_files(intrasplat, long, offline, tmp_path, fingerprints):
+    before = fingerprints(offline)
+    assert intrasplat("evaluate", offline, long, "--out", offline / "evaluation").code == 2
+    assert intrasplat("evaluate", offline, long, "--out", offline).code == 2
+    assert fingerprints(offline) == before
+    cv2.imwrite(str(tmp_path / "mine.png"), np.zeros((4, 4, 3), np.uint8))
+    assert intrasplat("evaluate", offline, long, "--out", tmp_path).code == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.png"]
