@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import av
-import numpy as np
 
 from gsplat_core.io.recordings.decoded import DEPENDS
 from gsplat_core.io.recordings.decoder import PictureConverter, PictureDecoder, captured_log, frame_rate
@@ -113,8 +112,6 @@ class Connection:
                     seq=seq,
                     pts_ns=arrived_ns if pts_ns is None or abs(pts_ns) > 2**62 else pts_ns,
                     image=image,
-                    # As in recordings: no pixel of a damaged picture is known to be tissue.
-                    mask=None if why is None else np.zeros(image.shape[:2], np.uint8),
                     arrived_ns=arrived_ns,
                     status=FrameStatus.LIVE if why is None else FrameStatus.DAMAGED,
                     damage=why,
