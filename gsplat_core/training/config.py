@@ -68,6 +68,10 @@ class ReconstructorConfig:
     """Weight of the inverse-depth term where the recording has depth."""
     default_depth_mm: float = 60.0
     """Distance of the plane on which a recording without depth starts."""
+    motion_prior: str = "bumps"
+    """What is assumed about motion after the newest frame: a name in `MOTION_PRIORS`."""
+    start_from_motion: bool = False
+    """Whether a motion prior moves the scene to where a new frame shows it, before the first step on that frame."""
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,6 +23,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.coverage import CapturedCoverage
 from gsplat_core.training.growth import gaussians_for_uncovered_tissue
 from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion_prior
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
 from gsplat_core.training.offline import FitSettings, OfflineTraining
@@ -41,8 +43,7 @@ class Reconstructor:
     settings and seed give the same model. With the basis field that holds for any number of threads; the HexPlane's network is
     trained by torch's matrix products, which round differently with another number.
 
-    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares the next frame; the host waits for
-    it where that one is searched for uncovered tissue.
+    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares the next frame.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class Reconstructor:
         self._recording_digest = recording_digest
         self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
         self._step: TrainingStep | None = None
+        self._prior: MotionPrior | None = None
         self._coverage: CapturedCoverage | None = None
         self._unsettled: Observation | None = None
         """The frame whose steps are queued; whether their splats fitted the tile lists is not known yet."""
@@ -125,6 +127,10 @@ class Reconstructor:
         self._window.forget_before(self._step.field.time_window_s[0])
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
+        if self._prior is not None:
+            self._prior.observe(
+                frame, observation.time_s, observation.camera, self._step, start_there=self.config.start_from_motion
+            )
         self._window.add(observation)
         if not first:
             self._grow(frame, observation)
@@ -234,15 +240,9 @@ class Reconstructor:
             raise InvalidInput("there is no model yet: observe a frame first")
         self._settle()
         self._version += 1
-        gaussians, field = self._step.copy()
-        return Model(
-            version=self._version,
-            gaussians=gaussians,
-            field=field,
-            camera=self.camera,
-            time_window_s=self._time_window_s,
-            training_digest=self._recording_digest,
-        )
+        with continued(self._step, self._prior):
+            gaussians, field = self._step.copy()
+        return Model(gaussians=gaussians, field=field, **self._facts())
 
     def publish(self) -> Model | Snapshot:
         """The model as it is now, for showing it, with the next version number. As `snapshot`, but on a GPU it is copied into a slot.
@@ -252,14 +252,13 @@ class Reconstructor:
         if self._step is None or self.device.type != "cuda" or not SnapshotSlots.can_hold(self._step.field):
             return self.snapshot()
         self._version += 1
-        return self._slots.publish(
-            self._step.gaussians,
-            self._step.field,
-            version=self._version,
-            camera=self.camera,
-            time_window_s=self._time_window_s,
-            training_digest=self._recording_digest,
-        )
+        with continued(self._step, self._prior):
+            return self._slots.publish(self._step.gaussians, self._step.field, **self._facts())
+
+    def _facts(self) -> dict[str, Any]:
+        """What a model or snapshot states beside its tensors."""
+        window_s, digest = self._time_window_s, self._recording_digest
+        return dict(version=self._version, camera=self.camera, time_window_s=window_s, training_digest=digest)
 
     def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
         """The Gaussians that a scene starts with; its camera and first time are those of the frame."""
@@ -281,6 +280,7 @@ class Reconstructor:
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config, self.camera)
+        self._prior = None if end_s is not None else new_motion_prior(self.config.motion_prior, field)
         if self.device.type == "cuda" and SnapshotSlots.can_hold(field):
             self._coverage = CapturedCoverage(self.camera, self.device, self._fixed_rows)
 
