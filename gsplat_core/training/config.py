@@ -107,11 +107,11 @@ class ReconstructorConfig:
 
     @classmethod
     def offline(cls, field: str = "auto") -> ReconstructorConfig:
-        """The configuration for `Reconstructor.fit`, which has time for more Gaussians than a stream.
+        """The configuration for `Reconstructor.fit`, which has time for more Gaussians and for finer motion than a stream.
 
         It starts with `gaussians` and ends with `max_gaussians`.
         """
-        return cls(field=field, gaussians=60_000, max_gaussians=80_000, squared_error=True)
+        return cls(field=field, gaussians=60_000, max_gaussians=80_000, bump_spacing_s=1 / 15, squared_error=True)
 
     @property
     def chosen_field(self) -> str:
