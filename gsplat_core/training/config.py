@@ -68,6 +68,8 @@ class ReconstructorConfig:
     """What is assumed about motion after the newest frame: a name in `MOTION_PRIORS`."""
     start_from_motion: bool = False
     """Whether a motion prior moves the scene to where a new frame shows it, before the first step on that frame."""
+    depth_from_motion: bool = False
+    """Whether the motion prior finds the depth of the scene where the camera moves, its poses are given, and no depth is."""
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:

@@ -38,12 +38,7 @@ class TrainingStep:
         self.field = field
         self._rates = config.rates
         self._weights = LossWeights(config.ssim_weight, config.depth_weight, config.squared_error)
-        # World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres.
-        centre = camera.viewmat.to(gaussians.device)
-        distance = (
-            (gaussians.means @ centre[2, :3] + centre[2, 3]).abs().median() if gaussians.count else torch.ones(())
-        )
-        self._mm_per_px = float(distance) / float(camera.K[0, 0])
+        self.set_distance(camera)
         self._adam = FusedAdam(gaussians.tensors())
         kind = kind_of(field.kind)
         self._field_rates = config.rates.field or kind.rates
@@ -78,6 +73,27 @@ class TrainingStep:
         own = self._training.update(gradients, self._field_rates.scaled(self._mm_per_px, rate_scale))
         self._adam.step(self.gaussians.tensors(), own, self._gaussian_rates(rate_scale))
         return loss
+
+    def scale_about(self, camera: Camera, factor: Tensor) -> None:
+        """Move every Gaussian to `factor` [N] times its distance from the camera's centre, at all times, and scale it with that: the camera
+        sees the same picture. Moments of Adam and rates follow."""
+        with torch.no_grad():
+            scene, each = self.gaussians, factor[:, None]
+            centre = torch.as_tensor(camera.position, dtype=scene.means.dtype).to(scene.device)
+            scene.means.copy_(centre + each * (scene.means - centre))
+            scene.log_scales.add_(each.log())
+            self.field.scale_positions(factor)
+            count = len(factor)
+            self._adam.first_moments["means"][:count].div_(each)
+            self._adam.second_moments["means"][:count].div_(each.square())
+        self.set_distance(camera)
+
+    def set_distance(self, camera: Camera) -> None:
+        """Take the scene's typical distance from `camera`, with which rates given in pixels become rates in the scene's units. Waits for it."""
+        view, means = camera.viewmat.to(self.gaussians.device), self.gaussians.means
+        distance = (means @ view[2, :3] + view[2, 3]).abs().median() if self.gaussians.count else torch.ones(())
+        self._mm_per_px = float(distance) / float(camera.K[0, 0])
+        self._scaled_for = None
 
     def settle(self, observation: Observation, rate_scale: float = 1.0) -> None:
         """Wait for the captured steps. Those that changed nothing, because a tile list was beyond its capacity, are taken again on
