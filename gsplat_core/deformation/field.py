@@ -16,6 +16,7 @@ from gsplat_core.deformation.field_slots import FieldSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.rows import RowMoves
 from gsplat_core.value_ranges import ListOf, NumberIn
 
 WINDOW_S = ListOf(NumberIn(-1e10, 1e10), 2, 2)
@@ -172,6 +173,21 @@ class DeformationField(torch.nn.Module):
 
     def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
         """Add state for new Gaussians at the end: still, or copied from `parents` (int64 [count]). Here there is none."""
+
+    def reserve(self, rows: int) -> bool:
+        """Take the memory for `rows` Gaussians now, so that `append` and `close_gaps` move no tensor until there are more.
+
+        False where the field cannot do that. Here it can when there is no state for each Gaussian.
+        """
+        return self.count is None
+
+    def close_gaps(self, moves: RowMoves) -> None:
+        """Let Gaussians leave: the rows in use stay the first ones."""
+        self.select(moves.order)
+
+    def restart(self, time_s: float, count: int) -> bool:
+        """Become the untrained field of `count` Gaussians and a stream that starts at `time_s`, in place; False where that cannot be."""
+        return False
 
 
 def checked_window(time_window_s: tuple[float, float]) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.scene.cameras import Camera
@@ -28,6 +29,8 @@ LEAST_PARALLAX_PX = 1.5
 """Motion by parallax, as a median, from which the scene's distance is taken as a whole."""
 LEAST_EXPLAINED = 0.5
 """Share of the motion left by the camera's turning that one distance for the whole scene has to explain."""
+SMALLEST_SHIFT = 1e-9
+"""Of a camera's centre along an axis, in the scene's units: less is rounding."""
 ROUNDS = 4
 """Of reweighting, so that points that move otherwise do not decide the distance."""
 
@@ -43,6 +46,8 @@ class DepthFromMotion:
 
         Nothing changes where the camera only turned or stood still. On a GPU the host waits until the scene's distance is known.
         """
+        if not np.any(translation_between(motion.before, motion.after)):
+            return
         with torch.no_grad():
             deltas = step.field.deltas(before_s)[:, POSITION]
             points = step.gaussians.means + deltas
@@ -52,7 +57,8 @@ class DepthFromMotion:
             information = torch.where(seen.inside[:, 0] & (measured > 0), information / FLOW_ERROR_PX**2, 0.0)
             known = 1 / seen.depth[:, 0]
             whole = torch.ones_like(known)
-            if not self._distance_is_known:
+            found = not self._distance_is_known
+            if found:
                 distance = self._distance(seen.pixels, target, motion, known, information)
                 if distance is None:
                     return
@@ -64,6 +70,8 @@ class DepthFromMotion:
             factor = whole * (known / refined).clamp(1 / LARGEST_STEP, LARGEST_STEP)
             factor = torch.where(seen.inside[:, 0] & factor.isfinite() & (factor > 0), factor, whole)
             step.scale_about(motion.before, factor)
+            if found:
+                step.take_distance(motion.after)
 
     def _distance(
         self, pixels: Tensor, target: Tensor, motion: SurfaceMotion, known: Tensor, information: Tensor
@@ -103,6 +111,12 @@ def inverse_depths(pixels: Tensor, target: Tensor, before: Camera, after: Camera
     c, d = parallax_terms(pixels, target, before, after)
     squared = (c * c).sum(dim=1)
     return (c * d).sum(dim=1) / squared.clamp(min=1e-20), squared * float(after.K[0, 0]) ** 2
+
+
+def translation_between(before: Camera, after: Camera) -> NDArray[np.float64]:
+    """Where the second camera sees the first one's centre [3]; exactly 0 where it only turned or stood still."""
+    moved = before.position - after.position
+    return np.asarray(after.world_to_camera[:3, :3] @ np.where(np.abs(moved) < SMALLEST_SHIFT, 0.0, moved))
 
 
 def _normalised(pixels: Tensor, camera: Camera) -> Tensor:

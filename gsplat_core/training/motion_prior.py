@@ -160,11 +160,13 @@ def new_motion_prior(config: ReconstructorConfig, field: DeformationField) -> Mo
 @contextmanager
 def continued(step: TrainingStep, prior: MotionPrior | None) -> Iterator[None]:
     """For the time of a copy for publishing the scene goes on after the newest frame as the prior says; training knows nothing of it."""
-    velocity = None if prior is None else prior.velocity(step)
-    if prior is None or velocity is None:
+    if prior is None:
         yield
         return
-    step.field.continue_with(velocity, prior.newest_s, HORIZON_S)
+    # Also without a velocity: slots whose fields have a continuation from the start need no other memory later.
+    velocity = prior.velocity(step)
+    still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
+    step.field.continue_with(still if velocity is None else velocity, prior.newest_s, HORIZON_S)
     try:
         yield
     finally:

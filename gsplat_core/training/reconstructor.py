@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -17,15 +16,17 @@ from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
-from gsplat_core.training.budget import Budget, Ending, Spending, StepsInFlight
+from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.coverage import CapturedCoverage
 from gsplat_core.training.growth import gaussians_for_uncovered_tissue
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion_prior
 from gsplat_core.training.observations import Observation, ObservationWindow
+from gsplat_core.training.observe_report import ObserveReport
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
@@ -35,24 +36,6 @@ STEP_TIME_DECAY = 0.3
 """How fast the usual time of a step follows the newest frames', where budgets are timed."""
 
 
-@dataclass(frozen=True)
-class ObserveReport:
-    """What one frame changed."""
-
-    seq: int
-    steps: int
-    arriving_loss: HostCopy | None
-    """Loss of the last step, which a GPU may not have finished; None when the frame was not trained on."""
-    gaussians: int
-    ending: Ending = "steps"
-    """Why training on the frame ended."""
-
-    @property
-    def loss(self) -> float | None:
-        """Loss of the last step; waits for it."""
-        return None if self.arriving_loss is None else self.arriving_loss.item()
-
-
 class Reconstructor:
     """Owns the model that is being learned.
 
@@ -60,8 +43,7 @@ class Reconstructor:
     settings and seed give the same model. With the basis field that holds for any number of threads; the HexPlane's network is
     trained by torch's matrix products, which round differently with another number.
 
-    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares the next frame; the host waits for
-    it where that one is searched for uncovered tissue.
+    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares the next frame.
     """
 
     def __init__(
@@ -88,7 +70,7 @@ class Reconstructor:
         self._step_s: float | None = None
         """How long a step took lately, where budgets are timed."""
         self._version = 0
-        self._slots = SnapshotSlots(self.device)
+        self._slots = SnapshotSlots(self.device, rows=self._fixed_rows)
         self._usual_first_loss = math.inf
         self._first_time_s = 0.0
         self._last_time_s = 0.0
@@ -97,6 +79,19 @@ class Reconstructor:
     def gaussians(self) -> int:
         """How many Gaussians the model has now."""
         return 0 if self._step is None else self._step.gaussians.count
+
+    @property
+    def _fixed_rows(self) -> int:
+        """Gaussians that memory is taken for at once; 0: for those that there are."""
+        return self.config.max_gaussians if self.config.preallocate else 0
+
+    @property
+    def _time_window_s(self) -> tuple[float, float]:
+        """What the model shows: since the first frame, or as far back as the field reaches."""
+        start = self._first_time_s
+        if self._step is not None and self.config.history_s is not None:
+            start = min(max(start, self._step.field.time_window_s[0]), self._last_time_s)
+        return start, self._last_time_s
 
     def observe(
         self, frame: Frame, *, budget: Budget | None = None, steps: int | None = None, train: bool = True
@@ -129,6 +124,7 @@ class Reconstructor:
         assert self._step is not None
         self._step.field.cover(observation.time_s, self._last_time_s)
         self._last_time_s = observation.time_s
+        self._window.forget_before(self._step.field.time_window_s[0])
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
         if self._prior is not None:
@@ -257,12 +253,14 @@ class Reconstructor:
 
     def _facts(self) -> dict[str, Any]:
         """What a model or snapshot states beside its tensors."""
-        window_s = self._first_time_s, self._last_time_s
-        digest = self._recording_digest
-        return {"version": self._version, "camera": self.camera, "time_window_s": window_s, "training_digest": digest}
+        window_s, digest = self._time_window_s, self._recording_digest
+        return dict(version=self._version, camera=self.camera, time_window_s=window_s, training_digest=digest)
 
-    def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
-        gaussians = gaussians_from_frame(
+    def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
+        """The Gaussians that a scene starts with; its camera and first time are those of the frame."""
+        self._first_time_s = observation.time_s
+        self.camera = observation.camera
+        return gaussians_from_frame(
             frame,
             observation.camera,
             self.config.gaussians,
@@ -270,16 +268,17 @@ class Reconstructor:
             default_depth_mm=self.config.default_depth_mm,
             seed=self._seed,
         ).to(self.device)
-        self._first_time_s = observation.time_s
-        self.camera = observation.camera
-        wanted = NewField(gaussians, observation.time_s, end_s, self.config.bump_spacing_s)
+
+    def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
+        gaussians = self._first_gaussians(frame, observation)
+        wanted = NewField(gaussians, observation.time_s, end_s, self.config.bump_spacing_s, self.config.history_s)
         with torch.random.fork_rng(devices=[]):  # planes and layers start random
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config, self.camera)
         self._prior = None if end_s is not None else new_motion_prior(self.config, field)
         if self.device.type == "cuda" and SnapshotSlots.can_hold(field):
-            self._coverage = CapturedCoverage(self.camera, self.device)
+            self._coverage = CapturedCoverage(self.camera, self.device, self._fixed_rows)
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
         """Add Gaussians where the frame shows tissue that the model does not cover."""

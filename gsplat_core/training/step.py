@@ -13,6 +13,7 @@ from gsplat_core.deformation.registry import kind_of
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.rows import GaussianRows, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.field_training import AutogradTraining
 from gsplat_core.training.fused_step import FusedStep
@@ -22,6 +23,13 @@ from gsplat_core.training.photometric import LossWeights, loss_and_gradients
 
 SETTLE_EVERY = 32
 """Captured steps after which the host waits for them, so that tile lists beyond their capacity are noticed soon; also after the first."""
+
+
+def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
+    """World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres."""
+    centre = camera.viewmat.to(gaussians.device)
+    distance = (gaussians.means @ centre[2, :3] + centre[2, 3]).abs().median() if gaussians.count else torch.ones(())
+    return float(distance) / float(camera.K[0, 0])
 
 
 class TrainingStep:
@@ -34,12 +42,19 @@ class TrainingStep:
     def __init__(
         self, gaussians: Gaussians, field: DeformationField, config: ReconstructorConfig, camera: Camera
     ) -> None:
-        self.gaussians = gaussians
         self.field = field
         self._rates = config.rates
         self._weights = LossWeights(config.ssim_weight, config.depth_weight, config.squared_error)
-        self.set_distance(camera)
+        self._mm_per_px = mm_per_px(gaussians, camera)
         self._adam = FusedAdam(gaussians.tensors())
+        self._rows: GaussianRows | None = None
+        """Where Gaussians join and leave without a tensor moving."""
+        if config.preallocate and field.reserve(config.max_gaussians):
+            self._rows = GaussianRows(gaussians, config.max_gaussians)
+            self._adam.reserve(config.max_gaussians)
+            gaussians = self._rows.used
+        self.gaussians = gaussians
+        """Those in use."""
         kind = kind_of(field.kind)
         self._field_rates = config.rates.field or kind.rates
         if not isinstance(self._field_rates, type(kind.rates)):
@@ -56,7 +71,7 @@ class TrainingStep:
             training = kind.captured_training(field)
             if training is not None:
                 self._rate_values = training.rate_values
-                self._captured = FusedStep(gaussians, training, self._adam, self._weights, camera)
+                self._captured = FusedStep(self._all_rows, training, self._adam, self._weights, camera)
         self._training: FieldTraining = (
             AutogradTraining(field, self._field_rates) if kind.training is None else kind.training(field)
         )
@@ -76,7 +91,7 @@ class TrainingStep:
 
     def scale_about(self, camera: Camera, factor: Tensor) -> None:
         """Move every Gaussian to `factor` [N] times its distance from the camera's centre, at all times, and scale it with that: the camera
-        sees the same picture. Moments of Adam and rates follow."""
+        sees the same picture. Adam's moments follow, the rates with `take_distance`."""
         with torch.no_grad():
             scene, each = self.gaussians, factor[:, None]
             centre = torch.as_tensor(camera.position, dtype=scene.means.dtype).to(scene.device)
@@ -86,14 +101,10 @@ class TrainingStep:
             count = len(factor)
             self._adam.first_moments["means"][:count].div_(each)
             self._adam.second_moments["means"][:count].div_(each.square())
-        self.set_distance(camera)
 
-    def set_distance(self, camera: Camera) -> None:
-        """Take the scene's typical distance from `camera`, with which rates given in pixels become rates in the scene's units. Waits for it."""
-        view, means = camera.viewmat.to(self.gaussians.device), self.gaussians.means
-        distance = (means @ view[2, :3] + view[2, 3]).abs().median() if self.gaussians.count else torch.ones(())
-        self._mm_per_px = float(distance) / float(camera.K[0, 0])
-        self._scaled_for = None
+    def take_distance(self, camera: Camera) -> None:
+        """Let rates that are given in pixels follow the scene's distance from the camera. Waits for it."""
+        self._mm_per_px, self._scaled_for = mm_per_px(self.gaussians, camera), None
 
     def settle(self, observation: Observation, rate_scale: float = 1.0) -> None:
         """Wait for the captured steps. Those that changed nothing, because a tile list was beyond its capacity, are taken again on
@@ -115,7 +126,11 @@ class TrainingStep:
 
     def append(self, added: Gaussians) -> None:
         """Add Gaussians, which start still."""
-        self.gaussians = self.gaussians.append(added)
+        if self._rows is not None:
+            self._rows.append(added)
+            self.gaussians = self._rows.used
+        else:
+            self.gaussians = self.gaussians.append(added)
         self.field.append(added)
         self._adam.append(added.count)
 
@@ -137,6 +152,37 @@ class TrainingStep:
             self._adam.reset(name, parents)
         self._adam.append(second.count)
 
+    def remove(self, leaving: Tensor) -> RowMoves:
+        """Let the Gaussians marked in `leaving`, bool [N], go; returns how the others moved. Waits for the device."""
+        moves = RowMoves.without(leaving)
+        if self._rows is not None:
+            self._rows.close_gaps(moves)
+            self.gaussians = self._rows.used
+            self._adam.close_gaps(moves)
+            self.field.close_gaps(moves)
+        else:
+            self.gaussians = self.gaussians.select(moves.order)
+            self._adam.select(moves.order)
+            self.field.select(moves.order)
+        return moves
+
+    def restart(self, gaussians: Gaussians, time_s: float, camera: Camera) -> bool:
+        """Begin with another scene of the same camera size in the same memory; False, with nothing changed, where that cannot be."""
+        count = gaussians.count
+        if self._rows is None or count > self._rows.capacity or not self.field.restart(time_s, count):
+            return False
+        self._rows.replace(gaussians)
+        self.gaussians = self._rows.used
+        self._adam.restart(count)
+        if self._captured is not None:
+            self._captured.restart()
+        self._mm_per_px, self._scaled_for = mm_per_px(gaussians, camera), None
+        return True
+
+    @property
+    def _all_rows(self) -> Gaussians:
+        return self.gaussians if self._rows is None else self._rows.all
+
     def _captured_step(self, captured: FusedStep, observation: Observation, rate_scale: float) -> Tensor:
         if rate_scale != self._scaled_for:
             # Online the scale is always 1: worked out once, not for every step.
@@ -146,7 +192,7 @@ class TrainingStep:
                 self._rate_values(self._field_rates.scaled(self._mm_per_px, rate_scale)),
             )
         time = self.field.frame_time(observation.time_s)
-        loss = captured(self.gaussians, observation, time, *self._scaled_rates)
+        loss = captured(self._all_rows, observation, time, *self._scaled_rates)
         first, self._unsettled_steps = not self._has_settled, self._unsettled_steps + 1
         if first or self._unsettled_steps >= SETTLE_EVERY:
             self.settle(observation, rate_scale)

@@ -17,6 +17,8 @@ from operators.frame_clock import ClockSettings
 
 LIVE_WINDOW_FRAMES = 150
 LIVE_BUMP_SPACING_S = 0.1
+LIVE_HISTORY_S = 6.0
+"""How much of the past stays deformable: what the window holds at 30 frames a second, and the last 5 s rendered again."""
 LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
 """Beside L1: follows motion better. On a CPU a step takes half as long again with it, and steps are what is short there."""
 
@@ -67,6 +69,8 @@ class LiveSettings:
             field=self.field,
             window_frames=LIVE_WINDOW_FRAMES,
             bump_spacing_s=LIVE_BUMP_SPACING_S,
+            history_s=LIVE_HISTORY_S,
+            preallocate=True,
             ssim_weight=LIVE_SSIM_WEIGHT[self.device],
         )
         most = max(64, pixels // PIXELS_PER_GAUSSIAN)

@@ -15,7 +15,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
-from gsplat_core.training.reconstructor import ObserveReport
+from gsplat_core.training.observe_report import ObserveReport
 from operators.applications.delivery import Report, delivered
 from operators.applications.device import seeded
 from operators.applications.finishing import FirstFrames, measures_baselines, saves_model
