@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from gsplat_core.deformation.rates import FieldRates, check_rates
 from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.training.motion_priors import MOTION_PRIORS
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,7 @@ class ReconstructorConfig:
         for name in ("gaussians", "max_gaussians", "steps_per_frame", "first_frame_steps", "window_frames"):
             if getattr(self, name) < 1:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 1")
+        MOTION_PRIORS.check(self.motion_prior)
         if not 0 <= self.sh_degree <= 4:
             raise InvalidSetting(f"sh_degree is {self.sh_degree}; it must be 0 to 4")
         if self.max_gaussians < self.gaussians:

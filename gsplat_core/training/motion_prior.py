@@ -6,7 +6,7 @@ are a module and a line there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField
-from gsplat_core.registry import Registry
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.layout import COLOUR, LOG_SCALE, POSITION, RAW_COLUMNS
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.depth_from_motion import DepthFromMotion
 from gsplat_core.training.image_motion import ImageMotion, typical_px
+from gsplat_core.training.motion_priors import MOTION_PRIORS
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import SurfaceMotion
 from gsplat_core.transfers import tensor_of
@@ -145,15 +145,13 @@ def _followed(frame: Frame) -> NDArray[np.uint8] | None:
     return frame.mask & frame.loss_mask
 
 
-MOTION_PRIORS: Registry[Callable[[ReconstructorConfig], MotionPrior | None]] = Registry(
-    "motion prior", {"bumps": lambda config: None, "flow": FlowPrior}
-)
-"""By name. `bumps`: the field's bumps simply go on."""
+def no_prior(config: ReconstructorConfig) -> None:
+    """The field's bumps go on as they do."""
 
 
 def new_motion_prior(config: ReconstructorConfig, field: DeformationField) -> MotionPrior | None:
     """The prior that is configured, where the field can be continued. Raises InvalidSetting for an unknown name."""
-    prior = MOTION_PRIORS[config.motion_prior](config)
+    prior: MotionPrior | None = MOTION_PRIORS[config.motion_prior](config)
     return prior if field.continues else None
 
 
