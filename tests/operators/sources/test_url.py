@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import http.server
+import itertools
 import os
 import signal
+import socket
 import threading
 import time
 
@@ -162,6 +164,32 @@ def test_a_video_by_http_ends_with_its_last_frame(web, tmp_path, reading):
     assert [stream.frame().seq for _ in range(30)] == list(range(30))
     assert stream.source.read(SOON_S) is None and stream.source.state is SourceState.ENDED
     assert stream.source.state_sentence.endswith("has given its last frame")
+
+
+def test_a_transport_stream_by_udp_that_is_joined_in_its_middle(reading, free_port):
+    port, stop = free_port(socket.SOCK_DGRAM), threading.Event()
+
+    def send():
+        with av.open(f"udp://127.0.0.1:{port}?pkt_size=1316", "w", format="mpegts") as out:
+            stream = out.add_stream("libx264", rate=25, options={"tune": "zerolatency", "g": "10"})
+            stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+            k = 0
+            while not stop.wait(0.04):
+                frame = av.VideoFrame.from_ndarray(moving(k), format="rgb24")
+                frame.pts = k
+                out.mux(stream.encode(frame))
+                k += 1
+
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    try:
+        stream = reading(open_source(f"udp://127.0.0.1:{port}", HERE))
+        frames = [stream.frame() for _ in range(20)]
+    finally:
+        stop.set()
+        thread.join()
+    assert all(frame.image.shape == (120, 160, 3) for frame in frames) and frames[-1].damage is None
+    assert [b.seq - a.seq for a, b in itertools.pairwise(frames)][-5:] == [1] * 5
 
 
 def test_max_frames_ends_a_stream(web, tmp_path, reading):
