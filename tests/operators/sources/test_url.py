@@ -85,6 +85,15 @@ def test_a_server_that_is_killed_and_comes_back_after_five_seconds(rtsp_server, 
     assert stream.frame().seq > after.seq
 
 
+def test_what_piled_up_before_the_source_was_opened_is_not_shown(rtsp_server, reading):
+    rtsp_server.start()
+    source = open_source(rtsp_server.url("camera"), HERE)
+    first = source._connection
+    time.sleep(1.5)
+    assert reading(source).frame() and first._container is None, "it was connected to anew"
+    assert source.counts().get("reconnections", 0) == 0
+
+
 def test_a_server_that_hangs_is_a_stall_and_then_a_lost_connection(rtsp_server, reading):
     rtsp_server.start()
     stream = reading(open_source(rtsp_server.url("camera") + "#stall_s=2&open_s=2", HERE))
