@@ -21,7 +21,8 @@ from gsplat_core.io.sessions.schedule import Observed
 from gsplat_core.io.sessions.writer import Shown
 from operators.errors import OutputError, StorageFull
 from operators.sinks import session_recorder
-from operators.sinks.session_recorder import SessionRecorder, stated
+from operators.sinks.recorded import stated
+from operators.sinks.session_recorder import SessionRecorder
 from operators.storage import StorageReserve
 from tests.gsplat_core.io.sessions.made import new_frame, same_frame, session_info
 
