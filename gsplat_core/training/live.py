@@ -72,6 +72,11 @@ class LiveReconstructor(Reconstructor):
         """That of the scene before, whose memory the next scene takes over."""
         self._rehearsing = StepsInFlight(self.device, most=REHEARSED_IN_FLIGHT)
 
+    def kept(self) -> dict[str, int]:
+        """How much of the stream is held, by what holds it; none of it grows without end."""
+        columns = 0 if self._step is None else getattr(self._step.field, "bumps", 0)
+        return {"window_frames": len(self._window), "columns": columns}
+
     def rehearse(self, steps: int) -> None:
         """So many steps on frames of the window. On a GPU they are queued, and at most `REHEARSED_IN_FLIGHT` of them are not finished when
         this returns, so that the next frame need not wait long. Raises InvalidInput before the first frame."""

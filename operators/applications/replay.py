@@ -93,9 +93,9 @@ class ReplaySettings:
         """What the run reads from the disk."""
         return (Path(self.recording),)
 
-    def reconstructor_config(self, pixels: int | None = None) -> ReconstructorConfig:
-        """The reconstructor's settings for frames of so many pixels. Raises InvalidSetting."""
-        config = ReconstructorConfig(field=self.field)
+    def reconstructor_config(self, pixels: int | None = None, *, offline: bool = False) -> ReconstructorConfig:
+        """The reconstructor's settings for frames of so many pixels. offline: for `Reconstructor.fit`. Raises InvalidSetting."""
+        config = ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig(field=self.field)
         if pixels is not None:
             # More Gaussians than a quarter of the pixels have nothing to show.
             most = max(64, pixels // PIXELS_PER_GAUSSIAN)
@@ -252,14 +252,14 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
     """
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device)
-    config = settings.reconstructor_config()
+    config = settings.reconstructor_config(offline=offline)
     source = open_source(settings.recording, SourceOptions(settings.scale, settings.max_frames))
     description = source.description
     if description.frame_count is None:
         raise InvalidSetting(f"{description.name} has no end; give --max-frames, or a recording")
     check_picture(description.camera, settings.scale)
     if settings.device == "cpu":
-        sized = settings.reconstructor_config(description.width_px * description.height_px)
+        sized = settings.reconstructor_config(description.width_px * description.height_px, offline=offline)
         require_memory(
             replay_bytes(description, sized, offline=offline),
             f"{description.frame_count} frames of {description.name}",
@@ -275,11 +275,11 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
     return source
 
 
-def new_reconstructor(settings: ReplaySettings, source: FrameSource) -> Reconstructor:
-    """A reconstructor for the frames of a source."""
+def new_reconstructor(settings: ReplaySettings, source: FrameSource, *, offline: bool = False) -> Reconstructor:
+    """A reconstructor for the frames of a source; offline: for `fit`."""
     description = source.description
     return Reconstructor(
-        settings.reconstructor_config(description.width_px * description.height_px),
+        settings.reconstructor_config(description.width_px * description.height_px, offline=offline),
         description.camera,
         seed=settings.seed,
         recording_digest=description.digest,

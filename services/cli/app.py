@@ -11,10 +11,10 @@ from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
     DeviceOption,
     EvaluatedArgument,
+    EvaluateOptions,
     EvaluationOutOption,
     JsonOption,
     LiveOutOption,
-    MaxFramesOption,
     ModelArgument,
     OutOption,
     RecordingArgument,
@@ -192,42 +192,18 @@ def render(
 
 
 @app.command()
+@takes_run_options
 def evaluate(
     model: EvaluatedArgument,
     recording: RecordingArgument,
+    options: EvaluateOptions,
     out: EvaluationOutOption = None,
-    protocol: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="heldout, live, retention or causal (which learns from the recording again); more than once for several.",
-            show_default="all but causal",
-        ),
-    ] = None,
-    device: DeviceOption = "cpu",
-    renderer: RendererOption = "alpha",
-    scale: Annotated[
-        float | None, typer.Option(help="Resize the frames by this factor.", show_default="the model's")
-    ] = None,
-    max_frames: MaxFramesOption = None,
-    steps_per_frame: Annotated[
-        int | None, typer.Option(help="Optimiser steps per frame of causal.", show_default="the run's")
-    ] = None,
     json: JsonOption = False,
 ) -> int:
     """Measure a model or a run on a recording, beside what doing nothing scores."""
-    from operators.applications.evaluation import EvaluationSettings
-    from services.cli.evaluate import evaluate_command
+    from services.cli.evaluate import evaluate_command, evaluation_settings
 
-    settings = EvaluationSettings(
-        recording,
-        tuple(protocol or ()),
-        device=device,
-        renderer=renderer,
-        scale=scale,
-        max_frames=max_frames,
-        steps_per_frame=steps_per_frame,
-    )
-    return evaluate_command(model, settings, out, as_json=json)
+    return evaluate_command(model, evaluation_settings(recording, options), out, as_json=json)
 
 
 @app.command()
