@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -35,7 +36,9 @@ MOST_LINES = 100_000
 MOST_ARRIVED = 64
 """Frames that came in and may still be prepared for training."""
 CLOSE_S = 10.0
-"""How long `close` waits for what is in the queue."""
+"""How long `close` waits while nothing more of what is in the queue is written."""
+MOST_CLOSE_S = 60.0
+"""How long it waits at most."""
 NICENESS = 10
 """How far the thread steps back behind the graph where both want the processor."""
 _SLOW = "writing is too slow"
@@ -153,7 +156,7 @@ class SessionRecorder:
     def close(self, why: str = "the session ended") -> None:
         """Write what is in the queue and finish the files; without effect when it is not open.
 
-        Waits at most `CLOSE_S`. Raises what went wrong in the thread, unless it was the disk.
+        Waits while it is being written, but at most `MOST_CLOSE_S`. Raises what went wrong in the thread, unless it was the disk.
         """
         thread, self._thread = self._thread, None
         if thread is None:
@@ -162,7 +165,10 @@ class SessionRecorder:
             self._closing = True
             self._why = why
             self._changed.notify_all()
-        thread.join(CLOSE_S)
+        begun, left = time.monotonic(), -1
+        while thread.is_alive() and time.monotonic() - begun < MOST_CLOSE_S and left != len(self._waiting):
+            left = len(self._waiting)
+            thread.join(CLOSE_S)
         with self._changed:
             if thread.is_alive():
                 self._end(

@@ -246,6 +246,22 @@ def test_a_disk_that_does_not_answer_is_given_up(tmp_path, gate, monkeypatch):
     assert recorder.recorded.ended is not None and "does not answer" in recorder.recorded.ended
 
 
+def test_what_is_being_written_is_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(session_recorder, "CLOSE_S", 1.0)
+    written = SessionWriter.frame
+
+    def slow(self, frame):
+        time.sleep(0.1)
+        written(self, frame)
+
+    monkeypatch.setattr(SessionWriter, "frame", slow)
+    recorder = recorder_in(tmp_path)
+    for seq in range(16):
+        recorder.frame(new_frame(seq))
+    recorder.close()
+    assert (recorder.recorded.frames, recorder.recorded.ended) == (16, None)
+
+
 def test_a_folder_with_a_recording_is_refused(tmp_path):
     recorder_in(tmp_path).close()
     with pytest.raises(OutputError, match="already holds a recording"):
