@@ -42,6 +42,7 @@ MOST_CLOSE_S = 60.0
 NICENESS = 10
 """How far the thread steps back behind the graph where both want the processor."""
 _SLOW = "writing is too slow"
+_UNFIT = "no recording can hold it"
 What = Literal["frame", "prepared", "shown"]
 
 
@@ -250,7 +251,7 @@ class SessionRecorder:
             if wrong is None:
                 self._written[what] += 1
             else:
-                self._lost[f"{what}: {wrong}"] += 1
+                self._lost[f"{what}: {_UNFIT}"] += 1  # the line says why, which differs from frame to frame
 
     def _give_up(self, writer: SessionWriter, why: str) -> None:
         with self._changed:

@@ -165,13 +165,15 @@ def frame_of(line: FrameLine, pictures: SegmentPictures) -> Frame | None:
 
 
 def prepared_of(line: PreparedLine, arrived: Frame, pictures: SegmentPictures) -> Frame | None:
-    """What training was given of a frame; None where it cannot be decoded."""
+    """What training was given of a frame, damaged where a part of it, or the frame itself, is; None where there is no image at all."""
     planes, damage = pictures.of(line)
     for track in line.same:
         plane = getattr(arrived, track, None)
         if plane is not None:
             planes[track] = plane
-    return None if damage is not None else _frame(line, planes, line.damage)
+    if line.status != FrameStatus.DAMAGED.value and arrived.status is FrameStatus.DAMAGED:
+        damage = damage or arrived.damage
+    return _frame(line, planes, line.damage or damage)
 
 
 def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], damage: str | None) -> Frame | None:

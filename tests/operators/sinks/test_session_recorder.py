@@ -222,8 +222,9 @@ def test_a_frame_that_no_recording_can_hold_is_counted(tmp_path):
     recorder.frame(new_frame(2))
     recorder.close()
     assert [frame.seq for frame in frames_of(tmp_path)] == [0, 2]
-    (what,) = recorder.recorded.lost or {}
-    assert what.startswith("frame: ")
+    assert recorder.recorded.lost == {"frame: no recording can hold it": 1}
+    (line,) = (line for _, line in SessionReader(tmp_path / "s").lines() if isinstance(line, LostLine))
+    assert line.seq == 1 and "pose" in line.why
 
 
 def test_a_bug_in_the_thread_is_raised_where_it_is_closed(tmp_path, monkeypatch):
