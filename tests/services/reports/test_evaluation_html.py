@@ -83,13 +83,14 @@ def content():
         "baselines": [
             *copies(), baseline("half_velocity_flow", "every", 38.25), baseline("previous_frame", "heldout", 37.25),
             baseline("half_way_flow", "heldout", 41.75, sees_future=True), baseline("last_frame", "last", 20.5),
+            baseline("previous_frame", "live", 37.0), baseline("previous_frame", "settled", 37.5),
         ],
         "left_out": {"withheld": 1},
         "notes": ["no <mask>"],
         "outputs": {},
         "series": {
             "baselines": entries(half_velocity_flow_db=31.0, previous_frame_db=30.0, half_way_flow_db=34.0),
-            "causal": entries(), "heldout": entries(), "live": entries(age_ms=40.0, behind=0), "retention": entries(),
+            "causal": entries(), "heldout": entries(), "live": entries(age_ms=40.0, behind=0, previous_frame_db=29.0), "retention": entries(),
         },
         "series_frames_per_entry": {"causal": 12},
     }  # fmt: skip
@@ -112,7 +113,7 @@ def test_nothing_is_fetched_from_anywhere_and_nothing_can_be_injected(report):
 def test_each_protocol_stands_beside_its_baselines(report):
     text = render_evaluation(report)
     for said in (
-        "42.50", "39.25", "38.50", "36.50", "+1.00 dB", "+5.50 dB", "-3.25 dB", "+16.00 dB", "41.75", "(sees the future)", "37.00",
+        "42.50", "39.25", "38.50", "36.50", "+1.00 dB", "+5.50 dB", "+6.00 dB", "-3.25 dB", "+16.00 dB", "41.75", "(sees the future)", "37.00",
         "Held out: not scored 2 (damaged)", "Baselines: not scored 1 (withheld)", "1.500 mm", "99.5 %",
         "31.50, –, 33.50", "1 by 1, 1 by 8 or more", "Each point is the mean of 12 frames.", "40 steps a frame", "43.50",
     ):  # fmt: skip
