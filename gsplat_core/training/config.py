@@ -105,6 +105,14 @@ class ReconstructorConfig:
         if not 0 < self.newest_share <= 1:
             raise InvalidSetting(f"newest_share is {self.newest_share}; it must be in (0, 1]")
 
+    @classmethod
+    def offline(cls, field: str = "auto") -> ReconstructorConfig:
+        """The configuration for `Reconstructor.fit`, which has time for more Gaussians than a stream.
+
+        It starts with `gaussians` and ends with `max_gaussians`.
+        """
+        return cls(field=field, gaussians=60_000, max_gaussians=80_000, squared_error=True)
+
     @property
     def chosen_field(self) -> str:
         """The field's own name: for `auto`, of the field that it stands for."""

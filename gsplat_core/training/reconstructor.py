@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,6 +26,7 @@ from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion_prior
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
+from gsplat_core.training.offline import FitSettings, OfflineTraining
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
@@ -196,9 +196,13 @@ class Reconstructor:
         self._step_s = known + STEP_TIME_DECAY * (spending.step_s - known)
 
     def fit(
-        self, frames: Iterable[Frame], steps: int, progress: Callable[[int, Tensor], None] | None = None
+        self,
+        frames: Iterable[Frame],
+        steps: int,
+        progress: Callable[[int, Tensor], None] | None = None,
+        settings: FitSettings | None = None,
     ) -> ObserveReport:
-        """Train offline on all of `frames`, in random order, the rates decaying exponentially to a tenth.
+        """Train offline on all of `frames`, as `settings` say; `ReconstructorConfig.offline` is the configuration for it.
 
         `progress(step, loss)` is called after each step; on a GPU reading the loss, a tensor [] on the device, waits for the step. All
         frames are held in the device's memory (1 byte per channel).
@@ -220,16 +224,14 @@ class Reconstructor:
         self._last_time_s = observations[-1][1].time_s
         for frame, observation in observations[1:]:
             self._grow(frame, observation)
-        random = np.random.default_rng(self._seed)
-        order: list[int] = []
-        loss = torch.zeros(())
-        for step in range(steps):
-            if not order:
-                order = random.permutation(len(observations)).tolist()
-            loss = self._step(observations[order.pop()][1], rate_scale=0.1 ** (step / steps))
-            if progress is not None:
-                progress(step + 1, loss)
-        self._step.settle(observations[-1][1], rate_scale=0.1)
+        training = OfflineTraining(
+            self._step,
+            [observation for _, observation in observations],
+            settings or FitSettings(),
+            most_gaussians=self.config.max_gaussians,
+            seed=self._seed,
+        )
+        loss = training(steps, progress)
         return ObserveReport(observations[-1][0].seq, steps, HostCopy(loss), self.gaussians)
 
     def snapshot(self) -> Model:

@@ -107,33 +107,26 @@ class TrainingStep:
         """Gaussians and field with memory of their own, free of training state."""
         return self.gaussians.detach().clone(), self.field.detached_copy()
 
-    def append(self, added: Gaussians) -> None:
-        """Add Gaussians, which start still."""
+    def append(self, added: Gaussians, parents: Tensor | None = None) -> None:
+        """Add Gaussians, which start still, or move as those at `parents` (int64 indices) do."""
         if self._rows is not None:
             self._rows.append(added)
             self.gaussians = self._rows.used
         else:
             self.gaussians = self.gaussians.append(added)
-        self.field.append(added)
+        self.field.append(added, parents)
         self._adam.append(added.count)
 
-    def split(self, kept: Tensor, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
-        """Keep the Gaussians in `kept` (int64 indices), and put two in the place of each of those at `parents` (indices into `kept`).
+    def split(self, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
+        """Put two Gaussians, made by `halves`, in the place of each of those at `parents` (int64 indices); both move as their parent does.
 
-        `halves` makes the two; both move as their parent does. The new ones, and their parents' Gaussians, start with fresh moments.
+        The second ones come last. All of them start with fresh moments.
         """
-        gaussians = self.gaussians.select(kept)
-        first, second = halves(gaussians.select(parents))
-        changed = gaussians.map(Tensor.clone)
-        for name, tensor in changed.tensors().items():
+        first, second = halves(self.gaussians.select(parents))
+        for name, tensor in self.gaussians.tensors().items():
             tensor[parents] = first.tensors()[name]
-        self.gaussians = changed.append(second)
-        self.field.select(kept)
-        self.field.append(second, parents)
-        self._adam.select(kept)
-        for name in self._adam.first_moments:
             self._adam.reset(name, parents)
-        self._adam.append(second.count)
+        self.append(second, parents)
 
     def remove(self, leaving: Tensor) -> RowMoves:
         """Let the Gaussians marked in `leaving`, bool [N], go; returns how the others moved. Waits for the device."""
