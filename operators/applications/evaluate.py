@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
@@ -19,6 +20,7 @@ from gsplat_core.evaluation.retention import Retention, Return, evaluate_retenti
 from gsplat_core.evaluation.scores import Record
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.model import Model
+from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded
 from operators.applications.evaluated import EvaluatedRun, Playback, SeenFrames, fitting_source, frame_tolerance_s
 from operators.applications.evaluation import PROTOCOLS, WITHOUT_LEARNING, CausalRun, Evaluation, EvaluationSettings
@@ -26,7 +28,7 @@ from operators.applications.limits import check_picture
 from operators.applications.live_log import is_live_log, read_live_log
 from operators.applications.memory import render_bytes, replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
-from operators.applications.replay import ReplaySettings, new_reconstructor
+from operators.applications.replay import ReplaySettings
 from operators.frame_log import FRAMES_FILE, FrameLog, read_frames
 from operators.sources.source import FrameSource
 
@@ -164,14 +166,15 @@ class _Work:
         settings = self._learning_settings()
         description = self.source.description
         config = settings.reconstructor_config(description.width_px * description.height_px)
+        if self.settings.motion_prior is not None:
+            config = replace(config, motion_prior=self.settings.motion_prior)
         if settings.device == "cpu":
             require_memory(replay_bytes(description, config), "the causal protocol", "give a smaller --scale")
+        learning = Reconstructor(config, self.camera, seed=settings.seed, device=settings.device)
         pictures = PictureMaker(self.camera, settings.device, self.settings.renderer)
         with self._log("causal") as record, seeded(settings.seed, settings.device):
-            score = evaluate_causal(
-                self._frames("causal"), new_reconstructor(settings, self.source), pictures, record=record
-            )
-        return CausalRun(score, config.chosen_field, config.steps_per_frame, settings.seed)
+            score = evaluate_causal(self._frames("causal"), learning, pictures, record=record)
+        return CausalRun(score, config.chosen_field, config.steps_per_frame, settings.seed, config.motion_prior)
 
     def _learning_settings(self) -> ReplaySettings:
         """How the causal protocol learns: as the run did."""

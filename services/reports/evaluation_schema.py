@@ -71,6 +71,7 @@ class CausalFacts(Part):
     field: str
     steps_per_frame: int
     seed: int
+    motion_prior: str
 
 
 class AgeFacts(Part):

@@ -104,6 +104,14 @@ def test_reports_are_written_and_the_table_is_printed(intrasplat, long, offline,
     assert not (out / "evaluation-causal.jsonl").exists(), "a new evaluation replaces the earlier one whole"
 
 
+def test_the_motion_prior_of_the_prediction_can_be_chosen(intrasplat, long, offline):
+    few = ("--protocol", "causal", "--steps-per-frame", 2, "--max-frames", 5)
+    flow, plain = (evaluated(intrasplat, offline, long, *few, *more) for more in (("--motion-prior", "flow"), ()))
+    assert flow.causal is not None and plain.causal is not None
+    assert (flow.causal.motion_prior, plain.causal.motion_prior) == ("flow", "bumps")
+    assert flow.series["causal"] != plain.series["causal"]
+
+
 def test_a_prediction_depends_on_nothing_that_comes_later(intrasplat, long, offline, tmp_path):
     whole = evaluated(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2)
     start = evaluated(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2, "--max-frames", 6)
@@ -160,6 +168,7 @@ def test_the_size_of_the_model_is_taken_unless_another_one_is_asked_for(intraspl
         (["--scale", "0"], "scale must be a positive number"),
         (["--steps-per-frame", "0"], "steps_per_frame"),
         (["--max-frames", "0"], "max_frames"),
+        (["--motion-prior", "magic"], "magic"),
         (["--device", "abacus"], "is not known"),
         (["--renderer", "crayon"], "crayon"),
     ],
