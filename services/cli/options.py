@@ -105,6 +105,9 @@ class EvaluateOptions:
     steps_per_frame: Annotated[
         int | None, typer.Option(help="Optimiser steps per frame of causal.", show_default="the run's")
     ] = None
+    motion_prior: Annotated[
+        str | None, typer.Option(help="What causal assumes about motion: bumps or flow.", show_default="bumps")
+    ] = None
     place: PlaceOption = None
 
 
