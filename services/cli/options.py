@@ -30,7 +30,7 @@ def _path_option(name: str, help_text: str) -> Any:
 
 
 RecordingArgument = Annotated[
-    Path, _path_argument("RECORDING", "A video, or a folder with video.mp4, images/ or cameras.json.")
+    Path, _path_argument("RECORDING", "A video, or a folder with video.mp4, images/, cameras.json or session.json.")
 ]
 SourceArgument = Annotated[
     str,
