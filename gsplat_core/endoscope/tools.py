@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.endoscope.small_picture import averaged
 from gsplat_core.endoscope.tool_regions import Regions, neighbourhood, tool_regions, whole_tools
 from gsplat_core.errors import InvalidInput
 
@@ -113,7 +114,9 @@ class ToolFinder:
     def _stretched(self, redness: Plane, lit: Flags) -> Plane:
         """Redness with the scene's contrast taken out, after the running distribution has taken in this frame's."""
         values = redness[lit]
-        reach = float(np.partition(values, int(0.75 * (values.size - 1)))[int(0.75 * (values.size - 1))])
+        some = values[::4]
+        at = int(0.75 * (some.size - 1))
+        reach = float(np.partition(some, at)[at])
         stretch = RED_SCENE / min(max(reach, PALEST_SCENE), RED_SCENE)
         histogram = _histogram(values * np.float32(stretch))
         if self._histogram is not None and np.abs(histogram - self._histogram).sum() > OTHER_SCENE:
@@ -132,9 +135,7 @@ def view_of(image: NDArray[np.uint8]) -> View:
     height, width = image.shape[:2]
     scale = min(1.0, LONG_SIDE_PX / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    # Twice the rows and columns that are needed are averaged; taking the others in would change little and cost more.
-    step = max(1, max(height, width) // (2 * LONG_SIDE_PX))
-    small = cv2.resize(np.ascontiguousarray(image[::step, ::step]), size, interpolation=cv2.INTER_AREA)
+    small = averaged(image, size)
     red, green, blue = cv2.split(small)
     brightness = np.asarray(cv2.max(cv2.max(red, green), blue), np.uint8)
     inside = field_of_view(brightness)
