@@ -60,7 +60,7 @@ class Options:
     average: float = 0.04
     """Horizon of the moving average, as a share of all steps."""
     smooth: float = 0.0
-    smooth_every: int = 10
+    smooth_every: int = 20
     decay: float = 0.0
     seconds: float | None = None
     steps: int | None = None
@@ -75,6 +75,7 @@ class Options:
     """Gaussians at its end, at full size."""
     until: float = 0.5
     unseen: float = 0.05
+    epsilon: float = 1e-8
     cloned_from: int = 0
     beta2: float = 0.999
 
@@ -166,6 +167,7 @@ class Run:
             self.learning._grow(frame, observation)
         self.step: TrainingStep = self.learning._step
         self.step._adam.betas = (0.9, options.beta2)
+        BasisField.adam_step_at.__defaults__ = ((0.9, 0.999), options.epsilon)
         self.average: list[Tensor] | None = None
 
     def _start_hexplane(self, config: ReconstructorConfig, first, last) -> None:  # type: ignore[no-untyped-def]

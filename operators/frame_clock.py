@@ -32,8 +32,8 @@ class ClockSettings:
 
     budget_ms: float | None = None
     """A frame is to be shown so long after it has come; None: `auto_share` of the time between frames, at most `auto_most_ms`."""
-    auto_share: float = 0.5
-    auto_most_ms: float = 18.0
+    auto_share: float = 0.6
+    auto_most_ms: float = 18.3
     at_least_steps: int = 5
     """Steps that every frame gets, though it is shown late: fewer would change nothing that can be seen."""
     at_most_steps: int = 80

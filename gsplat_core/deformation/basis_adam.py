@@ -38,3 +38,7 @@ class Moments:
     def map(self, change: Callable[[Tensor], Tensor]) -> Moments:
         """The same change of rows or columns applied to every tensor."""
         return Moments([change(t) for t in self.first], [change(t) for t in self.second], change(self.steps))
+
+    def of_first(self, count: int) -> Moments:
+        """Those of the first `count` Gaussians, in the same memory."""
+        return self if count == self.steps.shape[0] else self.map(lambda tensor: tensor[:count])

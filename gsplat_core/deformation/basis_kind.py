@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.basis import COLUMNS_AHEAD, BasisField
+from gsplat_core.deformation.basis import BasisField
 from gsplat_core.deformation.basis_adam import BasisRates
+from gsplat_core.deformation.basis_columns import COLUMNS_AHEAD
 from gsplat_core.deformation.kind import FieldKind, NewField
 from gsplat_core.deformation.rates import FieldRates
 from gsplat_core.scene.gaussians import Gaussians
@@ -94,11 +95,14 @@ class CapturedBasisTraining:
 
 
 def new_basis_field(wanted: NewField) -> BasisField:
-    """Columns `spacing_s` apart over the window; online over what `BasisField.cover` keeps ahead."""
+    """Columns `spacing_s` apart over the window; online over what `BasisField.cover` keeps ahead, as a ring where only so much is kept."""
     spacing_s = wanted.spacing_s
     span_s = COLUMNS_AHEAD * spacing_s if wanted.end_s is None else max(wanted.end_s - wanted.start_s, spacing_s)
     bumps = max(4, round(span_s / spacing_s) + 3)
-    return BasisField(wanted.gaussians.count, (wanted.start_s, wanted.start_s + span_s), bumps=bumps)
+    field = BasisField(wanted.gaussians.count, (wanted.start_s, wanted.start_s + span_s), bumps=bumps)
+    if wanted.end_s is None and wanted.history_s is not None:
+        field.keep_last(wanted.history_s)
+    return field
 
 
 KIND = FieldKind(

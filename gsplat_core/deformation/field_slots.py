@@ -5,12 +5,14 @@ A captured CUDA graph can therefore read the field of every published snapshot. 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
 
 from gsplat_core.deformation.basis_columns import INERT, INERT_CENTER, bump_capacity
+from gsplat_core.deformation.continuation import Continuation
 
 if TYPE_CHECKING:
     from gsplat_core.deformation.basis import BasisField
@@ -65,10 +67,14 @@ class BasisSlot:
     """A basis field with capacity for more Gaussians and more bumps than it has; those that are not in use are inert."""
 
     def __init__(self, source: BasisField, rows: int) -> None:
+        # A ring has its places from the start, and the copy has the same ones.
+        places = source.columns.places if source.columns.is_ring else bump_capacity(source.bumps)
         with torch.device(source.weights.device):
-            self.field = type(source)(rows, source.time_window_s, bumps=bump_capacity(source.bumps))
+            self.field = type(source)(rows, source.time_window_s, bumps=places)
         self.field.requires_grad_(False)
         self.field.centers.data.fill_(INERT_CENTER)
+        if source.continuation is not None:
+            self.field.continuation = Continuation(rows, source.weights.device)
         self._used = 0, 0
         self._in_use: list[Tensor] = [tensor.data[:0, :0] for tensor in self.field.parameters()]
 
@@ -82,16 +88,32 @@ class BasisSlot:
         """Copy the bumps and the layout of the columns, and make inert what an earlier state had used beyond them."""
         if not isinstance(source, type(self.field)):
             return False
-        count, bumps = source.count, source.bumps
-        if count > self.field.count or bumps > self.field.bumps:
+        if source.continuation is not None and self.field.continuation is None:
             return False
-        if self._used != (count, bumps):
-            self._use(count, bumps)
+        count, columns = source.count, source.columns
+        places = int(self.field.weights.shape[1])
+        if count > self.field.count or columns.count > places or (columns.is_ring and columns.places != places):
+            return False
+        if self._used != (count, columns.count):
+            self._use(count, columns.count)
         theirs = (source.centers.data, source.log_widths.data, source.weights.data)
-        copy_each(self._in_use, [values[:, :bumps] for values in theirs])
-        for name in ("_time_window_s", "_origin_s", "_spacing_s"):
-            setattr(self.field, name, getattr(source, name))
+        # Bumps lie at the first places, or in a ring at all of them.
+        copy_each(self._in_use, [values[:count, : columns.count] for values in theirs])
+        self.field._time_window_s = source.time_window_s
+        self.field._columns = replace(columns, places=places)
+        self._continue(source.continuation)
         return True
+
+    def _continue(self, source: Continuation | None) -> None:
+        """Continue as `source` does, or not at all."""
+        mine = self.field.continuation
+        if mine is None:
+            return
+        if source is None:
+            mine.stop()
+            return
+        mine.write(source.velocity, source.from_s, source.horizon_s)
+        mine.set_clock(self.field.tau, self.field.spacing_s)
 
     def _use(self, count: int, bumps: int) -> None:
         """Choose the part of every tensor that is written, and make inert what an earlier state had used beyond it."""
@@ -107,7 +129,7 @@ class BasisSlot:
 
     def exact_copy(self) -> DeformationField:
         """A field of as many Gaussians and bumps as are in use."""
-        count, bumps = self._used
-        copied = self.field.detached_copy()
-        copied._set_parameters(*(p.data[:count, :bumps] for p in copied._parameters_in_order()))
+        copied = self.field._copy_of(self._used[0])
+        if self.field.continuation is not None:
+            copied.continuation = self.field.continuation.of_first(self._used[0])
         return copied

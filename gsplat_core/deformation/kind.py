@@ -29,6 +29,8 @@ class NewField:
     """The last frame's time; None online, where it is not known and `DeformationField.cover` follows the frames."""
     spacing_s: float
     """The shortest time, in seconds, within which motion has to change its course."""
+    history_s: float | None = None
+    """How much of the past, in seconds, has to stay deformable online; None: all of it."""
 
     @property
     def time_window_s(self) -> tuple[float, float]:

@@ -16,12 +16,13 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import DeformationField
+from gsplat_core.deformation.field import DeformationField, continued_window
 from gsplat_core.deformation.field_slots import FieldSlot, copy_each
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model, clamp_time
+from gsplat_core.scene.rows import inert_gaussians
 
 ROW_STEP = 1024
 """The capacity for Gaussians is a multiple of this."""
@@ -33,8 +34,10 @@ MOST_SLOTS = 8
 class SnapshotSlot:
     """Memory for one snapshot. Made and written by `SnapshotSlots`; read inside `Snapshot.reading`."""
 
-    def __init__(self, number: int, device: torch.device) -> None:
+    def __init__(self, number: int, device: torch.device, rows: int = 0) -> None:
+        """`rows` are the fewest that it has room for from the start."""
         self.number = number
+        self._fewest_rows = rows
         self.layout = 0
         """Counts up when the tensors are replaced by larger ones: what was captured for the old ones is void then."""
         self._gaussians: Gaussians | None = None
@@ -92,8 +95,11 @@ class SnapshotSlot:
         return True
 
     def _replace(self, gaussians: Gaussians, field: DeformationField | None) -> None:
-        rows = math.ceil(max(gaussians.count * ROW_HEADROOM, 1) / ROW_STEP) * ROW_STEP
-        self._gaussians = _inert_gaussians(gaussians, rows)
+        wanted: float = self._fewest_rows
+        if gaussians.count > wanted or wanted == 0:
+            wanted = max(gaussians.count * ROW_HEADROOM, 1)
+        rows = math.ceil(wanted / ROW_STEP) * ROW_STEP
+        self._gaussians = inert_gaussians(gaussians, rows)
         self._count, self._in_use = 0, []
         self._field = None if field is None else field.slot(rows)
         self.layout += 1
@@ -145,8 +151,8 @@ class Snapshot:
             self.slot._order.after_reading()
 
     def clamp_time(self, time_s: float) -> float:
-        """`time_s` brought into the time window."""
-        return clamp_time(time_s, self.time_window_s)
+        """`time_s` brought into the time window, or into what the field continues after it."""
+        return clamp_time(time_s, continued_window(self.time_window_s, self.slot.field))
 
     def at(self, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`, clamped to the window, in memory of their own."""
@@ -172,8 +178,10 @@ class Snapshot:
 class SnapshotSlots:
     """The slots of one publisher. One thread publishes; any threads hold snapshots."""
 
-    def __init__(self, device: torch.device | str, most: int = MOST_SLOTS) -> None:
+    def __init__(self, device: torch.device | str, most: int = MOST_SLOTS, rows: int = 0) -> None:
+        """`rows`: Gaussians that every slot has room for from the start; 0: a quarter more than it gets first."""
         self._device = torch.device(device)
+        self._rows = rows
         self._most = most
         self._slots: list[SnapshotSlot] = []
 
@@ -223,7 +231,7 @@ class SnapshotSlots:
             raise InvalidInput(
                 f"all {self._most} snapshots of this publisher are held; let go of some, or keep Snapshot.as_model()"
             )
-        self._slots.append(SnapshotSlot(len(self._slots), self._device))
+        self._slots.append(SnapshotSlot(len(self._slots), self._device, self._rows))
         return self._slots[-1]
 
 
@@ -261,11 +269,3 @@ class _DeviceOrder:
 
 def _fits(gaussians: Gaussians, capacity: Gaussians) -> bool:
     return gaussians.count <= capacity.count and gaussians.sh_degree == capacity.sh_degree
-
-
-def _inert_gaussians(like: Gaussians, rows: int) -> Gaussians:
-    """Gaussians that no renderer shows, with the harmonics, type and device of `like`."""
-    inert = like.map(lambda tensor: tensor.new_zeros(rows, *tensor.shape[1:]))
-    inert.quats[:, 0] = 1
-    inert.logit_opacities.fill_(-math.inf)
-    return inert

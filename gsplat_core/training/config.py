@@ -58,12 +58,20 @@ class ReconstructorConfig:
     """The shortest time within which motion changes its course: the time between the basis functions of the basis field."""
     squared_error: bool = False
     """Whether colours are compared by the squared error, which PSNR measures, in place of L1."""
+    history_s: float | None = None
+    """How much of the past stays deformable online, with the basis field; None: all of it, in memory that grows with the stream."""
+    preallocate: bool = False
+    """Take the memory for `max_gaussians` at once, so that nothing is captured again when Gaussians join or leave."""
     ssim_weight: float = 0.0
     """Weight of 1 - SSIM beside L1 or the squared error, 0..1."""
     depth_weight: float = 0.02
     """Weight of the inverse-depth term where the recording has depth."""
     default_depth_mm: float = 60.0
     """Distance of the plane on which a recording without depth starts."""
+    motion_prior: str = "bumps"
+    """What is assumed about motion after the newest frame: a name in `MOTION_PRIORS`."""
+    start_from_motion: bool = False
+    """Whether a motion prior moves the scene to where a new frame shows it, before the first step on that frame."""
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:
@@ -86,12 +94,24 @@ class ReconstructorConfig:
         for name in ("bump_spacing_s", "default_depth_mm", "jump_ratio"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be positive")
+        if self.history_s is not None and not 0 < self.history_s < math.inf:
+            raise InvalidSetting(
+                f"history_s is {self.history_s}; it must be a positive number of seconds, or None for all"
+            )
         if not 0 <= self.ssim_weight <= 1:
             raise InvalidSetting(f"ssim_weight is {self.ssim_weight}; it must be between 0 and 1")
         if not 0 <= self.depth_weight < math.inf:
             raise InvalidSetting(f"depth_weight is {self.depth_weight}; it must be at least 0")
         if not 0 < self.newest_share <= 1:
             raise InvalidSetting(f"newest_share is {self.newest_share}; it must be in (0, 1]")
+
+    @classmethod
+    def offline(cls, field: str = "auto") -> ReconstructorConfig:
+        """The configuration for `Reconstructor.fit`, which has time for more Gaussians than a stream.
+
+        It starts with `gaussians` and ends with `max_gaussians`.
+        """
+        return cls(field=field, gaussians=60_000, max_gaussians=80_000, squared_error=True)
 
     @property
     def chosen_field(self) -> str:

@@ -36,8 +36,9 @@ class CapturedCoverage:
     tenth of the launches of deforming and rendering the scene where it is.
     """
 
-    def __init__(self, camera: Camera, device: torch.device) -> None:
-        self._slots = SnapshotSlots(device, most=2)  # the renderer holds one while the other is written
+    def __init__(self, camera: Camera, device: torch.device, rows: int = 0) -> None:
+        """`rows`: Gaussians that the scene has room for; 0: a quarter more than it has first."""
+        self._slots = SnapshotSlots(device, most=2, rows=rows)  # the renderer holds one while the other is written
         self._renderer = AlphaRenderer(camera, device)
 
     def leaves_much_uncovered(self, gaussians: Gaussians, field: DeformationField, observation: Observation) -> bool:

@@ -92,6 +92,10 @@ class FusedStep:
             self._captured = CapturedSequence(self._sequence, self._image.device, self._memory, warm_up=False)
         return self._captured.replay().clone()
 
+    def restart(self) -> None:
+        """The tensors hold another scene and Adam counts its steps from 1 again; nothing is captured anew."""
+        self._step.fill_(self._adam.steps)
+
     def _take(self, observation: Observation) -> None:
         """Copy an observation to where the graph reads it."""
         if observation is self._taken:

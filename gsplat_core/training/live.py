@@ -10,7 +10,9 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.observations import Observation, ObservationWindow
-from gsplat_core.training.reconstructor import ObserveReport, Reconstructor
+from gsplat_core.training.observe_report import ObserveReport
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
 REHEARSED_IN_FLIGHT = 2
@@ -65,7 +67,15 @@ class LiveReconstructor(Reconstructor):
     ) -> None:
         super().__init__(config, camera, seed=seed, recording_digest=recording_digest, device=device)
         self._live = live or LiveTraining()
+        self._kept_size: tuple[int, int] | None = None
+        self._kept: TrainingStep | None = None
+        """That of the scene before, whose memory the next scene takes over."""
         self._rehearsing = StepsInFlight(self.device, most=REHEARSED_IN_FLIGHT)
+
+    def kept(self) -> dict[str, int]:
+        """How much of the stream is held, by what holds it; none of it grows without end."""
+        columns = 0 if self._step is None else getattr(self._step.field, "bumps", 0)
+        return {"window_frames": len(self._window), "columns": columns}
 
     def rehearse(self, steps: int) -> None:
         """So many steps on frames of the window. On a GPU they are queued, and at most `REHEARSED_IN_FLIGHT` of them are not finished when
@@ -93,7 +103,8 @@ class LiveReconstructor(Reconstructor):
     def forget(self) -> None:
         """As if no frame had been observed, but for what is known about the device: the memory that was taken, how long a step takes."""
         self._settle()
-        self._step = self._coverage = None
+        self._kept = self._step or self._kept
+        self._step = None
         self._version = 0
         self._window = ObservationWindow(self.config.window_frames, self.config.newest_share, self._seed)
 
@@ -104,6 +115,21 @@ class LiveReconstructor(Reconstructor):
         self._version = version
         if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
             self.camera = self.camera.resized(frame.width_px, frame.height_px)
+
+    def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
+        kept, self._kept = self._kept, None
+        camera = observation.camera
+        same_size = self._kept_size == (camera.width_px, camera.height_px)
+        self._kept_size = camera.width_px, camera.height_px
+        if kept is not None and same_size and end_s is None:
+            gaussians = self._first_gaussians(frame, observation)
+            if kept.restart(gaussians, observation.time_s, self.camera):
+                self._step = kept
+                if self._prior is not None:
+                    self._prior.forget()
+                return
+        self._coverage = None
+        super()._start(frame, observation, end_s)
 
     def _train_on(self, observation: Observation, budget: Budget, first: bool) -> ObserveReport:
         assert self._step is not None

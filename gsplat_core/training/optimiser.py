@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.adam.adam import adam_step_queued
+from gsplat_core.scene.rows import RowMoves
 
 
 class FusedAdam:
@@ -46,6 +47,8 @@ class FusedAdam:
         self.steps = 0
         """Steps taken."""
         self._skipped: int | Tensor = 0
+        self._spare_rows = 0
+        """Rows at the end of the moments that no Gaussian has yet; see `reserve`."""
         self.first_moments = {name: _zeros(tensor) for name, tensor in parameters.items()}
         self.second_moments = {name: _zeros(tensor) for name, tensor in parameters.items()}
         self.learning_rates = self._checked_rates(learning_rates) if learning_rates is not None else {}
@@ -88,7 +91,8 @@ class FusedAdam:
             InvalidInput: a tensor or its rate is missing, or its shape is not that of its moments.
         """
         self.learning_rates = self._checked_rates({**self.learning_rates, **(learning_rates or {})})
-        for name, moment in self.first_moments.items():
+        first_moments, second_moments = (self._in_use(each) for each in (self.first_moments, self.second_moments))
+        for name, moment in first_moments.items():
             if name not in parameters or parameters[name].shape != moment.shape:
                 shape = list(parameters[name].shape) if name in parameters else "nothing"
                 raise InvalidInput(
@@ -96,7 +100,7 @@ class FusedAdam:
                 )
         self.steps += 1
         counts: list[Tensor] = []
-        for name, first in self.first_moments.items():
+        for name, first in first_moments.items():
             parameter = parameters[name]
             gradient = parameter.grad if gradients is None else gradients.get(name)
             if gradient is None or first.numel() == 0:
@@ -106,7 +110,7 @@ class FusedAdam:
                 parameter.detach(),
                 gradient,
                 first,
-                self.second_moments[name],
+                second_moments[name],
                 self.steps,
                 self.learning_rates[name],
                 self.betas,
@@ -124,23 +128,50 @@ class FusedAdam:
     def count(self) -> int:
         """Number of rows (Gaussians)."""
         self._need_rows()
-        return next(iter(self.first_moments.values())).shape[0] if self.first_moments else 0
+        rows = next(iter(self.first_moments.values())).shape[0] if self.first_moments else 0
+        return rows - self._spare_rows
+
+    def reserve(self, rows: int) -> None:
+        """Take the memory for `rows` Gaussians now: `append` and `close_gaps` then move no tensor until there are more."""
+        added = rows - self.count - self._spare_rows
+        if added > 0:
+            for moments in (self.first_moments, self.second_moments):
+                for name, moment in moments.items():
+                    moments[name] = torch.cat([moment, moment.new_zeros((added, *moment.shape[1:]))])
+            self._spare_rows += added
+
+    def close_gaps(self, moves: RowMoves) -> None:
+        """Let Gaussians leave, as the rows that they were in are closed."""
+        self._need_rows()
+        for moments in (self.first_moments, self.second_moments):
+            for moment in moments.values():
+                moves.apply(moment, 0.0)
+        self._spare_rows += moves.before - moves.count
+
+    def restart(self, count: int) -> None:
+        """Forget everything, for `count` other Gaussians; the tensors stay where they are."""
+        self.reserve(count)
+        self._spare_rows += self.count - count
+        self.steps = 0
+        for moments in (self.first_moments, self.second_moments):
+            for moment in moments.values():
+                moment.zero_()
 
     def select(self, index: Tensor) -> None:
         """Keep the moments of some rows, as `Gaussians.select(index)` does: booleans [N] or indices, in their order."""
         self._need_rows()
         for moments in (self.first_moments, self.second_moments):
-            for name, moment in moments.items():
+            for name, moment in self._in_use(moments).items():
                 moments[name] = moment[index].contiguous()
+        self._spare_rows = 0
 
     def append(self, count: int) -> None:
         """Add rows with zero moments at the end; they share the step count, so their first steps are up to 3 times the usual."""
         self._need_rows()
         if count < 0:
             raise InvalidInput(f"cannot append {count} rows")
-        for moments in (self.first_moments, self.second_moments):
-            for name, moment in moments.items():
-                moments[name] = torch.cat([moment, moment.new_zeros((count, *moment.shape[1:]))])
+        self.reserve(self.count + count)
+        self._spare_rows -= count
 
     def follow(self, parameters: Mapping[str, Tensor]) -> None:
         """Make the moments fit tensors that were replaced by others of another shape.
@@ -164,6 +195,12 @@ class FusedAdam:
                 moments[name].zero_()
             else:
                 moments[name][index] = 0
+
+    def _in_use(self, moments: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The moments without the spare rows."""
+        if self._spare_rows == 0:
+            return dict(moments)
+        return {name: moment[: moment.shape[0] - self._spare_rows] for name, moment in moments.items()}
 
     def _need_rows(self) -> None:
         if not self.rows:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,14 +15,18 @@ from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
-from gsplat_core.training.budget import Budget, Ending, Spending, StepsInFlight
+from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.coverage import CapturedCoverage
 from gsplat_core.training.growth import gaussians_for_uncovered_tissue
 from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion_prior
 from gsplat_core.training.observations import Observation, ObservationWindow
+from gsplat_core.training.observe_report import ObserveReport
+from gsplat_core.training.offline import FitSettings, OfflineTraining
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
@@ -33,24 +36,6 @@ STEP_TIME_DECAY = 0.3
 """How fast the usual time of a step follows the newest frames', where budgets are timed."""
 
 
-@dataclass(frozen=True)
-class ObserveReport:
-    """What one frame changed."""
-
-    seq: int
-    steps: int
-    arriving_loss: HostCopy | None
-    """Loss of the last step, which a GPU may not have finished; None when the frame was not trained on."""
-    gaussians: int
-    ending: Ending = "steps"
-    """Why training on the frame ended."""
-
-    @property
-    def loss(self) -> float | None:
-        """Loss of the last step; waits for it."""
-        return None if self.arriving_loss is None else self.arriving_loss.item()
-
-
 class Reconstructor:
     """Owns the model that is being learned.
 
@@ -58,8 +43,7 @@ class Reconstructor:
     settings and seed give the same model. With the basis field that holds for any number of threads; the HexPlane's network is
     trained by torch's matrix products, which round differently with another number.
 
-    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares the next frame; the host waits for
-    it where that one is searched for uncovered tissue.
+    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares the next frame.
     """
 
     def __init__(
@@ -78,6 +62,7 @@ class Reconstructor:
         self._recording_digest = recording_digest
         self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
         self._step: TrainingStep | None = None
+        self._prior: MotionPrior | None = None
         self._coverage: CapturedCoverage | None = None
         self._unsettled: Observation | None = None
         """The frame whose steps are queued; whether their splats fitted the tile lists is not known yet."""
@@ -85,7 +70,7 @@ class Reconstructor:
         self._step_s: float | None = None
         """How long a step took lately, where budgets are timed."""
         self._version = 0
-        self._slots = SnapshotSlots(self.device)
+        self._slots = SnapshotSlots(self.device, rows=self._fixed_rows)
         self._usual_first_loss = math.inf
         self._first_time_s = 0.0
         self._last_time_s = 0.0
@@ -94,6 +79,19 @@ class Reconstructor:
     def gaussians(self) -> int:
         """How many Gaussians the model has now."""
         return 0 if self._step is None else self._step.gaussians.count
+
+    @property
+    def _fixed_rows(self) -> int:
+        """Gaussians that memory is taken for at once; 0: for those that there are."""
+        return self.config.max_gaussians if self.config.preallocate else 0
+
+    @property
+    def _time_window_s(self) -> tuple[float, float]:
+        """What the model shows: since the first frame, or as far back as the field reaches."""
+        start = self._first_time_s
+        if self._step is not None and self.config.history_s is not None:
+            start = min(max(start, self._step.field.time_window_s[0]), self._last_time_s)
+        return start, self._last_time_s
 
     def observe(
         self, frame: Frame, *, budget: Budget | None = None, steps: int | None = None, train: bool = True
@@ -126,8 +124,13 @@ class Reconstructor:
         assert self._step is not None
         self._step.field.cover(observation.time_s, self._last_time_s)
         self._last_time_s = observation.time_s
+        self._window.forget_before(self._step.field.time_window_s[0])
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
+        if self._prior is not None:
+            self._prior.observe(
+                frame, observation.time_s, observation.camera, self._step, start_there=self.config.start_from_motion
+            )
         self._window.add(observation)
         if not first:
             self._grow(frame, observation)
@@ -193,9 +196,13 @@ class Reconstructor:
         self._step_s = known + STEP_TIME_DECAY * (spending.step_s - known)
 
     def fit(
-        self, frames: Iterable[Frame], steps: int, progress: Callable[[int, Tensor], None] | None = None
+        self,
+        frames: Iterable[Frame],
+        steps: int,
+        progress: Callable[[int, Tensor], None] | None = None,
+        settings: FitSettings | None = None,
     ) -> ObserveReport:
-        """Train offline on all of `frames`, in random order, the rates decaying exponentially to a tenth.
+        """Train offline on all of `frames`, as `settings` say; `ReconstructorConfig.offline` is the configuration for it.
 
         `progress(step, loss)` is called after each step; on a GPU reading the loss, a tensor [] on the device, waits for the step. All
         frames are held in the device's memory (1 byte per channel).
@@ -217,16 +224,14 @@ class Reconstructor:
         self._last_time_s = observations[-1][1].time_s
         for frame, observation in observations[1:]:
             self._grow(frame, observation)
-        random = np.random.default_rng(self._seed)
-        order: list[int] = []
-        loss = torch.zeros(())
-        for step in range(steps):
-            if not order:
-                order = random.permutation(len(observations)).tolist()
-            loss = self._step(observations[order.pop()][1], rate_scale=0.1 ** (step / steps))
-            if progress is not None:
-                progress(step + 1, loss)
-        self._step.settle(observations[-1][1], rate_scale=0.1)
+        training = OfflineTraining(
+            self._step,
+            [observation for _, observation in observations],
+            settings or FitSettings(),
+            most_gaussians=self.config.max_gaussians,
+            seed=self._seed,
+        )
+        loss = training(steps, progress)
         return ObserveReport(observations[-1][0].seq, steps, HostCopy(loss), self.gaussians)
 
     def snapshot(self) -> Model:
@@ -235,15 +240,9 @@ class Reconstructor:
             raise InvalidInput("there is no model yet: observe a frame first")
         self._settle()
         self._version += 1
-        gaussians, field = self._step.copy()
-        return Model(
-            version=self._version,
-            gaussians=gaussians,
-            field=field,
-            camera=self.camera,
-            time_window_s=(self._first_time_s, self._last_time_s),
-            training_digest=self._recording_digest,
-        )
+        with continued(self._step, self._prior):
+            gaussians, field = self._step.copy()
+        return Model(gaussians=gaussians, field=field, **self._facts())
 
     def publish(self) -> Model | Snapshot:
         """The model as it is now, for showing it, with the next version number. As `snapshot`, but on a GPU it is copied into a slot.
@@ -253,17 +252,19 @@ class Reconstructor:
         if self._step is None or self.device.type != "cuda" or not SnapshotSlots.can_hold(self._step.field):
             return self.snapshot()
         self._version += 1
-        return self._slots.publish(
-            self._step.gaussians,
-            self._step.field,
-            version=self._version,
-            camera=self.camera,
-            time_window_s=(self._first_time_s, self._last_time_s),
-            training_digest=self._recording_digest,
-        )
+        with continued(self._step, self._prior):
+            return self._slots.publish(self._step.gaussians, self._step.field, **self._facts())
 
-    def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
-        gaussians = gaussians_from_frame(
+    def _facts(self) -> dict[str, Any]:
+        """What a model or snapshot states beside its tensors."""
+        window_s, digest = self._time_window_s, self._recording_digest
+        return dict(version=self._version, camera=self.camera, time_window_s=window_s, training_digest=digest)
+
+    def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
+        """The Gaussians that a scene starts with; its camera and first time are those of the frame."""
+        self._first_time_s = observation.time_s
+        self.camera = observation.camera
+        return gaussians_from_frame(
             frame,
             observation.camera,
             self.config.gaussians,
@@ -271,15 +272,17 @@ class Reconstructor:
             default_depth_mm=self.config.default_depth_mm,
             seed=self._seed,
         ).to(self.device)
-        self._first_time_s = observation.time_s
-        self.camera = observation.camera
-        wanted = NewField(gaussians, observation.time_s, end_s, self.config.bump_spacing_s)
+
+    def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
+        gaussians = self._first_gaussians(frame, observation)
+        wanted = NewField(gaussians, observation.time_s, end_s, self.config.bump_spacing_s, self.config.history_s)
         with torch.random.fork_rng(devices=[]):  # planes and layers start random
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config, self.camera)
+        self._prior = None if end_s is not None else new_motion_prior(self.config.motion_prior, field)
         if self.device.type == "cuda" and SnapshotSlots.can_hold(field):
-            self._coverage = CapturedCoverage(self.camera, self.device)
+            self._coverage = CapturedCoverage(self.camera, self.device, self._fixed_rows)
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
         """Add Gaussians where the frame shows tissue that the model does not cover."""

@@ -13,6 +13,7 @@ from gsplat_core.deformation.registry import kind_of
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.rows import GaussianRows, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.field_training import AutogradTraining
 from gsplat_core.training.fused_step import FusedStep
@@ -22,6 +23,13 @@ from gsplat_core.training.photometric import LossWeights, loss_and_gradients
 
 SETTLE_EVERY = 32
 """Captured steps after which the host waits for them, so that tile lists beyond their capacity are noticed soon; also after the first."""
+
+
+def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
+    """World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres."""
+    centre = camera.viewmat.to(gaussians.device)
+    distance = (gaussians.means @ centre[2, :3] + centre[2, 3]).abs().median() if gaussians.count else torch.ones(())
+    return float(distance) / float(camera.K[0, 0])
 
 
 class TrainingStep:
@@ -34,17 +42,19 @@ class TrainingStep:
     def __init__(
         self, gaussians: Gaussians, field: DeformationField, config: ReconstructorConfig, camera: Camera
     ) -> None:
-        self.gaussians = gaussians
         self.field = field
         self._rates = config.rates
         self._weights = LossWeights(config.ssim_weight, config.depth_weight, config.squared_error)
-        # World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres.
-        centre = camera.viewmat.to(gaussians.device)
-        distance = (
-            (gaussians.means @ centre[2, :3] + centre[2, 3]).abs().median() if gaussians.count else torch.ones(())
-        )
-        self._mm_per_px = float(distance) / float(camera.K[0, 0])
+        self._mm_per_px = mm_per_px(gaussians, camera)
         self._adam = FusedAdam(gaussians.tensors())
+        self._rows: GaussianRows | None = None
+        """Where Gaussians join and leave without a tensor moving."""
+        if config.preallocate and field.reserve(config.max_gaussians):
+            self._rows = GaussianRows(gaussians, config.max_gaussians)
+            self._adam.reserve(config.max_gaussians)
+            gaussians = self._rows.used
+        self.gaussians = gaussians
+        """Those in use."""
         kind = kind_of(field.kind)
         self._field_rates = config.rates.field or kind.rates
         if not isinstance(self._field_rates, type(kind.rates)):
@@ -61,7 +71,7 @@ class TrainingStep:
             training = kind.captured_training(field)
             if training is not None:
                 self._rate_values = training.rate_values
-                self._captured = FusedStep(gaussians, training, self._adam, self._weights, camera)
+                self._captured = FusedStep(self._all_rows, training, self._adam, self._weights, camera)
         self._training: FieldTraining = (
             AutogradTraining(field, self._field_rates) if kind.training is None else kind.training(field)
         )
@@ -97,29 +107,57 @@ class TrainingStep:
         """Gaussians and field with memory of their own, free of training state."""
         return self.gaussians.detach().clone(), self.field.detached_copy()
 
-    def append(self, added: Gaussians) -> None:
-        """Add Gaussians, which start still."""
-        self.gaussians = self.gaussians.append(added)
-        self.field.append(added)
+    def append(self, added: Gaussians, parents: Tensor | None = None) -> None:
+        """Add Gaussians, which start still, or move as those at `parents` (int64 indices) do."""
+        if self._rows is not None:
+            self._rows.append(added)
+            self.gaussians = self._rows.used
+        else:
+            self.gaussians = self.gaussians.append(added)
+        self.field.append(added, parents)
         self._adam.append(added.count)
 
-    def split(self, kept: Tensor, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
-        """Keep the Gaussians in `kept` (int64 indices), and put two in the place of each of those at `parents` (indices into `kept`).
+    def split(self, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
+        """Put two Gaussians, made by `halves`, in the place of each of those at `parents` (int64 indices); both move as their parent does.
 
-        `halves` makes the two; both move as their parent does. The new ones, and their parents' Gaussians, start with fresh moments.
+        The second ones come last. All of them start with fresh moments.
         """
-        gaussians = self.gaussians.select(kept)
-        first, second = halves(gaussians.select(parents))
-        changed = gaussians.map(Tensor.clone)
-        for name, tensor in changed.tensors().items():
+        first, second = halves(self.gaussians.select(parents))
+        for name, tensor in self.gaussians.tensors().items():
             tensor[parents] = first.tensors()[name]
-        self.gaussians = changed.append(second)
-        self.field.select(kept)
-        self.field.append(second, parents)
-        self._adam.select(kept)
-        for name in self._adam.first_moments:
             self._adam.reset(name, parents)
-        self._adam.append(second.count)
+        self.append(second, parents)
+
+    def remove(self, leaving: Tensor) -> RowMoves:
+        """Let the Gaussians marked in `leaving`, bool [N], go; returns how the others moved. Waits for the device."""
+        moves = RowMoves.without(leaving)
+        if self._rows is not None:
+            self._rows.close_gaps(moves)
+            self.gaussians = self._rows.used
+            self._adam.close_gaps(moves)
+            self.field.close_gaps(moves)
+        else:
+            self.gaussians = self.gaussians.select(moves.order)
+            self._adam.select(moves.order)
+            self.field.select(moves.order)
+        return moves
+
+    def restart(self, gaussians: Gaussians, time_s: float, camera: Camera) -> bool:
+        """Begin with another scene of the same camera size in the same memory; False, with nothing changed, where that cannot be."""
+        count = gaussians.count
+        if self._rows is None or count > self._rows.capacity or not self.field.restart(time_s, count):
+            return False
+        self._rows.replace(gaussians)
+        self.gaussians = self._rows.used
+        self._adam.restart(count)
+        if self._captured is not None:
+            self._captured.restart()
+        self._mm_per_px, self._scaled_for = mm_per_px(gaussians, camera), None
+        return True
+
+    @property
+    def _all_rows(self) -> Gaussians:
+        return self.gaussians if self._rows is None else self._rows.all
 
     def _captured_step(self, captured: FusedStep, observation: Observation, rate_scale: float) -> Tensor:
         if rate_scale != self._scaled_for:
@@ -130,7 +168,7 @@ class TrainingStep:
                 self._rate_values(self._field_rates.scaled(self._mm_per_px, rate_scale)),
             )
         time = self.field.frame_time(observation.time_s)
-        loss = captured(self.gaussians, observation, time, *self._scaled_rates)
+        loss = captured(self._all_rows, observation, time, *self._scaled_rates)
         first, self._unsettled_steps = not self._has_settled, self._unsettled_steps + 1
         if first or self._unsettled_steps >= SETTLE_EVERY:
             self.settle(observation, rate_scale)

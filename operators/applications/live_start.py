@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from gsplat_core.rendering.registry import new_renderer
@@ -23,6 +24,8 @@ from operators.sources.source import FrameSource
 
 SWITCH_INTERVAL_S = 0.0002
 """How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
+OPENCV_THREADS = 2
+"""More of them take longer to start than small pictures take to look at."""
 WARM_FRAMES = 3
 WARM_STEPS = {"cpu": 3, "cuda": 40}
 """Optimiser steps on each picture before the first frame."""
@@ -74,6 +77,8 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> WarmParts:
 def low_latency() -> Iterator[None]:
     """Inside, threads take turns often, and what exists already is never searched for garbage again."""
     interval_s = sys.getswitchinterval()
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(min(threads, OPENCV_THREADS))
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()
@@ -81,4 +86,5 @@ def low_latency() -> Iterator[None]:
         yield
     finally:
         gc.unfreeze()
+        cv2.setNumThreads(threads)
         sys.setswitchinterval(interval_s)

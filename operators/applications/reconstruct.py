@@ -15,7 +15,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
-from gsplat_core.training.reconstructor import ObserveReport
+from gsplat_core.training.observe_report import ObserveReport
 from operators.applications.delivery import Report, delivered
 from operators.applications.device import seeded
 from operators.applications.finishing import FirstFrames, measures_baselines, saves_model
@@ -105,7 +105,7 @@ def _fit(
     description = source.description
     if description.digest is None or description.frame_count is None:
         raise InvalidSetting(f"{description.name} can be read only once; reconstruct needs a recording, or use replay")
-    learning = new_reconstructor(settings, source)
+    learning = new_reconstructor(settings, source, offline=True)
     done = 0
 
     def after_step(step: int, loss: Tensor) -> None:

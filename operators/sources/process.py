@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 import weakref
 from collections import Counter
@@ -13,7 +14,7 @@ from gsplat_core.scene.frames import Frame
 from operators.errors import SourceLost, SourceUnavailable
 from operators.sources.backoff import Backoff
 from operators.sources.child_process import ChildLost, ChildProcess, Opening
-from operators.sources.live import LiveSource
+from operators.sources.live import STALLED_AFTER_S, LiveSource
 from operators.sources.options import SourceOptions
 from operators.sources.order import FrameOrder
 from operators.sources.shared_memory import BadHeader
@@ -49,7 +50,8 @@ class ProcessSource(LiveSource):
     ) -> None:
         """opener: `module:function` that makes the source from address and options, in the process. Raises SourceUnavailable with what it said."""
         options = options or SourceOptions()
-        super().__init__(waiting=options.waiting, order=FrameOrder(trusted=True))
+        # The process knows best whether its source stalls, and counts it; whether the process itself does is asked in `state`.
+        super().__init__(waiting=options.waiting, stalled_after_s=math.inf, order=FrameOrder(trusted=True))
         self._opening = Opening(opener, address, options)
         self._hung_after_s, self._open_timeout_s = hung_after_s, open_timeout_s
         self._child_state: tuple[SourceState, str] | None = None
@@ -65,15 +67,22 @@ class ProcessSource(LiveSource):
     @property
     def state(self) -> SourceState:
         """See `FrameSource`. What the process says of its source counts as long as the process itself is well."""
-        state, told = super().state, self._child_state
-        well = state in (SourceState.LIVE, SourceState.STALLED)
-        return told[0] if told is not None and well and told[0] is not SourceState.ENDED else state
+        state, told, child = super().state, self._child_state, self._child
+        if state is not SourceState.LIVE or self._ready:
+            return state
+        if child is not None and time.monotonic() - child.heard_s > STALLED_AFTER_S:
+            return SourceState.STALLED
+        return told[0] if told is not None and told[0] is not SourceState.ENDED else state
 
     @property
     def state_sentence(self) -> str:
         """See `LiveSource`."""
-        told = self._child_state
-        return told[1] if told is not None and self.state is told[0] and told[1] else super().state_sentence
+        told, state = self._child_state, self.state
+        if told is not None and state is told[0] and told[1]:
+            return told[1]
+        if state is SourceState.STALLED:
+            return f"the process that reads {self.description.name} says nothing"
+        return super().state_sentence
 
     def counts(self) -> Mapping[str, int]:
         """See `LiveSource`: what was dropped in the process and here."""

@@ -59,7 +59,7 @@ def test_extending_keeps_the_motion_that_was_there():
     columns = field.bumps
     field.extend((0.0, 9.0))
     assert field.bumps > columns and field.time_window_s == (0.0, 9.0)
-    assert (field.bumps - 1) * field.spacing_s + field._origin_s >= 9.0 + field.spacing_s - 1e-6
+    assert (field.bumps - 1) * field.spacing_s + field.columns.origin_s >= 9.0 + field.spacing_s - 1e-6
     for t, wanted in zip(times, before, strict=True):
         torch.testing.assert_close(field.deltas(t).detach(), wanted, rtol=0, atol=0)
 
@@ -190,7 +190,7 @@ def test_spare_columns_become_bumps_at_the_same_addresses(device):
         torch.manual_seed(3)
         field = BasisField(7, (0.0, 1.0), bumps=6).to(device)
         if spare:
-            field._add_spare(9)
+            field._add_places(9)
         for step in range(4):
             torch.manual_seed(step)
             for parameter in field.parameters():
@@ -208,7 +208,7 @@ def test_spare_columns_become_bumps_at_the_same_addresses(device):
     assert {name: tensor.shape for name, tensor in published.items()} == {n: t.shape for n, t in expected.items()}
     assert all(torch.equal(tensor, expected[name]) for name, tensor in published.items())
     before = spared.weights.data_ptr()
-    spared._add_spare(3)
+    spared._add_places(3)
     at = spared.weights.data_ptr()
     spared.extend((0.0, 3.3), hold_at_s=3.0)
     assert at != before and spared.weights.data_ptr() == at

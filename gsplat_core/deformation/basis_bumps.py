@@ -1,0 +1,291 @@
+"""The tensors of a `BasisField`: bumps as columns that follow a stream, Gaussians as rows that come and go, and Adam's state beside them."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from gsplat_core.deformation.basis_adam import Moments
+from gsplat_core.deformation.basis_columns import (
+    COLUMNS_AHEAD,
+    INERT,
+    Columns,
+    bump_capacity,
+    columns_to_change,
+    ring_places,
+    with_columns,
+)
+from gsplat_core.deformation.field import DeformationField, checked_window, count_of
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.basis_field.plain_torch import BUMP_REACH
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.layout import BASIS_CHANNELS
+from gsplat_core.scene.rows import RowMoves
+
+BUMPS_PER_SPACING = math.sqrt(math.pi)
+"""What a row of equal bumps of width 1, one per spacing, adds up to at any time (within 0.02 %)."""
+
+
+class BumpTensors(DeformationField):
+    """Centres and log-widths [N, B], weights [N, B, 13], and their moments once they are trained.
+
+    Each Gaussian is a row and each bump a column. Both may have spare ones that are inert, for Gaussians (`reserve`) and times to come.
+    """
+
+    def __init__(
+        self, count: int, time_window_s: tuple[float, float], *, bumps: int = 26, spacing_s: float | None = None
+    ) -> None:
+        """`bumps` columns spread over the window, or as many as it takes at a distance of `spacing_s`."""
+        super().__init__(time_window_s)
+        start, end = self._time_window_s
+        if spacing_s is not None:
+            if not (math.isfinite(spacing_s) and spacing_s > 0):
+                raise InvalidInput(f"spacing_s must be a positive number of seconds, got {spacing_s}")
+            bumps = max(4, math.ceil((end - start) / spacing_s - 1e-6) + 3)
+        if bumps < 4:
+            raise InvalidInput(f"bumps must be at least 4 (one past each end of the window), got {bumps}")
+        spacing = spacing_s or ((end - start) or 1.0) / (bumps - 3)
+        self._columns = Columns(start - spacing, spacing, bumps, bumps)
+        self._history_s: float | None = None
+        self._spare_rows = 0
+        """Inert rows at the end, which `append` turns into Gaussians without moving a tensor."""
+        self.centers = torch.nn.Parameter(torch.arange(bumps, dtype=torch.float32).repeat(count, 1))
+        self.log_widths = torch.nn.Parameter(torch.zeros(count, bumps))
+        self.weights = torch.nn.Parameter(torch.zeros(count, bumps, BASIS_CHANNELS))
+        self._moments: Moments | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians N."""
+        return int(self.weights.shape[0]) - self._spare_rows
+
+    @property
+    def bumps(self) -> int:
+        """Number of bumps per Gaussian B; the parameters may have spare columns beyond them."""
+        return self._columns.count
+
+    @property
+    def spacing_s(self) -> float:
+        """Seconds between neighbouring bumps as they are laid out."""
+        return self._columns.spacing_s
+
+    @property
+    def columns(self) -> Columns:
+        """Where the bumps lie in the tensors."""
+        return self._columns
+
+    def tau(self, time_s: float) -> float:
+        """Time in bump spacings from the first column, clamped to the window."""
+        return (self.clamp_time(time_s) - self._columns.origin_s) / self._columns.spacing_s
+
+    def deltas(self, time_s: float) -> Tensor:
+        """What the field adds at `time_s`: [N, 13] position, rotation, log-scale, colour. Differentiable."""
+        raise NotImplementedError
+
+    def keep_last(self, history_s: float) -> None:
+        """From now on keep only the last `history_s` seconds before the newest frame deformable.
+
+        All memory is taken here: new bumps take the places of the oldest ones, and no tensor moves while the stream goes on. Times
+        before the window show its first state. Columns are then never dropped by the start of a window.
+        """
+        if not (math.isfinite(history_s) and history_s > 0):
+            raise InvalidInput(f"history_s must be a positive number of seconds, got {history_s}")
+        places = max(ring_places(history_s, self.spacing_s), self._columns.places)
+        self._add_places(places - self._columns.places)
+        self._columns = replace(self._columns, is_ring=True)
+        self._history_s = history_s
+
+    def restart(self, time_s: float, count: int) -> bool:
+        """See `DeformationField.restart`; there have to be rows for so many Gaussians."""
+        spare_rows = self.weights.shape[0] - count
+        if spare_rows < 0:
+            return False
+        self._spare_rows = spare_rows
+        self._time_window_s = checked_window((time_s, time_s + COLUMNS_AHEAD * self.spacing_s))
+        origin_s = time_s - self.spacing_s
+        self._columns = replace(self._columns, origin_s=origin_s, count=COLUMNS_AHEAD + 3, oldest=0)
+        for tensor, inert in self._tensors_and_fill():
+            tensor.fill_(inert)
+        self.centers.data[:count] = self._columns.laid_out(self.centers.data)
+        return True
+
+    def extend(self, time_window_s: tuple[float, float], *, hold_at_s: float | None = None) -> None:
+        """Move the window on: new bumps at the head, and bumps that ended before the new start dropped.
+
+        The start and the end may only grow. New bumps start still (zero weights), or so that they continue the deformation at
+        `hold_at_s`: tissue that a tool hides then stays as it was last seen, instead of falling back to its canonical state.
+        Past the window the field holds its last state. A bump is dropped when its laid-out place is more than 4 spacings before
+        the new start; after `keep_last` the oldest ones are written over, and the window starts where the rest of them reaches.
+        """
+        start, end = checked_window(time_window_s)
+        if start < self._time_window_s[0] or end < self._time_window_s[1]:
+            raise InvalidInput(f"the window {self._time_window_s} can only move forward, got {(start, end)}")
+        added, dropped = columns_to_change((start, end), self._columns)
+        if added:
+            passed = self._append_columns(added, None if hold_at_s is None else self.deltas(hold_at_s).detach())
+            if passed:
+                start = max(start, self._columns.origin_s + BUMP_REACH * self.spacing_s)
+        if dropped and not self._columns.is_ring:
+            self._drop_columns(dropped)
+        self._time_window_s = (start, end)
+
+    def cover(self, time_s: float, newest_s: float) -> None:
+        """Keep `COLUMNS_AHEAD` columns ahead of `time_s`, and one beyond; new ones continue the deformation at `newest_s`."""
+        start, end = self._time_window_s
+        ahead_s = COLUMNS_AHEAD * self.spacing_s
+        if time_s + ahead_s > end:
+            if self._history_s is not None:
+                start = max(start, time_s - self._history_s)
+            self.extend((start, time_s + ahead_s + self.spacing_s), hold_at_s=newest_s)
+
+    def select(self, index: Tensor) -> None:
+        """Keep the bumps of the Gaussians in `index`."""
+        used = self.count
+        self._set_parameters(*(p.data[:used][index] for p in self._whole_parameters()))
+        self._change_moments(lambda t: t[:used][index])
+        self._spare_rows = 0
+
+    def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
+        """Add still bumps for new Gaussians, or copies of the bumps of `parents`; their Adam state starts afresh."""
+        count, used = count_of(added), self.count
+        if parents is not None and parents.shape != (count,):
+            raise InvalidInput(f"parents must be [{count}], one for each new Gaussian, got {list(parents.shape)}")
+        if count > self._spare_rows:
+            self.reserve(used + count)
+        self._spare_rows -= count
+        if parents is not None:
+            for parameter in self._whole_parameters():
+                parameter.data[used : used + count] = parameter.data[parents]
+        else:
+            self.centers.data[used : used + count] = self._columns.laid_out(self.centers.data)
+
+    def reserve(self, rows: int) -> bool:
+        """See `DeformationField.reserve`."""
+        added = rows - self.weights.shape[0]
+        if added > 0:
+            widened = (
+                torch.cat([p.data, p.data.new_full((added, *p.shape[1:]), inert)])
+                for p, inert in zip(self._whole_parameters(), INERT, strict=True)
+            )
+            self._set_parameters(*widened)
+            self._change_moments(lambda t: torch.cat([t, t.new_zeros(added, *t.shape[1:])]))
+            self._spare_rows += added
+        return True
+
+    def close_gaps(self, moves: RowMoves) -> None:
+        """See `DeformationField.close_gaps`; the tensors stay where they are."""
+        for tensor, inert in self._tensors_and_fill():
+            moves.apply(tensor, inert)
+        self._spare_rows += moves.before - moves.count
+
+    def config(self) -> dict[str, Any]:
+        """Kind, window and the layout of the columns."""
+        return {
+            "kind": self.kind,
+            "time_window_s": list(self._time_window_s),
+            "bumps": self.bumps,
+            "channels": BASIS_CHANNELS,
+            "origin_s": self._columns.origin_s,
+            "spacing_s": self._columns.spacing_s,
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any], gaussians: Gaussians) -> Self:
+        """An untrained field with the columns that `config` describes."""
+        start, end = config["time_window_s"]
+        field = cls(gaussians.count, (start, end), bumps=config["bumps"])
+        field._columns = replace(
+            field._columns, origin_s=float(config["origin_s"]), spacing_s=float(config["spacing_s"])
+        )
+        return field
+
+    def detached_copy(self) -> Self:
+        """See `DeformationField.detached_copy`: the Gaussians and bumps in use, those in the order of their times, and no ring."""
+        return self._copy_of(self.count)
+
+    def _copy_of(self, rows: int) -> Self:
+        memo: dict[int, Any] = {id(state): None for state in self._training_state()}
+        for parameter in self._whole_parameters():
+            kept = self._columns.in_order(parameter.data[:rows]).clone(memory_format=torch.contiguous_format)
+            memo[id(parameter)] = torch.nn.Parameter(kept, requires_grad=False)
+        copied = copy.deepcopy(self, memo)
+        copied._columns = replace(self._columns, places=self.bumps, oldest=0, is_ring=False)
+        copied._history_s, copied._spare_rows = None, 0
+        return copied.requires_grad_(False)
+
+    def _training_state(self) -> Sequence[object]:
+        return (self._moments,)
+
+    def _append_columns(self, added: int, held: Tensor | None) -> int:
+        """Lay out columns at the head; returns how many at the tail they were written over."""
+        before = self._columns
+        if added > before.spare and not before.is_ring:
+            end = before.count + added
+            self._add_places((end if self.weights.is_cpu else bump_capacity(end)) - before.places)
+        self._columns, passed = self._columns.moved_on(added)
+        if passed:
+            self.centers.data[: self.count] -= (
+                passed  # exact: whole numbers of spacings, and the centres become smaller
+            )
+        for places, numbers in self._columns.newest_places(min(added, self.bumps)):
+            self._lay_out(places, numbers, held)
+        return passed
+
+    def _lay_out(self, places: slice, numbers: range, held: Tensor | None) -> None:
+        """Write new bumps over whatever these places held."""
+        used = self.count
+        for tensor, inert in self._tensors_and_fill():
+            tensor[:used, places] = inert
+        self.centers.data[:used, places] = torch.arange(
+            numbers.start, numbers.stop, dtype=self.centers.dtype, device=self.centers.device
+        )
+        if held is not None:
+            self.weights.data[:used, places] = held[:, None] / BUMPS_PER_SPACING
+
+    def _drop_columns(self, dropped: int) -> None:
+        columns = self._columns
+        self._set_parameters(*(p.data[:, dropped:] for p in self._whole_parameters()))
+        self.centers.data -= dropped
+        self._change_moments(lambda t: t[:, dropped:].contiguous())
+        origin_s = columns.origin_s + dropped * columns.spacing_s
+        self._columns = replace(
+            columns, origin_s=origin_s, count=columns.count - dropped, places=columns.places - dropped
+        )
+
+    def _add_places(self, added: int) -> None:
+        widened = (with_columns(p.data, added, v) for p, v in zip(self._whole_parameters(), INERT, strict=True))
+        self._set_parameters(*widened)
+        self._change_moments(lambda t: with_columns(t, added))
+        self._columns = replace(self._columns, places=self._columns.places + added)
+
+    def _moments_in_use(self) -> Moments:
+        if self._moments is None:
+            self._moments = Moments.zeros([p.data for p in self._whole_parameters()])
+        return self._moments
+
+    def _whole_parameters(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Centres, log-widths and weights with their spare rows and columns."""
+        return self.centers, self.log_widths, self.weights
+
+    def _tensors_and_fill(self) -> Iterator[tuple[Tensor, float]]:
+        """Every tensor with rows and columns, and what it holds where there is no bump."""
+        yield from zip((p.data for p in self._whole_parameters()), INERT, strict=True)
+        if self._moments is not None:
+            yield from ((moment, 0.0) for moment in (*self._moments.first, *self._moments.second, self._moments.steps))
+
+    def _set_parameters(self, centers: Tensor, log_widths: Tensor, weights: Tensor) -> None:
+        """New parameters of other sizes; an optimiser that holds the old ones must be given the new ones."""
+        requires_grad = self.weights.requires_grad
+        self.centers = torch.nn.Parameter(centers.contiguous(), requires_grad)
+        self.log_widths = torch.nn.Parameter(log_widths.contiguous(), requires_grad)
+        self.weights = torch.nn.Parameter(weights.contiguous(), requires_grad)
+
+    def _change_moments(self, change: Callable[[Tensor], Tensor]) -> None:
+        if self._moments is not None:
+            self._moments = self._moments.map(change)
