@@ -49,6 +49,8 @@ class Regions:
     """The field of view."""
     previous: Flags | None
     """The frame before's tools."""
+    sharp_edge: float = SHARP_EDGE
+    """What a tool's outline must have."""
 
 
 @cache
@@ -80,7 +82,7 @@ def tool_regions(view: Regions) -> Flags:
     enough = area >= less * area_inside * np.where(reaches, SMALLEST_REGION, SMALLEST_INNER_REGION)
     lit = reaches | (glare < MOST_GLARE)
     core = share(view.redness < view.threshold - CLEARLY_BELOW) > less * CORE
-    sharp = _sharpness(view, grey, labels, count) > less * SHARP_EDGE
+    sharp = _sharpness(view, grey, labels, count) > less * view.sharp_edge
     tool = enough & lit & core & sharp
     tool[0] = False
     tools: Flags = tool[labels]
