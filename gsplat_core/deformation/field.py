@@ -158,6 +158,10 @@ class DeformationField(torch.nn.Module):
         can. False, with nothing changed, for a field that cannot do that: here."""
         return False
 
+    def scale_positions(self, factor: Tensor) -> None:
+        """Multiply what the field adds to each position by `factor` [N], at all times. Raises InvalidInput for a kind that cannot: here."""
+        raise InvalidInput(f"a {self.kind} field cannot be scaled")
+
     def continue_with(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
         """Go on with `velocity` [N, 16] per second after `from_s`, for `horizon_s`; see `Continuation`.
 
@@ -169,6 +173,12 @@ class DeformationField(torch.nn.Module):
 
     def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
         """Add state for new Gaussians at the end: still, or copied from `parents` (int64 [count]). Here there is none."""
+
+    def smooth_in_time(self, amount: float) -> None:
+        """Move what is learned for each time `amount` (0..1) of the way to the mean of what is learned for the times before and after.
+
+        In place, outside of any optimiser; for a field of which all frames are known. Here nothing is learned for times.
+        """
 
     def reserve(self, rows: int) -> bool:
         """Take the memory for `rows` Gaussians now, so that `append` and `close_gaps` move no tensor until there are more.

@@ -17,6 +17,7 @@ from operators.graph import Operator, OperatorSpec
 from operators.messages import ShownPicture
 from operators.outcome import OutcomeBuilder
 from operators.sinks.session_recorder import Recorded, SessionRecorder, stated
+from operators.storage import mebibytes
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,9 @@ class RecordFramesOp(Operator):
         """See `Contributor`."""
         recorded = self.recorder.recorded
         outcome.add(RecordingResult(recorded))
+        if recorded.frames:
+            # As a note, and not as an output: it lies outside of what the run publishes, and grows there while the run goes on.
+            outcome.note(f"{recorded.frames} frames were recorded in {recorded.folder} ({mebibytes(recorded.bytes)})")
         for sentence in stated(recorded):
             outcome.note(sentence)
 

@@ -219,3 +219,12 @@ def test_an_interrupted_evaluation_leaves_what_it_reached(long, offline, tmp_pat
     report = EvaluationReport.read(tmp_path / "out" / "evaluation.json")
     assert report.evaluated.interrupted and any("interrupted" in note for note in report.notes)
     assert report.causal is not None and report.causal.score.frames < 11
+
+
+def test_a_long_series_is_summed_up(intrasplat, long, offline, monkeypatch):
+    monkeypatch.setattr("services.reports.evaluation_build.MAX_SERIES", 4)
+    report = evaluated(intrasplat, offline, long, "--protocol", "retention")
+    assert report.series_frames_per_entry == {"baselines": 3, "retention": 3}
+    assert [len(report.series[name]) for name in ("baselines", "retention")] == [4, 4]
+    (own,) = report.series["retention"][:1]
+    assert own["frames"] == 3 and own["psnr_tissue_min_db"] <= own["psnr_tissue_db"]
