@@ -23,6 +23,7 @@ from gsplat_core.deformation.basis_shift import shifted_bumps_
 from gsplat_core.deformation.continuation import Continuation
 from gsplat_core.deformation.field import ops_for
 from gsplat_core.deformation.field_slots import BasisSlot
+from gsplat_core.deformation.smoothing import towards_neighbours_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
@@ -106,6 +107,14 @@ class BasisField(BumpTensors):
         self._ops.basis_field_backward_adam_(
             gradient, tau, parameters, moments.first, moments.second, moments.steps, rates, betas, epsilon
         )
+
+    def smooth_in_time(self, amount: float) -> None:
+        """See `DeformationField.smooth_in_time`: the weights of neighbouring bumps."""
+        if self.columns.is_ring:
+            raise InvalidInput(
+                "a field that forgets its past has no columns in the order of time; smooth one that keeps them all"
+            )
+        towards_neighbours_(self.weights.data[: self.count, : self.bumps], amount)
 
     @property
     def has_frame_deltas(self) -> bool:

@@ -174,6 +174,12 @@ class DeformationField(torch.nn.Module):
     def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
         """Add state for new Gaussians at the end: still, or copied from `parents` (int64 [count]). Here there is none."""
 
+    def smooth_in_time(self, amount: float) -> None:
+        """Move what is learned for each time `amount` (0..1) of the way to the mean of what is learned for the times before and after.
+
+        In place, outside of any optimiser; for a field of which all frames are known. Here nothing is learned for times.
+        """
+
     def reserve(self, rows: int) -> bool:
         """Take the memory for `rows` Gaussians now, so that `append` and `close_gaps` move no tensor until there are more.
 

@@ -23,7 +23,7 @@ class HexPlaneLearningRates(FieldRates):
         return "planes" if parameter.startswith("planes") else "network"
 
 
-ROWS_PER_SPACING = 2
+ROWS_PER_SPACING = 1
 """Time rows of the planes, where the recording's end is known, for each of `NewField.spacing_s`: between rows they are linear."""
 MOST_ROWS = 1 << 10
 

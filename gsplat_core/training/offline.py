@@ -1,4 +1,4 @@
-"""Training on all frames of a recording at once: their order, the learning rates' decay, and when Gaussians are split."""
+"""Training on all frames of a recording at once: their order, the learning rates' decay, smoothing, and when Gaussians are split."""
 
 from __future__ import annotations
 
@@ -15,6 +15,11 @@ from gsplat_core.training.densification import densify, shares_of
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
 
+SMOOTH_EVERY = 20
+"""Steps from one smoothing to the next: it touches all columns, a step only those near its time."""
+MOST_AT_ONCE = 0.5
+"""Of the way to the neighbours' mean."""
+
 
 @dataclass(frozen=True)
 class FitSettings:
@@ -22,6 +27,9 @@ class FitSettings:
 
     final_rate: float = 0.02
     """What is left of every learning rate at the end, as a share; on the way there they follow half a cosine."""
+    smoothing: float = 0.9
+    """How far, in a pass over all frames, what the field learned for each time is moved to the mean of its neighbours in time, times the
+    factor of the learning rates: a frame between two others is then shown between them, not with the noise of both. 0: not at all."""
     densify_rounds: int = 10
     """How often Gaussians that nobody sees are dropped and those with the largest error are split; 0: never."""
     densify_until: float = 0.7
@@ -33,6 +41,8 @@ class FitSettings:
         for name in ("final_rate", "densify_until"):
             if not 0 < getattr(self, name) <= 1:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be above 0 and at most 1")
+        if not 0 <= self.smoothing < math.inf:
+            raise InvalidSetting(f"smoothing is {self.smoothing}; it must be at least 0")
         if self.densify_rounds < 0 or self.densify_frames < 1:
             raise InvalidSetting(
                 f"densify_rounds is {self.densify_rounds} and densify_frames {self.densify_frames}; they must be at least 0 and 1"
@@ -75,6 +85,8 @@ class OfflineTraining:
                 rounds.pop(0)
             self._rate = self._settings.rate_at(number / steps)
             loss = self._step(self._next(), rate_scale=self._rate)
+            if (number + 1) % SMOOTH_EVERY == 0 and self._settings.smoothing:
+                self._smooth()
             if progress is not None:
                 progress(number + 1, loss)
         self._step.settle(self._observations[-1], rate_scale=self._rate)
@@ -85,6 +97,11 @@ class OfflineTraining:
         if not self._order:
             self._order = self._random.permutation(len(self._observations)).tolist()
         return self._observations[self._order.pop()]
+
+    def _smooth(self) -> None:
+        """As much as belongs to the steps since the last time."""
+        amount = self._settings.smoothing * self._rate * SMOOTH_EVERY / len(self._observations)
+        self._step.field.smooth_in_time(min(amount, MOST_AT_ONCE))
 
     def _densify(self, share: float) -> None:
         """A round; `share` of all rounds is over with it, and their number grows from the first to the most along with that."""

@@ -271,7 +271,7 @@ class SessionRecorder:
 
 def _bytes(frame: Frame, arrived: Frame | None = None) -> int:
     """Of the frame's pictures, but for those that wait already as those of `arrived`."""
-    planes = ("image", "right_image", "depth", "mask", "loss_mask")
+    planes = ("image", "right_image", "depth", "mask", "loss_mask", "rehearsal_mask")
     mine = {id(plane): plane.nbytes for name in planes if (plane := getattr(frame, name)) is not None}
     others = () if arrived is None else (id(getattr(arrived, name)) for name in planes)
     for key in others:

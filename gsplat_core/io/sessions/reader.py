@@ -200,6 +200,7 @@ def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], dama
             depth=planes.get("depth"),
             mask=planes.get("mask"),
             loss_mask=planes.get("loss_mask"),
+            rehearsal_mask=planes.get("rehearsal_mask"),
             pose=None if line.pose is None else np.array(line.pose).reshape(4, 4),
             status=status,
             damage=damage,

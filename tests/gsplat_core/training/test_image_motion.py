@@ -29,9 +29,9 @@ def test_a_shift_is_measured(shift: tuple[float, float]) -> None:
     assert abs(typical_px(flow) - np.hypot(*shift)) < 0.15
 
 
-@pytest.mark.parametrize("size", [(400, 500), (700, 801)])
-def test_large_pictures_are_measured_in_their_own_pixels(size: tuple[int, int]) -> None:
-    motion = ImageMotion()
+@pytest.mark.parametrize("size", [(96, 128), (420, 501)])
+def test_the_quick_search_measures_in_pixels_of_the_full_picture(size: tuple[int, int]) -> None:
+    motion = ImageMotion("half")
     motion.follow(texture(0, 0, size), None)
     flow = motion.follow(texture(3, -2, size), None)
     assert flow is not None and flow.shape == (round(size[0] / 4), round(size[1] / 4), 2)

@@ -8,9 +8,10 @@ from collections import Counter
 import pytest
 import torch
 
+from gsplat_core.deformation import BasisField
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.offline import FitSettings
+from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY, FitSettings
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.step import TrainingStep
 
@@ -38,6 +39,8 @@ def test_rounds_are_spread_evenly_up_to_their_share_of_the_steps():
         {"final_rate": 1.5},
         {"final_rate": math.nan},
         {"densify_until": 0},
+        {"smoothing": -0.1},
+        {"smoothing": math.inf},
         {"densify_rounds": -1},
         {"densify_frames": 0},
     ],
@@ -84,6 +87,25 @@ def test_every_frame_is_trained_on_equally_often(tissue_video, camera, monkeypat
     monkeypatch.setattr(TrainingStep, "__call__", counted)
     fitted(camera, tissue_video(5), 15)
     assert seen == dict.fromkeys(range(5), 3)
+
+
+def test_smoothing_brings_neighbours_in_time_together(tissue_video, camera):
+    def roughness(smoothing):
+        learning, _ = fitted(camera, tissue_video(12), 60, densify_rounds=0, smoothing=smoothing)
+        weights = learning.snapshot().field.weights
+        return float(weights.diff(dim=1).square().sum() / weights.square().sum())
+
+    assert roughness(2.0) < 0.8 * roughness(0.0)
+
+
+def test_smoothing_never_goes_beyond_the_neighbours(tissue_video, camera, monkeypatch):
+    amounts = []
+    monkeypatch.setattr(BasisField, "smooth_in_time", lambda self, amount: amounts.append(amount))
+    fitted(camera, tissue_video(2), 100, smoothing=5.0)
+    assert len(amounts) == 100 // SMOOTH_EVERY
+    assert max(amounts) == MOST_AT_ONCE
+    fitted(camera, tissue_video(2), 100, smoothing=0.0)
+    assert len(amounts) == 100 // SMOOTH_EVERY
 
 
 def test_densification_helps_where_the_first_frame_was_too_coarse(tissue_video, camera):
