@@ -28,7 +28,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import BASIS_CHANNELS, BASIS_GROUPS, width_of
+from gsplat_core.scene.layout import BASIS_CHANNELS, BASIS_GROUPS, POSITION, width_of
 
 
 class BasisField(BumpTensors):
@@ -142,9 +142,17 @@ class BasisField(BumpTensors):
 
         return at if self.continuation is None else self.continuation.captured(at)
 
+    def scale_positions(self, factor: Tensor) -> None:
+        """See `DeformationField.scale_positions`; Adam's moments follow."""
+        count, each = len(factor), factor[:, None, None]
+        self.weights.data[:count, :, POSITION] *= each
+        if self._moments is not None:
+            self._moments.first[2][:count, :, POSITION] /= each
+            self._moments.second[2][:count, :, POSITION] /= each.square()
+
     def continue_with(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
         """See `DeformationField.continue_with`."""
-        continuation = Continuation(self.count, self.weights.device)
+        continuation = Continuation(int(self.weights.shape[0]), self.weights.device)
         continuation.write(velocity, from_s, horizon_s)
         continuation.set_clock(self.tau, self.spacing_s)
         self.continuation = continuation

@@ -158,6 +158,10 @@ class DeformationField(torch.nn.Module):
         can. False, with nothing changed, for a field that cannot do that: here."""
         return False
 
+    def scale_positions(self, factor: Tensor) -> None:
+        """Multiply what the field adds to each position by `factor` [N], at all times. Raises InvalidInput for a kind that cannot: here."""
+        raise InvalidInput(f"a {self.kind} field cannot be scaled")
+
     def continue_with(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
         """Go on with `velocity` [N, 16] per second after `from_s`, for `horizon_s`; see `Continuation`.
 

@@ -101,10 +101,10 @@ class BasisSlot:
         copy_each(self._in_use, [values[:count, : columns.count] for values in theirs])
         self.field._time_window_s = source.time_window_s
         self.field._columns = replace(columns, places=places)
-        self._continue(source.continuation)
+        self._continue(source.continuation, count)
         return True
 
-    def _continue(self, source: Continuation | None) -> None:
+    def _continue(self, source: Continuation | None, count: int) -> None:
         """Continue as `source` does, or not at all."""
         mine = self.field.continuation
         if mine is None:
@@ -112,7 +112,7 @@ class BasisSlot:
         if source is None:
             mine.stop()
             return
-        mine.write(source.velocity, source.from_s, source.horizon_s)
+        mine.write(source.velocity[:count], source.from_s, source.horizon_s)
         mine.set_clock(self.field.tau, self.field.spacing_s)
 
     def _use(self, count: int, bumps: int) -> None:

@@ -19,6 +19,10 @@ REHEARSED_IN_FLIGHT = 2
 """Rehearsal steps that may be queued on a GPU and not finished: the next frame's first step waits for them."""
 
 
+LONGER_STEP_DECAY = 0.1
+"""How fast the usual time of a step follows longer ones."""
+
+
 @dataclass(frozen=True)
 class LiveTraining:
     """How the steps beside a live stream are taken. Raises InvalidSetting for a value out of its range."""
@@ -130,6 +134,15 @@ class LiveReconstructor(Reconstructor):
                 return
         self._coverage = None
         super()._start(frame, observation, end_s)
+
+    def _learn_step_time(self, spending: Spending) -> None:
+        """Soon when steps are found to be shorter; slowly when they seem longer, for the first ones on a device take far longer."""
+        spending.all_finished()
+        known = self._step_s
+        if known is None or spending.step_s < known:
+            self._step_s = spending.step_s
+        else:
+            self._step_s = known + LONGER_STEP_DECAY * (min(spending.step_s, 2 * known) - known)
 
     def _train_on(self, observation: Observation, budget: Budget, first: bool) -> ObserveReport:
         assert self._step is not None

@@ -6,7 +6,7 @@ are a module and a line there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField
-from gsplat_core.registry import Registry
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.layout import COLOUR, LOG_SCALE, POSITION, RAW_COLUMNS
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.depth_from_motion import DepthFromMotion
 from gsplat_core.training.image_motion import ImageMotion, typical_px
+from gsplat_core.training.motion_priors import MOTION_PRIORS
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import SurfaceMotion
 from gsplat_core.transfers import tensor_of
@@ -45,11 +47,9 @@ USUAL_DECAY = 0.1
 class MotionPrior(Protocol):
     """One stream's assumption about motion. Its memory and the time of a call do not grow with the stream."""
 
-    def observe(self, frame: Frame, time_s: float, camera: Camera, step: TrainingStep, *, start_there: bool) -> None:
-        """Take the next frame before the model is trained on it.
-
-        The field covers `time_s` already. With `start_there` the scene is moved to where the frame shows it.
-        """
+    def observe(self, frame: Frame, time_s: float, camera: Camera, step: TrainingStep) -> None:
+        """Take the next frame before the model is trained on it; the field covers `time_s` already. The scene may be moved to where the
+        frame shows it."""
 
     def velocity(self, step: TrainingStep) -> Tensor | None:
         """What the raw parameters change by per second after the newest frame, [N, 16]; None for nothing."""
@@ -68,13 +68,17 @@ class FlowPrior:
     That is more exact than the model's own past: bumps in time average over several frames.
     """
 
-    def __init__(self) -> None:
-        self._image_motion = ImageMotion()
+    def __init__(self, config: ReconstructorConfig) -> None:
+        self._starts_there, self._finds_depth = config.start_from_motion, config.depth_from_motion
+        self._image_motion = ImageMotion(config.motion_detail)
+        self._newest_seq: int | None = None
         self.forget()
 
     def forget(self) -> None:
         """See `MotionPrior.forget`."""
+        self._newest_seq = None
         self._image_motion.forget()
+        self._depth = DepthFromMotion()
         self._camera: Camera | None = None
         self._motion: SurfaceMotion | None = None
         self._interval_s = 0.0
@@ -82,18 +86,22 @@ class FlowPrior:
         self._is_sudden = False
         self.newest_s = 0.0
 
-    def observe(self, frame: Frame, time_s: float, camera: Camera, step: TrainingStep, *, start_there: bool) -> None:
+    def observe(self, frame: Frame, time_s: float, camera: Camera, step: TrainingStep) -> None:
         """See `MotionPrior.observe`."""
         before, before_s = self._camera, self.newest_s
         self._camera, self.newest_s = camera, time_s
         self._motion = None
-        flow = self._image_motion.follow(frame.image, _followed(frame))
+        known = frame.flow if frame.flow_since == self._newest_seq else None
+        self._newest_seq = frame.seq
+        flow = self._image_motion.follow(frame.image, _followed(frame), known)
         if flow is None or before is None or camera.model != "pinhole":
             return
         self._interval_s = time_s - before_s
         self._judge(typical_px(flow))
         self._motion = SurfaceMotion(tensor_of(flow, step.gaussians.device), before, camera)
-        if start_there:
+        if self._finds_depth and frame.pose is not None and frame.depth is None:
+            self._depth.apply(step, self._motion, before_s)
+        if self._starts_there:
             self._start_there(step, before_s, time_s)
 
     def velocity(self, step: TrainingStep) -> Tensor | None:
@@ -141,26 +149,26 @@ def _followed(frame: Frame) -> NDArray[np.uint8] | None:
     return frame.mask & frame.loss_mask
 
 
-MOTION_PRIORS: Registry[Callable[[], MotionPrior | None]] = Registry(
-    "motion prior", {"bumps": lambda: None, "flow": FlowPrior}
-)
-"""By name. `bumps`: the field's bumps simply go on."""
+def no_prior(config: ReconstructorConfig) -> None:
+    """The field's bumps go on as they do."""
 
 
-def new_motion_prior(name: str, field: DeformationField) -> MotionPrior | None:
-    """The prior of that name, where the field can be continued. Raises InvalidSetting for an unknown name."""
-    prior = MOTION_PRIORS[name]()
+def new_motion_prior(config: ReconstructorConfig, field: DeformationField) -> MotionPrior | None:
+    """The prior that is configured, where the field can be continued. Raises InvalidSetting for an unknown name."""
+    prior: MotionPrior | None = MOTION_PRIORS[config.motion_prior](config)
     return prior if field.continues else None
 
 
 @contextmanager
 def continued(step: TrainingStep, prior: MotionPrior | None) -> Iterator[None]:
     """For the time of a copy for publishing the scene goes on after the newest frame as the prior says; training knows nothing of it."""
-    velocity = None if prior is None else prior.velocity(step)
-    if prior is None or velocity is None:
+    if prior is None:
         yield
         return
-    step.field.continue_with(velocity, prior.newest_s, HORIZON_S)
+    # Also without a velocity: slots whose fields have a continuation from the start need no other memory later.
+    velocity = prior.velocity(step)
+    still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
+    step.field.continue_with(still if velocity is None else velocity, prior.newest_s, HORIZON_S)
     try:
         yield
     finally:

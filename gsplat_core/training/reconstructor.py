@@ -128,9 +128,7 @@ class Reconstructor:
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
         if self._prior is not None:
-            self._prior.observe(
-                frame, observation.time_s, observation.camera, self._step, start_there=self.config.start_from_motion
-            )
+            self._prior.observe(frame, observation.time_s, observation.camera, self._step)
         self._window.add(observation)
         if not first:
             self._grow(frame, observation)
@@ -280,7 +278,7 @@ class Reconstructor:
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config, self.camera)
-        self._prior = None if end_s is not None else new_motion_prior(self.config.motion_prior, field)
+        self._prior = None if end_s is not None else new_motion_prior(self.config, field)
         if self.device.type == "cuda" and SnapshotSlots.can_hold(field):
             self._coverage = CapturedCoverage(self.camera, self.device, self._fixed_rows)
 

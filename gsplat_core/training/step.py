@@ -89,6 +89,23 @@ class TrainingStep:
         self._adam.step(self.gaussians.tensors(), own, self._gaussian_rates(rate_scale))
         return loss
 
+    def scale_about(self, camera: Camera, factor: Tensor) -> None:
+        """Move every Gaussian to `factor` [N] times its distance from the camera's centre, at all times, and scale it with that: the camera
+        sees the same picture. Adam's moments follow, the rates with `take_distance`."""
+        with torch.no_grad():
+            scene, each = self.gaussians, factor[:, None]
+            centre = torch.as_tensor(camera.position, dtype=scene.means.dtype).to(scene.device)
+            scene.means.copy_(centre + each * (scene.means - centre))
+            scene.log_scales.add_(each.log())
+            self.field.scale_positions(factor)
+            count = len(factor)
+            self._adam.first_moments["means"][:count].div_(each)
+            self._adam.second_moments["means"][:count].div_(each.square())
+
+    def take_distance(self, camera: Camera) -> None:
+        """Let rates that are given in pixels follow the scene's distance from the camera. Waits for it."""
+        self._mm_per_px, self._scaled_for = mm_per_px(self.gaussians, camera), None
+
     def settle(self, observation: Observation, rate_scale: float = 1.0) -> None:
         """Wait for the captured steps. Those that changed nothing, because a tile list was beyond its capacity, are taken again on
         `observation`."""

@@ -26,22 +26,26 @@ class SurfaceMotion:
     before: Camera
     after: Camera
 
+    def seen_before(self, points: Tensor) -> Seen:
+        """Points [N, 3] as the first frame's camera sees them."""
+        return Seen(self.before, points)
+
     def ahead(self, points: Tensor) -> Tensor:
         """World-space motion [N, 3] of `points` [N, 3] from where they are in the first frame to the second one; 0 outside the picture."""
-        seen = _Seen(self.before, points)
-        later = _Seen(self.after, points)
-        return later.to_world(seen.pixels + self._at(seen.pixels) - later.pixels, seen.inside)
+        seen = Seen(self.before, points)
+        later = Seen(self.after, points)
+        return later.to_world(seen.pixels + self.at(seen.pixels) - later.pixels, seen.inside)
 
     def arrived(self, points: Tensor) -> Tensor:
         """World-space motion [N, 3] by which points came to be where they are in the second frame, `points` [N, 3]."""
-        seen = _Seen(self.after, points)
-        earlier = _Seen(self.before, points)
+        seen = Seen(self.after, points)
+        earlier = Seen(self.before, points)
         came_from = seen.pixels
         for _ in range(INVERSE_STEPS):
-            came_from = seen.pixels - self._at(came_from)
+            came_from = seen.pixels - self.at(came_from)
         return earlier.to_world(earlier.pixels - came_from, seen.inside)
 
-    def _at(self, pixels: Tensor) -> Tensor:
+    def at(self, pixels: Tensor) -> Tensor:
         """The flow at pixels [N, 2], bilinear; beyond the picture's edge that of the edge."""
         size = pixels.new_tensor([self.after.width_px, self.after.height_px])
         grid = (2 * pixels / size - 1).clamp(-2, 2)
@@ -51,21 +55,22 @@ class SurfaceMotion:
         return sampled[0, :, 0].T
 
 
-class _Seen:
+class Seen:
     """Points as a pinhole camera sees them."""
 
     def __init__(self, camera: Camera, points: Tensor) -> None:
+        """`pixels` [N, 2], `depth` [N, 1], and whether each is `inside` the picture [N, 1]."""
         view, intrinsics = camera.matrices(points.device, points.dtype)
         self._rotation = view[:3, :3]
         self._focal = intrinsics[[0, 1], [0, 1]]
         local = points @ self._rotation.T + view[:3, 3]
-        self._depth = local[:, 2:].clamp(min=NEAREST)
-        self.pixels = local[:, :2] / self._depth * self._focal + intrinsics[:2, 2]
+        self.depth = local[:, 2:].clamp(min=NEAREST)
+        self.pixels = local[:, :2] / self.depth * self._focal + intrinsics[:2, 2]
         size = points.new_tensor([camera.width_px, camera.height_px])
         in_picture = ((self.pixels >= 0) & (self.pixels <= size)).all(dim=1, keepdim=True)
         self.inside = in_picture & (local[:, 2:] > NEAREST)
 
     def to_world(self, moved_px: Tensor, inside: Tensor) -> Tensor:
         """Motion [N, 2] in pixels as motion in the world at the points' depth; none for points that are not `inside` [N, 1]."""
-        moved = torch.where(inside, moved_px * self._depth / self._focal, torch.zeros_like(moved_px))
+        moved = torch.where(inside, moved_px * self.depth / self._focal, torch.zeros_like(moved_px))
         return moved @ self._rotation[:2]

@@ -67,7 +67,9 @@ class LiveApplication(Application):
         reserve = StorageReserve(out, self.room_to_finish)
         self.source_op = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
         recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
-        analysis = analysis_operator(self, settings.tool_mask, settings.out_of_body)
+        analysis = analysis_operator(
+            self, settings.tool_mask, settings.out_of_body, recording.behind_gate(), recording.behind_analysis()
+        )
         self.add_flow(self.source_op, analysis, {("frame", "frame")})
         self.reconstruct = LiveReconstructOp(
             self,
@@ -77,8 +79,7 @@ class LiveApplication(Application):
             listener=recording.listener,
         )
         deform = DeformOp(self, name="deform")
-        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
-        rasterize.adopt(self._warm.renderer, self.frame_source.description.camera, self._warm.reconstructor.device)
+        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer, rasterizer=self._warm.rasterizer)
         self.display = DisplayOp(
             self,
             name="display",

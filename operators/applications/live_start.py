@@ -9,26 +9,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import cv2
-import numpy as np
 
-from gsplat_core.rendering.registry import new_renderer
-from gsplat_core.rendering.renderer import Renderer
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.budget import Budget
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.live import LiveReconstructor
 from operators.applications.device import seeded
 from operators.applications.live_settings import LiveSettings
+from operators.applications.warm_reconstructor import noise, warm_reconstructor
 from operators.display import labelled
-from operators.messages import PictureState
+from operators.messages import DeformedScene, PictureState
+from operators.rasterize import Rasterizer
 from operators.sources.source import FrameSource
 
 SWITCH_INTERVAL_S = 0.0002
 """How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
 OPENCV_THREADS = 2
 """More of them take longer to start than small pictures take to look at."""
-WARM_FRAMES = 3
-WARM_STEPS = {"cpu": 3, "cuda": 40}
-"""Optimiser steps on each picture before the first frame."""
 
 
 def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveReconstructor:
@@ -48,29 +45,24 @@ class WarmParts:
     """What a live run works with, used once already."""
 
     reconstructor: LiveReconstructor
-    renderer: Renderer
+    rasterizer: Rasterizer
 
 
 def warm_up(settings: LiveSettings, source: FrameSource) -> WarmParts:
     """Do everything once that takes long the first time: kernels are loaded, graphs captured, memory is taken, threads are started. The
     stream's first frame then has to wait for none of it."""
     camera = source.description.camera
-    noise = np.random.default_rng(0).integers(0, 256, (camera.height_px, camera.width_px, 3), np.uint8)
+    rasterizer = Rasterizer(settings.renderer)
+
+    def draw(frame: Frame, model: Model | Snapshot) -> object:
+        scene = DeformedScene(frame, model, camera, trained=True)
+        return scene, rasterizer.draw(scene)
+
     with seeded(settings.seed, settings.device):
         reconstructor = new_live_reconstructor(settings, source)
-        renderer = new_renderer(settings.renderer, camera, reconstructor.device)
-        published = []
-        for seq in range(WARM_FRAMES):
-            # Budgets in time, so that the length of a step is known. All snapshots are held: every slot that a run needs is made.
-            budget = Budget.until(0.0, at_least=WARM_STEPS[settings.device])
-            reconstructor.observe(Frame(seq, seq * 33_000_000, noise), budget=budget)
-            published.append(reconstructor.publish())
-            renderer.prepare(published[-1])
-            renderer.render(camera, seq * 0.033).result()
-            reconstructor.rehearse(2)
-        reconstructor.forget()
-    labelled(noise, PictureState.LIVE, 0)
-    return WarmParts(reconstructor, renderer)
+        warm_reconstructor(reconstructor, draw)
+    labelled(noise(camera), PictureState.LIVE, 0)
+    return WarmParts(reconstructor, rasterizer)
 
 
 @contextmanager

@@ -25,8 +25,6 @@ from operators.storage import StorageReserve
 if TYPE_CHECKING:
     from operators.applications.live_settings import LiveSettings
 
-GATE = "out_of_body"
-"""The operator behind which frames may be recorded."""
 RECORDING_RESERVE_BYTES = 64 * 2**20
 """Room that a recording leaves on the disk, beside what finishing the run needs."""
 
@@ -70,15 +68,17 @@ class RunRecording:
         if settings.record is not None:
             self.recorder = new_recorder(settings.record, source, settings, room)
 
-    def analysis(self, operators: list[Operator]) -> list[Operator]:
-        """The operators that look at each frame, with those between them that record it: behind the out-of-body gate, and behind all."""
+    def behind_gate(self) -> list[Operator]:
+        """What records each frame as it comes through the out-of-body gate."""
         if self.recorder is None:
-            return operators
-        names = [operator.name for operator in operators]
-        behind_gate = names.index(GATE) + 1 if GATE in names else 0
-        frames = RecordFramesOp(self._graph, name="recorded_frames", recorder=self.recorder)
-        preparation = RecordPreparationOp(self._graph, name="recorded_preparation", recorder=self.recorder)
-        return [*operators[:behind_gate], frames, *operators[behind_gate:], preparation]
+            return []
+        return [RecordFramesOp(self._graph, name="recorded_frames", recorder=self.recorder)]
+
+    def behind_analysis(self) -> list[Operator]:
+        """What records each frame as it goes into training."""
+        if self.recorder is None:
+            return []
+        return [RecordPreparationOp(self._graph, name="recorded_preparation", recorder=self.recorder)]
 
     def pictures_of(self, display: Operator) -> None:
         """Record what `display` shows."""

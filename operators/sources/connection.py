@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import av
-import numpy as np
 
 from gsplat_core.io.recordings.decoded import DEPENDS
 from gsplat_core.io.recordings.decoder import PictureConverter, PictureDecoder, captured_log, frame_rate
@@ -17,6 +16,8 @@ from gsplat_core.scene.frames import Frame, FrameStatus
 
 KEPT_PACKETS = 256
 """So many packets may be under way in a decoder."""
+WHOLE_PICTURES = frozenset({"rawvideo", "wrapped_avframe", "mjpeg"})
+"""Codecs each of whose packets is a picture, whether or not it is marked as a key frame."""
 PACKETS_WITHOUT_KEY = 300
 """A stream that has no key frame among so many packets is decoded without one."""
 
@@ -89,7 +90,7 @@ class Connection:
         came: dict[int, int] = {}
         tick = self._stream.time_base or Fraction(1, 90_000)
         number = seq = 0
-        began = False
+        began = alone = self._stream.codec_context.name in WHOLE_PICTURES
         for packet in self._packets():
             if packet is not None and not began:
                 began = packet.is_keyframe or self.skipped >= PACKETS_WITHOUT_KEY
@@ -99,7 +100,7 @@ class Connection:
             if packet is not None:
                 came[number] = time.monotonic_ns()
                 came.pop(number - KEPT_PACKETS, None)
-                damage.saw(number, packet.is_keyframe)
+                damage.saw(number, alone or packet.is_keyframe)
             for own, decoded in self._decoder.decode(packet, number, shown=True):
                 damage.doubt(self._decoder.doubts)
                 if decoded.width * decoded.height > MAX_PIXELS:
@@ -111,8 +112,6 @@ class Connection:
                     seq=seq,
                     pts_ns=arrived_ns if pts_ns is None or abs(pts_ns) > 2**62 else pts_ns,
                     image=image,
-                    # As in recordings: no pixel of a damaged picture is known to be tissue.
-                    mask=None if why is None else np.zeros(image.shape[:2], np.uint8),
                     arrived_ns=arrived_ns,
                     status=FrameStatus.LIVE if why is None else FrameStatus.DAMAGED,
                     damage=why,

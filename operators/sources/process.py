@@ -46,14 +46,16 @@ class ProcessSource(LiveSource):
         *,
         opener: str = OPENER,
         hung_after_s: float = HUNG_AFTER_S,
+        stuck_after_s: float = math.inf,
         open_timeout_s: float = OPEN_TIMEOUT_S,
     ) -> None:
-        """opener: `module:function` that makes the source from address and options, in the process. Raises SourceUnavailable with what it said."""
+        """opener: `module:function` that makes the source from address and options, in the process. hung_after_s: a process that says nothing
+        for so long is replaced. stuck_after_s: so is one whose source stalls for so long. Raises SourceUnavailable with what it said."""
         options = options or SourceOptions()
         # The process knows best whether its source stalls, and counts it; whether the process itself does is asked in `state`.
         super().__init__(waiting=options.waiting, stalled_after_s=math.inf, order=FrameOrder(trusted=True))
         self._opening = Opening(opener, address, options)
-        self._hung_after_s, self._open_timeout_s = hung_after_s, open_timeout_s
+        self._hung_after_s, self._stuck_after_s, self._open_timeout_s = hung_after_s, stuck_after_s, open_timeout_s
         self._child_state: tuple[SourceState, str] | None = None
         self._child_counts: dict[str, int] = {}
         self._earlier_counts: Counter[str] = Counter()
@@ -105,7 +107,7 @@ class ProcessSource(LiveSource):
 
     def frames(self) -> Iterator[Frame]:
         """The frames of one process after another."""
-        backoff = Backoff()
+        backoff, crashes = Backoff(), 0
         try:
             while True:
                 try:
@@ -113,6 +115,7 @@ class ProcessSource(LiveSource):
                         self._start()
                     for frame in self._received():
                         backoff.worked()
+                        crashes = 0
                         yield frame
                     return
                 except (ChildLost, SourceUnavailable) as error:
@@ -121,9 +124,11 @@ class ProcessSource(LiveSource):
                     self._child_counts, self._child_state = {}, None
                     name = self.description.name
                     delay_s = backoff.failed()
-                    if backoff.failures >= MOST_FAILURES:
+                    # What is not there may come back; what ends its process again and again will not.
+                    crashes = 0 if isinstance(error, SourceUnavailable) else crashes + 1
+                    if crashes >= MOST_FAILURES:
                         raise SourceLost(
-                            f"{name} is given up after {backoff.failures} attempts: {error}. Check the source and start again."
+                            f"{name} is given up after {crashes} attempts: {error}. Check the source and start again."
                         ) from error
                     self.count("process_restarts")
                     self.lost(f"the process that reads {name} failed ({error}); another one is started")
@@ -137,6 +142,7 @@ class ProcessSource(LiveSource):
         child = self._child
         assert child is not None
         child.say("open")
+        last_s = time.monotonic()
         while not self.wait(0):
             told = child.hear(LOOK_S)
             if told is None:
@@ -144,11 +150,15 @@ class ProcessSource(LiveSource):
                     raise ChildLost(f"it has said nothing for {self._hung_after_s:g} s")
                 continue
             if told["kind"] == "frame":
+                last_s = child.heard_s
                 yield self._frame(child, told)
             elif told["kind"] == "ended":
                 return
             else:
                 self._note(told)
+                stalls = self._child_state is not None and self._child_state[0] is SourceState.STALLED
+                if stalls and child.heard_s - last_s > self._stuck_after_s:
+                    raise ChildLost(f"it has given no frame for {self._stuck_after_s:g} s")
 
     def _frame(self, child: ChildProcess, told: dict[str, Any]) -> Frame:
         try:

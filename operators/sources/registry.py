@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Callable
@@ -27,6 +28,10 @@ SOURCES: Registry[SourceFactory] = Registry(
         "recording": "operators.sources.recording:recording_source",
         "realtime": "operators.sources.realtime:realtime_source",
         "pipe": "operators.sources.pipe:pipe_source",
+        "zmq+tcp": "operators.sources.zeromq:tcp_source",
+        "zmq+ipc": "operators.sources.zeromq:ipc_source",
+        "v4l2": "operators.sources.v4l2:v4l2_source",
+        "folder": "operators.sources.folder:folder_source",
         "synthetic": "operators.sources.synthetic:synthetic_source",
         **{scheme: f"operators.sources.url:{scheme}_source" for scheme in _URLS},
     },
@@ -34,12 +39,14 @@ SOURCES: Registry[SourceFactory] = Registry(
 
 _OF_PATHS = frozenset({"recording", "realtime", "folder", "v4l2", "pipe", "zmq+ipc"})
 """What follows these schemes is a path, which may begin with a slash."""
-_BLOCKING = frozenset(_URLS)
+_BLOCKING = frozenset({*_URLS, "v4l2"})
 """Sources that wait within a library or a driver: they read in a process of their own."""
 
 _BUILT_IN = frozenset(SOURCES)
 _SLOW_TO_OPEN_S = {"synthetic": 900.0}
 """It renders before it plays."""
+_STUCK_AFTER_S = {"v4l2": 5.0}
+"""A driver may wait for a camera for ever; only the end of its process ends that."""
 _TWO_SOURCES = "stereo:"
 _STEREO = re.compile(r"(?P<before>[?&#])stereo=(?P<layout>[^&#]*)")
 
@@ -76,8 +83,12 @@ def open_source(address: str | os.PathLike[str], options: SourceOptions | None =
     if _reads_in_a_process(scheme, rest, options):
         from operators.sources.process import OPEN_TIMEOUT_S, ProcessSource
 
-        timeout_s = _SLOW_TO_OPEN_S.get(scheme, OPEN_TIMEOUT_S)
-        source: FrameSource = ProcessSource(text, replace(options, process=False), open_timeout_s=timeout_s)
+        source: FrameSource = ProcessSource(
+            text,
+            replace(options, process=False),
+            stuck_after_s=_STUCK_AFTER_S.get(scheme, math.inf),
+            open_timeout_s=_SLOW_TO_OPEN_S.get(scheme, OPEN_TIMEOUT_S),
+        )
     else:
         source = SOURCES[scheme](rest, options)
     return source if layout is None else _split(source, layout)

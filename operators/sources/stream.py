@@ -6,12 +6,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
 from gsplat_core.io.recordings.frame_files import resize_area, resize_nearest
 from gsplat_core.io.recordings.image_files import MAX_PIXELS
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.sources.live import STALLED_AFTER_S, LiveSource
 from operators.sources.options import SourceOptions
 from operators.sources.order import FrameOrder
@@ -77,6 +79,9 @@ class StreamSource(LiveSource):
     def frames(self) -> Iterator[Frame]:
         """See `LiveSource`."""
         for given, frame in enumerate(self.pictures(), start=1):
+            if frame.status is FrameStatus.DAMAGED:
+                # As in recordings: no pixel of a damaged picture is known to be tissue.
+                frame = replace(frame, mask=np.zeros(frame.image.shape[:2], np.uint8))
             yield resized(frame, self.options.scale)
             if given == self.options.max_frames:
                 return

@@ -178,7 +178,9 @@ def test_packets_that_are_lost_mark_pictures_as_damaged_until_the_next_key_frame
         data[packet * 188 : packet * 188 + 188] = b"\x47\x1f\xff\x10" + 184 * b"\xff"  # a null packet in its place
     (tmp_path / "torn.ts").write_bytes(data)
     stream = reading(open_source(f"{web}/torn.ts", SourceOptions(process=False, waiting=64, max_frames=38)))
-    status = [stream.frame().status for _ in range(36)]
+    frames = [stream.frame() for _ in range(36)]
+    status = [frame.status for frame in frames]
+    assert all((frame.mask is not None and not frame.mask.any()) == bool(frame.damage) for frame in frames)
     assert FrameStatus.DAMAGED in status and status[0] is FrameStatus.LIVE and status[-1] is FrameStatus.LIVE
 
 
