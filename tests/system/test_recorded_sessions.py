@@ -49,12 +49,14 @@ def test_a_killed_session_is_replayed_and_stays_when_the_next_one_is_recorded(sc
     notes = replayed(intrasplat, killed, tmp_path / "replay").notes
     assert any("byte for byte" in note for note in notes), notes
 
-    done = intrasplat("live", scope, "--seconds", "2", "--out", out, "--record", "--json")
+    done = intrasplat("live", scope, "--loop", "--seconds", "2", "--out", out, "--record", "--json")
     assert done.code == 0, done.err
     recordings = sorted((out / "recordings").iterdir())
     assert killed in recordings and len(recordings) == 2
     assert open_recording(killed).frame_count == frames
-    assert any("frames were recorded in" in note for note in RunReport.read(out / "report.json").notes)
+    notes = RunReport.read(out / "report.json").notes
+    assert any("frames were recorded in" in note for note in notes)
+    assert any("ended after 2 s" in note for note in notes)
     assert (out / "model").is_dir()
 
 
