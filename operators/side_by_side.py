@@ -28,7 +28,8 @@ class SideBySideOp(Operator):
         frame: `Frame`.
 
     Params:
-        gate: a chain that may withhold a frame from everything that comes after; the others see its picture all the same.
+        gate: a chain whose first operator may withhold a frame from everything that comes after; the other chains see its picture all the
+            same.
         first: the chain whose frame goes on.
         beside: further chains.
         then: the last chain.
@@ -82,7 +83,7 @@ class SideBySideOp(Operator):
             wait(others)
         gated, *found = [other.result() for other in others]
         if gated.withheld is None:
-            for each in found:
+            for each in (gated, *found):
                 decided = with_findings(decided, each)
         else:
             decided = gated.with_fields(seq=decided.seq, pts_ns=decided.pts_ns)

@@ -22,7 +22,10 @@ WIDE_WEIGHT = 0.02
 
 
 Detail: TypeAlias = Literal["full", "half"]
-"""`full`: pictures as they are, a thorough search (some 12 to 40 ms for 640x512). `half`: half the size, a quick one (1 to 3 ms)."""
+"""`full`: pictures as they are, a thorough search (some 12 to 40 ms for 640x512). `half`: a quick search (1 to 3 ms), of pictures of more than
+`SMALL_PIXELS` at half their size."""
+SMALL_PIXELS = 150_000
+"""Halved, so small a picture would lose the details that the search follows, and it is quick without that."""
 
 
 class ImageMotion:
@@ -60,10 +63,10 @@ class ImageMotion:
     def raw_flow(
         self, image: NDArray[np.uint8], known: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32] | None:
-        """As `follow`, without the tissue: [h, w, 2] in pixels of the full picture, h and w its own size or half of it."""
+        """As `follow`, without the tissue: [h, w, 2] in pixels of the full picture, h and w its own size or half of it where that is searched."""
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-        if self._shrinks:
-            height, width = grey.shape
+        height, width = grey.shape
+        if self._shrinks and height * width > SMALL_PIXELS:
             grey = np.asarray(cv2.resize(grey, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA))
         before, self._before = self._before, grey
         if before is None or before.shape != grey.shape or min(grey.shape) < SMALLEST_PX:
@@ -71,7 +74,7 @@ class ImageMotion:
         if known is not None and known.shape[:2] == grey.shape:
             return known
         flow = np.asarray(self._method.calc(before, grey, None), np.float32)
-        return flow * (image.shape[1] / grey.shape[1]) if self._shrinks else flow
+        return flow if grey.shape[1] == width else flow * (width / grey.shape[1])
 
     def forget(self) -> None:
         """The next picture is the first one."""

@@ -167,7 +167,8 @@ class _Work:
         description = self.source.description
         config = settings.reconstructor_config(description.width_px * description.height_px)
         if self.settings.motion_prior is not None:
-            config = replace(config, motion_prior=self.settings.motion_prior)
+            prior = self.settings.motion_prior
+            config = replace(config, motion_prior=prior, start_from_motion=True, depth_from_motion=True)
         if settings.device == "cpu":
             require_memory(replay_bytes(description, config), "the causal protocol", "give a smaller --scale")
         learning = Reconstructor(config, self.camera, seed=settings.seed, device=settings.device)

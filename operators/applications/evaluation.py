@@ -14,7 +14,7 @@ from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.places import Visits
 from gsplat_core.evaluation.retention import LAST_S, Retention, Return
 from gsplat_core.evaluation.scores import Score
-from gsplat_core.training.motion_prior import MOTION_PRIORS
+from gsplat_core.training.motion_priors import MOTION_PRIORS
 from operators.applications.limits import check_max_frames, check_scale, check_steps
 from operators.sources.source import SourceDescription
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from operators.applications.live_settings import LIVE_MOTION_DETAIL
 from operators.endoscope.stage import StageOp
 from operators.endoscope.stages import PICTURE_STAGES, TISSUE_STAGES, new_stages
 from operators.graph import Operator
 from operators.out_of_body import OutOfBodyGateOp, Policy
-from operators.picture_flow import PictureFlowOp
 from operators.side_by_side import SideBySideOp
 from operators.tool_mask import new_tool_mask
 
@@ -35,14 +33,11 @@ def analysis_operator(
     return SideBySideOp(
         fragment,
         name="analysis",
-        gate=[OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body)],
-        first=[StageOp(fragment, name="picture", stages=new_stages(PICTURE_STAGES, without=[BESIDE]))],
-        beside=[
-            [new_tool_mask(fragment, tool_mask)],
-            [
-                StageOp(fragment, name="highlights", stages=new_stages(PICTURE_STAGES, without=others)),
-                PictureFlowOp(fragment, name="flow", detail=LIVE_MOTION_DETAIL),
-            ],
+        gate=[
+            OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body),
+            StageOp(fragment, name="highlights", stages=new_stages(PICTURE_STAGES, without=others)),
         ],
+        first=[StageOp(fragment, name="picture", stages=new_stages(PICTURE_STAGES, without=[BESIDE]))],
+        beside=[[new_tool_mask(fragment, tool_mask)]],
         then=[*behind_gate, StageOp(fragment, name="tissue", stages=new_stages(TISSUE_STAGES)), *behind],
     )

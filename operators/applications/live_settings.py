@@ -89,8 +89,6 @@ class LiveSettings:
             preallocate=True,
             motion_prior="flow",
             motion_detail=LIVE_MOTION_DETAIL,
-            start_from_motion=True,
-            depth_from_motion=True,
             ssim_weight=LIVE_SSIM_WEIGHT[self.device],
         )
         most = max(64, pixels // PIXELS_PER_GAUSSIAN)
