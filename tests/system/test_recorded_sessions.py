@@ -45,7 +45,7 @@ def test_a_killed_session_is_replayed_and_stays_when_the_next_one_is_recorded(sc
     process.communicate(timeout=60)
     (killed,) = (out / "recordings").iterdir()
     frames = open_recording(killed).frame_count
-    assert frames > 5
+    assert frames >= 5  # six were shown, and FFmpeg keeps the newest picture until the next one
     notes = replayed(intrasplat, killed, tmp_path / "replay").notes
     assert any("byte for byte" in note for note in notes), notes
 
