@@ -24,7 +24,7 @@ def recording_under_way(start, source, out):
     recordings = out / "recordings"
     for _ in range(1200):
         logs = [path.read_bytes() for path in recordings.glob("*/segments/000000/log.jsonl")]
-        if any(log.count(b'"shown"') > 5 for log in logs):
+        if any(log.count(b'"event":"shown"') > 5 for log in logs):
             return process
         assert process.poll() is None, process.communicate()
         time.sleep(0.05)
