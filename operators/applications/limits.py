@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
@@ -74,28 +72,3 @@ def frames_to_render(window_s: tuple[float, float], fps: float) -> int:
             " rendered: give a smaller --fps"
         )
     return math.floor(span + 1e-6) + 1
-
-
-class StopAfter:
-    """Answers True when `stop_requested` does, and from so many seconds on after it was first asked; None: only then."""
-
-    def __init__(
-        self,
-        seconds: float | None,
-        stop_requested: Callable[[], bool],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._seconds = math.inf if seconds is None else seconds
-        self._stop_requested, self._clock = stop_requested, clock
-        self._begun_s: float | None = None
-        self.over = False
-        """Whether the time was over before a stop was requested."""
-
-    def __call__(self) -> bool:
-        now_s = self._clock()
-        if self._begun_s is None:
-            self._begun_s = now_s
-        if self._stop_requested():
-            return True
-        self.over = self.over or now_s - self._begun_s >= self._seconds
-        return self.over

@@ -16,7 +16,7 @@ from gsplat_core.rendering.registry import check_renderer
 from operators.applications.delivery import Report, delivered
 from operators.applications.device import check_device
 from operators.applications.finishing import saves_model
-from operators.applications.limits import StopAfter, check_picture
+from operators.applications.limits import check_picture
 from operators.applications.live_analysis import analysis_operator
 from operators.applications.live_settings import LiveSettings
 from operators.applications.live_start import WarmParts, low_latency, warm_up
@@ -130,17 +130,11 @@ def live(
 
     def run(inside: LiveSettings, notes: list[str]) -> RunOutcome:
         source = prepare(inside, notes)
-        until = StopAfter(inside.seconds, stop_requested)
-
-        def says_time_is_over(session: Session) -> None:
-            if until.over:
-                session.notes.append(f"the run ended after {inside.seconds:g} s, as it was asked to")
-
         graph = LiveApplication(
             source,
             inside,
             warm_up(inside, source),
-            stop_requested=until,
+            stop_requested=stop_requested,
             on_scored=on_scored,
             on_shown=on_shown,
         )
@@ -149,7 +143,7 @@ def live(
                 graph,
                 inside.stated(),
                 command="live",
-                finish=[saves_model(inside.out), says_time_is_over],
+                finish=[saves_model(inside.out)],
                 notes=notes,
                 stop_requested=stop_requested,
             ).execute()
