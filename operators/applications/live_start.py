@@ -9,17 +9,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import cv2
+import numpy as np
 
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.live import LiveReconstructor
 from operators.applications.device import seeded
+from operators.applications.live_analysis import analysis_operator
 from operators.applications.live_settings import LiveSettings
-from operators.applications.warm_reconstructor import noise, warm_reconstructor
+from operators.applications.warm_reconstructor import WARM_FRAMES, noise, warm_reconstructor
 from operators.display import labelled
 from operators.messages import DeformedScene, PictureState
 from operators.rasterize import Rasterizer
+from operators.side_by_side import through
 from operators.sources.source import FrameSource
 
 SWITCH_INTERVAL_S = 0.0002
@@ -34,7 +37,7 @@ def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveR
     return LiveReconstructor(
         settings.reconstructor_config(camera.width_px * camera.height_px),
         camera,
-        live=settings.training,
+        live=settings.chosen_training,
         seed=settings.seed,
         device=settings.device,
     )
@@ -62,6 +65,13 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> WarmParts:
         reconstructor = new_live_reconstructor(settings, source)
         warm_reconstructor(reconstructor, draw)
     labelled(noise(camera), PictureState.LIVE, 0)
+    analysis = analysis_operator(None, settings.tool_mask, settings.out_of_body)
+    analysis.start()
+    try:
+        for seq in range(WARM_FRAMES):
+            through([analysis], Frame(seq, seq * 33_000_000, np.roll(noise(camera), seq, axis=1)))
+    finally:
+        analysis.stop()
     return WarmParts(reconstructor, rasterizer)
 
 
