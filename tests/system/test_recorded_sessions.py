@@ -24,7 +24,7 @@ def recording_under_way(start, source, out):
     recordings = out / "recordings"
     for _ in range(1200):
         logs = [path.read_bytes() for path in recordings.glob("*/segments/000000/log.jsonl")]
-        if any(log.count(b'"shown"') > 5 for log in logs):
+        if any(log.count(b'"event":"shown"') > 5 for log in logs):
             return process
         assert process.poll() is None, process.communicate()
         time.sleep(0.05)
@@ -45,11 +45,11 @@ def test_a_killed_session_is_replayed_and_stays_when_the_next_one_is_recorded(sc
     process.communicate(timeout=60)
     (killed,) = (out / "recordings").iterdir()
     frames = open_recording(killed).frame_count
-    assert frames > 5
+    assert frames >= 5  # six were shown, and FFmpeg keeps the newest picture until the next one
     notes = replayed(intrasplat, killed, tmp_path / "replay").notes
     assert any("byte for byte" in note for note in notes), notes
 
-    done = intrasplat("live", scope, "--seconds", "2", "--out", out, "--record", "--json")
+    done = intrasplat("live", scope, "--loop", "--seconds", "2", "--out", out, "--record", "--json")
     assert done.code == 0, done.err
     recordings = sorted((out / "recordings").iterdir())
     assert killed in recordings and len(recordings) == 2

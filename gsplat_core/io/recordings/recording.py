@@ -106,9 +106,13 @@ class FileRecording:
         return frame.with_fields(
             image=resize_area(frame.image, *size),
             right_image=None if frame.right_image is None else resize_area(frame.right_image, *size),
-            depth=None if frame.depth is None else resize_nearest(frame.depth, *size),
-            mask=None if frame.mask is None else resize_nearest(frame.mask, *size),
-            loss_mask=None if frame.loss_mask is None else resize_nearest(frame.loss_mask, *size),
+            **{
+                name: resize_nearest(plane, *size)
+                for name in ("depth", "mask", "loss_mask", "rehearsal_mask")
+                if (plane := getattr(frame, name)) is not None
+            },
+            flow=None,
+            flow_since=None,
         )
 
 

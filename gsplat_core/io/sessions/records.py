@@ -96,7 +96,7 @@ class _FrameLine(Record):
 
 
 class FrameLine(_FrameLine):
-    """A frame as it came in: behind the out-of-body gate, before anything else."""
+    """A frame as it came in: behind the out-of-body gate and what looks at the picture beside it."""
 
     event: Literal["frame"] = "frame"
 

@@ -71,7 +71,10 @@ def test_everything_is_there_when_it_is_closed(tmp_path):
 
 def test_a_slow_disk_loses_frames_says_so_and_makes_nobody_wait(tmp_path, gate):
     frames = [new_frame(seq) for seq in range(50)]
-    size = sum(frames[0].__dict__[name].nbytes for name in ("image", "right_image", "depth", "mask", "loss_mask"))
+    size = sum(
+        frames[0].__dict__[name].nbytes
+        for name in ("image", "right_image", "depth", "mask", "loss_mask", "rehearsal_mask")
+    )
     recorder = recorder_in(tmp_path, queue_bytes=10 * size)
     begin = time.monotonic()
     for frame in frames:
@@ -87,7 +90,9 @@ def test_a_slow_disk_loses_frames_says_so_and_makes_nobody_wait(tmp_path, gate):
 
 
 def test_shown_pictures_are_lost_before_frames(tmp_path, gate):
-    frames = [new_frame(seq, right_image=None, depth=None, mask=None, loss_mask=None) for seq in range(8)]
+    frames = [
+        new_frame(seq, right_image=None, depth=None, mask=None, loss_mask=None, rehearsal_mask=None) for seq in range(8)
+    ]
     recorder = recorder_in(tmp_path, queue_bytes=8 * frames[0].image.nbytes)
     for frame in frames[:4]:
         recorder.frame(frame)

@@ -35,6 +35,7 @@ def new_frame(seq: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX, **
         "depth": depth,
         "mask": rng.integers(0, 2, size, np.uint8),
         "loss_mask": rng.integers(0, 2, size, np.uint8),
+        "rehearsal_mask": rng.integers(0, 2, size, np.uint8),
         "pose": pose,
         "arrived_ns": 10**15 + seq,
         "status": FrameStatus.LIVE,
@@ -47,7 +48,10 @@ def new_frame(seq: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX, **
 
 def same_frame(a: Frame, b: Frame) -> bool:
     """Whether two frames have the same pictures, to the bit, and say the same; but for `arrived_ns` and `live`, which replay does not have."""
-    planes = [(getattr(a, n), getattr(b, n)) for n in ("image", "right_image", "depth", "mask", "loss_mask", "pose")]
+    planes = [
+        (getattr(a, n), getattr(b, n))
+        for n in ("image", "right_image", "depth", "mask", "loss_mask", "rehearsal_mask", "pose")
+    ]
     facts = ("seq", "pts_ns", "exposure", "withheld", "new_scene", "damage")
     return all(x is y is None or x.tobytes() == y.tobytes() for x, y in planes) and all(
         getattr(a, n) == getattr(b, n) for n in facts

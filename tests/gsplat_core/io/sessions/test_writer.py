@@ -45,7 +45,7 @@ def test_what_training_was_given_comes_back_to_the_bit(session, frames):
                         loss_mask=np.ones_like(frames[line.seq].mask), exposure=(1.0, 2.0, 3.0)
                     )
                     assert same_frame(frame, wanted)
-                    assert line.same == ("image", "right_image", "mask", "depth")
+                    assert line.same == ("image", "right_image", "mask", "rehearsal_mask", "depth")
                     seen += 1
     assert seen == len(frames)
 
