@@ -72,7 +72,8 @@ class FrameClock:
         """Usual time from a published model to its shown picture."""
         self.training_ns = 0.0
         """Usual time from taking a frame to its published model."""
-        self._last_arrival_ns: int | None = None
+        self._last_arrival: tuple[int, int] | None = None
+        """When the newest frame came, and its number."""
         self._last_taken_ns: int | None = None
         self._shown = threading.Event()
 
@@ -80,7 +81,7 @@ class FrameClock:
         """The training that a frame may take before it is shown; the `first` one of a scene takes longer."""
         settings = self.settings
         arrived_ns = self.now_ns() if frame.arrived_ns is None else frame.arrived_ns
-        self._learn_interval(arrived_ns)
+        self._learn_interval(arrived_ns, frame.seq)
         self._last_taken_ns = self.now_ns()
         until_ns = arrived_ns + (settings.first_ms * 1e6 if first else self.show_after_ns) - self.display_ns
         if settings.budget_ms is None and not first:
@@ -131,10 +132,11 @@ class FrameClock:
         """Wait until the newest published model is shown, but not for long: its picture has the device for itself meanwhile."""
         self._shown.wait(SHOWN_WITHIN_S)
 
-    def _learn_interval(self, arrived_ns: int) -> None:
-        last, self._last_arrival_ns = self._last_arrival_ns, arrived_ns
+    def _learn_interval(self, arrived_ns: int, seq: int) -> None:
+        last, self._last_arrival = self._last_arrival, (arrived_ns, seq)
         if last is None:
             return
-        # A pause is no interval, and neither is a burst after one.
-        seen = min(max(arrived_ns - last, 0.2 * self.interval_ns), 5 * self.interval_ns)
+        # Frames that were passed over have come, too. A pause is no interval, and neither is a burst after one.
+        each_ns = (arrived_ns - last[0]) / max(1, seq - last[1])
+        seen = min(max(each_ns, 0.2 * self.interval_ns), 5 * self.interval_ns)
         self.interval_ns += INTERVAL_DECAY * (seen - self.interval_ns)

@@ -49,6 +49,13 @@ def test_the_interval_follows_the_frames_and_not_a_pause(clock, frame, fake_time
     assert clock.interval_ns < 30e6
 
 
+def test_frames_that_were_passed_over_do_not_make_the_interval_longer(clock, frame, fake_time):
+    for k in range(60):
+        fake_time.pass_ms(100)
+        clock.budget(frame(5 * k, arrived_ns=fake_time.ns))
+    assert clock.interval_ns == pytest.approx(20e6, rel=0.05)
+
+
 def test_frames_that_come_at_once_do_not_make_the_interval_zero(clock, frame, fake_time):
     for k in range(500):
         clock.budget(frame(k, arrived_ns=fake_time.ns))
