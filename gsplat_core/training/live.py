@@ -7,11 +7,15 @@ from dataclasses import dataclass
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.coverage import CapturedCoverage
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
+from gsplat_core.training.places import Place, Places
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
 REHEARSED_IN_FLIGHT = 2
@@ -67,11 +71,16 @@ class LiveReconstructor(Reconstructor):
         super().__init__(config, camera, seed=seed, recording_digest=recording_digest, device=device)
         self._live = live or LiveTraining()
         self._rehearsing = StepsInFlight(self.device, most=REHEARSED_IN_FLIGHT)
+        self._places = Places()
+        self._taken_up: Place | None = None
+        """The place that the next frame shows, from which its scene starts."""
+        self._idle: tuple[TrainingStep, CapturedCoverage | None, tuple[int, int, str]] | None = None
+        """Memory and captured graphs of the scene before, and the size and model of the camera that they are for."""
 
     def kept(self) -> dict[str, int]:
         """How much of the stream is held, by what holds it; none of it grows without end."""
         columns = 0 if self._step is None else getattr(self._step.field, "bumps", 0)
-        return {"window_frames": len(self._window), "columns": columns}
+        return {"window_frames": len(self._window), "columns": columns, "places": len(self._places)}
 
     def rehearse(self, steps: int) -> None:
         """So many steps on frames of the window. On a GPU they are queued, and at most `REHEARSED_IN_FLIGHT` of them are not finished when
@@ -98,18 +107,46 @@ class LiveReconstructor(Reconstructor):
 
     def forget(self) -> None:
         """As if no frame had been observed, but for what is known about the device: the memory that was taken, how long a step takes."""
-        self._settle()
-        self._step = self._coverage = None
+        self._put_aside()
+        self._places = Places()
         self._version = 0
+
+    def _put_aside(self) -> None:
+        """End the scene. Its memory and what was captured for it serve the next one."""
+        self._settle()
+        if self._step is not None:
+            self._idle = self._step, self._coverage, self._picture
+        self._step = self._coverage = self._taken_up = None
         self._window = ObservationWindow(self.config.window_frames, self.config.newest_share, self._seed)
 
-    def begin_scene(self, frame: Frame) -> None:
-        """Forget the scene: `frame`, which is observed next, starts another one. The frame may be of another size; versions go on counting."""
-        version = self._version
-        self.forget()
-        self._version = version
+    def begin_scene(self, frame: Frame) -> bool:
+        """Leave the scene: `frame`, which is observed next, starts another one, or one that was left before; says whether it is such.
+
+        Places that were left are kept as they were last, in host memory; their number is bounded. The frame may be of another size. Versions
+        go on counting.
+        """
+        if self._step is not None:
+            self._places.leave(self._step.at(self._last_time_s), self._window.newest.camera, self._last_time_s)
+        self._put_aside()
         if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
             self.camera = self.camera.resized(frame.width_px, frame.height_px)
+        self._taken_up = self._places.take(frame)
+        return self._taken_up is not None
+
+    def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
+        place, self._taken_up = self._taken_up, None
+        return super()._first_gaussians(frame, observation) if place is None else place.gaussians
+
+    def _begin(self, gaussians: Gaussians, start_s: float, end_s: float | None) -> None:
+        idle, self._idle = self._idle, None
+        if idle is not None and idle[2] == self._picture and idle[0].restart(gaussians, start_s, self.camera):
+            self._step, self._coverage, _ = idle
+        else:
+            super()._begin(gaussians, start_s, end_s)
+
+    @property
+    def _picture(self) -> tuple[int, int, str]:
+        return self.camera.width_px, self.camera.height_px, self.camera.model
 
     def _train_on(self, observation: Observation, budget: Budget, first: bool) -> ObserveReport:
         assert self._step is not None

@@ -15,6 +15,7 @@ from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
@@ -259,17 +260,23 @@ class Reconstructor:
         )
 
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
-        gaussians = gaussians_from_frame(
+        self._first_time_s = observation.time_s
+        self.camera = observation.camera
+        self._begin(self._first_gaussians(frame, observation).to(self.device), observation.time_s, end_s)
+
+    def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
+        return gaussians_from_frame(
             frame,
             observation.camera,
             self.config.gaussians,
             sh_degree=self.config.sh_degree,
             default_depth_mm=self.config.default_depth_mm,
             seed=self._seed,
-        ).to(self.device)
-        self._first_time_s = observation.time_s
-        self.camera = observation.camera
-        wanted = NewField(gaussians, observation.time_s, end_s, self.config.bump_spacing_s, self.config.history_s)
+        )
+
+    def _begin(self, gaussians: Gaussians, start_s: float, end_s: float | None) -> None:
+        """Make the field and the step that train a scene from here on."""
+        wanted = NewField(gaussians, start_s, end_s, self.config.bump_spacing_s, self.config.history_s)
         with torch.random.fork_rng(devices=[]):  # planes and layers start random
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
