@@ -13,6 +13,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.coverage import CapturedCoverage
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
+from gsplat_core.training.out_of_view import OutOfView
 from gsplat_core.training.places import Place, Places
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.step import TrainingStep
@@ -74,13 +75,16 @@ class LiveReconstructor(Reconstructor):
         self._places = Places()
         self._taken_up: Place | None = None
         """The place that the next frame shows, from which its scene starts."""
+        self._out_of_view = OutOfView(config.max_gaussians, self.device) if config.preallocate else None
         self._idle: tuple[TrainingStep, CapturedCoverage | None, tuple[int, int, str]] | None = None
         """Memory and captured graphs of the scene before, and the size and model of the camera that they are for."""
 
     def kept(self) -> dict[str, int]:
         """How much of the stream is held, by what holds it; none of it grows without end."""
         columns = 0 if self._step is None else getattr(self._step.field, "bumps", 0)
-        return {"window_frames": len(self._window), "columns": columns, "places": len(self._places)}
+        archived = 0 if self._out_of_view is None else len(self._out_of_view.archive)
+        kept = {"window_frames": len(self._window), "columns": columns, "places": len(self._places)}
+        return {**kept, "archived": archived}
 
     def rehearse(self, steps: int) -> None:
         """So many steps on frames of the window. On a GPU they are queued, and at most `REHEARSED_IN_FLIGHT` of them are not finished when
@@ -100,7 +104,11 @@ class LiveReconstructor(Reconstructor):
     def grow(self, frame: Frame) -> None:
         """Add Gaussians where `frame`, the newest one that was trained on, shows tissue that the model does not cover. `observe` leaves
         that for the time after the frame was shown."""
-        super()._grow(frame, self._window.newest)
+        assert self._step is not None
+        observation = self._window.newest
+        if self._out_of_view is not None:
+            self._out_of_view.follow(self._step, observation)
+        super()._grow(frame, observation)
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
         pass
@@ -139,6 +147,8 @@ class LiveReconstructor(Reconstructor):
 
     def _begin(self, gaussians: Gaussians, start_s: float, end_s: float | None) -> None:
         idle, self._idle = self._idle, None
+        if self._out_of_view is not None:
+            self._out_of_view.restart()
         if idle is not None and idle[2] == self._picture and idle[0].restart(gaussians, start_s, self.camera):
             self._step, self._coverage, _ = idle
         else:
