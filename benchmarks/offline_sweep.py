@@ -29,7 +29,7 @@ from gsplat_core.deformation.hexplane import HexPlaneField
 from gsplat_core.deformation.hexplane_kind import HexPlaneLearningRates
 from gsplat_core.io.recordings import is_heldout, open_recording
 from gsplat_core.rendering.rasterization import render
-from gsplat_core.training import densification, fused_step, photometric
+from gsplat_core.training import densification
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
 from gsplat_core.training.densification import densify, shares_of
 from gsplat_core.training.initialisation import gaussians_from_frame
@@ -60,8 +60,7 @@ class Options:
     average: float = 0.04
     """Horizon of the moving average, as a share of all steps."""
     smooth: float = 0.0
-    smooth_every: int = 10
-    decay: float = 0.0
+    smooth_every: int = 20
     seconds: float | None = None
     steps: int | None = None
     recording: str | None = None
@@ -75,50 +74,9 @@ class Options:
     """Gaussians at its end, at full size."""
     until: float = 0.5
     unseen: float = 0.05
+    epsilon: float = 1e-8
     cloned_from: int = 0
     beta2: float = 0.999
-
-
-def use_loss(name: str) -> None:
-    """Swap the loss of both step kinds for one in plain torch (huber…), or back."""
-    if name in ("l1", "l2"):
-        fused_step.frame_loss, photometric.image_loss = ORIGINAL
-        return
-
-    def gradient(image: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        inside = (mask > 0)[..., None].to(image.dtype)
-        error = (image - target.to(image.dtype) / 255) * inside
-        count = 3 * inside.sum().clamp(min=1)
-        delta = float(name.removeprefix("huber"))  # error / sqrt(error² + delta²)
-        root = (error.square() + delta**2).sqrt()
-        return (root - delta).sum() / count, error / root / count
-
-    def frame(image, alphas, target, mask, depth, *_):  # type: ignore[no-untyped-def]
-        loss, grad = gradient(image[..., :3], target, mask)
-        return fused_step_loss(loss, torch.nn.functional.pad(grad, (0, 1)), torch.zeros_like(alphas))
-
-    def image(image, target, mask, *_):  # type: ignore[no-untyped-def]
-        loss, grad = gradient(image, target, mask)
-        return photometric_loss(loss, grad)
-
-    fused_step.frame_loss, photometric.image_loss = frame, image
-
-
-@dataclass
-class photometric_loss:
-    loss: Tensor
-    grad_image: Tensor
-    grad_depth: Tensor | None = None
-
-
-@dataclass
-class fused_step_loss:
-    loss: Tensor
-    grad_image: Tensor
-    grad_alphas: Tensor
-
-
-ORIGINAL = fused_step.frame_loss, photometric.image_loss
 
 
 @functools.cache
@@ -166,6 +124,7 @@ class Run:
             self.learning._grow(frame, observation)
         self.step: TrainingStep = self.learning._step
         self.step._adam.betas = (0.9, options.beta2)
+        BasisField.adam_step_at.__defaults__ = ((0.9, 0.999), options.epsilon)
         self.average: list[Tensor] | None = None
 
     def _start_hexplane(self, config: ReconstructorConfig, first, last) -> None:  # type: ignore[no-untyped-def]
@@ -227,15 +186,9 @@ class Run:
         self.average = None
 
     def smooth_field(self, rate: float) -> None:
-        """Towards the mean of the neighbours in time, and towards zero."""
-        if not isinstance(self.step.field, BasisField):
-            return
-        weights = self.step.field.weights.data
-        if self.options.smooth:
-            change = torch.diff(weights, n=2, dim=1)
-            weights[:, 1:-1] += self.options.smooth * rate * change / 2
-        if self.options.decay:
-            weights *= 1 - self.options.decay * rate
+        """Towards the mean of the neighbours in time: `smooth` of the way in a pass over all frames."""
+        share = self.options.smooth_every / len(self.train)
+        self.step.field.smooth_in_time(min(0.5, self.options.smooth * rate * share))
 
     def __call__(self, seconds: float | None, steps: int | None, moments: list[float]) -> None:
         options = self.options
@@ -244,7 +197,6 @@ class Run:
         order: list[int] = []
         moments = sorted(moments)
         elapsed, done, share = 0.0, 0, 0.0
-        use_loss(options.loss)
         every = 10
         rounds = [options.until * (k + 1) / options.densify for k in range(options.densify)]
         total = len(rounds)
@@ -275,7 +227,7 @@ class Run:
             done += 1
             if done % every == 0 and options.average and share > 0.05:
                 self._take_average(every, done, share)
-            if (options.smooth or options.decay) and done % options.smooth_every == 0:
+            if options.smooth and done % options.smooth_every == 0:
                 self.smooth_field(rate)
 
     def _take_average(self, every: int, done: int, share: float) -> None:

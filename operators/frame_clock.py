@@ -32,13 +32,13 @@ class ClockSettings:
 
     budget_ms: float | None = None
     """A frame is to be shown so long after it has come; None: `auto_share` of the time between frames, at most `auto_most_ms`."""
-    auto_share: float = 0.5
-    auto_most_ms: float = 18.0
+    auto_share: float = 0.6
+    auto_most_ms: float = 18.3
     at_least_steps: int = 5
     """Steps that every frame gets, though it is shown late: fewer would change nothing that can be seen."""
     at_most_steps: int = 80
     """Steps before a frame is shown, though there is time left."""
-    first_ms: float = 150.0
+    first_ms: float = 40.0
     """A scene's first frame may take so long, at least `first_at_least_steps`."""
     first_at_least_steps: int = 10
     first_at_most_steps: int = 60
@@ -115,7 +115,9 @@ class FrameClock:
 
     def shown(self, published_ns: int, shown_ns: int) -> None:
         """A picture of the model that was published then is shown now."""
-        self.display_ns += DISPLAY_DECAY * (max(0, shown_ns - published_ns) - self.display_ns)
+        # One that took very long, as a first one may, says little about the next.
+        seen = min(max(0, shown_ns - published_ns), 4 * self.display_ns + 1e6)
+        self.display_ns += DISPLAY_DECAY * (seen - self.display_ns)
         self._shown.set()
 
     def wait_until_shown(self) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from gsplat_core.errors import InvalidInput
@@ -12,7 +13,7 @@ from gsplat_core.io.recordings.decoded import DamagedFrames
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
-from operators.sources.source import FrameSource, SourceDescription, SourceState
+from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,12 @@ class SourceResult:
     """Whether the source gave all that it had; False when the run ended before."""
     damaged: int = 0
     """How many of the frames were damaged: shown, but neither trained on nor scored."""
+    counts: Mapping[str, int] = field(default_factory=dict)
+    """What the source dropped or repaired, by reason (`docs/sources.md`)."""
+    state_s: Mapping[str, float] = field(default_factory=dict)
+    """Seconds of the run that the source spent in each state but `live`."""
+    state_sentence: str = ""
+    """What the source said of its state last."""
 
 
 class SourceOp(Operator):
@@ -61,6 +68,7 @@ class SourceOp(Operator):
         self.damaged = DamagedFrames()
         """Those of the emitted frames that are damaged."""
         self._last_seq: int | None = None
+        self._states = _TimeInStates()
         super().__init__(fragment, *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:
@@ -69,6 +77,7 @@ class SourceOp(Operator):
     def start(self) -> None:
         self.emitted, self.reached_end, self._last_seq = 0, False, None
         self.damaged = DamagedFrames()
+        self._states = _TimeInStates()
         self.source.open()
 
     def stop(self) -> None:
@@ -95,7 +104,21 @@ class SourceOp(Operator):
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
-        outcome.add(SourceResult(self.source.description, self.emitted, self.reached_end, self.damaged.count))
+        counts = dict(self.source.counts()) if isinstance(self.source, ReportingSource) else {}
+        outcome.add(
+            SourceResult(
+                self.source.description,
+                self.emitted,
+                self.reached_end,
+                self.damaged.count,
+                counts,
+                self._states.seconds(),
+                self._states.sentence,
+            )
+        )
+        if counts:
+            said = ", ".join(f"{reason} {times}" for reason, times in sorted(counts.items()))
+            outcome.note(f"the source {self.source.description.name} dropped or repaired: {said}")
         if self.damaged.count:
             outcome.note(self.damaged.sentence(self.emitted))
 
@@ -106,6 +129,7 @@ class SourceOp(Operator):
                 self.stop_execution()
                 return None
             frame = self.source.read(LOOK_S)
+            self._states.saw(self.source, frame is not None)
             if frame is not None:
                 return frame
             if self.source.state is SourceState.ENDED:
@@ -116,3 +140,30 @@ class SourceOp(Operator):
     def _end(self) -> None:
         self.reached_end = True
         self.stop_execution()
+
+
+class _TimeInStates:
+    """How long a source was in each state but `live`, as seen by whoever reads it, and what it said last."""
+
+    def __init__(self) -> None:
+        self.sentence = ""
+        self._seconds: dict[SourceState, float] = {}
+        self._state = SourceState.LIVE
+        self._since_s = 0.0
+
+    def saw(self, source: FrameSource, frame_came: bool) -> None:
+        """Look at the source, after it was read."""
+        state = SourceState.LIVE if frame_came else source.state
+        if state is self._state is SourceState.LIVE:
+            return
+        now_s = time.monotonic()
+        if self._state is not SourceState.LIVE:
+            self._seconds[self._state] = self._seconds.get(self._state, 0.0) + now_s - self._since_s
+        if state is not self._state and isinstance(source, ReportingSource):
+            self.sentence = source.state_sentence
+            log.info("source %s: %s", state.value, self.sentence)
+        self._state, self._since_s = state, now_s
+
+    def seconds(self) -> dict[str, float]:
+        """By the states' names."""
+        return {state.value: seconds for state, seconds in self._seconds.items()}

@@ -31,6 +31,8 @@ from operators.storage import STAGING_PREFIX, storage_errors, write_whole
 
 _FORMAT = "intrasplat-output"
 _COMPLETE, _OLD = ".complete-", ".old-"
+RECORDINGS = "recordings"
+"""Holds what runs have recorded, one folder each. It is written as the run goes on, and no later run replaces it."""
 _RESULT = re.compile(
     r"reconstruction\.mp4|model|frames\.jsonl|report\.json|report\.html|\d{6,}\.png|evaluation\.(?:json|html)|evaluation-\w+\.jsonl"
 )
@@ -106,7 +108,7 @@ class OutputFolder:
 
     def _remove_marker(self) -> None:
         with contextlib.suppress(OSError):  # the folder was deleted meanwhile
-            if not _results(self.folder):
+            if not _results(self.folder) and not (self.folder / RECORDINGS).is_dir():
                 (self.folder / MARKER).unlink()
 
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from gsplat_core.rendering.registry import RENDERERS, new_renderer
 from gsplat_core.rendering.renderer import Renderer
-from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.transfers import HostCopy
@@ -29,46 +28,22 @@ def _displayed(image: torch.Tensor) -> HostCopy:
     return HostCopy((image.clamp(0, 1) * 255).round().to(torch.uint8))
 
 
-class RasterizeOp(Operator):
-    """Renders colour, depth and opacity with the renderer of a name.
+class Rasterizer:
+    """Renders colour, depth and opacity with the renderer of a name, for one thread at a time.
 
-    On a GPU the frame is queued on a stream of its own, which goes before the training that is queued for later frames. This operator's
-    thread waits until the picture has arrived in page-locked memory; the other threads go on meanwhile.
-
-    Inputs:
-        scene: `DeformedScene`.
-
-    Outputs:
-        rendered: `RenderedFrame`, complete.
-
-    Params:
-        renderer: a name in `gsplat_core.rendering.registry.RENDERERS`.
+    On a GPU a frame is queued on a stream of its own, which goes before the training that is queued for later frames; the calling thread waits
+    until the picture has arrived in page-locked memory.
     """
 
-    renderer: str
-
-    def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, renderer: str) -> None:
+        """renderer: a name in `gsplat_core.rendering.registry.RENDERERS`."""
+        self.renderer = renderer
         self._made: Renderer | None = None
         self._made_for: tuple[int, int, str, torch.device] | None = None
         self._stream: torch.cuda.Stream | None = None
-        super().__init__(fragment, *args, **kwargs)
 
-    def setup(self, spec: OperatorSpec) -> None:
-        spec.input("scene", type=DeformedScene)
-        spec.output("rendered", type=RenderedFrame)
-        spec.param("renderer", "alpha")
-
-    def adopt(self, renderer: Renderer, camera: Camera, device: torch.device) -> None:
-        """Use a renderer of this operator's kind that was made for such a camera on such a device, instead of making one."""
-        self._made = renderer
-        self._made_for = camera.width_px, camera.height_px, camera.model, device
-
-    def stop(self) -> None:
-        # It holds the last model and, on a GPU, memory.
-        self._made = self._made_for = self._stream = None
-
-    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        scene: DeformedScene = op_input.receive("scene")
+    def draw(self, scene: DeformedScene) -> RenderedFrame:
+        """The picture of a scene, complete."""
         with torch.inference_mode(), self._own_stream(scene.model):
             renderer = self._renderer_for(scene)
             reads_snapshots = RENDERERS[self.renderer].capabilities.reads_snapshots
@@ -80,7 +55,7 @@ class RasterizeOp(Operator):
                 picture = picture * picture.new_tensor(scene.frame.exposure)
             image, depth, alpha = _displayed(picture), HostCopy(output.depth), HostCopy(output.alpha)
             made_from = scene.reconstruction
-            rendered = RenderedFrame(
+            return RenderedFrame(
                 frame=scene.frame,
                 image=image.numpy(),
                 depth=depth.numpy(),
@@ -92,7 +67,6 @@ class RasterizeOp(Operator):
                 taken_ns=None if made_from is None else made_from.taken_ns,
                 published_ns=None if made_from is None else made_from.published_ns,
             )
-        op_output.emit(rendered, "rendered")
 
     def _renderer_for(self, scene: DeformedScene) -> Renderer:
         camera = scene.camera
@@ -111,3 +85,40 @@ class RasterizeOp(Operator):
             # Nothing says when its copy was complete; a snapshot orders that by itself.
             self._stream.wait_stream(torch.cuda.current_stream(model.device))
         return cast(AbstractContextManager[Any], torch.cuda.stream(self._stream))
+
+
+class RasterizeOp(Operator):
+    """Renders colour, depth and opacity of each scene.
+
+    On a GPU this operator's thread waits for the picture (see `Rasterizer`); the other threads go on meanwhile.
+
+    Inputs:
+        scene: `DeformedScene`.
+
+    Outputs:
+        rendered: `RenderedFrame`, complete.
+
+    Params:
+        renderer: a name in `gsplat_core.rendering.registry.RENDERERS`.
+        rasterizer: one that was used already; this operator is its only user from now on. None: it makes one.
+    """
+
+    renderer: str
+
+    def __init__(self, fragment: Any, *args: Any, rasterizer: Rasterizer | None = None, **kwargs: Any) -> None:
+        self._rasterizer = rasterizer
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("scene", type=DeformedScene)
+        spec.output("rendered", type=RenderedFrame)
+        spec.param("renderer", "alpha")
+
+    def stop(self) -> None:
+        # It holds the last model and, on a GPU, memory.
+        self._rasterizer = None
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        if self._rasterizer is None:
+            self._rasterizer = Rasterizer(self.renderer)
+        op_output.emit(self._rasterizer.draw(op_input.receive("scene")), "rendered")

@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
 from gsplat_core.endoscope.tools import ToolFinder
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.registry import Registry
@@ -166,6 +168,27 @@ class NoToolMaskOp(Operator):
         op_output.emit(frame.with_fields(mask=all_tissue(frame)), "frame")
 
 
+class OnnxToolMaskOp(FoundToolMaskOp):
+    """Finds tools by a network, an ONNX model (`OnnxToolFinder`), which is loaded once.
+
+    Params:
+        path: the model's. Raises InvalidSetting for one that cannot be used.
+    """
+
+    def __init__(self, fragment: Any, *args: Any, path: Path, **kwargs: Any) -> None:
+        finder = OnnxToolFinder(path)
+        self.finder = finder
+        super().__init__(fragment, *args, make_finder=lambda: finder, method="onnx", **kwargs)
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        super().contribute(outcome)
+        if self.finder.not_finite:
+            outcome.note(
+                f"the tool network gave NaN for {self.finder.not_finite} frames; all of their pixels counted as tool"
+            )
+
+
 def all_tissue(frame: Frame) -> NDArray[np.uint8]:
     """A mask without tools for a frame."""
     return np.ones(frame.image.shape[:2], np.uint8)
@@ -185,11 +208,18 @@ def _plain(kind: type[Operator], method: str) -> ToolMaskFactory:
     return make
 
 
+def _onnx(fragment: Any, name: str, argument: str) -> Operator:
+    if not argument:
+        raise InvalidSetting("tool mask 'onnx' needs the path of a model: onnx:PATH")
+    return OnnxToolMaskOp(fragment, name=name, path=Path(argument))
+
+
 TOOL_MASKS: Registry[ToolMaskFactory] = Registry(
     "tool mask",
     {
         "recorded": _plain(RecordedToolMaskOp, "recorded"),
         "builtin": _plain(BuiltInToolMaskOp, "builtin"),
+        "onnx": _onnx,
         "none": _plain(NoToolMaskOp, "none"),
     },
 )
@@ -203,3 +233,8 @@ def new_tool_mask(fragment: Any, choice: str, name: str = "tool_mask") -> Operat
     """
     method, _, argument = choice.partition(":")
     return TOOL_MASKS[method](fragment, name, argument)
+
+
+def check_tool_mask(choice: str) -> None:
+    """Raises as `new_tool_mask` does, before a run: for a name that is not known or a network that cannot be used."""
+    new_tool_mask(None, choice)

@@ -19,13 +19,16 @@ from torch import Tensor
 
 from gsplat_core.deformation.basis_adam import BasisRates
 from gsplat_core.deformation.basis_bumps import BumpTensors
+from gsplat_core.deformation.basis_shift import shifted_bumps_
+from gsplat_core.deformation.continuation import Continuation
 from gsplat_core.deformation.field import ops_for
 from gsplat_core.deformation.field_slots import BasisSlot
+from gsplat_core.deformation.smoothing import towards_neighbours_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import BASIS_GROUPS, width_of
+from gsplat_core.scene.layout import BASIS_CHANNELS, BASIS_GROUPS, POSITION, width_of
 
 
 class BasisField(BumpTensors):
@@ -40,6 +43,7 @@ class BasisField(BumpTensors):
 
     kind = "basis"
     slot_type = BasisSlot
+    continues = True
 
     @classmethod
     def for_gaussians(cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any) -> BasisField:
@@ -47,7 +51,11 @@ class BasisField(BumpTensors):
 
     def deltas(self, time_s: float) -> Tensor:
         """What the field adds at `time_s`: [N, 13] position, rotation, log-scale, colour. Differentiable."""
-        return cast(Tensor, self._ops.basis_field(*self._parameters_of(self.count), self.tau(time_s)))
+        past = self.continuation
+        bumps_s = time_s if past is None else min(time_s, past.from_s)
+        deltas = cast(Tensor, self._ops.basis_field(*self._parameters_of(self.count), self.tau(bumps_s)))
+        added = None if past is None else past.added(time_s, self.count)
+        return deltas if added is None else deltas + added[:, :BASIS_CHANNELS]
 
     def displaced(self, gaussians: Gaussians, deltas: Tensor) -> Gaussians:
         """The Gaussians with `deltas` [N, 13] added; differentiable in both."""
@@ -100,6 +108,14 @@ class BasisField(BumpTensors):
             gradient, tau, parameters, moments.first, moments.second, moments.steps, rates, betas, epsilon
         )
 
+    def smooth_in_time(self, amount: float) -> None:
+        """See `DeformationField.smooth_in_time`: the weights of neighbouring bumps."""
+        if self.columns.is_ring:
+            raise InvalidInput(
+                "a field that forgets its past has no columns in the order of time; smooth one that keeps them all"
+            )
+        towards_neighbours_(self.weights.data[: self.count, : self.bumps], amount)
+
     @property
     def has_frame_deltas(self) -> bool:
         """Always."""
@@ -124,7 +140,29 @@ class BasisField(BumpTensors):
             parameters = (p.data for p in self._parameters_of(count))
             return cast(Tensor, self._ops.basis_field(*parameters, tau, padded=True))
 
-        return at
+        return at if self.continuation is None else self.continuation.captured(at)
+
+    def scale_positions(self, factor: Tensor) -> None:
+        """See `DeformationField.scale_positions`; Adam's moments follow."""
+        count, each = len(factor), factor[:, None, None]
+        self.weights.data[:count, :, POSITION] *= each
+        if self._moments is not None:
+            self._moments.first[2][:count, :, POSITION] /= each
+            self._moments.second[2][:count, :, POSITION] /= each.square()
+
+    def continue_with(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
+        """See `DeformationField.continue_with`."""
+        continuation = Continuation(int(self.weights.shape[0]), self.weights.device)
+        continuation.write(velocity, from_s, horizon_s)
+        continuation.set_clock(self.tau, self.spacing_s)
+        self.continuation = continuation
+
+    def move_at(self, time_s: float, change: Tensor) -> bool:
+        """See `DeformationField.move_at`: each bump's weight changes in proportion to its height then, the smallest change that does it."""
+        with torch.no_grad():
+            centers, log_widths, weights = (p.data for p in self._parameters_of(self.count))
+            shifted_bumps_(centers, log_widths, weights, self.tau(time_s), change)
+        return True
 
     def training_tensors(self) -> tuple[Tensor, ...]:
         """Everything that `adam_step_at` changes: parameters, both moments of each, updates per bump. Made where they are not yet.

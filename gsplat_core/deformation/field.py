@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self, cast
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation.continuation import Continuation
 from gsplat_core.deformation.field_slots import FieldSlot
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.native import CUDA_MISSING
@@ -38,8 +39,13 @@ class DeformationField(torch.nn.Module):
     slot_type: ClassVar[type[Any] | None] = None
     """The `FieldSlot` for `slot`, made from a field and a number of rows. None: every snapshot of such a field gets memory of its own."""
 
+    continues: ClassVar[bool] = False
+    """Whether `continuation` is looked at."""
+
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__()
+        self.continuation: Continuation | None = None
+        """What the field does after the newest frame; None: nothing of its own."""
         self._time_window_s = checked_window(time_window_s)
 
     @classmethod
@@ -68,15 +74,20 @@ class DeformationField(torch.nn.Module):
         return self._time_window_s
 
     def clamp_time(self, time_s: float) -> float:
-        """`time_s` brought into the window; InvalidInput when it is not a finite number."""
+        """`time_s` brought into the window, or into what its continuation adds to it; InvalidInput when it is not a finite number."""
         if not math.isfinite(time_s):
             raise InvalidInput(f"time_s must be finite, got {time_s}")
-        start, end = self._time_window_s
+        start, end = continued_window(self._time_window_s, self)
         return min(max(float(time_s), start), end)
 
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`, in the same raw parametrisation; differentiable in the field and the Gaussians."""
         raise NotImplementedError
+
+    def deltas(self, time_s: float) -> Tensor:
+        """What the field adds at `time_s`, [N, C], the first columns of a raw row. Raises InvalidInput for a kind that needs the Gaussians
+        for that."""
+        raise InvalidInput(f"a {self.kind} field says what it adds only for given Gaussians; use forward")
 
     def cached(self, gaussians: Gaussians) -> Callable[[float], Gaussians]:
         """A function time_s -> Gaussians for inference: no autograd graph, and what does not depend on time is computed once.
@@ -142,11 +153,32 @@ class DeformationField(torch.nn.Module):
         if time_s > end:
             self.extend((start, start + 2 * (time_s - start)))
 
+    def move_at(self, time_s: float, change: Tensor) -> bool:
+        """Change what the field adds at `time_s` by `change` [N, C], the first columns of a raw row, and at other times as little as it
+        can. False, with nothing changed, for a field that cannot do that: here."""
+        return False
+
+    def scale_positions(self, factor: Tensor) -> None:
+        """Multiply what the field adds to each position by `factor` [N], at all times. Raises InvalidInput for a kind that cannot: here."""
+        raise InvalidInput(f"a {self.kind} field cannot be scaled")
+
+    def continue_with(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
+        """Go on with `velocity` [N, 16] per second after `from_s`, for `horizon_s`; see `Continuation`.
+
+        Raises InvalidInput for a kind of field that does not look at its continuation."""
+        raise InvalidInput(f"a {self.kind} field has no continuation")
+
     def select(self, index: Tensor) -> None:
         """Keep the state of the Gaussians in `index` (int64 positions or a bool mask), in that order. Here there is none."""
 
     def append(self, added: int | Gaussians, parents: Tensor | None = None) -> None:
         """Add state for new Gaussians at the end: still, or copied from `parents` (int64 [count]). Here there is none."""
+
+    def smooth_in_time(self, amount: float) -> None:
+        """Move what is learned for each time `amount` (0..1) of the way to the mean of what is learned for the times before and after.
+
+        In place, outside of any optimiser; for a field of which all frames are known. Here nothing is learned for times.
+        """
 
     def reserve(self, rows: int) -> bool:
         """Take the memory for `rows` Gaussians now, so that `append` and `close_gaps` move no tensor until there are more.
@@ -170,6 +202,14 @@ def checked_window(time_window_s: tuple[float, float]) -> tuple[float, float]:
     if not (math.isfinite(start) and math.isfinite(end) and start <= end):
         raise InvalidInput(f"time_window_s must be two finite times in order, got {time_window_s}")
     return start, end
+
+
+def continued_window(window_s: tuple[float, float], field: DeformationField | None) -> tuple[float, float]:
+    """The window with the time for which the field goes on by its continuation."""
+    continuation = None if field is None else field.continuation
+    if continuation is None or not math.isfinite(continuation.from_s):
+        return window_s
+    return window_s[0], max(window_s[1], continuation.from_s + continuation.horizon_s)
 
 
 def ops_for(tensor: Tensor, compiled: ModuleType, plain: ModuleType) -> ModuleType:

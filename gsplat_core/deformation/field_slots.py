@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.deformation.basis_columns import INERT, INERT_CENTER, bump_capacity
+from gsplat_core.deformation.continuation import Continuation
 
 if TYPE_CHECKING:
     from gsplat_core.deformation.basis import BasisField
@@ -72,6 +73,8 @@ class BasisSlot:
             self.field = type(source)(rows, source.time_window_s, bumps=places)
         self.field.requires_grad_(False)
         self.field.centers.data.fill_(INERT_CENTER)
+        if source.continuation is not None:
+            self.field.continuation = Continuation(rows, source.weights.device)
         self._used = 0, 0
         self._in_use: list[Tensor] = [tensor.data[:0, :0] for tensor in self.field.parameters()]
 
@@ -85,6 +88,8 @@ class BasisSlot:
         """Copy the bumps and the layout of the columns, and make inert what an earlier state had used beyond them."""
         if not isinstance(source, type(self.field)):
             return False
+        if source.continuation is not None and self.field.continuation is None:
+            return False
         count, columns = source.count, source.columns
         places = int(self.field.weights.shape[1])
         if count > self.field.count or columns.count > places or (columns.is_ring and columns.places != places):
@@ -96,7 +101,19 @@ class BasisSlot:
         copy_each(self._in_use, [values[:count, : columns.count] for values in theirs])
         self.field._time_window_s = source.time_window_s
         self.field._columns = replace(columns, places=places)
+        self._continue(source.continuation, count)
         return True
+
+    def _continue(self, source: Continuation | None, count: int) -> None:
+        """Continue as `source` does, or not at all."""
+        mine = self.field.continuation
+        if mine is None:
+            return
+        if source is None:
+            mine.stop()
+            return
+        mine.write(source.velocity[:count], source.from_s, source.horizon_s)
+        mine.set_clock(self.field.tau, self.field.spacing_s)
 
     def _use(self, count: int, bumps: int) -> None:
         """Choose the part of every tensor that is written, and make inert what an earlier state had used beyond it."""
@@ -112,4 +129,7 @@ class BasisSlot:
 
     def exact_copy(self) -> DeformationField:
         """A field of as many Gaussians and bumps as are in use."""
-        return self.field._copy_of(self._used[0])
+        copied = self.field._copy_of(self._used[0])
+        if self.field.continuation is not None:
+            copied.continuation = self.field.continuation.of_first(self._used[0])
+        return copied

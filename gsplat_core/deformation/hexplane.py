@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField, checked_window, ops_for
 from gsplat_core.deformation.field_slots import WholeFieldSlot
+from gsplat_core.deformation.smoothing import towards_neighbours_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane import hexplane as compiled
 from gsplat_core.ops.hexplane import plain_torch
@@ -208,6 +209,11 @@ class HexPlaneField(DeformationField):
         for plane in self._named(TIME_PLANES):
             plane.data.copy_(torch.lerp(plane.data[row], plane.data[row + 1], share))
         self._time_window_s = (start, end)
+
+    def smooth_in_time(self, amount: float) -> None:
+        """See `DeformationField.smooth_in_time`: the rows of the time planes."""
+        for plane in self._named(TIME_PLANES):
+            towards_neighbours_(plane.data.transpose(0, 1), amount)
 
     def plane_tensors(self) -> list[Tensor]:
         """The planes' memory, outside of autograd: xy, xz, yz, xt, yt, zt of every level."""

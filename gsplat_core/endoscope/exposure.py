@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -154,7 +155,7 @@ class ExposureEstimator:
     def _sample(self, image: NDArray[np.uint8], kept: NDArray[np.generic] | None) -> _Sample:
         # Averaged from 8-bit values in floats: at 32x24 in 8 bits a step of 1 % in a dark channel would be lost.
         small = reduced(image, 4 * WIDTH_PX, 4 * HEIGHT_PX).astype(np.float32)
-        small = small.reshape(HEIGHT_PX, 4, WIDTH_PX, 4, 3).mean(axis=(1, 3))
+        small = np.asarray(cv2.resize(small, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA), np.float32)
         valid = (small > self.settings.darkest) & (small < self.settings.brightest)
         if kept is not None:
             valid &= reduced_mask(kept, WIDTH_PX, HEIGHT_PX)[..., None]

@@ -12,7 +12,7 @@ from gsplat_core.endoscope.reduced import luma
 from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
-ROWS = 128
+SAMPLES = 128
 """About how many rows of a picture are looked at; in each of them about as many pixels."""
 SMALLEST_FOR_NOISE_PX = 32
 """In narrower pictures neighbouring pixels differ without being noise."""
@@ -25,7 +25,7 @@ class SequenceSettings:
     black_level: int = 20
     """A picture is black when all but `odd_share` of it is darker than this."""
     one_colour_levels: int = 3
-    """A picture is of one colour when all but `odd_share` of it is within this of its median colour."""
+    """A picture is of one colour when all but `odd_share` of it is within this of its most frequent colour."""
     odd_share: float = 0.03
     """Share that may be otherwise: a line of text, a logo."""
     noise_share: float = 0.5
@@ -78,34 +78,36 @@ class SequenceCheck:
 
         One of "black", "one colour", "noise", "duplicate", "frozen" and "torn".
         """
-        step_y, step_x = (max(1, size // ROWS) for size in image.shape[:2])
-        sampled = np.ascontiguousarray(image[::step_y, ::step_x])
-        previous, self._previous = self._previous, sampled
+        height, width = (max(1, side // max(1, side // SAMPLES)) for side in image.shape[:2])
+        small = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
+        previous, self._previous = self._previous, small
         if previous is None or self._shape != image.shape:
             self._shape, self._frames_seen, self._same_run = image.shape, 0, 0
-            self._row_moves = np.zeros(len(sampled))
+            self._row_moves = np.zeros(height)
             self._new_since_ns = pts_ns
-            return self._unusable(image, sampled)
-        differs = cv2.absdiff(sampled, previous).max(axis=2) > self.settings.same_levels
+            return self._unusable(image, small)
+        # By channel: [rows, columns * 3].
+        differs = (cv2.absdiff(small, previous) > self.settings.same_levels).reshape(height, -1)
         if differs.mean() <= 1 - self.settings.same_share:
-            return self._unusable(image, sampled) or self._repeated(pts_ns)
+            return self._unusable(image, small) or self._repeated(pts_ns)
         self._new_since_ns, self._same_run = pts_ns, 0
         changed = differs.mean(axis=1) > 0.01
-        torn = self._torn(sampled, changed)
+        torn = self._torn(small, changed)
         if not torn:
             # Quick at first, then over about the last 50 frames.
             self._frames_seen += 1
             self._row_moves += (changed - self._row_moves) / min(self._frames_seen, 50)
-        return self._unusable(image, sampled) or ("torn" if torn else None)
+        return self._unusable(image, small) or ("torn" if torn else None)
 
-    def _unusable(self, image: NDArray[np.uint8], sampled: NDArray[np.uint8]) -> str | None:
+    def _unusable(self, image: NDArray[np.uint8], small: NDArray[np.uint8]) -> str | None:
         settings = self.settings
-        grey = luma(sampled)
-        if (grey >= settings.black_level).mean() <= settings.odd_share:
+        grey = luma(small)
+        if np.count_nonzero(grey >= settings.black_level) <= settings.odd_share * grey.size:
             return "black"
-        middle = np.median(sampled[::2, ::2].reshape(-1, 3), axis=0).astype(np.int16)
-        away = np.abs(sampled.astype(np.int16) - middle).max(axis=2) > settings.one_colour_levels
-        if away.mean() <= settings.odd_share:
+        levels = settings.one_colour_levels
+        most = [int(np.bincount(small[:, :, channel].ravel(), minlength=1).argmax()) for channel in range(3)]
+        of_it = cv2.inRange(small, tuple(level - levels for level in most), tuple(level + levels for level in most))
+        if np.count_nonzero(of_it) >= (1 - settings.odd_share) * of_it.size:
             return "one colour"
         if min(image.shape[:2]) >= SMALLEST_FOR_NOISE_PX and _roughness(image) > settings.noise_share:
             return "noise"
@@ -117,13 +119,13 @@ class SequenceCheck:
         long = self._same_run >= 2 and without_new_s >= self.settings.frozen_s
         return "frozen" if long or self._same_run >= self.settings.frozen_frames else "duplicate"
 
-    def _torn(self, sampled: NDArray[np.uint8], changed: NDArray[np.bool_]) -> bool:
+    def _torn(self, small: NDArray[np.uint8], changed: NDArray[np.bool_]) -> bool:
         """Whether the lowest rows are the ones of the picture before, or of one colour, while what is above moved as usual."""
         if self._frames_seen < 5:
             return False
         moving = self._row_moves >= self.settings.moving_share
-        flat = np.ptp(sampled[:, ::4].astype(np.int16), axis=1).max(axis=1) <= 2 * self.settings.one_colour_levels
-        least = max(3, round(self.settings.torn_share * len(sampled)))
+        flat = np.ptp(small[:, ::4], axis=1).max(axis=1) <= 2 * self.settings.one_colour_levels
+        least = max(3, round(self.settings.torn_share * len(small)))
         for stale in (~changed, flat & changed):
             # From the lowest row that moves, upwards: all rows that move must be stale.
             rows = np.flatnonzero(moving)[::-1]

@@ -116,7 +116,7 @@ def measure_baselines(
             if not is_heldout(frame.seq) and reason in (None, "no tissue"):
                 train_mean.add(frame.image)
             if reason is None and before:
-                pool.put(_compare, (frame, before, after, ages, flow), lambda values: sums.add(values, record))
+                pool.put(_compare, (frame, before, after, ages, flow), lambda values: sums.add(values, ages, record))
     mean_image = train_mean.image()
     for frame in recording if mean_image is not None else ():
         if is_heldout(frame.seq) and why_left_out(frame) is None:
@@ -131,14 +131,20 @@ class _Values:
     frame: Frame
     by_key: dict[tuple[str, object], tuple[float, ...]]
 
-    def entry(self) -> Entry:
-        """For a log; the copy of the previous frame is what the other figures are compared with."""
-        named = {f"{name}_db": finite(values[0]) for (group, name), values in self.by_key.items() if group != "copies"}
-        copies = {
-            f"copy_{age}_db": finite(values[0]) for (group, age), values in self.by_key.items() if group == "copies"
+    def entry(self, ages: Sequence[int]) -> Entry:
+        """For a log, every entry with the same names; the copy of the previous frame is what the other figures are compared with."""
+        frame = self.frame
+        value = lambda group, name: finite(self.by_key[group, name][0]) if (group, name) in self.by_key else None
+        return {
+            "seq": frame.seq,
+            "time_s": frame.time_s,
+            "trained": False,
+            "model_version": 0,
+            "psnr_tissue_db": value("copies", 1),
+            **{f"copy_{age}_db": value("copies", age) for age in ages},
+            f"{HALF_VELOCITY}_db": value("every", HALF_VELOCITY),
+            **{f"{name}_db": value("heldout", name) for name in (PREVIOUS_FRAME, NEIGHBOUR_MEAN, HALF_WAY)},
         }
-        own = {"seq": self.frame.seq, "time_s": self.frame.time_s, "trained": False, "model_version": 0}
-        return {**own, "psnr_tissue_db": copies["copy_1_db"], **named, **copies}
 
 
 def _compare(frame: Frame, before: Sequence[Frame], after: Frame | None, ages: Sequence[int], flow: bool) -> _Values:
@@ -198,11 +204,11 @@ class _Sums:
         ):
             mean.add(value)
 
-    def add(self, values: _Values, record: Record | None) -> None:
+    def add(self, values: _Values, ages: Sequence[int], record: Record | None) -> None:
         for key, measured in values.by_key.items():
             self.take(key, *measured)
         if record is not None:
-            record(values.entry())
+            record(values.entry(ages))
 
     def baselines(self, ages: Sequence[int], left_out: Mapping[str, int]) -> Baselines:
         scores: dict[str, dict[Any, BaselineScore]] = {"copies": {age: _NOTHING for age in ages}}

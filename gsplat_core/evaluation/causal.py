@@ -28,12 +28,8 @@ class Learner(Protocol):
         """The model as it is now."""
 
 
-def predicted(learner: Learner, frame: Frame) -> Model | Snapshot:
-    """The model that is to show `frame` before it was seen: moved on to its time.
-
-    frame: see `_hidden`.
-    """
-    learner.observe(frame, train=False)
+def published(learner: Learner, frame: Frame) -> Model | Snapshot:
+    """The model as it is before `frame` was seen; it is rendered at that frame's time, where its motion goes on as the model has it."""
     return learner.publish()
 
 
@@ -47,7 +43,7 @@ def evaluate_causal(
     learner: Learner,
     picture_of: Callable[[Model | Snapshot, Frame], Picture],
     *,
-    predict: Callable[[Learner, Frame], Model | Snapshot] = predicted,
+    predict: Callable[[Learner, Frame], Model | Snapshot] = published,
     record: Record | None = None,
 ) -> Score:
     """Run the learner over the frames; each is predicted and scored before it is learned from. The first one has no prediction.

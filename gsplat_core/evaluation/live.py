@@ -7,8 +7,7 @@ scored, and a viewer of a source that stopped sees what was shown last: nothing 
 
 from __future__ import annotations
 
-import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,11 +19,13 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.ages import AgeHistogram, Ages
 from gsplat_core.evaluation.scores import Record, Score, ScoreSums, measures, why_left_out
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.metrics import FrameQuality, frame_quality, psnr_tissue_db
+from gsplat_core.training.metrics import FrameQuality, frame_quality
 
 MOST_BEHIND = 8
 """Lateness is counted up to so many frames; what is later counts as this many."""
-NOTHING_SHOWN, NOT_KEPT = "nothing shown yet", "picture not kept"
+SETTLING_S = 1.0
+"""The first second, in which a model begins, is in `score` and not in `settled`."""
+NOTHING_SHOWN, NOT_KEPT, OTHER_SIZE = "nothing shown yet", "picture not kept", "picture of another size"
 _MAX_STATES = 16
 _NS_PER_MS = 1e6
 
@@ -41,8 +42,6 @@ class Shown:
     """When the picture was on the screen; both by one clock."""
     image: NDArray[np.uint8] | None = None
     """RGB [H, W, 3]; None where the picture was not kept."""
-    psnr_tissue_db: float | None = None
-    """What it scored against its own frame, where that was measured when it was shown."""
     state: str = "live"
     """What was written on it: `live`, `stale`, `frozen`, `source lost`."""
 
@@ -52,6 +51,8 @@ class Live:
     """How good what a viewer saw was, and how old."""
 
     score: Score
+    settled: Score
+    """Without the first second."""
     age_when_shown: Ages | None
     """From a frame's arrival to the moment when its picture was shown."""
     age_on_screen: Ages | None
@@ -60,10 +61,57 @@ class Live:
     """Frames whose own picture was on the screen when the next one came."""
     behind: Mapping[int, int]
     """How many frames older than the newest one the picture on the screen was, and how often; `MOST_BEHIND` stands for all that is more."""
-    estimated: int
-    """Frames whose late picture was not kept: scored by the raw frame that it shows, or by the picture's own figure where that is lower."""
     states: Mapping[str, int]
     """How many pictures were shown in each state."""
+
+
+class LiveSums:
+    """Takes what was shown and what was on the screen, one at a time; `live` is what they come to."""
+
+    def __init__(self, record: Record | None = None) -> None:
+        """record: given each scored frame's figures."""
+        self._record = record
+        self._score, self._settled = ScoreSums(), ScoreSums()
+        self._when_shown, self._on_screen = AgeHistogram(), AgeHistogram()
+        self._behind: Counter[int] = Counter()
+        self._states: Counter[str] = Counter()
+        self._first_s: float | None = None
+
+    def picture(self, age_ms: float, state: str) -> None:
+        """A picture was shown, so old and in that state."""
+        self._when_shown.add(age_ms)
+        known = state in self._states or len(self._states) < _MAX_STATES
+        self._states[state if known else "other"] += 1
+
+    def frame(self, quality: FrameQuality, time_s: float, behind: int, age_ms: float) -> None:
+        """What was on the screen when the next frame came, against frame `quality.seq` of that time: so many frames older, and so old then."""
+        if self._first_s is None:
+            self._first_s = time_s
+        self._on_screen.add(age_ms)
+        self._behind[min(max(behind, 0), MOST_BEHIND)] += 1
+        self._score.take(quality)
+        if time_s - self._first_s >= SETTLING_S:
+            self._settled.take(quality)
+        if self._record is not None:
+            own = {"seq": quality.seq, "time_s": time_s, "trained": True, "model_version": 0}
+            self._record({**own, **measures(quality), "age_ms": age_ms, "behind": behind})
+
+    def leave_out(self, reason: str) -> None:
+        """A frame that is not scored."""
+        self._score.leave_out(reason)
+
+    @property
+    def live(self) -> Live:
+        """Everything so far."""
+        return Live(
+            score=self._score.score,
+            settled=self._settled.score,
+            age_when_shown=self._when_shown.ages(),
+            age_on_screen=self._on_screen.ages(),
+            in_time=self._behind[0],
+            behind=dict(sorted(self._behind.items())),
+            states=dict(sorted(self._states.items())),
+        )
 
 
 def evaluate_live(frames: Iterable[Frame], shown: Iterable[Shown], *, record: Record | None = None) -> Live:
@@ -77,41 +125,36 @@ def evaluate_live(frames: Iterable[Frame], shown: Iterable[Shown], *, record: Re
 
     Raises InvalidInput when a frame has no time of arrival, or when times run backwards.
     """
-    screen = _Screen(shown)
-    sums = _Sums(record)
-    raw: deque[Frame] = deque(maxlen=MOST_BEHIND + 1)
+    sums = LiveSums(record)
+    screen = _Screen(shown, sums)
     for frame, following in pairwise(_in_order(frames)):
-        raw.append(frame)
         assert following.arrived_ns is not None
         picture = screen.at(following.arrived_ns)
         reason = why_left_out(frame)
-        if reason is None and picture is None:
-            reason = NOTHING_SHOWN
-        if reason is not None or picture is None:
-            sums.score.leave_out(str(reason))
-            continue
-        sums.add(frame, picture, following.arrived_ns, raw)
+        if reason is not None:
+            sums.leave_out(reason)
+        elif picture is None:
+            sums.leave_out(NOTHING_SHOWN)
+        elif picture.image is None:
+            sums.leave_out(NOT_KEPT)
+        elif picture.image.shape != frame.image.shape:
+            sums.leave_out(OTHER_SIZE)
+        else:
+            quality = frame_quality(frame.seq, picture.image, frame.image, frame.mask)
+            age_ms = (following.arrived_ns - picture.arrived_ns) / _NS_PER_MS
+            sums.frame(quality, frame.time_s, frame.seq - picture.seq, age_ms)
     screen.rest()
-    return Live(
-        score=sums.score.score,
-        age_when_shown=screen.ages.ages(),
-        age_on_screen=sums.ages.ages(),
-        in_time=sums.behind[0],
-        behind=dict(sorted(sums.behind.items())),
-        estimated=sums.estimated,
-        states=dict(sorted(screen.states.items())),
-    )
+    return sums.live
 
 
 class _Screen:
     """What is to be seen at a moment. Takes the pictures as time goes on."""
 
-    def __init__(self, shown: Iterable[Shown]) -> None:
+    def __init__(self, shown: Iterable[Shown], sums: LiveSums) -> None:
         self._coming = iter(shown)
         self._next: Shown | None = next(self._coming, None)
         self._now: Shown | None = None
-        self.ages = AgeHistogram()
-        self.states: Counter[str] = Counter()
+        self._sums = sums
 
     def at(self, moment_ns: int) -> Shown | None:
         """The last picture shown before the moment."""
@@ -131,53 +174,8 @@ class _Screen:
             raise InvalidInput(
                 f"the picture of frame {picture.seq} was shown before that of frame {before.seq}, which came first; give them in order"
             )
-        self.ages.add((picture.shown_ns - picture.arrived_ns) / _NS_PER_MS)
-        known = picture.state in self.states or len(self.states) < _MAX_STATES
-        self.states[picture.state if known else "other"] += 1
+        self._sums.picture((picture.shown_ns - picture.arrived_ns) / _NS_PER_MS, picture.state)
         self._now, self._next = picture, next(self._coming, None)
-
-
-class _Sums:
-    """What the frames scored so far come to."""
-
-    def __init__(self, record: Record | None) -> None:
-        self.score = ScoreSums()
-        self.ages = AgeHistogram()
-        self.behind: Counter[int] = Counter()
-        self.estimated = 0
-        self._record = record
-
-    def add(self, frame: Frame, picture: Shown, moment_ns: int, raw: Iterable[Frame]) -> None:
-        """Score what is on the screen at a moment. raw: the newest frames that have come."""
-        age_ms = (moment_ns - picture.arrived_ns) / _NS_PER_MS
-        late = min(max(frame.seq - picture.seq, 0), MOST_BEHIND)
-        self.ages.add(age_ms)
-        self.behind[late] += 1
-        quality = self._quality(frame, picture, raw)
-        if quality is None:
-            self.score.leave_out(NOT_KEPT)
-            return
-        self.score.take(quality)
-        if self._record is not None:
-            own = {"seq": frame.seq, "time_s": frame.time_s, "trained": True, "model_version": 0}
-            self._record({**own, **measures(quality), "age_ms": age_ms, "behind": frame.seq - picture.seq})
-
-    def _quality(self, frame: Frame, picture: Shown, raw: Iterable[Frame]) -> FrameQuality | None:
-        if picture.image is not None:
-            if picture.image.shape == frame.image.shape:
-                return frame_quality(frame.seq, picture.image, frame.image, frame.mask)
-            return None
-        own_db = math.nan if picture.psnr_tissue_db is None else picture.psnr_tissue_db
-        if picture.seq == frame.seq:
-            return None if math.isnan(own_db) else FrameQuality(frame.seq, own_db, math.nan, math.nan)
-        for old in raw:
-            if old.seq == picture.seq and old.image.shape == frame.image.shape:
-                self.estimated += 1
-                held_db = psnr_tissue_db(old.image, frame.image, frame.mask)
-                return FrameQuality(
-                    frame.seq, min(held_db, own_db) if own_db == own_db else held_db, math.nan, math.nan
-                )
-        return None
 
 
 def _in_order(frames: Iterable[Frame]) -> Iterator[Frame]:

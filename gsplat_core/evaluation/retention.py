@@ -9,7 +9,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.baselines import BaselineScore
 from gsplat_core.evaluation.pictures import Picture
 from gsplat_core.evaluation.places import PlaceFinder, Range, Visits
-from gsplat_core.evaluation.scores import Entry, Record, Score, ScoreSums, measures, why_left_out
+from gsplat_core.evaluation.scores import Entry, Record, Score, ScoreSums, measures, number, why_left_out
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import ScoredMean, psnrs_db
 
@@ -122,11 +122,9 @@ def returns(entries: Iterable[Entry], places: Sequence[Visits]) -> list[Return]:
     first: list[list[float | None]] = [[] for _ in places]
     count, found = [0] * len(places), [None] * len(places)  # type: list[int], list[int | None]
     for entry in entries:
-        value, time_s = entry["psnr_tissue_db"], entry["time_s"]
-        assert isinstance(time_s, float | int)
-        assert value is None or isinstance(value, float | int)
+        value, time_s = number(entry, "psnr_tissue_db"), number(entry, "time_s")
         for k, place in enumerate(places):
-            if not place.again[0] <= time_s <= place.again[1]:
+            if time_s is None or not place.again[0] <= time_s <= place.again[1]:
                 continue
             count[k] += 1
             if len(first[k]) < FIRST_FRAMES:

@@ -95,3 +95,9 @@ def measures(quality: FrameQuality) -> Entry:
 def finite(value: float | None) -> float | None:
     """The value; None where it is not a finite number."""
     return value if value is not None and math.isfinite(value) else None
+
+
+def number(entry: Entry, name: str) -> float | None:
+    """A figure of an entry; None where it has none of that name."""
+    value = entry.get(name)
+    return None if value is None or isinstance(value, str) else float(value)

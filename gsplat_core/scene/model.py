@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import DeformationField, checked_window
+from gsplat_core.deformation.field import DeformationField, checked_window, continued_window
 from gsplat_core.errors import InvalidInput
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.scene.cameras import Camera
@@ -95,8 +95,8 @@ class Model:
         return self
 
     def clamp_time(self, time_s: float) -> float:
-        """`time_s` brought into the time window."""
-        return clamp_time(time_s, self.time_window_s)
+        """`time_s` brought into the time window, or into what the field continues after it."""
+        return clamp_time(time_s, continued_window(self.time_window_s, self.field))
 
     def at(self, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`, clamped to the window. The last answer is remembered, so asking again is free."""

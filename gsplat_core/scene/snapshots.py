@@ -16,7 +16,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import DeformationField
+from gsplat_core.deformation.field import DeformationField, continued_window
 from gsplat_core.deformation.field_slots import FieldSlot, copy_each
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
@@ -151,8 +151,8 @@ class Snapshot:
             self.slot._order.after_reading()
 
     def clamp_time(self, time_s: float) -> float:
-        """`time_s` brought into the time window."""
-        return clamp_time(time_s, self.time_window_s)
+        """`time_s` brought into the time window, or into what the field continues after it."""
+        return clamp_time(time_s, continued_window(self.time_window_s, self.slot.field))
 
     def at(self, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`, clamped to the window, in memory of their own."""

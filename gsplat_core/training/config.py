@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from gsplat_core.deformation.rates import FieldRates, check_rates
 from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.training.motion_priors import MOTION_PRIORS
 
 
 @dataclass(frozen=True)
@@ -56,18 +57,24 @@ class ReconstructorConfig:
     """Extra steps for a jump, in multiples of the frame's own."""
     bump_spacing_s: float = 0.2
     """The shortest time within which motion changes its course: the time between the basis functions of the basis field."""
+    squared_error: bool = False
+    """Whether colours are compared by the squared error, which PSNR measures, in place of L1."""
     history_s: float | None = None
     """How much of the past stays deformable online, with the basis field; None: all of it, in memory that grows with the stream."""
     preallocate: bool = False
     """Take the memory for `max_gaussians` at once, so that nothing is captured again when Gaussians join or leave."""
-    squared_error: bool = False
-    """Whether colours are compared by the squared error, which PSNR measures, in place of L1."""
     ssim_weight: float = 0.0
     """Weight of 1 - SSIM beside L1 or the squared error, 0..1."""
     depth_weight: float = 0.02
     """Weight of the inverse-depth term where the recording has depth."""
     default_depth_mm: float = 60.0
     """Distance of the plane on which a recording without depth starts."""
+    motion_prior: str = "bumps"
+    """What is assumed about motion after the newest frame: a name in `MOTION_PRIORS`."""
+    start_from_motion: bool = False
+    """Whether a motion prior moves the scene to where a new frame shows it, before the first step on that frame."""
+    depth_from_motion: bool = False
+    """Whether the motion prior finds the depth of the scene where the camera moves, its poses are given, and no depth is."""
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:
@@ -79,6 +86,7 @@ class ReconstructorConfig:
         for name in ("gaussians", "max_gaussians", "steps_per_frame", "first_frame_steps", "window_frames"):
             if getattr(self, name) < 1:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 1")
+        MOTION_PRIORS.check(self.motion_prior)
         if not 0 <= self.sh_degree <= 4:
             raise InvalidSetting(f"sh_degree is {self.sh_degree}; it must be 0 to 4")
         if self.max_gaussians < self.gaussians:
@@ -100,6 +108,14 @@ class ReconstructorConfig:
             raise InvalidSetting(f"depth_weight is {self.depth_weight}; it must be at least 0")
         if not 0 < self.newest_share <= 1:
             raise InvalidSetting(f"newest_share is {self.newest_share}; it must be in (0, 1]")
+
+    @classmethod
+    def offline(cls, field: str = "auto") -> ReconstructorConfig:
+        """The configuration for `Reconstructor.fit`, which has time for more Gaussians and for finer motion than a stream.
+
+        It starts with `gaussians` and ends with `max_gaussians`.
+        """
+        return cls(field=field, gaussians=60_000, max_gaussians=80_000, bump_spacing_s=1 / 15, squared_error=True)
 
     @property
     def chosen_field(self) -> str:

@@ -18,7 +18,7 @@ from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
 
-UNSEEN_PX = 0.05
+UNSEEN_PX = 0.5
 """A Gaussian whose blending weights add up to less than this in every picture is not seen."""
 SHRINK = 1.6
 """Both halves of a split Gaussian are smaller than it by this factor (Kerbl et al. 2023, section 5.2)."""
@@ -60,20 +60,22 @@ def shares_of(step: TrainingStep, observations: Sequence[Observation]) -> Shares
 @torch.no_grad()
 def densify(step: TrainingStep, shares: Shares, count: int) -> None:
     """Drop the Gaussians that nobody sees, and split those with the largest error until there are `count`."""
-    kept = (shares.seen_px >= UNSEEN_PX).nonzero()[:, 0]
-    wanted = min(count - len(kept), len(kept))
+    unseen = shares.seen_px < UNSEEN_PX
+    left = step.gaussians.count - int(torch.count_nonzero(unseen))
+    wanted = min(count - left, left)
     if wanted <= 0:
         return
-    worst = shares.error[kept].topk(wanted).indices
-    step.split(kept, worst, halves)
+    order = step.remove(unseen).order
+    step.split(shares.error[order].argsort(descending=True, stable=True)[:wanted], halves)
 
 
 def halves(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
     """Two Gaussians in the place of each: apart along the longest axis, smaller, and together about as opaque."""
     longest = parents.log_scales.argmax(1)
-    axis = _turned(parents.quats, torch.nn.functional.one_hot(longest, 3).to(parents.dtype))
+    along = torch.nn.functional.one_hot(longest, 3).to(parents.dtype)
+    axis = _turned(parents.quats, along)
     reach = parents.log_scales.gather(1, longest[:, None]).exp() * APART
-    smaller = parents.log_scales.scatter_add(1, longest[:, None], torch.full_like(reach, -math.log(SHRINK)))
+    smaller = parents.log_scales - math.log(SHRINK) * along
     sides = (replace(parents, means=parents.means + side * reach * axis, log_scales=smaller) for side in (-1, 1))
     first, second = sides
     return first, second

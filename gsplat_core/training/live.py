@@ -10,7 +10,6 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.coverage import CapturedCoverage
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
 from gsplat_core.training.out_of_view import OutOfView
@@ -21,6 +20,10 @@ from gsplat_core.transfers import HostCopy
 
 REHEARSED_IN_FLIGHT = 2
 """Rehearsal steps that may be queued on a GPU and not finished: the next frame's first step waits for them."""
+
+
+LONGER_STEP_DECAY = 0.1
+"""How fast the usual time of a step follows longer ones."""
 
 
 @dataclass(frozen=True)
@@ -71,13 +74,14 @@ class LiveReconstructor(Reconstructor):
     ) -> None:
         super().__init__(config, camera, seed=seed, recording_digest=recording_digest, device=device)
         self._live = live or LiveTraining()
+        self._kept_size: tuple[int, int] | None = None
+        self._kept: TrainingStep | None = None
+        """That of the scene before, whose memory the next scene takes over."""
         self._rehearsing = StepsInFlight(self.device, most=REHEARSED_IN_FLIGHT)
         self._places = Places()
-        self._taken_up: Place | None = None
-        """The place that the next frame shows, from which its scene starts."""
+        self._taken_up: tuple[int, Place] | None = None
+        """The number of a frame and the place that it shows, from which its scene starts."""
         self._out_of_view = OutOfView(config.max_gaussians, self.device) if config.preallocate else None
-        self._idle: tuple[TrainingStep, CapturedCoverage | None, tuple[int, int, str]] | None = None
-        """Memory and captured graphs of the scene before, and the size and model of the camera that they are for."""
 
     def kept(self) -> dict[str, int]:
         """How much of the stream is held, by what holds it; none of it grows without end."""
@@ -115,16 +119,11 @@ class LiveReconstructor(Reconstructor):
 
     def forget(self) -> None:
         """As if no frame had been observed, but for what is known about the device: the memory that was taken, how long a step takes."""
-        self._put_aside()
+        self._settle()
+        self._kept = self._step or self._kept
+        self._step = self._taken_up = None
         self._places = Places()
         self._version = 0
-
-    def _put_aside(self) -> None:
-        """End the scene. Its memory and what was captured for it serve the next one."""
-        self._settle()
-        if self._step is not None:
-            self._idle = self._step, self._coverage, self._picture
-        self._step = self._coverage = self._taken_up = None
         self._window = ObservationWindow(self.config.window_frames, self.config.newest_share, self._seed)
 
     def begin_scene(self, frame: Frame) -> bool:
@@ -133,30 +132,48 @@ class LiveReconstructor(Reconstructor):
         Places that were left are kept as they were last, in host memory; their number is bounded. The frame may be of another size. Versions
         go on counting.
         """
+        version, places = self._version, self._places
         if self._step is not None:
-            self._places.leave(self._step.at(self._last_time_s), self._window.newest.camera, self._last_time_s)
-        self._put_aside()
+            places.leave(self._step.at(self._last_time_s), self._window.newest.camera, self._last_time_s)
+        self.forget()
+        self._version, self._places = version, places
         if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
             self.camera = self.camera.resized(frame.width_px, frame.height_px)
-        self._taken_up = self._places.take(frame)
-        return self._taken_up is not None
+        place = places.take(frame)
+        self._taken_up = None if place is None else (frame.seq, place)
+        return place is not None
 
     def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
-        place, self._taken_up = self._taken_up, None
-        return super()._first_gaussians(frame, observation) if place is None else place.gaussians
+        if self._taken_up is None or self._taken_up[0] != frame.seq:
+            return super()._first_gaussians(frame, observation)
+        self._first_time_s, self.camera = observation.time_s, observation.camera
+        return self._taken_up[1].gaussians.to(self.device)
 
-    def _begin(self, gaussians: Gaussians, start_s: float, end_s: float | None) -> None:
-        idle, self._idle = self._idle, None
+    def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
+        kept, self._kept = self._kept, None
         if self._out_of_view is not None:
             self._out_of_view.restart()
-        if idle is not None and idle[2] == self._picture and idle[0].restart(gaussians, start_s, self.camera):
-            self._step, self._coverage, _ = idle
-        else:
-            super()._begin(gaussians, start_s, end_s)
+        camera = observation.camera
+        same_size = self._kept_size == (camera.width_px, camera.height_px)
+        self._kept_size = camera.width_px, camera.height_px
+        if kept is not None and same_size and end_s is None:
+            gaussians = self._first_gaussians(frame, observation)
+            if kept.restart(gaussians, observation.time_s, self.camera):
+                self._step = kept
+                if self._prior is not None:
+                    self._prior.forget()
+                return
+        self._coverage = None
+        super()._start(frame, observation, end_s)
 
-    @property
-    def _picture(self) -> tuple[int, int, str]:
-        return self.camera.width_px, self.camera.height_px, self.camera.model
+    def _learn_step_time(self, spending: Spending) -> None:
+        """Soon when steps are found to be shorter; slowly when they seem longer, for the first ones on a device take far longer."""
+        spending.all_finished()
+        known = self._step_s
+        if known is None or spending.step_s < known:
+            self._step_s = spending.step_s
+        else:
+            self._step_s = known + LONGER_STEP_DECAY * (min(spending.step_s, 2 * known) - known)
 
     def _train_on(self, observation: Observation, budget: Budget, first: bool) -> ObserveReport:
         assert self._step is not None

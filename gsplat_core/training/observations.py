@@ -75,15 +75,15 @@ class ObservationWindow:
         """Make `observation` the newest; the oldest leaves a full window."""
         self._frames.append(observation)
 
-    def forget_before(self, time_s: float) -> None:
-        """Drop frames that are older, all but the newest: the field no longer tells their times apart."""
-        while len(self._frames) > 1 and self._frames[0].time_s < time_s:
-            self._frames.popleft()
-
     @property
     def newest(self) -> Observation:
         """The frame that was added last."""
         return self._frames[-1]
+
+    def forget_before(self, time_s: float) -> None:
+        """Drop frames that are older, all but the newest: the field no longer tells their times apart."""
+        while len(self._frames) > 1 and self._frames[0].time_s < time_s:
+            self._frames.popleft()
 
     def __len__(self) -> int:
         return len(self._frames)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from itertools import pairwise
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,8 +23,10 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.coverage import CapturedCoverage
 from gsplat_core.training.growth import gaussians_for_uncovered_tissue
 from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion_prior
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
+from gsplat_core.training.offline import FitSettings, OfflineTraining
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
@@ -41,8 +43,7 @@ class Reconstructor:
     settings and seed give the same model. With the basis field that holds for any number of threads; the HexPlane's network is
     trained by torch's matrix products, which round differently with another number.
 
-    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares the next frame; the host waits for
-    it where that one is searched for uncovered tissue.
+    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares the next frame.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class Reconstructor:
         self._recording_digest = recording_digest
         self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
         self._step: TrainingStep | None = None
+        self._prior: MotionPrior | None = None
         self._coverage: CapturedCoverage | None = None
         self._unsettled: Observation | None = None
         """The frame whose steps are queued; whether their splats fitted the tile lists is not known yet."""
@@ -125,6 +127,8 @@ class Reconstructor:
         self._window.forget_before(self._step.field.time_window_s[0])
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
+        if self._prior is not None:
+            self._prior.observe(frame, observation.time_s, observation.camera, self._step)
         self._window.add(observation)
         if not first:
             self._grow(frame, observation)
@@ -190,9 +194,13 @@ class Reconstructor:
         self._step_s = known + STEP_TIME_DECAY * (spending.step_s - known)
 
     def fit(
-        self, frames: Iterable[Frame], steps: int, progress: Callable[[int, Tensor], None] | None = None
+        self,
+        frames: Iterable[Frame],
+        steps: int,
+        progress: Callable[[int, Tensor], None] | None = None,
+        settings: FitSettings | None = None,
     ) -> ObserveReport:
-        """Train offline on all of `frames`, in random order, the rates decaying exponentially to a tenth.
+        """Train offline on all of `frames`, as `settings` say; `ReconstructorConfig.offline` is the configuration for it.
 
         `progress(step, loss)` is called after each step; on a GPU reading the loss, a tensor [] on the device, waits for the step. All
         frames are held in the device's memory (1 byte per channel).
@@ -214,16 +222,14 @@ class Reconstructor:
         self._last_time_s = observations[-1][1].time_s
         for frame, observation in observations[1:]:
             self._grow(frame, observation)
-        random = np.random.default_rng(self._seed)
-        order: list[int] = []
-        loss = torch.zeros(())
-        for step in range(steps):
-            if not order:
-                order = random.permutation(len(observations)).tolist()
-            loss = self._step(observations[order.pop()][1], rate_scale=0.1 ** (step / steps))
-            if progress is not None:
-                progress(step + 1, loss)
-        self._step.settle(observations[-1][1], rate_scale=0.1)
+        training = OfflineTraining(
+            self._step,
+            [observation for _, observation in observations],
+            settings or FitSettings(),
+            most_gaussians=self.config.max_gaussians,
+            seed=self._seed,
+        )
+        loss = training(steps, progress)
         return ObserveReport(observations[-1][0].seq, steps, HostCopy(loss), self.gaussians)
 
     def snapshot(self) -> Model:
@@ -232,15 +238,9 @@ class Reconstructor:
             raise InvalidInput("there is no model yet: observe a frame first")
         self._settle()
         self._version += 1
-        gaussians, field = self._step.copy()
-        return Model(
-            version=self._version,
-            gaussians=gaussians,
-            field=field,
-            camera=self.camera,
-            time_window_s=self._time_window_s,
-            training_digest=self._recording_digest,
-        )
+        with continued(self._step, self._prior):
+            gaussians, field = self._step.copy()
+        return Model(gaussians=gaussians, field=field, **self._facts())
 
     def publish(self) -> Model | Snapshot:
         """The model as it is now, for showing it, with the next version number. As `snapshot`, but on a GPU it is copied into a slot.
@@ -250,21 +250,18 @@ class Reconstructor:
         if self._step is None or self.device.type != "cuda" or not SnapshotSlots.can_hold(self._step.field):
             return self.snapshot()
         self._version += 1
-        return self._slots.publish(
-            self._step.gaussians,
-            self._step.field,
-            version=self._version,
-            camera=self.camera,
-            time_window_s=self._time_window_s,
-            training_digest=self._recording_digest,
-        )
+        with continued(self._step, self._prior):
+            return self._slots.publish(self._step.gaussians, self._step.field, **self._facts())
 
-    def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
-        self._first_time_s = observation.time_s
-        self.camera = observation.camera
-        self._begin(self._first_gaussians(frame, observation).to(self.device), observation.time_s, end_s)
+    def _facts(self) -> dict[str, Any]:
+        """What a model or snapshot states beside its tensors."""
+        window_s, digest = self._time_window_s, self._recording_digest
+        return dict(version=self._version, camera=self.camera, time_window_s=window_s, training_digest=digest)
 
     def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
+        """The Gaussians that a scene starts with; its camera and first time are those of the frame."""
+        self._first_time_s = observation.time_s
+        self.camera = observation.camera
         return gaussians_from_frame(
             frame,
             observation.camera,
@@ -272,15 +269,16 @@ class Reconstructor:
             sh_degree=self.config.sh_degree,
             default_depth_mm=self.config.default_depth_mm,
             seed=self._seed,
-        )
+        ).to(self.device)
 
-    def _begin(self, gaussians: Gaussians, start_s: float, end_s: float | None) -> None:
-        """Make the field and the step that train a scene from here on."""
-        wanted = NewField(gaussians, start_s, end_s, self.config.bump_spacing_s, self.config.history_s)
+    def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
+        gaussians = self._first_gaussians(frame, observation)
+        wanted = NewField(gaussians, observation.time_s, end_s, self.config.bump_spacing_s, self.config.history_s)
         with torch.random.fork_rng(devices=[]):  # planes and layers start random
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config, self.camera)
+        self._prior = None if end_s is not None else new_motion_prior(self.config, field)
         if self.device.type == "cuda" and SnapshotSlots.can_hold(field):
             self._coverage = CapturedCoverage(self.camera, self.device, self._fixed_rows)
 

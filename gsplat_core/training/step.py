@@ -89,6 +89,23 @@ class TrainingStep:
         self._adam.step(self.gaussians.tensors(), own, self._gaussian_rates(rate_scale))
         return loss
 
+    def scale_about(self, camera: Camera, factor: Tensor) -> None:
+        """Move every Gaussian to `factor` [N] times its distance from the camera's centre, at all times, and scale it with that: the camera
+        sees the same picture. Adam's moments follow, the rates with `take_distance`."""
+        with torch.no_grad():
+            scene, each = self.gaussians, factor[:, None]
+            centre = torch.as_tensor(camera.position, dtype=scene.means.dtype).to(scene.device)
+            scene.means.copy_(centre + each * (scene.means - centre))
+            scene.log_scales.add_(each.log())
+            self.field.scale_positions(factor)
+            count = len(factor)
+            self._adam.first_moments["means"][:count].div_(each)
+            self._adam.second_moments["means"][:count].div_(each.square())
+
+    def take_distance(self, camera: Camera) -> None:
+        """Let rates that are given in pixels follow the scene's distance from the camera. Waits for it."""
+        self._mm_per_px, self._scaled_for = mm_per_px(self.gaussians, camera), None
+
     def settle(self, observation: Observation, rate_scale: float = 1.0) -> None:
         """Wait for the captured steps. Those that changed nothing, because a tile list was beyond its capacity, are taken again on
         `observation`."""
@@ -107,15 +124,26 @@ class TrainingStep:
         """Gaussians and field with memory of their own, free of training state."""
         return self.gaussians.detach().clone(), self.field.detached_copy()
 
-    def append(self, added: Gaussians) -> None:
-        """Add Gaussians, which start still."""
+    def append(self, added: Gaussians, parents: Tensor | None = None) -> None:
+        """Add Gaussians, which start still, or move as those at `parents` (int64 indices) do."""
         if self._rows is not None:
             self._rows.append(added)
             self.gaussians = self._rows.used
         else:
             self.gaussians = self.gaussians.append(added)
-        self.field.append(added)
+        self.field.append(added, parents)
         self._adam.append(added.count)
+
+    def split(self, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
+        """Put two Gaussians, made by `halves`, in the place of each of those at `parents` (int64 indices); both move as their parent does.
+
+        The second ones come last. All of them start with fresh moments.
+        """
+        first, second = halves(self.gaussians.select(parents))
+        for name, tensor in self.gaussians.tensors().items():
+            tensor[parents] = first.tensors()[name]
+            self._adam.reset(name, parents)
+        self.append(second, parents)
 
     def remove(self, leaving: Tensor) -> RowMoves:
         """Let the Gaussians marked in `leaving`, bool [N], go; returns how the others moved. Waits for the device."""
@@ -147,25 +175,6 @@ class TrainingStep:
     @property
     def _all_rows(self) -> Gaussians:
         return self.gaussians if self._rows is None else self._rows.all
-
-    def split(self, kept: Tensor, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
-        """Keep the Gaussians in `kept` (int64 indices), and put two in the place of each of those at `parents` (indices into `kept`).
-
-        `halves` makes the two; both move as their parent does. The new ones, and their parents' Gaussians, start with fresh moments.
-        """
-        self._rows = None  # the tensors are replaced by others in any case
-        gaussians = self.gaussians.select(kept)
-        first, second = halves(gaussians.select(parents))
-        changed = gaussians.map(Tensor.clone)
-        for name, tensor in changed.tensors().items():
-            tensor[parents] = first.tensors()[name]
-        self.gaussians = changed.append(second)
-        self.field.select(kept)
-        self.field.append(second, parents)
-        self._adam.select(kept)
-        for name in self._adam.first_moments:
-            self._adam.reset(name, parents)
-        self._adam.append(second.count)
 
     def _captured_step(self, captured: FusedStep, observation: Observation, rate_scale: float) -> Tensor:
         if rate_scale != self._scaled_for:

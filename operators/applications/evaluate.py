@@ -8,11 +8,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
 
-from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.baselines import AGES, measure_baselines
 from gsplat_core.evaluation.causal import evaluate_causal
 from gsplat_core.evaluation.heldout import HeldOut, evaluate_heldout
-from gsplat_core.evaluation.live import Live, evaluate_live
+from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.pictures import PictureMaker
 from gsplat_core.evaluation.retention import Retention, Return, evaluate_retention, find_places, returns
 from gsplat_core.evaluation.scores import Record
@@ -22,7 +22,7 @@ from operators.applications.device import check_device, seeded
 from operators.applications.evaluated import EvaluatedRun, SeenFrames, fitting_source, frame_tolerance_s
 from operators.applications.evaluation import PROTOCOLS, WITHOUT_LEARNING, CausalRun, Evaluation, EvaluationSettings
 from operators.applications.limits import check_picture
-from operators.applications.live_log import is_live_log, live_frames, shown_pictures
+from operators.applications.live_log import is_live_log, read_live_log
 from operators.applications.memory import render_bytes, replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplaySettings, new_reconstructor
@@ -189,13 +189,8 @@ class _Work:
 
     def _live(self) -> Live:
         assert self.run is not None
-        log = self.run.folder / FRAMES_FILE
-        frames = SeenFrames(self.source, float("inf"), self.stop_requested, self._progress("live"))
         with self._log("live") as record:
-            try:
-                return evaluate_live(live_frames(frames, log), shown_pictures(log), record=record)
-            except InvalidInput as error:  # the log comes from a file, which anyone may have changed
-                raise InvalidSetting(f"{log} cannot be evaluated: {error}") from error
+            return read_live_log(self.run.folder / FRAMES_FILE, record)
 
     def _returns(self, retention: object) -> dict[str, tuple[Return, ...]]:
         if not isinstance(retention, Retention) or not retention.places:

@@ -1,7 +1,7 @@
 """Live: a stream is reconstructed and shown beside a clock, without an end.
 
-    source → sequence → tool_mask → scene ─┬─► reconstruct → deform → rasterize → display ─┬─► sinks
-                                           └───────────────────────► on_screen ◄───────────┘
+    source → analysis ─┬─► reconstruct → deform → rasterize → display ─┬─► sinks
+                       └───────────────────────► on_screen ◄───────────┘
 
 Each operator has a thread of its own. The newest frame wins wherever one comes too late: into `reconstruct`, into `rasterize` and into
 `display`; every frame that is passed over is counted by the edge. What is shown says how old it is.
@@ -17,9 +17,10 @@ from operators.applications.delivery import Report, delivered
 from operators.applications.device import check_device
 from operators.applications.finishing import saves_model
 from operators.applications.limits import check_picture
-from operators.applications.live_analysis import analysis_operators
+from operators.applications.live_analysis import analysis_operator
 from operators.applications.live_settings import LiveSettings
 from operators.applications.live_start import WarmParts, low_latency, warm_up
+from operators.applications.recording import RunRecording
 from operators.applications.replay import REPORT_RESERVE_BYTES
 from operators.applications.result import RunOutcome
 from operators.applications.session import Session
@@ -27,7 +28,7 @@ from operators.deform import DeformOp
 from operators.display import DisplayOp
 from operators.frame_clock import FrameClock
 from operators.frame_log import FRAMES_FILE, FrameLog
-from operators.graph import Application, MultiThreadScheduler, Operator
+from operators.graph import Application, MultiThreadScheduler
 from operators.ingest import SourceOp
 from operators.live_reconstruct import LiveReconstructOp
 from operators.metrics import ScoredFrame
@@ -65,19 +66,20 @@ class LiveApplication(Application):
         settings, out = self.settings, self.settings.out
         reserve = StorageReserve(out, self.room_to_finish)
         self.source_op = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
-        last: Operator = self.source_op
-        for operator in analysis_operators(self, settings.tool_mask):
-            self.add_flow(last, operator, {("frame", "frame")})
-            last = operator
+        recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
+        analysis = analysis_operator(
+            self, settings.tool_mask, settings.out_of_body, recording.behind_gate(), recording.behind_analysis()
+        )
+        self.add_flow(self.source_op, analysis, {("frame", "frame")})
         self.reconstruct = LiveReconstructOp(
             self,
             name="reconstruct",
-            make_reconstructor=lambda: self._warm.reconstructor,
+            make_reconstructor=recording.made_by(lambda: self._warm.reconstructor),
             clock=self.clock,
+            listener=recording.listener,
         )
         deform = DeformOp(self, name="deform")
-        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
-        rasterize.adopt(self._warm.renderer, self.frame_source.description.camera, self._warm.reconstructor.device)
+        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer, rasterizer=self._warm.rasterizer)
         self.display = DisplayOp(
             self,
             name="display",
@@ -86,13 +88,14 @@ class LiveApplication(Application):
             settings=settings.display,
         )
         self.metrics = OnScreenMetricsOp(self, name="on_screen", log=FrameLog(out / FRAMES_FILE, reserve))
-        self.add_flow(last, self.reconstruct, {("frame", "frame")})
+        self.add_flow(analysis, self.reconstruct, {("frame", "frame")})
         self.add_flow(
             self.reconstruct, deform, {("reconstruction", "reconstruction")}, policy="drop_oldest", capacity=2
         )
         self.add_flow(deform, rasterize, {("scene", "scene")}, policy="drop_oldest", capacity=2)
         self.add_flow(rasterize, self.display, {("rendered", "rendered")})
-        self.add_flow(last, self.metrics, {("frame", "frame")})
+        recording.pictures_of(self.display)
+        self.add_flow(analysis, self.metrics, {("frame", "frame")})
         self.add_flow(self.display, self.metrics, {("shown", "shown")})
         if self._on_shown is not None:
             shown = CallbackSinkOp(self, name="viewer", callback=self._on_shown)

@@ -2,23 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
-from operators.endoscope.cuts import CutStage
-from operators.endoscope.exposure import ExposureStage
-from operators.endoscope.sequence import MaskAndDepthStage, SequenceStage
 from operators.endoscope.stage import StageOp
+from operators.endoscope.stages import PICTURE_STAGES, TISSUE_STAGES, new_stages
 from operators.graph import Operator
+from operators.out_of_body import OutOfBodyGateOp, Policy
+from operators.side_by_side import SideBySideOp
 from operators.tool_mask import new_tool_mask
 
+BESIDE = "highlights"
+"""The stage that needs no other one: it runs beside them."""
 
-def analysis_operators(fragment: Any, tool_mask: str) -> list[Operator]:
-    """The operators between the source and the reconstruction, in order; each takes and gives `frame`.
 
-    tool_mask: how tools are found, a name in `TOOL_MASKS`.
+def analysis_operator(
+    fragment: Any,
+    tool_mask: str,
+    out_of_body: Policy,
+    behind_gate: Sequence[Operator] = (),
+    behind: Sequence[Operator] = (),
+) -> Operator:
+    """The operator between the source and the reconstruction; it takes and gives `frame`.
+
+    Tools and highlights are looked for while the others judge the picture. tool_mask: how tools are found, a name in `TOOL_MASKS`.
+    out_of_body: what happens to pictures from outside of the body. behind_gate: operators that see each frame as it comes through that
+    gate. behind: those that see it at the end.
     """
-    return [
-        StageOp(fragment, name="sequence", stages=[SequenceStage()]),
-        new_tool_mask(fragment, tool_mask),
-        StageOp(fragment, name="scene", stages=[MaskAndDepthStage(), CutStage(), ExposureStage()]),
-    ]
+    others = [name for name in PICTURE_STAGES if name != BESIDE]
+    return SideBySideOp(
+        fragment,
+        name="analysis",
+        first=[
+            OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body),
+            *behind_gate,
+            StageOp(fragment, name="picture", stages=new_stages(PICTURE_STAGES, without=[BESIDE])),
+        ],
+        second=[
+            new_tool_mask(fragment, tool_mask),
+            StageOp(fragment, name="highlights", stages=new_stages(PICTURE_STAGES, without=others)),
+        ],
+        then=[StageOp(fragment, name="tissue", stages=new_stages(TISSUE_STAGES)), *behind],
+    )

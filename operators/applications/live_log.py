@@ -1,82 +1,128 @@
-"""What a live run's log says about when frames arrived and what was shown when."""
+"""What the log of a live run says about what was on the screen when each frame was replaced by the next."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from itertools import count
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.evaluation.live import Shown
-from gsplat_core.scene.frames import Frame
-from operators.frame_log import Entry, read_frames
+from gsplat_core.evaluation.live import NOTHING_SHOWN, Live, LiveSums
+from gsplat_core.evaluation.scores import Entry, Record, number
+from gsplat_core.training.metrics import MEASURES, FrameQuality
+from operators.frame_log import read_frames
+
+NOT_SCORED, NO_FIGURE = "too fast to be scored", "damaged or without tissue"
+_NS_PER_MS = 1e6
+
+
+@dataclass(frozen=True)
+class _Line:
+    """One frame and the picture that was on the screen when the next one came, which the run has scored against it."""
+
+    seq: int
+    time_s: float
+    arrived_ns: int
+    shown_seq: int
+    shown_ns: int
+    age_ms: float
+    """Of the picture when it was shown."""
+    state: str
+    withheld: str | None
+    quality: FrameQuality
 
 
 def is_live_log(path: Path) -> bool:
-    """Whether a run's log says when its pictures were shown."""
-    first = next(read_frames(path), None)
+    """Whether a run's log says when its pictures were shown. Raises InvalidSetting for a file that is no log."""
+    first = next(_entries(path), None)
     return first is not None and "shown_ns" in first and "arrived_ns" in first
 
 
-def shown_pictures(path: Path) -> Iterator[Shown]:
-    """The pictures of a live run in the order in which they were shown. The log has their figures, not the pictures themselves."""
-    for entry in read_frames(path):
-        psnr_db = entry.get("psnr_tissue_db")
-        yield Shown(
-            seq=_whole(entry, "seq", path),
-            arrived_ns=_whole(entry, "arrived_ns", path),
-            shown_ns=_whole(entry, "shown_ns", path),
-            psnr_tissue_db=None if psnr_db is None else float(psnr_db),
-            state=str(entry.get("state", "live")),
-        )
+def read_live_log(path: Path, record: Record | None = None) -> Live:
+    """The live protocol's figures of a run, from its log. Raises InvalidSetting for a line that is none of such a log.
 
-
-def live_frames(recording: Iterable[Frame], log: Path) -> Iterator[Frame]:
-    """The frames of a live run, with the times at which they arrived: those of the recording that it played, again from the beginning where
-    it was looped.
-
-    A frame that was dropped has no line in the log: its arrival is put between those of its neighbours, in proportion to its number.
+    The pictures themselves were scored while they were shown (`OnScreenMetricsOp`). The last frame is left out, since nobody knows when the
+    next one would have come. record: given each scored frame's figures.
     """
-    arrivals = _arrivals(log)
-    before = after = next(arrivals, None)
-    for index, frame in zip(count(), _looped(recording), strict=False):
-        while after is not None and after[0] < index:
-            before, after = after, next(arrivals, None)
-        if after is None or before is None:
-            return
-        if index < before[0]:
-            continue  # nothing is known of frames before the first one that was shown
-        share = 0.0 if after[0] == before[0] else (index - before[0]) / (after[0] - before[0])
-        yield frame.with_fields(seq=index, arrived_ns=round(before[1] + share * (after[1] - before[1])))
+    sums = LiveSums(record)
+    last_shown: tuple[int, int] | None = None
+    started = False
+    for line, following in pairwise(_lines(path)):
+        if not started:
+            for _ in range(line.seq):
+                sums.leave_out(NOTHING_SHOWN)
+            started = True
+        shown = line.shown_seq, line.shown_ns
+        if shown != last_shown:
+            sums.picture(line.age_ms, line.state)
+            last_shown = shown
+        if line.withheld is not None:
+            sums.leave_out("withheld")
+        elif not math.isfinite(line.quality.psnr_tissue_db):
+            sums.leave_out(NO_FIGURE)
+        else:
+            content_ns = line.shown_ns - line.age_ms * _NS_PER_MS
+            on_screen_ms = (following.arrived_ns - content_ns) / _NS_PER_MS
+            sums.frame(line.quality, line.time_s, line.seq - line.shown_seq, on_screen_ms)
+        for _ in range(following.seq - line.seq - 1):
+            sums.leave_out(NOT_SCORED)
+    return sums.live
 
 
-def _arrivals(log: Path) -> Iterator[tuple[int, int]]:
-    """Number and arrival of each frame that was shown, each once."""
-    newest = -1
-    for entry in read_frames(log):
-        seq = _whole(entry, "seq", log)
-        if seq > newest:
-            newest = seq
-            yield seq, _whole(entry, "arrived_ns", log)
+def _lines(path: Path) -> Iterator[_Line]:
+    before: _Line | None = None
+    for entry in _entries(path):
+        seq = _whole(entry, "seq", path)
+        line = _Line(
+            seq=seq,
+            time_s=_finite(entry, "time_s", path),
+            arrived_ns=_whole(entry, "arrived_ns", path),
+            shown_seq=_whole(entry, "shown_seq", path) if "shown_seq" in entry else seq,
+            shown_ns=_whole(entry, "shown_ns", path),
+            age_ms=_finite(entry, "age_ms", path),
+            state=str(entry.get("state", "live")),
+            withheld=None if entry.get("withheld") is None else str(entry["withheld"]),
+            quality=FrameQuality(seq, *(_measure(entry, name) for name in MEASURES)),
+        )
+        if before is not None and (seq <= before.seq or line.arrived_ns < before.arrived_ns):
+            raise InvalidSetting(
+                f"{path}: frame {seq} comes after frame {before.seq} and arrived at {line.arrived_ns} ns after {before.arrived_ns} ns; the log"
+                " of a live run is in order"
+            )
+        yield line
+        before = line
 
 
-def _looped(recording: Iterable[Frame]) -> Iterator[Frame]:
-    """The frames again and again; time goes on from one round to the next."""
-    offset_ns = 0
-    while True:
-        first = last = before = None
-        for frame in recording:
-            first, before, last = first or frame, last, frame
-            yield frame.with_fields(pts_ns=frame.pts_ns + offset_ns)
-        if first is None or last is None or before is None:
-            return
-        offset_ns += last.pts_ns - first.pts_ns + (last.pts_ns - before.pts_ns)
+def _entries(path: Path) -> Iterator[Entry]:
+    try:
+        for entry in read_frames(path):
+            if not isinstance(entry, dict):
+                raise InvalidSetting(f"{path} has a line that holds no figures by name; it is not the log of a run")
+            yield entry
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, InvalidSetting):
+            raise
+        raise InvalidSetting(f"{path} is not the log of a run: {error}") from error
+
+
+def _measure(entry: Entry, name: str) -> float:
+    value = number(entry, name)
+    return math.nan if value is None else value
 
 
 def _whole(entry: Entry, name: str, path: Path) -> int:
     value = entry.get(name)
-    if not isinstance(value, int) or isinstance(value, bool):
+    if not isinstance(value, int) or isinstance(value, bool) or abs(value) >= 1 << 63:
         raise InvalidSetting(
             f"{path} has a line whose {name} is {value!r}; it must be a whole number: it is not the log of a live run"
         )
+    return value
+
+
+def _finite(entry: Entry, name: str, path: Path) -> float:
+    value = number(entry, name)
+    if value is None or not math.isfinite(value):
+        raise InvalidSetting(f"{path} has a line whose {name} is {entry.get(name)!r}; it must be a number")
     return value

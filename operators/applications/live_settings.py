@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.sessions import WriterOptions
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.live import LiveTraining
 from operators.applications.limits import check_max_frames, check_scale, check_seed
@@ -14,6 +16,8 @@ from operators.applications.replay import PIXELS_PER_GAUSSIAN
 from operators.applications.result import RunSettings
 from operators.display import DisplaySettings
 from operators.frame_clock import ClockSettings
+from operators.out_of_body import Policy
+from operators.tool_mask import check_tool_mask
 
 LIVE_WINDOW_FRAMES = 150
 LIVE_BUMP_SPACING_S = 0.1
@@ -42,8 +46,14 @@ class LiveSettings:
     """Play a recording again and again."""
     fps: float | None = None
     """Play a recording at this rate instead of its own."""
+    record: Path | None = None
+    """Record the session into this folder, which is not there yet; None: it is not recorded."""
+    recording: WriterOptions = dataclasses.field(default_factory=WriterOptions)
+    """How it is recorded."""
     tool_mask: str = "builtin"
     """How tools are found in frames that come without a mask (`operators.tool_mask.TOOL_MASKS`)."""
+    out_of_body: Policy = "withhold"
+    """What happens to pictures from outside of the body: nothing of them goes on, or (`off`) they are not looked for."""
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
     display: DisplaySettings = dataclasses.field(default_factory=DisplaySettings)
     training: LiveTraining = dataclasses.field(default_factory=LiveTraining)
@@ -56,6 +66,10 @@ class LiveSettings:
             raise InvalidSetting(f"seconds is {self.seconds:g}; it must be positive")
         if self.fps is not None and not 0 < self.fps <= 1000:
             raise InvalidSetting(f"fps is {self.fps:g}; it must be above 0 and at most 1000")
+
+        if self.out_of_body not in get_args(Policy):
+            raise InvalidSetting(f"out-of-body is {self.out_of_body!r}; choose {' or '.join(get_args(Policy))}")
+        check_tool_mask(self.tool_mask)
 
     @property
     def inputs(self) -> tuple[Path, ...]:

@@ -8,22 +8,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from gsplat_core.rendering.registry import new_renderer
-from gsplat_core.rendering.renderer import Renderer
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.live import LiveReconstructor
 from operators.applications.device import seeded
 from operators.applications.live_settings import LiveSettings
 from operators.display import labelled
-from operators.messages import PictureState
+from operators.messages import DeformedScene, PictureState
+from operators.rasterize import Rasterizer
 from operators.sources.source import FrameSource
 
 SWITCH_INTERVAL_S = 0.0002
 """How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
-WARM_FRAMES = 3
+OPENCV_THREADS = 2
+"""More of them take longer to start than small pictures take to look at."""
+WARM_FRAMES = 4
 WARM_STEPS = {"cpu": 3, "cuda": 40}
 """Optimiser steps on each picture before the first frame."""
 
@@ -45,7 +47,7 @@ class WarmParts:
     """What a live run works with, used once already."""
 
     reconstructor: LiveReconstructor
-    renderer: Renderer
+    rasterizer: Rasterizer
 
 
 def warm_up(settings: LiveSettings, source: FrameSource) -> WarmParts:
@@ -53,27 +55,30 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> WarmParts:
     stream's first frame then has to wait for none of it."""
     camera = source.description.camera
     noise = np.random.default_rng(0).integers(0, 256, (camera.height_px, camera.width_px, 3), np.uint8)
+    rasterizer = Rasterizer(settings.renderer)
     with seeded(settings.seed, settings.device):
         reconstructor = new_live_reconstructor(settings, source)
-        renderer = new_renderer(settings.renderer, camera, reconstructor.device)
-        published = []
+        pictures = []
         for seq in range(WARM_FRAMES):
-            # Budgets in time, so that the length of a step is known. All snapshots are held: every slot that a run needs is made.
-            budget = Budget.until(0.0, at_least=WARM_STEPS[settings.device])
-            reconstructor.observe(Frame(seq, seq * 33_000_000, noise), budget=budget)
-            published.append(reconstructor.publish())
-            renderer.prepare(published[-1])
-            renderer.render(camera, seq * 0.033).result()
+            frame = Frame(seq, seq * 33_000_000, noise)
+            # Budgets in time, so that the length of a step is known.
+            reconstructor.observe(frame, budget=Budget.until(0.0, at_least=WARM_STEPS[settings.device]))
+            # All of them are held: every snapshot and piece of page-locked memory that a run needs is made.
+            scene = DeformedScene(frame, reconstructor.publish(), camera, trained=True)
+            pictures.append((scene, rasterizer.draw(scene)))
             reconstructor.rehearse(2)
+            reconstructor.grow(frame)
         reconstructor.forget()
     labelled(noise, PictureState.LIVE, 0)
-    return WarmParts(reconstructor, renderer)
+    return WarmParts(reconstructor, rasterizer)
 
 
 @contextmanager
 def low_latency() -> Iterator[None]:
     """Inside, threads take turns often, and what exists already is never searched for garbage again."""
     interval_s = sys.getswitchinterval()
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(min(threads, OPENCV_THREADS))
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()
@@ -81,4 +86,5 @@ def low_latency() -> Iterator[None]:
         yield
     finally:
         gc.unfreeze()
+        cv2.setNumThreads(threads)
         sys.setswitchinterval(interval_s)

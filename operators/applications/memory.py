@@ -37,7 +37,9 @@ def replay_bytes(source: SourceDescription, config: ReconstructorConfig, *, offl
     # A field of basis functions grows with the stream.
     basis = config.chosen_field == "basis"
     bumps = _BUMPS_AT_START + round(frames / source.fps / config.bump_spacing_s) if basis else 0
-    model = PARAMETER_BYTES * config.gaussians * (_CANONICAL + _BUMP * bumps)
+    # Offline every Gaussian is there in the end; online they come where tissue appears, on a fixed scope hardly any.
+    gaussians = config.max_gaussians if offline else config.gaussians
+    model = PARAMETER_BYTES * gaussians * (_CANONICAL + _BUMP * bumps)
     return (
         FIXED_BYTES + (0 if basis else OTHER_FIELD_BYTES) + pixels * (PIXEL_BYTES + WINDOW_PIXEL_BYTES * kept) + model
     )

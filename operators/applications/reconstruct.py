@@ -105,7 +105,7 @@ def _fit(
     description = source.description
     if description.digest is None or description.frame_count is None:
         raise InvalidSetting(f"{description.name} can be read only once; reconstruct needs a recording, or use replay")
-    learning = new_reconstructor(settings, source)
+    learning = new_reconstructor(settings, source, offline=True)
     done = 0
 
     def after_step(step: int, loss: Tensor) -> None:

@@ -32,6 +32,7 @@ from operators.applications.memory import replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.result import RunOutcome, RunSettings
 from operators.applications.session import Session
+from operators.applications.session_replay import FollowedSession, followed_session
 from operators.deform import DeformOp
 from operators.frame_log import FRAMES_FILE, FrameLog
 from operators.graph import Application, Engine
@@ -71,6 +72,8 @@ class ReplaySettings:
     """Optimiser steps per frame; None is the reconstructor's default."""
     max_frames: int | None = None
     scale: float = 1.0
+    ignore_schedule: bool = False
+    """Replay a recorded session like any other recording, and not with the calls that it made."""
     heldout: bool = False
     """Show the protocol's held-out frames without training on them, and score them apart."""
 
@@ -90,9 +93,9 @@ class ReplaySettings:
         """What the run reads from the disk."""
         return (Path(self.recording),)
 
-    def reconstructor_config(self, pixels: int | None = None) -> ReconstructorConfig:
-        """The reconstructor's settings for frames of so many pixels. Raises InvalidSetting."""
-        config = ReconstructorConfig(field=self.field)
+    def reconstructor_config(self, pixels: int | None = None, *, offline: bool = False) -> ReconstructorConfig:
+        """The reconstructor's settings for frames of so many pixels. offline: for `Reconstructor.fit`. Raises InvalidSetting."""
+        config = ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig(field=self.field)
         if pixels is not None:
             # More Gaussians than a quarter of the pixels have nothing to show.
             most = max(64, pixels // PIXELS_PER_GAUSSIAN)
@@ -128,6 +131,7 @@ class ReplayApplication(Application):
         progress: ProgressCallback | None = None,
         stop_requested: Callable[[], bool] = lambda: False,
         make_reconstructor: Callable[[], Any] | None = None,
+        followed: FollowedSession | None = None,
         stage: str = "replay",
     ) -> None:
         super().__init__(name="replay", track=True)
@@ -139,6 +143,7 @@ class ReplayApplication(Application):
         self._stop_requested = stop_requested
         self._make_reconstructor = make_reconstructor or self._new_reconstructor
         self._reserve_bytes = reserve_bytes
+        self._followed = followed
 
     def compose(self) -> None:
         """Wire the operators; see the module's picture."""
@@ -146,9 +151,7 @@ class ReplayApplication(Application):
         reserve = StorageReserve(out, self.room_to_finish)
         source = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
         tool_mask = RecordedToolMaskOp(self, name="tool_mask")
-        self.reconstruct = ReconstructOp(
-            self, name="reconstruct", make_reconstructor=self._make_reconstructor, held_out=self._held_out
-        )
+        self.reconstruct = self._reconstruct_op()
         deform = DeformOp(self, name="deform")
         rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
         self.metrics = MetricsOp(self, name="metrics", log=FrameLog(out / FRAMES_FILE, reserve))
@@ -168,8 +171,17 @@ class ReplayApplication(Application):
             port, kind = input_of(sink)
             if kind is ScoredFrame:
                 self.add_flow(self.metrics, sink, {("scored", port)})
+        if self._followed is not None:
+            self.add_flow(rasterize, self._followed.compare_op(self, "compare"), {("rendered", "rendered")})
         progress = CallbackSinkOp(self, name="progress", callback=self._report)
         self.add_flow(self.metrics, progress, {("scored", "message")})
+
+    def _reconstruct_op(self) -> ReconstructOp:
+        if self._followed is not None:
+            return self._followed.reconstruct_op(self, "reconstruct")
+        return ReconstructOp(
+            self, name="reconstruct", make_reconstructor=self._make_reconstructor, held_out=self._held_out
+        )
 
     def room_to_finish(self) -> int:
         """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
@@ -213,14 +225,18 @@ def replay(
 
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
         source = prepare(inside, notes)
-        graph = ReplayApplication(source, inside, progress=progress, stop_requested=stop_requested)
+        followed = followed_session(inside, notes)
+        if followed is not None:
+            source, inside = followed.source, replace(inside, seed=followed.made.seed, field=followed.config.field)
+        graph = ReplayApplication(source, inside, progress=progress, stop_requested=stop_requested, followed=followed)
         graph.announce()
         return Session(
             graph,
             inside.stated(online=True),
             command="replay",
             engine=inside.engine,
-            finish=[saves_model(inside.out), measures_baselines(source)],
+            # A session passes frames over, so that what it showed is not the beginning of what it read.
+            finish=[saves_model(inside.out), *([] if followed else [measures_baselines(source)])],
             notes=notes,
             stop_requested=stop_requested,
         ).execute()
@@ -236,14 +252,14 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
     """
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device)
-    config = settings.reconstructor_config()
+    config = settings.reconstructor_config(offline=offline)
     source = open_source(settings.recording, SourceOptions(settings.scale, settings.max_frames))
     description = source.description
     if description.frame_count is None:
         raise InvalidSetting(f"{description.name} has no end; give --max-frames, or a recording")
     check_picture(description.camera, settings.scale)
     if settings.device == "cpu":
-        sized = settings.reconstructor_config(description.width_px * description.height_px)
+        sized = settings.reconstructor_config(description.width_px * description.height_px, offline=offline)
         require_memory(
             replay_bytes(description, sized, offline=offline),
             f"{description.frame_count} frames of {description.name}",
@@ -259,11 +275,11 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
     return source
 
 
-def new_reconstructor(settings: ReplaySettings, source: FrameSource) -> Reconstructor:
-    """A reconstructor for the frames of a source."""
+def new_reconstructor(settings: ReplaySettings, source: FrameSource, *, offline: bool = False) -> Reconstructor:
+    """A reconstructor for the frames of a source; offline: for `fit`."""
     description = source.description
     return Reconstructor(
-        settings.reconstructor_config(description.width_px * description.height_px),
+        settings.reconstructor_config(description.width_px * description.height_px, offline=offline),
         description.camera,
         seed=settings.seed,
         recording_digest=description.digest,

@@ -19,6 +19,18 @@ _TEXT = (232, 236, 240)
 _HELD_OUT = (255, 196, 87)
 
 
+def fitted(picture: NDArray[np.uint8], height_px: int, width_px: int) -> NDArray[np.uint8]:
+    """The picture [H, W, 3] at another size, as large as it goes without being stretched, on the background's colour."""
+    factor = min(height_px / picture.shape[0], width_px / picture.shape[1])
+    height, width = (max(1, round(side * factor)) for side in picture.shape[:2])
+    canvas = np.empty((height_px, width_px, 3), np.uint8)
+    canvas[...] = _BACKGROUND
+    above, left = (height_px - height) // 2, (width_px - width) // 2
+    resized = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR)
+    canvas[above : above + height, left : left + width] = resized
+    return canvas
+
+
 def side_by_side(rendered: RenderedFrame) -> NDArray[np.uint8]:
     """Raw | reconstruction, RGB uint8, with frame number, time and model version in a caption above, never on the tissue."""
     frame = rendered.frame

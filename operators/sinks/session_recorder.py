@@ -9,14 +9,16 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import av
 from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.sessions import SessionInfo, SessionWriter, WriterOptions
-from gsplat_core.io.sessions.records import LostLine
+from gsplat_core.io.sessions.records import MOST_NS, LostLine
 from gsplat_core.io.sessions.schedule import ScheduleLine
+from gsplat_core.io.sessions.session_file import SESSION_FILE
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
 from operators.errors import OutputError
@@ -34,7 +36,28 @@ CLOSE_S = 10.0
 """How long `close` waits for what is in the queue."""
 NICENESS = 10
 """How far the thread steps back behind the graph where both want the processor."""
-_SLOW = "the disk is too slow"
+_SLOW = "writing is too slow"
+What = Literal["frame", "prepared", "shown"]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Something to write."""
+
+    write: Callable[[SessionWriter], None]
+    what: What | None = None
+    """None: a line without pictures."""
+    seq: int = 0
+    bytes: int = 0
+    """Of its pictures."""
+    share: float = 1.0
+    """Share of the queue beyond which it is lost."""
+
+    def lost(self, why: str) -> LostLine | None:
+        """The line that says so; None where there is nothing to say."""
+        if self.what is None or not 0 <= self.seq <= MOST_NS:
+            return None
+        return LostLine(seq=self.seq, what=self.what, why=why)
 
 
 @dataclass(frozen=True)
@@ -77,8 +100,7 @@ class SessionRecorder:
         self._reserve = reserve or StorageReserve(folder, lambda: 0)
         self._queue_bytes = queue_bytes
         self._changed = threading.Condition()
-        self._waiting: deque[tuple[int, Callable[[SessionWriter], None], str, int]] = deque()
-        """Bytes of the pictures, what writes it, what it is, of which frame."""
+        self._waiting: deque[_Part] = deque()
         self._waiting_bytes = 0
         self._arrived: OrderedDict[int, Frame] = OrderedDict()
         self._lost: Counter[str] = Counter()
@@ -91,21 +113,21 @@ class SessionRecorder:
 
     def open(self) -> None:
         """Begin the recording. Raises OutputError where the folder does not take it, or holds one already."""
-        try:
-            with storage_errors(self.folder):
-                self.folder.mkdir(parents=True, exist_ok=True)
-                self._reserve.require()
-                writer = SessionWriter(self.folder, self.info, self.options)
-        except FileExistsError as error:
-            raise OutputError(f"{self.folder} already holds a recording; choose another folder") from error
+        if (self.folder / SESSION_FILE).exists():
+            raise OutputError(f"{self.folder} already holds a recording; choose another folder")
+        with storage_errors(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._reserve.require()
+            writer = SessionWriter(self.folder, self.info, self.options)
         name = f"record {self.folder.name}"
         self._thread = threading.Thread(target=self._run, args=(writer,), name=name, daemon=True)
         self._thread.start()
 
     def frame(self, frame: Frame) -> None:
         """A frame that came in."""
+        part = _Part(lambda writer: writer.frame(frame), "frame", frame.seq, _bytes(frame))
         with self._changed:
-            if self._put(lambda writer: writer.frame(frame), "frame", frame.seq, _bytes(frame), 1.0):
+            if self._put(part):
                 self._arrived[frame.seq] = frame
                 while len(self._arrived) > MOST_ARRIVED:
                     self._arrived.popitem(last=False)
@@ -116,20 +138,25 @@ class SessionRecorder:
             arrived = self._arrived.get(frame.seq)
             while self._arrived and next(iter(self._arrived)) <= frame.seq:
                 self._arrived.popitem(last=False)
+            # Without `arrived` it is lost, and never written.
+            part = _Part(
+                lambda writer: writer.prepared(frame, arrived or frame), "prepared", frame.seq, _bytes(frame, arrived)
+            )
             if arrived is None:
-                self._lose("prepared", frame.seq, "the frame itself is not there")
+                self._lose(part, "the frame itself is not there")
             else:
-                self._put(lambda writer: writer.prepared(frame, arrived), "prepared", frame.seq, _bytes(frame), 1.0)
+                self._put(part)
 
     def line(self, line: ScheduleLine) -> None:
         """What was trained."""
         with self._changed:
-            self._put(lambda writer: writer.line(line), "line", 0, 0, 1.0)
+            self._put(_Part(lambda writer: writer.line(line)))
 
     def shown(self, shown: Shown) -> None:
         """A picture that was shown."""
+        size = shown.rendered.nbytes if shown.new else 0
         with self._changed:
-            self._put(lambda writer: writer.shown(shown), "shown", shown.frame.seq, shown.image.nbytes, SHOWN_SHARE)
+            self._put(_Part(lambda writer: writer.shown(shown), "shown", shown.frame.seq, size, SHOWN_SHARE))
 
     @property
     def recorded(self) -> Recorded:
@@ -162,26 +189,28 @@ class SessionRecorder:
         if failure is not None:
             raise failure
 
-    def _put(self, write: Callable[[SessionWriter], None], what: str, seq: int, size: int, share: float) -> bool:
+    def _put(self, part: _Part) -> bool:
         """With the lock held: hand something to the thread, if there is room; False where it is lost."""
         if self._ended is not None or self._closing:
-            self._lost[f"{what}: the recording has ended"] += 1
+            self._lost[f"{part.what or 'line'}: the recording has ended"] += 1
             return False
-        if size and self._waiting_bytes + size > share * self._queue_bytes:
-            self._lose(what, seq, _SLOW)
+        if part.bytes and self._waiting_bytes + part.bytes > part.share * self._queue_bytes:
+            self._lose(part, _SLOW)
             return False
         if len(self._waiting) >= MOST_LINES:
             self._end(f"the disk of {self.folder} does not answer; the recording has ended")
             return False
-        self._waiting.append((size, write, what, seq))
-        self._waiting_bytes += size
+        self._waiting.append(part)
+        self._waiting_bytes += part.bytes
         self._changed.notify_all()
         return True
 
-    def _lose(self, what: str, seq: int, why: str) -> None:
-        self._lost[f"{what}: {why}"] += 1
-        line = LostLine(seq=seq, what=what, why=why)  # type: ignore[arg-type]
-        self._put(lambda writer: writer.line(line), "line", seq, 0, 1.0)
+    def _lose(self, part: _Part, why: str) -> None:
+        """With the lock held: count what is lost, and have it written that it is."""
+        self._lost[f"{part.what}: {why}"] += 1
+        line = part.lost(why)
+        if line is not None:
+            self._put(_Part(lambda writer: writer.line(line)))
 
     def _end(self, why: str) -> None:
         """With the lock held: nothing more is recorded."""
@@ -198,7 +227,7 @@ class SessionRecorder:
         try:
             with storage_errors(self.folder):
                 while (taken := self._take()) is not None:
-                    self._write(writer, *taken)
+                    self._write(writer, taken)
                 writer.close(self._why)
         except OutputError as error:
             self._give_up(writer, str(error))
@@ -208,30 +237,31 @@ class SessionRecorder:
             self._give_up(writer, f"the recording failed: {type(error).__name__}: {error}")
             self._failure = error
 
-    def _take(self) -> tuple[int, Callable[[SessionWriter], None], str, int] | None:
+    def _take(self) -> _Part | None:
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._closing or self._ended)
             return self._waiting[0] if self._waiting else None
 
-    def _write(
-        self, writer: SessionWriter, size: int, write: Callable[[SessionWriter], None], what: str, seq: int
-    ) -> None:
-        self._reserve.require(size)
+    def _write(self, writer: SessionWriter, part: _Part) -> None:
+        self._reserve.require(part.bytes)
         wrong: str | None = None
         try:
-            write(writer)
+            part.write(writer)
         except (InvalidInput, ValidationError) as error:
             # A frame that no recording can hold, such as one whose pose is NaN.
             wrong = " ".join(str(error).split())[:200]
+        if wrong is not None and (line := part.lost(wrong)) is not None:
+            writer.line(line)
         with self._changed:
             if self._waiting:
                 self._waiting.popleft()
-                self._waiting_bytes -= size
+                self._waiting_bytes -= part.bytes
             self._bytes, self._deleted = writer.bytes, writer.deleted_segments
+            what = part.what or "line"
             if wrong is None:
                 self._written[what] += 1
             else:
-                self._lose(what, seq, wrong)
+                self._lost[f"{what}: {wrong}"] += 1
 
     def _give_up(self, writer: SessionWriter, why: str) -> None:
         with self._changed:
@@ -239,9 +269,14 @@ class SessionRecorder:
         writer.abandon(why[:1000])
 
 
-def _bytes(frame: Frame) -> int:
-    planes = (frame.image, frame.right_image, frame.depth, frame.mask, frame.loss_mask)
-    return sum(plane.nbytes for plane in planes if plane is not None)
+def _bytes(frame: Frame, arrived: Frame | None = None) -> int:
+    """Of the frame's pictures, but for those that wait already as those of `arrived`."""
+    planes = ("image", "right_image", "depth", "mask", "loss_mask")
+    mine = {id(plane): plane.nbytes for name in planes if (plane := getattr(frame, name)) is not None}
+    others = () if arrived is None else (id(getattr(arrived, name)) for name in planes)
+    for key in others:
+        mine.pop(key, None)
+    return sum(mine.values())
 
 
 def stated(recorded: Recorded) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Any
 from operators.graph import Operator, OperatorSpec
 from operators.messages import RenderedFrame
 from operators.outcome import OutcomeBuilder
-from operators.sinks.pictures import side_by_side
+from operators.sinks.pictures import fitted, side_by_side
 from operators.sinks.registry import SinkOptions
 from operators.sinks.video_file import VideoFile
 from operators.storage import StorageReserve
@@ -45,6 +45,7 @@ class VideoSinkOp(Operator):
         self.reserve = reserve
         self.displayed = 0
         self._video: VideoFile | None = None
+        self._size: tuple[int, ...] = ()
         super().__init__(fragment, *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:
@@ -63,7 +64,11 @@ class VideoSinkOp(Operator):
         picture = side_by_side(rendered)
         if self._video is None:
             # The size is known with the first frame only.
+            self._size = picture.shape[:2]
             self._video = VideoFile(self.path, picture.shape[1], picture.shape[0], self.fps, self.reserve)
+        if picture.shape[:2] != self._size:
+            # A stream may change its size, a video cannot.
+            picture = fitted(picture, *self._size)
         self._video.write(picture, rendered.frame.time_s)
         self.displayed += 1
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 FIRST_S = 0.25
-MOST_S = 8.0
+MOST_S = 2.0
 """Seconds between two attempts: twice as long after each one that fails, from the first to the most."""
 
 

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any
@@ -39,7 +39,7 @@ class Opening:
 
     opener: str
     """`module:function`, called with the address and the options."""
-    address: str
+    address: str = field(repr=False)  # it may have a password in it
     options: SourceOptions
 
 

@@ -26,6 +26,8 @@ class SourceOptions:
     """Play a recording by the clock; other sources follow it anyway."""
     loop: bool = False
     """Play a recording over and over."""
+    bounce: bool = False
+    """Play each second round of a looped recording backwards, so that nothing jumps where one round meets the next."""
     speed: float = 1.0
     """How fast a recording's time passes; `math.inf`: each frame as soon as the one before it is taken, and none is dropped."""
     fps: float | None = None

@@ -39,7 +39,7 @@ class FrameOrder:
         return self._counts
 
     def begin(self) -> None:
-        """Forget everything: the next frame is the first one, and gets number 0."""
+        """Forget everything: the next frame is the first one, and gets number 0 and time 0."""
         self._counts.clear()
         self._out: Frame | None = None  # as it was handed on
         self._in: Frame | None = None  # the same, as the sender sent it
@@ -57,8 +57,10 @@ class FrameOrder:
         """The frame with its number and time put right; None for one to be dropped. arrived_ns: when it came in."""
         known, out = self._in, self._out
         if known is None or out is None:
-            self._seq_offset = 0 if self._trusted else -frame.seq
-            return self._accept(frame, frame.pts_ns, arrived_ns)
+            if not self._trusted:
+                # From nought: a time since the start of some machine has too many digits for single precision.
+                self._seq_offset, self._pts_offset_ns = -frame.seq, -frame.pts_ns
+            return self._accept(frame, frame.pts_ns + self._pts_offset_ns, arrived_ns)
         if self._restarted:
             return self._rebase(frame, arrived_ns, None)
         if self._trusted:

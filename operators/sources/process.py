@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 import weakref
 from collections import Counter
@@ -13,7 +14,7 @@ from gsplat_core.scene.frames import Frame
 from operators.errors import SourceLost, SourceUnavailable
 from operators.sources.backoff import Backoff
 from operators.sources.child_process import ChildLost, ChildProcess, Opening
-from operators.sources.live import LiveSource
+from operators.sources.live import STALLED_AFTER_S, LiveSource
 from operators.sources.options import SourceOptions
 from operators.sources.order import FrameOrder
 from operators.sources.shared_memory import BadHeader
@@ -45,13 +46,16 @@ class ProcessSource(LiveSource):
         *,
         opener: str = OPENER,
         hung_after_s: float = HUNG_AFTER_S,
+        stuck_after_s: float = math.inf,
         open_timeout_s: float = OPEN_TIMEOUT_S,
     ) -> None:
-        """opener: `module:function` that makes the source from address and options, in the process. Raises SourceUnavailable with what it said."""
+        """opener: `module:function` that makes the source from address and options, in the process. hung_after_s: a process that says nothing
+        for so long is replaced. stuck_after_s: so is one whose source stalls for so long. Raises SourceUnavailable with what it said."""
         options = options or SourceOptions()
-        super().__init__(waiting=options.waiting, order=FrameOrder(trusted=True))
+        # The process knows best whether its source stalls, and counts it; whether the process itself does is asked in `state`.
+        super().__init__(waiting=options.waiting, stalled_after_s=math.inf, order=FrameOrder(trusted=True))
         self._opening = Opening(opener, address, options)
-        self._hung_after_s, self._open_timeout_s = hung_after_s, open_timeout_s
+        self._hung_after_s, self._stuck_after_s, self._open_timeout_s = hung_after_s, stuck_after_s, open_timeout_s
         self._child_state: tuple[SourceState, str] | None = None
         self._child_counts: dict[str, int] = {}
         self._earlier_counts: Counter[str] = Counter()
@@ -65,15 +69,22 @@ class ProcessSource(LiveSource):
     @property
     def state(self) -> SourceState:
         """See `FrameSource`. What the process says of its source counts as long as the process itself is well."""
-        state, told = super().state, self._child_state
-        well = state in (SourceState.LIVE, SourceState.STALLED)
-        return told[0] if told is not None and well and told[0] is not SourceState.ENDED else state
+        state, told, child = super().state, self._child_state, self._child
+        if state is not SourceState.LIVE or self._ready:
+            return state
+        if child is not None and time.monotonic() - child.heard_s > STALLED_AFTER_S:
+            return SourceState.STALLED
+        return told[0] if told is not None and told[0] is not SourceState.ENDED else state
 
     @property
     def state_sentence(self) -> str:
         """See `LiveSource`."""
-        told = self._child_state
-        return told[1] if told is not None and self.state is told[0] and told[1] else super().state_sentence
+        told, state = self._child_state, self.state
+        if told is not None and state is told[0] and told[1]:
+            return told[1]
+        if state is SourceState.STALLED:
+            return f"the process that reads {self.description.name} says nothing"
+        return super().state_sentence
 
     def counts(self) -> Mapping[str, int]:
         """See `LiveSource`: what was dropped in the process and here."""
@@ -96,7 +107,7 @@ class ProcessSource(LiveSource):
 
     def frames(self) -> Iterator[Frame]:
         """The frames of one process after another."""
-        backoff = Backoff()
+        backoff, crashes = Backoff(), 0
         try:
             while True:
                 try:
@@ -104,6 +115,7 @@ class ProcessSource(LiveSource):
                         self._start()
                     for frame in self._received():
                         backoff.worked()
+                        crashes = 0
                         yield frame
                     return
                 except (ChildLost, SourceUnavailable) as error:
@@ -112,9 +124,11 @@ class ProcessSource(LiveSource):
                     self._child_counts, self._child_state = {}, None
                     name = self.description.name
                     delay_s = backoff.failed()
-                    if backoff.failures >= MOST_FAILURES:
+                    # What is not there may come back; what ends its process again and again will not.
+                    crashes = 0 if isinstance(error, SourceUnavailable) else crashes + 1
+                    if crashes >= MOST_FAILURES:
                         raise SourceLost(
-                            f"{name} is given up after {backoff.failures} attempts: {error}. Check the source and start again."
+                            f"{name} is given up after {crashes} attempts: {error}. Check the source and start again."
                         ) from error
                     self.count("process_restarts")
                     self.lost(f"the process that reads {name} failed ({error}); another one is started")
@@ -128,6 +142,7 @@ class ProcessSource(LiveSource):
         child = self._child
         assert child is not None
         child.say("open")
+        last_s = time.monotonic()
         while not self.wait(0):
             told = child.hear(LOOK_S)
             if told is None:
@@ -135,11 +150,15 @@ class ProcessSource(LiveSource):
                     raise ChildLost(f"it has said nothing for {self._hung_after_s:g} s")
                 continue
             if told["kind"] == "frame":
+                last_s = child.heard_s
                 yield self._frame(child, told)
             elif told["kind"] == "ended":
                 return
             else:
                 self._note(told)
+                stalls = self._child_state is not None and self._child_state[0] is SourceState.STALLED
+                if stalls and child.heard_s - last_s > self._stuck_after_s:
+                    raise ChildLost(f"it has given no frame for {self._stuck_after_s:g} s")
 
     def _frame(self, child: ChildProcess, told: dict[str, Any]) -> Frame:
         try:

@@ -12,6 +12,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import Recording, open_recording
 from gsplat_core.io.recordings.ahead import read_ahead
 from gsplat_core.scene.frames import Frame
+from operators.errors import SourceLost
 from operators.sources.address import Address
 from operators.sources.live import LiveSource
 from operators.sources.options import MAX_FPS, MAX_SPEED, SourceOptions
@@ -98,8 +99,21 @@ class RealtimeSource(LiveSource):
             return
         remembered: list[Frame] = []
         yield self._remembering(remembered)
+        if self.options.bounce and not remembered:
+            raise SourceLost(
+                f"{self.recording.name} is too large to be played backwards: its frames take more than {REMEMBERED_BYTES >> 20} MiB. "
+                "Give a smaller scale, or fewer frames."
+            )
+        backwards = self._backwards(remembered) if self.options.bounce else []
         while True:
+            if backwards:
+                yield iter(backwards)
             yield iter(remembered or self.recording)
+
+    def _backwards(self, forwards: list[Frame]) -> list[Frame]:
+        """The frames between the last and the first, with times that rise."""
+        last_ns = forwards[-1].pts_ns
+        return [replace(frame, pts_ns=last_ns - frame.pts_ns) for frame in reversed(forwards[1:-1])]
 
     def _remembering(self, remembered: list[Frame]) -> Iterator[Frame]:
         """The frames of the first round; `remembered` has them afterwards, unless they are too large."""
@@ -118,11 +132,13 @@ class RealtimeSource(LiveSource):
 
 
 def realtime_source(rest: str, options: SourceOptions) -> RealtimeSource:
-    """`realtime:PATH?loop=1&speed=2&fps=60`. Raises as `open_recording`, and InvalidSetting for options that are wrong."""
+    """`realtime:PATH?loop=1&speed=2&fps=60`; `loop=bounce` plays each second round backwards. Raises as `open_recording`, and InvalidSetting for options that are wrong."""
     address = Address.parse("realtime", rest)
+    bounces = address.text("loop") == "bounce"
     options = replace(
         options,
-        loop=address.flag("loop", options.loop),
+        loop=bounces or address.flag("loop", options.loop),
+        bounce=bounces or options.bounce,
         speed=math.inf if address.text("speed") == "max" else address.number("speed", options.speed, 0.01, MAX_SPEED),
         fps=address.number("fps", options.fps, 0.01, MAX_FPS),
     )

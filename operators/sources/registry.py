@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import cast, get_args
 
+from gsplat_core.errors import InvalidSetting
 from gsplat_core.registry import Registry
-from operators.sources.options import SourceOptions
+from operators.sources.options import SourceOptions, StereoLayout
 from operators.sources.source import FrameSource
 
 __all__ = ["SOURCES", "SourceFactory", "SourceOptions", "open_source", "split_address"]
@@ -17,18 +20,35 @@ __all__ = ["SOURCES", "SourceFactory", "SourceOptions", "open_source", "split_ad
 SourceFactory = Callable[[str, SourceOptions], FrameSource]
 """From what follows the scheme, and the options, to a source that is not open yet. Raises a UserError for what cannot be read."""
 
+_URLS = ("rtsp", "rtsps", "rtp", "udp", "tcp", "srt", "rtmp", "rtmps", "http", "https")
+
 SOURCES: Registry[SourceFactory] = Registry(
     "source",
     {
         "recording": "operators.sources.recording:recording_source",
         "realtime": "operators.sources.realtime:realtime_source",
+        "pipe": "operators.sources.pipe:pipe_source",
+        "zmq+tcp": "operators.sources.zeromq:tcp_source",
+        "zmq+ipc": "operators.sources.zeromq:ipc_source",
+        "v4l2": "operators.sources.v4l2:v4l2_source",
+        "folder": "operators.sources.folder:folder_source",
+        "synthetic": "operators.sources.synthetic:synthetic_source",
+        **{scheme: f"operators.sources.url:{scheme}_source" for scheme in _URLS},
     },
 )
 
 _OF_PATHS = frozenset({"recording", "realtime", "folder", "v4l2", "pipe", "zmq+ipc"})
 """What follows these schemes is a path, which may begin with a slash."""
-_BLOCKING = frozenset[str]()
+_BLOCKING = frozenset({*_URLS, "v4l2"})
 """Sources that wait within a library or a driver: they read in a process of their own."""
+
+_BUILT_IN = frozenset(SOURCES)
+_SLOW_TO_OPEN_S = {"synthetic": 900.0}
+"""It renders before it plays."""
+_STUCK_AFTER_S = {"v4l2": 5.0}
+"""A driver may wait for a camera for ever; only the end of its process ends that."""
+_TWO_SOURCES = "stereo:"
+_STEREO = re.compile(r"(?P<before>[?&#])stereo=(?P<layout>[^&#]*)")
 
 # Two letters at least: one is a drive. A Path keeps only one of two slashes.
 _ADDRESS = re.compile(r"(?P<scheme>[a-z][a-z0-9+.-]+):(?P<slashes>/{0,2})(?P<rest>.*)", re.DOTALL)
@@ -50,15 +70,82 @@ def split_address(address: str | os.PathLike[str]) -> tuple[str, str]:
 def open_source(address: str | os.PathLike[str], options: SourceOptions | None = None) -> FrameSource:
     """The source at `address`: `scheme://rest` or `scheme:rest`, with a scheme in `SOURCES`, or the path of a recording.
 
-    Raises InvalidSetting for a scheme that is not known, and as the source's factory.
+    `stereo=side_by_side` or `stereo=top_bottom` among an address's options splits the picture into two eyes; `stereo:LEFT|RIGHT` joins two
+    sources. Raises InvalidSetting for a scheme that is not known, and as the source's factory.
     """
     options = options or SourceOptions()
-    scheme, rest = split_address(address)
-    if options.process or (options.process is None and scheme in _BLOCKING):
-        from operators.sources.process import ProcessSource
+    text = os.fspath(address)
+    if text.startswith(_TWO_SOURCES):
+        return _joined(text[len(_TWO_SOURCES) :], options)
+    text, layout = _stereo_of(text, options)
+    options = replace(options, stereo=None)
+    scheme, rest = split_address(text)
+    if _reads_in_a_process(scheme, rest, options):
+        from operators.sources.process import OPEN_TIMEOUT_S, ProcessSource
 
-        return ProcessSource(os.fspath(address), replace(options, process=False))
-    return SOURCES[scheme](rest, options)
+        source: FrameSource = ProcessSource(
+            text,
+            replace(options, process=False),
+            stuck_after_s=_STUCK_AFTER_S.get(scheme, math.inf),
+            open_timeout_s=_SLOW_TO_OPEN_S.get(scheme, OPEN_TIMEOUT_S),
+        )
+    else:
+        source = SOURCES[scheme](rest, options)
+    return source if layout is None else _split(source, layout)
+
+
+def _reads_in_a_process(scheme: str, rest: str, options: SourceOptions) -> bool:
+    # Another process has neither this one's standard input nor what was registered here.
+    if scheme not in _BUILT_IN or (scheme == "pipe" and rest.partition("?")[0] == "-"):
+        return False
+    return scheme in _BLOCKING if options.process is None else options.process
+
+
+def _stereo_of(address: str, options: SourceOptions) -> tuple[str, StereoLayout | None]:
+    """An address without `stereo=…` among its options, and what that or the options say."""
+    if _exists(address) or not _ADDRESS.fullmatch(address):
+        return address, options.stereo
+    said = _STEREO.search(address)
+    if said is None:
+        return address, options.stereo
+    layout = said["layout"]
+    if layout not in get_args(StereoLayout):
+        raise InvalidSetting(f"stereo is {layout!r:.60}; choose {' or '.join(get_args(StereoLayout))}")
+    # `?stereo=x&more` leaves `?more`, `&stereo=x` leaves nothing.
+    before, after = address[: said.start()], address[said.end() :]
+    if said["before"] == "?" and after.startswith("&"):
+        after = "?" + after[1:]
+    return before + after, cast(StereoLayout, layout)
+
+
+def _split(source: FrameSource, layout: StereoLayout) -> FrameSource:
+    from operators.sources.stereo import SplitSource
+
+    try:
+        return SplitSource(source, layout)
+    except InvalidSetting:
+        source.close()
+        raise
+
+
+def _joined(addresses: str, options: SourceOptions) -> FrameSource:
+    from operators.sources.stereo import JoinedSource
+
+    eyes = addresses.split("|")
+    if len(eyes) != 2 or not all(eyes):
+        raise InvalidSetting(f"stereo: {addresses.count('|') + 1} sources are named; give stereo:LEFT|RIGHT")
+    left = open_source(eyes[0], options)
+    try:
+        right = open_source(eyes[1], options)
+    except BaseException:
+        left.close()
+        raise
+    try:
+        return JoinedSource(left, right, waiting=options.waiting)
+    except InvalidSetting:
+        left.close()
+        right.close()
+        raise
 
 
 def _exists(text: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol, runtime_checkable
@@ -78,4 +79,18 @@ class FrameSource(Protocol):
 
     def close(self) -> None:
         """Stop reading and release everything. Without effect when it is not open."""
+        ...
+
+
+@runtime_checkable
+class ReportingSource(Protocol):
+    """A `FrameSource` that says more about itself; sources that follow the clock do. Both may be asked for from any thread."""
+
+    def counts(self) -> Mapping[str, int]:
+        """What was dropped or repaired since `open`, by reason."""
+        ...
+
+    @property
+    def state_sentence(self) -> str:
+        """What its state means here, in a sentence without secrets."""
         ...

@@ -11,10 +11,10 @@ from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
     DeviceOption,
     EvaluatedArgument,
+    EvaluateOptions,
     EvaluationOutOption,
     JsonOption,
     LiveOutOption,
-    MaxFramesOption,
     ModelArgument,
     OutOption,
     RecordingArgument,
@@ -98,6 +98,12 @@ def replay(
             "--heldout/--no-heldout", help="Show frames 1, 9, 17, ... without training on them, and score them apart."
         ),
     ] = False,
+    ignore_schedule: Annotated[
+        bool,
+        typer.Option(
+            "--ignore-schedule", help="Replay a recorded session like any recording, without the steps that it made."
+        ),
+    ] = False,
     json: JsonOption = False,
 ) -> int:
     """Reconstruct a recording as if it were live: train on each frame as it comes, show it, measure it."""
@@ -110,6 +116,7 @@ def replay(
         engine=engine,  # type: ignore[arg-type]
         steps_per_frame=steps_per_frame,
         heldout=heldout,
+        ignore_schedule=ignore_schedule,
         **options.settings(),
     )
     return replay_command(settings, as_json=json)
@@ -132,14 +139,19 @@ def live(
     ] = "builtin",
     loop: Annotated[bool, typer.Option("--loop", help="Play a recording again and again.")] = False,
     fps: Annotated[float | None, typer.Option(help="Play a recording at this rate.", show_default="its own")] = None,
+    record: Annotated[
+        bool,
+        typer.Option(
+            "--record", help="Record what comes in, what is trained and what is shown: into recordings/ in --out."
+        ),
+    ] = False,
     json: JsonOption = False,
 ) -> int:
     """Reconstruct a stream live: show each frame's reconstruction within its time, and say how old it is."""
     from services.cli.live import live_command, live_settings
 
-    with live_settings(
-        source, out, budget_ms, seconds=seconds, loop=loop, fps=fps, tool_mask=tool_mask, **options.settings()
-    ) as settings:
+    wanted = {"seconds": seconds, "loop": loop, "fps": fps, "tool_mask": tool_mask, **options.settings()}
+    with live_settings(source, out, budget_ms, record, **wanted) as settings:
         return live_command(settings, keep=out is not None, as_json=json)
 
 
@@ -180,42 +192,18 @@ def render(
 
 
 @app.command()
+@takes_run_options
 def evaluate(
     model: EvaluatedArgument,
     recording: RecordingArgument,
+    options: EvaluateOptions,
     out: EvaluationOutOption = None,
-    protocol: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="heldout, live, retention or causal (which learns from the recording again); more than once for several.",
-            show_default="all but causal",
-        ),
-    ] = None,
-    device: DeviceOption = "cpu",
-    renderer: RendererOption = "alpha",
-    scale: Annotated[
-        float | None, typer.Option(help="Resize the frames by this factor.", show_default="the model's")
-    ] = None,
-    max_frames: MaxFramesOption = None,
-    steps_per_frame: Annotated[
-        int | None, typer.Option(help="Optimiser steps per frame of causal.", show_default="the run's")
-    ] = None,
     json: JsonOption = False,
 ) -> int:
     """Measure a model or a run on a recording, beside what doing nothing scores."""
-    from operators.applications.evaluation import EvaluationSettings
-    from services.cli.evaluate import evaluate_command
+    from services.cli.evaluate import evaluate_command, evaluation_settings
 
-    settings = EvaluationSettings(
-        recording,
-        tuple(protocol or ()),
-        device=device,
-        renderer=renderer,
-        scale=scale,
-        max_frames=max_frames,
-        steps_per_frame=steps_per_frame,
-    )
-    return evaluate_command(model, settings, out, as_json=json)
+    return evaluate_command(model, evaluation_settings(recording, options), out, as_json=json)
 
 
 @app.command()

@@ -2,22 +2,53 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from pathlib import Path
 
 import typer
 
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.evaluation.places import Visits
 from operators.applications.evaluate import evaluate
 from operators.applications.evaluation import EvaluationSettings
 from operators.output_folder import OutputFolder
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.interrupt import InterruptRequest
+from services.cli.options import EvaluateOptions
 from services.cli.progress import ProgressPrinter
 from services.cli.streams import printable
 from services.reports.evaluated import load_evaluated
 from services.reports.evaluation_build import build_evaluation, write_evaluation
 from services.reports.evaluation_rows import decibels, future, measured
 from services.reports.evaluation_schema import EvaluationReport
+
+
+def evaluation_settings(recording: Path, options: EvaluateOptions) -> EvaluationSettings:
+    """What the options ask for. Raises InvalidSetting."""
+    return EvaluationSettings(
+        recording,
+        tuple(options.protocol or ()),
+        device=options.device,
+        renderer=options.renderer,
+        scale=options.scale,
+        max_frames=options.max_frames,
+        steps_per_frame=options.steps_per_frame,
+        places=None if options.place is None else tuple(_place(text) for text in options.place),
+    )
+
+
+def _place(text: str) -> Visits:
+    """Two stays at a place from `0:2,60:62`, in seconds. Raises InvalidSetting."""
+    try:
+        first, again = ([float(end) for end in stay.split(":")] for stay in text.split(","))
+        if len(first) != 2 or len(again) != 2 or not all(math.isfinite(end) for end in (*first, *again)):
+            raise ValueError
+        return Visits((first[0], first[1]), (again[0], again[1]))
+    except ValueError as error:
+        raise InvalidSetting(
+            f"place is {text!r}; give two stays in seconds, the earlier one first and apart from the other, such as 0:2,60:62"
+        ) from error
 
 
 def evaluate_command(path: Path, settings: EvaluationSettings, out: Path | None, *, as_json: bool) -> int:

@@ -16,6 +16,7 @@ import typer
 from gsplat_core.errors import InvalidSetting
 from operators.applications.live import LiveApplication, live
 from operators.applications.live_settings import LiveSettings
+from operators.applications.recording import new_recording_folder
 from operators.applications.result import RunOutcome
 from operators.frame_clock import ClockSettings
 from operators.metrics import ScoredFrame
@@ -67,8 +68,10 @@ class LiveStatus:
 
 
 @contextmanager
-def live_settings(source: str, out: Path | None, budget_ms: str, **settings: Any) -> Iterator[LiveSettings]:
-    """The settings of a run; without `out` its results are written into a folder that goes with the context.
+def live_settings(
+    source: str, out: Path | None, budget_ms: str, record: bool = False, **settings: Any
+) -> Iterator[LiveSettings]:
+    """The settings of a run; without `out` its results are written into a folder that goes with the context, and nothing can be recorded.
 
     Raises InvalidSetting.
     """
@@ -79,8 +82,11 @@ def live_settings(source: str, out: Path | None, budget_ms: str, **settings: Any
             clock = ClockSettings(budget_ms=float(budget_ms))
         except ValueError:
             raise InvalidSetting(f"budget-ms is {budget_ms!r}; give auto, or a number of milliseconds") from None
+    if record and out is None:
+        raise InvalidSetting("--record needs a folder that stays; give --out, in which recordings/ is made")
     if out is not None:
-        yield LiveSettings(source=source, out=out, clock=clock, **settings)
+        recording = new_recording_folder(out) if record else None
+        yield LiveSettings(source=source, out=out, clock=clock, record=recording, **settings)
         return
     with TemporaryDirectory(prefix="intrasplat-live-") as folder:
         yield LiveSettings(source=source, out=Path(folder) / "out", clock=clock, **settings)

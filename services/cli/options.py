@@ -50,6 +50,15 @@ EvaluationOutOption = Annotated[
     Path | None,
     _path_option("--out", "Folder for evaluation.json and evaluation.html: new, empty, or left by an earlier run."),
 ]
+PlaceOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--place",
+        metavar="<s:s,s:s>",
+        help="Two stays at one place, in seconds (0:2,60:62), for retention; more than once for several.",
+        show_default="found by the poses",
+    ),
+]
 RenderOutOption = Annotated[Path, _path_option("--out", "A video (name.mp4) or a folder of images.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
 RendererOption = Annotated[str, typer.Option(help="How Gaussians become a picture: alpha.")]
@@ -76,21 +85,44 @@ class RunOptions:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """Those of `evaluate`."""
+
+    protocol: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="heldout, live, retention or causal (which learns from the recording again); more than once for several.",
+            show_default="all but causal",
+        ),
+    ] = None
+    device: DeviceOption = "cpu"
+    renderer: RendererOption = "alpha"
+    scale: Annotated[
+        float | None, typer.Option(help="Resize the frames by this factor.", show_default="the model's")
+    ] = None
+    max_frames: MaxFramesOption = None
+    steps_per_frame: Annotated[
+        int | None, typer.Option(help="Optimiser steps per frame of causal.", show_default="the run's")
+    ] = None
+    place: PlaceOption = None
+
+
 def takes_run_options(command: Callable[..., int]) -> Callable[..., int]:
-    """A command whose parameter `options` is filled from an option for each field of RunOptions."""
+    """A command whose parameter `options`, a dataclass, is filled from an option for each of its fields."""
+    kind: Any = get_type_hints(command, include_extras=True)["options"]
     shared = [
-        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default)
-        for field in fields(RunOptions)
+        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default) for field in fields(kind)
     ]
 
     @functools.wraps(command)
     def call(**values: Any) -> int:
-        options = RunOptions(**{field.name: values.pop(field.name) for field in fields(RunOptions)})
+        options = kind(**{field.name: values.pop(field.name) for field in fields(kind)})
         return command(options=options, **values)
 
     parameters = list(inspect.signature(command).parameters.values())
     place = [parameter.name for parameter in parameters].index("options")
-    hints = get_type_hints(command, include_extras=True) | get_type_hints(RunOptions, include_extras=True)
+    hints = get_type_hints(command, include_extras=True) | get_type_hints(kind, include_extras=True)
     both = [
         each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[each.name])
         for each in [*parameters[:place], *shared, *parameters[place + 1 :]]

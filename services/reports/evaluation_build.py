@@ -27,7 +27,7 @@ from services.reports.evaluation_schema import (
     EvaluatedFacts,
     EvaluationReport,
     HeldOutFacts,
-    LiveFacts,
+    OnScreenFacts,
     PlaceFacts,
     RetentionFacts,
     ReturnFacts,
@@ -65,7 +65,7 @@ def build_evaluation(
         evaluated=_evaluated(path, model, run, settings, evaluation),
         heldout=None if evaluation.heldout is None else HeldOutFacts.model_validate(asdict(evaluation.heldout)),
         causal=None if evaluation.causal is None else CausalFacts.model_validate(asdict(evaluation.causal)),
-        live=None if evaluation.live is None else LiveFacts.model_validate(asdict(evaluation.live)),
+        live=None if evaluation.live is None else OnScreenFacts.model_validate(asdict(evaluation.live)),
         retention=None
         if retention is None
         else RetentionFacts(

@@ -46,6 +46,7 @@ def measured(report: EvaluationReport) -> list[Measured]:
                 named("every", "previous_frame"),
             )
         )
+        found.append(Measured("settled", "Live, settled", "the same without the first second", report.live.settled, ()))
     if report.causal is not None:
         found.append(
             Measured(

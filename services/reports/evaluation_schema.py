@@ -81,13 +81,14 @@ class AgeFacts(Part):
     max_ms: float
 
 
-class LiveFacts(Part):
+class OnScreenFacts(Part):
     score: ScoreFacts
+    settled: ScoreFacts
+    """Without the first second."""
     age_when_shown: AgeFacts | None
     age_on_screen: AgeFacts | None
     in_time: Count
     behind: dict[int, Count]
-    estimated: Count
     states: dict[str, Count]
 
 
@@ -140,7 +141,7 @@ class EvaluationReport(Part):
     evaluated: EvaluatedFacts
     heldout: HeldOutFacts | None
     causal: CausalFacts | None
-    live: LiveFacts | None
+    live: OnScreenFacts | None
     retention: RetentionFacts | None
     returns: dict[str, list[ReturnFacts]]
     """By protocol."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
+from gsplat_core.evaluation.live import MOST_BEHIND
 from services.reports.evaluation_rows import at_age, decibels, future, measured
 from services.reports.evaluation_schema import BaselineFacts, EvaluationReport, ScoreFacts
 
@@ -113,14 +114,12 @@ def ages_section(report: EvaluationReport) -> str:
         )
         if ages is not None
     )
-    late = ", ".join(f"{count:,} by {k}" for k, count in live.behind.items() if k)
+    late = ", ".join(
+        f"{count:,} by {k}{' or more' if k == MOST_BEHIND else ''}" for k, count in live.behind.items() if k
+    )
     said = f"{live.in_time:,} frames were on the screen before the next one came" + (
         f"; late: {late} frames. " if late else ". "
     )
-    if live.estimated:
-        said += (
-            f"Of {live.estimated:,} late ones the picture was not kept: the raw frame that it showed stands for it. "
-        )
     if live.age_when_shown is not None:
         age_frames = live.age_when_shown.p50_ms * report.recording.fps / 1000
         hold = at_age(report, age_frames)

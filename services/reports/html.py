@@ -9,6 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from operators.storage import write_whole
+from services.reports.live_sections import live_section
 from services.reports.pictures import KeyframePictures
 from services.reports.schema import RunReport
 from services.reports.sections import (
@@ -39,6 +40,7 @@ def render_html(report: RunReport, keyframes: Sequence[KeyframePictures], worst_
     recording, run = report.recording, report.run
     sections = [
         tiles_section(report),
+        live_section(report),
         video_section(report),
         pictures_section(keyframes, worst_seq, report),
         quality_over_time_section(report),

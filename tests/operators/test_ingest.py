@@ -118,3 +118,40 @@ def test_an_error_names_the_operator_and_the_source_is_closed(camera, frame):
     with pytest.raises(OperatorFailed, match=r"operator 'source' failed in compute.*the file ends here"):
         Stream(source).run()
     assert source.closed == 1
+
+
+class Reporting(Scripted):
+    """A source that says what it dropped and why it gives nothing; a string in its script is a state."""
+
+    current = SourceState.LIVE
+
+    @property
+    def state(self):
+        return self.current if self.script else SourceState.ENDED
+
+    @property
+    def state_sentence(self):
+        return f"the camera is {self.state.value}"
+
+    def counts(self):
+        return {"too_late": 3}
+
+    def read(self, timeout_s):
+        step = super().read(timeout_s)
+        if isinstance(step, SourceState):
+            self.current = step
+            return None
+        return step
+
+
+def test_states_and_counts_of_a_live_source_are_contributed(camera, frame):
+    script = [frame(0), SourceState.STALLED, None, SourceState.RECONNECTING, None, frame(1), SourceState.LIVE, frame(2)]
+    app = Stream(Reporting(script, camera))
+    app.run()
+    found = result(app)
+    assert [seq for seq, _ in app.sink.seen] == [0, 1, 2] and found.reached_end
+    assert found.counts == {"too_late": 3} and set(found.state_s) == {"stalled", "reconnecting"}
+    assert all(seconds >= 0 for seconds in found.state_s.values()) and found.state_sentence == "the camera is ended"
+    outcome = OutcomeBuilder()
+    app.source.contribute(outcome)
+    assert "the source scripted dropped or repaired: too_late 3" in outcome.notes

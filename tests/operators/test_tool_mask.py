@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from onnx import TensorProto, helper
 
 from gsplat_core.errors import InvalidSetting
 from operators.outcome import OutcomeBuilder
-from operators.tool_mask import TOOL_MASKS, FoundMasks, FoundToolMaskOp, RecordedToolMaskOp, new_tool_mask
+from operators.tool_mask import (
+    TOOL_MASKS,
+    FoundMasks,
+    FoundToolMaskOp,
+    RecordedToolMaskOp,
+    check_tool_mask,
+    new_tool_mask,
+)
 
 
 def notes(operator):
@@ -102,14 +112,17 @@ def test_the_built_in_mask_finds_a_grey_tool(frame, compute):
 @pytest.mark.parametrize(
     ("choice", "sentence"),
     [
-        ("magic", "unknown tool mask 'magic'; known are recorded, builtin, none"),
+        ("magic", "unknown tool mask 'magic'; known are recorded, builtin, onnx, none"),
         ("", "unknown tool mask ''"),
+        ("onnx", "tool mask 'onnx' needs the path of a model: onnx:PATH"),
+        ("onnx:missing.onnx", "tool network missing.onnx cannot be read"),
         ("builtin:fast", "tool mask 'builtin' takes nothing after its name, got 'fast'"),
     ],
 )
 def test_a_choice_that_names_nothing_is_refused(choice, sentence):
-    with pytest.raises(InvalidSetting, match=sentence):
-        new_tool_mask(None, choice)
+    for refuse in (check_tool_mask, lambda choice: new_tool_mask(None, choice)):
+        with pytest.raises(InvalidSetting, match=sentence):
+            refuse(choice)
 
 
 def test_each_way_is_an_operator_of_frames():
@@ -118,3 +131,41 @@ def test_each_way_is_an_operator_of_frames():
             operator = new_tool_mask(None, choice, "mask")
             assert operator.name == "mask"
             assert list(operator.spec.inputs) == list(operator.spec.outputs) == ["frame"]
+
+
+def network(path: Path, *nodes: Any) -> Path:
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 16, 24])
+    mask = helper.make_tensor_value_info("mask", TensorProto.FLOAT, None)
+    graph = helper.make_graph(list(nodes), "tools", [image], [mask])
+    opset = [helper.make_opsetid("", 17)]
+    path.write_bytes(helper.make_model(graph, opset_imports=opset, ir_version=8).SerializeToString())
+    return path
+
+
+def test_a_users_network_is_named_by_its_path(frame, compute, tmp_path):
+    """It takes for a tool what is brightest in blue."""
+    path = network(tmp_path / "my:net.onnx", helper.make_node("Softmax", ["image"], ["mask"], axis=1))
+    check_tool_mask(f"onnx:{path}")
+    operator = new_tool_mask(None, f"onnx:{path}")
+    operator.start()
+    image = np.full((16, 24, 3), (200, 60, 50), np.uint8)
+    image[:, 12:] = (50, 60, 200)
+    (found,) = compute(operator, frame=frame(0, image=image))
+    assert found.mask[:, :10].all() and not found.mask[:, 14:].any()
+    assert found_masks(operator).method == "onnx"
+    operator.stop()
+    operator.start()
+    assert found_masks(operator).found == 0
+
+
+def test_what_a_network_could_not_say_is_stated(frame, compute, tmp_path):
+    """Log gives NaN for a negative number, which the picture's values less one are."""
+    path = tmp_path / "net.onnx"
+    (tmp_path / "net.onnx.json").write_text('{"mean": [1.5, 1.5, 1.5]}')
+    operator = new_tool_mask(None, f"onnx:{network(path, helper.make_node('Log', ['image'], ['mask']))}")
+    operator.start()
+    (found,) = compute(operator, frame=frame(0))
+    assert not found.mask.any()
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    assert outcome.notes == ("the tool network gave NaN for 1 frames; all of their pixels counted as tool",)

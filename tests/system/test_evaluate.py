@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from pathlib import Path
 
 import cv2
@@ -108,41 +109,6 @@ def test_a_prediction_depends_on_nothing_that_comes_later(intrasplat, long, offl
     assert start.series["causal"] == whole.series["causal"][:5]
 
 
-def test_a_live_run_is_scored_by_its_log(intrasplat, long, offline, tmp_path):
-    folder = tmp_path / "live"
-    shutil.copytree(offline, folder)
-    lines = []
-    for k in range(12):
-        arrived_ns = 10**9 + k * 40_000_000
-        late = 48_000_000 if k == 5 else 9_000_000
-        lines.append(
-            {
-                "seq": k,
-                "time_s": k / 25,
-                "arrived_ns": arrived_ns,
-                "shown_ns": arrived_ns + late,
-                "psnr_tissue_db": 30.0,
-                "state": "live",
-            }
-        )
-    del lines[8]  # dropped: its arrival lies between those of its neighbours
-    (folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    report = evaluated(intrasplat, folder, long, "--protocol", "live")
-    assert report.live is not None and report.live.age_when_shown is not None
-    assert report.live.age_when_shown.max_ms == pytest.approx(48)
-    assert report.live.age_when_shown.p50_ms == pytest.approx(9, rel=0.02)
-    assert report.live.behind == {0: 9, 1: 2} and report.live.estimated == 2
-    assert report.live.score.frames == 11 and report.live.states == {"live": 11}
-    (folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines[::-1]))
-    done = intrasplat("evaluate", folder, long, "--protocol", "live")
-    assert done.code == 2 and "frames.jsonl" in done.err and "Traceback" not in done.err
-    (folder / "frames.jsonl").write_text(
-        json.dumps({"seq": 0, "arrived_ns": 1, "shown_ns": "now", "psnr_tissue_db": 1.0}) + "\n"
-    )
-    done = intrasplat("evaluate", folder, long, "--protocol", "live")
-    assert done.code == 2 and "whole number" in done.err and "Traceback" not in done.err
-
-
 def test_a_run_that_trained_on_every_frame_has_no_held_out_figures(intrasplat, tiny, tmp_path):
     assert intrasplat("replay", tiny, "--out", tmp_path / "run", "--steps-per-frame", 1).code == 0
     done = intrasplat("evaluate", tmp_path / "run", tiny, "--protocol", "heldout")
@@ -227,3 +193,38 @@ def test_results_go_neither_into_the_run_nor_over_strangers_files(intrasplat, lo
     cv2.imwrite(str(tmp_path / "mine.png"), np.zeros((4, 4, 3), np.uint8))
     assert intrasplat("evaluate", offline, long, "--out", tmp_path).code == 2
     assert [path.name for path in tmp_path.iterdir()] == ["mine.png"]
+
+
+def test_places_are_named_by_their_times(intrasplat, long, offline):
+    report = evaluated(intrasplat, offline, long, "--protocol", "retention", "--place", "0:0.05,0.2:0.3")
+    assert report.retention is not None
+    (place,) = report.retention.places
+    assert (place.again_s, place.first.frames, place.again.frames) == ((0.2, 0.3), 2, 4)
+    for wrong in ("0:1", "a:b,c:d", "0:2,1:3", "0:nan,5:6", "", "0:1:2,3:4"):
+        done = intrasplat("evaluate", offline, long, "--place", wrong)
+        assert done.code == 2 and "such as 0:2,60:62" in done.err, wrong
+
+
+def test_an_interrupted_evaluation_leaves_what_it_reached(long, offline, tmp_path, start):
+    process = start(
+        "evaluate", offline, long, "--protocol", "causal", "--steps-per-frame", 3000, "--out", tmp_path / "out"
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("causal 1/"):
+            break
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    report = EvaluationReport.read(tmp_path / "out" / "evaluation.json")
+    assert report.evaluated.interrupted and any("interrupted" in note for note in report.notes)
+    assert report.causal is not None and report.causal.score.frames < 11
+
+
+def test_a_long_series_is_summed_up(intrasplat, long, offline, monkeypatch):
+    monkeypatch.setattr("services.reports.evaluation_build.MAX_SERIES", 4)
+    report = evaluated(intrasplat, offline, long, "--protocol", "retention")
+    assert report.series_frames_per_entry == {"baselines": 3, "retention": 3}
+    assert [len(report.series[name]) for name in ("baselines", "retention")] == [4, 4]
+    (own,) = report.series["retention"][:1]
+    assert own["frames"] == 3 and own["psnr_tissue_min_db"] <= own["psnr_tissue_db"]

@@ -38,13 +38,18 @@ class Calibration:
 
 def default_calibration(root: Path, width_px: int, height_px: int, findings: Findings) -> Calibration:
     """A stated guess: pinhole, f = 0.9 of the longer side, principal point in the middle, poses unknown."""
-    focal_px = DEFAULT_FOCAL_FACTOR * max(width_px, height_px)
+    camera = default_camera(width_px, height_px)
     findings.warn(
         root,
-        f"there is no calibration; a pinhole with f = {focal_px:.1f} px and no camera motion is assumed",
+        f"there is no calibration; a pinhole with f = {camera.K[0, 0]:.1f} px and no camera motion is assumed",
         "Add poses_bounds.npy or cameras.json; lengths have no scale until then",
     )
-    return Calibration(Camera.from_focal(focal_px, width_px, height_px), None, "default")
+    return Calibration(camera, None, "default")
+
+
+def default_camera(width_px: int, height_px: int) -> Camera:
+    """The camera that is assumed where none is known: a pinhole, f = 0.9 of the longer side, principal point in the middle."""
+    return Camera.from_focal(DEFAULT_FOCAL_FACTOR * max(width_px, height_px), width_px, height_px)
 
 
 def read_poses_bounds(

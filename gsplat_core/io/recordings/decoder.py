@@ -51,7 +51,8 @@ def captured_log() -> Iterator[list[tuple[int, str, str]]]:
 class PictureDecoder:
     """Decodes one stream, and says which packets are damaged."""
 
-    def __init__(self, stream: av.VideoStream) -> None:
+    def __init__(self, stream: av.VideoStream, *, probe: bool = True) -> None:
+        """probe: decode twice where only that shows some kinds of damage (H.265, VP8), which takes twice as long."""
         known = stream.codec_context
         name = known.codec.canonical_name
         self.doubts: dict[int, str] = {}
@@ -60,7 +61,7 @@ class PictureDecoder:
         self._at_once = name in _WITHOUT_DELAY
         self._context = _context(known, _DECODERS.get(name))
         self._probe: OverrunProbe | None = None
-        if name in PROBED:
+        if probe and name in PROBED:
             self._probe = OverrunProbe(_context(known, _DECODERS.get(name, name)), length_bytes(name, known.extradata))
 
     def decode(self, packet: av.Packet | None, number: int, shown: bool) -> list[tuple[int, av.VideoFrame]]:

@@ -48,11 +48,13 @@ class Cluster(NamedTuple):
     """The byte behind it."""
     time: int
     """Its timestamp, in the file's unit, which FFmpeg makes a millisecond."""
+    intact: bool
+    """False: its CRC-32 is wrong."""
 
 
-def intact_clusters(stream: BinaryIO, size: int, *, check_sums: bool) -> Iterator[Cluster]:
-    """The clusters of a file's first `size` bytes, up to the first one that is cut off, has no timestamp, or, where `check_sums`, whose
-    CRC-32 is wrong. Without `check_sums` only a few bytes of each are read."""
+def whole_clusters(stream: BinaryIO, size: int, *, check_sums: bool) -> Iterator[Cluster]:
+    """The clusters of a file's first `size` bytes, up to the first one that is cut off or has no timestamp. Without `check_sums` only a few
+    bytes of each are read, and all of them count as intact."""
     at = others = 0
     while at < size and others < _MOST_OTHERS:
         element = _element(stream, at)
@@ -68,9 +70,9 @@ def intact_clusters(stream: BinaryIO, size: int, *, check_sums: bool) -> Iterato
         at = body + length
         if identifier == _CLUSTER:
             time = _timestamp(stream, body, at)
-            if time is None or (check_sums and not _crc_holds(stream, body, length)):
+            if time is None:
                 return
-            yield Cluster(at, time)
+            yield Cluster(at, time, not check_sums or _crc_holds(stream, body, length))
 
 
 def _timestamp(stream: BinaryIO, body: int, end: int) -> int | None:

@@ -21,14 +21,14 @@ from gsplat_core.io.sessions.records import (
     SegmentEnds,
     ShownLine,
 )
-from gsplat_core.io.sessions.schedule import Observed, Published, Rehearsed, Restarted, Skipped
+from gsplat_core.io.sessions.schedule import Grown, Observed, ReconstructorMade, Rehearsed, SceneBegun
 
 LOG_FILE = "log.jsonl"
 MAX_LINE_BYTES = 1 << 20
 
 Line = (
     SegmentBegins | FrameLine | PreparedLine | ShownLine | LostLine | DeletedLine | NoteLine | SegmentEnds
-    | Restarted | Observed | Rehearsed | Published | Skipped
+    | ReconstructorMade | SceneBegun | Observed | Grown | Rehearsed
 )  # fmt: skip
 _LINES: TypeAdapter[Line] = TypeAdapter(Annotated[Line, Field(discriminator="event")])
 _UNKNOWN_EVENT = "union_tag_invalid"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from array import array
+from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,14 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.io.recordings.findings import printable
 from gsplat_core.io.sessions.log import Line
-from gsplat_core.io.sessions.records import FrameLine, PreparedLine
+from gsplat_core.io.sessions.records import FrameLine, PreparedLine, ShownLine
+from gsplat_core.io.sessions.schedule import SCHEDULE_LINES, ReconstructorMade, ScheduleLine
 from gsplat_core.io.sessions.segment_reader import SegmentPictures, SegmentReader, fits, mask_of_nothing
 from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SESSION_FILE, read_session_file
 from gsplat_core.scene.frames import Frame, FrameStatus
 
+MOST_ARRIVED = 64
+"""Frames that came in and may still be prepared for training."""
 _SEGMENT = re.compile(r"\d{6,9}")
 
 
@@ -82,9 +86,52 @@ class SessionReader:
                 for line in _of(segment, seqs):
                     yield line, frame_of(line, pictures)
 
-    def present(self, segment: SegmentReader) -> set[int]:
-        """The numbers of the frames of one segment that can be read."""
-        return set(self._there[self.segments.index(segment)])
+    def prepared(self) -> Iterator[Frame]:
+        """The frames as training was given them, in that order; one that cannot be read is left out."""
+        arrived: OrderedDict[int, Frame] = OrderedDict()
+        for segment, seqs in zip(self.segments, self._there, strict=True):
+            there = set(seqs)
+            with segment.open() as pictures:
+                for line in segment.lines():
+                    if isinstance(line, FrameLine) and line.seq in there:
+                        there.discard(line.seq)
+                        frame = frame_of(line, pictures)
+                        if frame is not None:
+                            arrived[line.seq] = frame
+                        while len(arrived) > MOST_ARRIVED:
+                            arrived.popitem(last=False)
+                    elif isinstance(line, PreparedLine) and line.seq in arrived and segment.there(line):
+                        prepared = prepared_of(line, arrived.pop(line.seq), pictures)
+                        if prepared is not None:
+                            yield prepared
+
+    @property
+    def prepared_count(self) -> int:
+        """How many frames `prepared` gives, unless pictures turn out to be damaged."""
+        count = 0
+        arrived: set[int] = set()
+        for segment, seqs in zip(self.segments, self._there, strict=True):
+            arrived.update(seqs)
+            for line in segment.lines():
+                if isinstance(line, PreparedLine) and line.seq in arrived and segment.there(line):
+                    arrived.discard(line.seq)
+                    count += 1
+        return count
+
+    def schedule(self) -> Iterator[ScheduleLine]:
+        """What was trained, in order."""
+        return (line for _, line in self.lines() if isinstance(line, SCHEDULE_LINES))
+
+    def digests(self) -> Iterator[ShownLine]:
+        """The new pictures that were shown, in order."""
+        return (line for _, line in self.lines() if isinstance(line, ShownLine) and line.sha256 is not None)
+
+    @property
+    def made(self) -> ReconstructorMade | None:
+        """How the session's first reconstructor was made; None where that, or what came before, is not there any more."""
+        if not self.segments or int(self.segments[0].folder.name) != 0:
+            return None
+        return next((line for line in self.segments[0].lines() if isinstance(line, ReconstructorMade)), None)
 
     def files(self) -> list[Path]:
         """Every file that is read, sorted."""

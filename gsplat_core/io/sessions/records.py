@@ -5,8 +5,8 @@
     lost         something could not be recorded     deleted    an older segment was removed
     note         a sentence                          end        the segment is complete
 
-The lines that say what was trained, `restart`, `observe`, `rehearse`, `publish` and `skipped`, are in `schedule`. A reader leaves out lines
-whose `event` it does not know.
+The lines that say what was trained, `reconstructor`, `observe`, `grow`, `rehearse` and `begin_scene`, are in `schedule`. A reader leaves out
+lines whose `event` it does not know.
 """
 
 from __future__ import annotations
@@ -116,19 +116,20 @@ class ShownLine(Record):
     """The frame whose content it shows."""
     width_px: Side
     height_px: Side
-    sha256: Digest
-    """Of the RGB bytes as shown, before any coding."""
     model_version: Count
+    sha256: Digest | None = None
+    """Of the RGB bytes of the rendered picture, before state and age are drawn into it; absent: the picture was there before, and only its
+    state or age has changed."""
     shown_ns: Nanoseconds | None = None
     age_ns: Nanoseconds | None = None
-    """From the arrival of the frame until it was shown."""
+    """From the arrival of the newest frame that it shows until it was shown."""
     state: Text | None = None
     tracks: Tracks
-    """Without `shown`: only the digest was recorded."""
+    """`shown`: the picture as it was on the screen."""
 
 
 class LostLine(Record):
-    """Something that should stand here and does not, because the disk was too slow for it."""
+    """Something that should stand here and does not, because writing was too slow for it, or because no line can hold it."""
 
     event: Literal["lost"] = "lost"
     seq: Count

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gsplat_core.io.recordings.containers import Container
 from gsplat_core.io.recordings.decoder import PictureDecoder, captured_log
 from gsplat_core.io.recordings.image_files import MAX_PIXELS
-from gsplat_core.io.recordings.matroska import intact_clusters
+from gsplat_core.io.recordings.matroska import whole_clusters
 from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
 from gsplat_core.io.recordings.video_index import open_container
 from gsplat_core.io.sessions.coding import CODINGS, Coding, decoded
@@ -28,18 +28,29 @@ class TrackIndex:
     """Which pictures of a track's file can be decoded: those in clusters that are whole, up to the first one that is not."""
 
     def __init__(self, path: Path, *, check_sums: bool) -> None:
-        """check_sums: whether every cluster's checksum is calculated, which reads the whole file. Raises UnreadableFile, OSError."""
-        self.path = path
+        """check_sums: whether it ends before the first cluster whose checksum is wrong, too; that reads the whole file. Without it, such
+        clusters are noticed when they are decoded. Raises UnreadableFile, OSError."""
+        self.path, self.checked = path, check_sums
         self.end = 0
         times: list[int] = []
         if path.is_symlink():
             raise UnreadableFile("it is a link")
         with open_plain(path) as file:
             size = file.seek(0, io.SEEK_END)
-            for cluster in islice(intact_clusters(file, size, check_sums=check_sums), MOST_PICTURES):
+            for cluster in islice(whole_clusters(file, size, check_sums=check_sums), MOST_PICTURES):
+                if not cluster.intact:
+                    break
                 times.append(cluster.time)
                 self.end = cluster.end
         self.times = frozenset(times)
+
+    def damaged(self) -> frozenset[int]:
+        """The times of pictures whose checksum is wrong. Raises UnreadableFile, OSError."""
+        if self.checked:
+            return frozenset()
+        with open_plain(self.path) as file:
+            clusters = islice(whole_clusters(file, self.end, check_sums=True), MOST_PICTURES)
+            return frozenset(cluster.time for cluster in clusters if not cluster.intact)
 
 
 class TrackReader:
@@ -83,7 +94,7 @@ class TrackReader:
             if context.width * context.height > 4 * MAX_PIXELS:
                 raise UnreadableFile(f"frames of {context.width}x{context.height} exceed the bound of pixels")
             coding: Coding = "vp9" if context.codec.canonical_name == "vp9" else self._coding
-            decoder = PictureDecoder(stream)
+            decoder, wrong = PictureDecoder(stream), self._index.damaged()
             times: dict[int, int] = {}
             for number, packet in enumerate(_packets(container, stream)):
                 if packet is not None:
@@ -93,7 +104,8 @@ class TrackReader:
                 for own, frame in decoder.decode(packet, number, True):
                     picture = decoded(coding, frame, *self._size)
                     damage = decoder.doubts.pop(own, None) if picture is not None else "it has another size or format"
-                    yield times.pop(own), picture, damage
+                    time = times.pop(own)
+                    yield time, picture, "the checksum of its part of the file is wrong" if time in wrong else damage
                 decoder.doubts.clear()
 
 

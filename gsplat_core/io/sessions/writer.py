@@ -69,12 +69,17 @@ class Shown:
     """A picture that was shown, and what is written about it."""
 
     frame: Frame
-    """The frame whose content it shows."""
-    image: NDArray[np.uint8]
-    """RGB uint8 [H, W, 3]."""
+    """The frame whose picture it is."""
+    rendered: NDArray[np.uint8]
+    """RGB uint8 [H, W, 3], as rendered."""
     model_version: int
+    on_screen: NDArray[np.uint8] | None = None
+    """As shown, with state and age drawn into it; None: as rendered."""
+    new: bool = True
+    """False: the picture was there before, and only its state or age has changed."""
     shown_ns: int | None = None
     """By `time.monotonic_ns`."""
+    age_ns: int | None = None
     state: str | None = None
     """`live`, `stale`, …"""
 
@@ -134,22 +139,21 @@ class SessionWriter:
     def shown(self, shown: Shown) -> None:
         """A picture that was shown."""
         self._go_on()
-        frame, image = shown.frame, np.ascontiguousarray(shown.image)
-        digest = sha256(image.data).hexdigest()
+        frame, rendered = shown.frame, np.ascontiguousarray(shown.rendered)
         tracks: dict[TrackName, int] = {}
-        if self.options.shown != "digest":
-            tracks["shown"] = self._segment.picture("", "shown", image, frame.pts_ns)
-        timed = shown.shown_ns is not None and frame.arrived_ns is not None
+        if shown.new and self.options.shown != "digest":
+            on_screen = rendered if shown.on_screen is None else shown.on_screen
+            tracks["shown"] = self._segment.picture("", "shown", on_screen, frame.pts_ns)
         self._segment.line(
             ShownLine(
                 seq=frame.seq,
-                width_px=image.shape[1],
-                height_px=image.shape[0],
-                sha256=digest,
+                width_px=rendered.shape[1],
+                height_px=rendered.shape[0],
                 model_version=shown.model_version,
+                sha256=sha256(rendered.data).hexdigest() if shown.new else None,
                 shown_ns=shown.shown_ns,
-                age_ns=(shown.shown_ns or 0) - (frame.arrived_ns or 0) if timed else None,
-                state=shown.state,
+                age_ns=shown.age_ns,
+                state=_short(shown.state),
                 tracks=tracks,
             )
         )

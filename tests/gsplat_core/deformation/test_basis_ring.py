@@ -281,3 +281,22 @@ def watch_on(field: BasisField, time_s: float, newest_s: float) -> None:
 def test_an_impossible_history_is_refused(history_s):
     with pytest.raises(InvalidInput, match="history_s"):
         online(1).keep_last(history_s)
+
+
+def test_what_is_held_fades_where_training_goes_on_and_stays_where_nobody_looks():
+    field, newest = online(2), 0.0
+    field.keep_last(HISTORY_S, fading_s=1.0)
+    pull = torch.zeros(2, 13)
+    for frame in range(60):
+        field.cover(frame * FRAME_S, newest)
+        newest = frame * FRAME_S
+        field.adam_step(newest, field.deltas(newest).detach() - 0.2, RATES)
+    before = field.deltas(newest).detach()
+    for frame in range(60, 160):
+        field.cover(frame * FRAME_S, newest)
+        newest = frame * FRAME_S
+        pull[0, 12] = 1e-15 if frame % 2 else -1e-15  # seen, and as it should be
+        field.adam_step(newest, pull, BasisRates(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    seen, hidden = field.deltas(newest).detach()
+    assert float((seen / before[0])[:3].max()) < 0.4
+    torch.testing.assert_close(hidden[:3], before[1, :3], rtol=0.1, atol=1e-3)

@@ -7,7 +7,7 @@ import itertools
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsplat_core.endoscope.cuts import CutDetector, CutSettings, FrameRate
@@ -127,6 +127,7 @@ def test_an_unsteady_clock_is_no_other_frame_rate():
     assert not any(found)
 
 
+@settings(deadline=None, max_examples=40)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32))
 def test_no_picture_of_any_size_raises(height, width, seed):
     rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsplat_core.endoscope.sequence import SequenceCheck, SequenceSettings
@@ -122,6 +122,7 @@ def test_another_size_begins_anew():
     assert set(faults([*texture(7, 10), *texture(7, 10, 96, 80)])) == {None}
 
 
+@settings(deadline=None, max_examples=40)
 @given(st.integers(1, 70), st.integers(1, 70), st.integers(0, 2**32), st.booleans())
 def test_no_picture_of_any_size_raises(height, width, seed, flat):
     rng = np.random.default_rng(seed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsplat_core.endoscope.stream_clock import ClockSettings, StreamClock
@@ -63,6 +63,7 @@ def test_equal_times_are_counted():
     assert run([0, STEP, STEP, 2 * STEP]) == ([0, STEP, STEP, 2 * STEP], [None, None, "repeated time", None])
 
 
+@settings(deadline=None, max_examples=40)
 @given(st.lists(st.tuples(st.integers(-(2**62), 2**62), st.one_of(st.none(), st.integers(0, 2**62))), max_size=40))
 def test_whatever_the_clocks_say_times_do_not_go_back(steps):
     clock = StreamClock()

@@ -13,14 +13,14 @@ class Holding:
     """Shows what it saw last, and remembers what it was given."""
 
     def __init__(self):
-        self.level, self.trained, self.moved = 0, [], []
+        self.level, self.trained, self.passed = 0, [], []
 
     def observe(self, frame, *, train=True):
         if train:
             self.level = int(frame.image[0, 0, 0])
             self.trained.append(frame.seq)
         else:
-            self.moved.append((frame.seq, int(frame.image.max()), frame.mask, frame.depth))
+            self.passed.append(frame.seq)
 
     def publish(self):
         return self.level
@@ -47,11 +47,22 @@ def test_a_model_that_holds_scores_the_copy_of_the_previous_frame(frame, picture
 
 
 def test_a_frame_is_learned_from_only_after_it_was_predicted_and_nothing_of_it_is_seen_before(frame, picture):
-    learner = Holding()
+    order = []
+
+    class Telling(Holding):
+        def observe(self, frame, *, train=True):
+            order.append(("learn", frame.seq))
+
+    def predict(learner, unseen):
+        order.append(("predict", unseen.seq))
+        assert not unseen.image.any() and unseen.mask is unseen.depth is None
+        assert unseen.time_s == pytest.approx(unseen.seq / 25) and unseen.pose is not None
+        return 100
+
     mask, depth = np.ones((16, 20), np.uint8), np.ones((16, 20), np.float32)
-    evaluate([frame(k, 100, mask=mask, depth=depth) for k in range(3)], picture, learner)
-    assert learner.trained == [0, 1, 2]
-    assert learner.moved == [(1, 0, None, None), (2, 0, None, None)]
+    frames = [frame(k, 100, mask=mask, depth=depth, pose=np.eye(4)) for k in range(3)]
+    evaluate(frames, picture, Telling(), predict=predict)
+    assert order == [("learn", 0), ("predict", 1), ("learn", 1), ("predict", 2), ("learn", 2)]
 
 
 def test_the_exposure_of_the_frame_before_stands_for_the_unknown_one(frame, picture):
@@ -79,6 +90,7 @@ def test_damaged_and_withheld_frames_are_neither_scored_nor_learned_from(frame, 
     ]
     score, shown = evaluate(frames, picture, learner)
     assert learner.trained == [1, 4, 5] and shown == [5]
+    assert learner.passed == [2, 3], "the stream's time goes on"
     assert score.left_out == {"before the first prediction": 1, "damaged": 2, "no tissue": 1, "withheld": 1}
     assert score.psnr_tissue_db == pytest.approx(decibels(10), abs=1e-6)
 

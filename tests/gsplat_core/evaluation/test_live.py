@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.evaluation.live import MOST_BEHIND, NOT_KEPT, NOTHING_SHOWN, Shown, evaluate_live
+from gsplat_core.evaluation.live import MOST_BEHIND, NOT_KEPT, NOTHING_SHOWN, OTHER_SIZE, Shown, evaluate_live
 
 MS = 1_000_000
 PERIOD = 40
@@ -78,21 +78,19 @@ def test_a_freeze_is_scored_with_the_frozen_picture_however_old_it_grows(frame):
     assert found.states == {"frozen": 1, "live": 1}
 
 
-def test_without_pictures_the_logged_figures_count_and_late_ones_are_estimated_by_the_raw_frame(frame, decibels):
-    found = evaluate_live(
-        arriving(frame, [100, 110, 120, 121]),
-        [shown(0, 10, psnr_tissue_db=41.0), shown(1, 45, psnr_tissue_db=20.0)],
-    )
-    # Frame 1 is seen as frame 0: ten levels apart. Frame 2 as the picture of frame 1, which was no better than 20 dB itself.
-    assert found.score.psnr_tissue_db == pytest.approx((41 + decibels(10) + 20) / 3, abs=1e-6)
-    assert found.estimated == 2 and found.score.ssim is None
-
-
-def test_a_picture_of_which_nothing_is_known_is_left_out(frame):
+def test_a_picture_that_was_not_kept_is_left_out(frame):
     found = evaluate_live(arriving(frame, [100, 110]), [shown(0, 10)])
-    assert found.score.left_out == {NOT_KEPT: 1} and found.behind == {0: 1}
+    assert found.score.left_out == {NOT_KEPT: 1} and found.behind == {}
     other_size = Shown(0, 1000 * MS, 1001 * MS, np.zeros((8, 8, 3), np.uint8))
-    assert evaluate_live(arriving(frame, [100, 110]), [other_size]).score.left_out == {NOT_KEPT: 1}
+    assert evaluate_live(arriving(frame, [100, 110]), [other_size]).score.left_out == {OTHER_SIZE: 1}
+
+
+def test_the_first_second_is_left_out_of_the_settled_figures(frame, decibels):
+    levels = [100] * 60
+    found = evaluate_live(arriving(frame, levels), [shown(k, 5, 120 if k < 25 else 101) for k in range(60)])
+    assert (found.score.frames, found.settled.frames) == (59, 34)
+    assert found.settled.psnr_tissue_db == found.settled.worst_db == pytest.approx(decibels(1), abs=1e-6)
+    assert found.score.worst_db == pytest.approx(decibels(20), abs=1e-6)
 
 
 def test_withheld_frames_are_not_scored(frame):

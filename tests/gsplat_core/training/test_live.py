@@ -24,8 +24,8 @@ def frame_at(k, width=WIDTH, height=HEIGHT):
     return Frame(k, k * 33_000_000, ((planes + 1) * 95 + 10).astype(np.uint8))
 
 
-def reconstructor(**live):
-    config = ReconstructorConfig(gaussians=120, max_gaussians=240, window_frames=8)
+def reconstructor(*, preallocate=False, **live):
+    config = ReconstructorConfig(gaussians=120, max_gaussians=240, window_frames=8, preallocate=preallocate)
     return LiveReconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT), live=LiveTraining(**live))
 
 
@@ -101,6 +101,25 @@ def test_another_scene_of_another_size_begins_in_the_middle():
     assert (model.camera.width_px, model.camera.height_px) == (64, 32)
     assert model.version == 2
     assert psnr_tissue_db(model.render(wide.time_s).image, wide.image) > 20
+
+
+@pytest.mark.parametrize("preallocate", [False, True])
+def test_a_scene_that_begins_again_is_as_good_as_the_first_one(preallocate):
+    """The same frames give the same model, whatever was learned before them."""
+    fresh, used = reconstructor(preallocate=preallocate), reconstructor(preallocate=preallocate)
+    for k in range(10, 14):
+        used.observe(frame_at(k), budget=Budget.of_steps(5))
+    used.forget()
+    assert run(fresh).sha256() == run(used).sha256()
+
+
+def test_the_next_scene_takes_over_the_memory_of_the_one_before():
+    made = reconstructor(preallocate=True)
+    run(made)
+    address = made._step.gaussians.means.data_ptr()
+    made.begin_scene(frame_at(20))
+    made.observe(frame_at(20), budget=Budget.of_steps(2))
+    assert made._step.gaussians.means.data_ptr() == address
 
 
 def test_a_frame_that_is_not_trained_on_changes_no_parameter():

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.endoscope.cuts import CutCounts, CutStage
 from operators.endoscope.exposure import ExposureCounts, ExposureStage
+from operators.endoscope.field_of_view import FieldOfViewStage
+from operators.endoscope.highlights import HighlightStage
+from operators.endoscope.interlacing import InterlacingStage
 from operators.endoscope.sequence import MaskAndDepthCounts, MaskAndDepthStage, SequenceCounts, SequenceStage
+from operators.endoscope.sharpness import SharpnessStage
 from operators.endoscope.stage import StageOp, left_out, tissue_of
+from operators.endoscope.stages import PICTURE_STAGES, TISSUE_STAGES, new_stages
+from operators.endoscope.strip import StripStage
 from operators.outcome import OutcomeBuilder
-from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, brightened, clip, texture
+from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, brightened, clip, resized, texture
 
 
 def frames(images, **fields):
@@ -110,43 +120,95 @@ def test_a_withheld_frame_keeps_the_exposure_of_the_one_before():
     assert passed[15].exposure == passed[14].exposure != (1.0, 1.0, 1.0)
 
 
-def stages():
-    return [SequenceStage(), CutStage(), MaskAndDepthStage(), ExposureStage()]
+def all_stages(without=()):
+    return [*new_stages(PICTURE_STAGES, without), *new_stages(TISSUE_STAGES, without)]
+
+
+def run_all(given, without=()):
+    passed = given
+    for stage in all_stages(without):
+        passed = run(stage, passed)
+    return passed
 
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", ["cutting", "heart"])
-def test_good_video_passes_unchanged_through_all_stages(recordings_dir, name, compute):
-    operator = StageOp(None, stages=stages())
+def test_good_video_keeps_everything_but_masks_of_the_loss(recordings_dir, name, compute):
+    operator = StageOp(None, stages=all_stages())
     operator.start()
     for frame in frames(clip(recordings_dir, name)):
         (passed,) = compute(operator, frame=frame)
-        assert passed is frame
+        assert dataclasses.replace(passed, loss_mask=None) == frame
+        assert passed.image is frame.image
     outcome = OutcomeBuilder()
     operator.contribute(outcome)
-    assert [part.found for part in outcome.parts.values()] == [{}] * 4
+    found = {what for part in outcome.parts.values() for what in part.found}
+    assert found <= {"frames with highlights", "strip or text"} and len(outcome.parts) == 9
 
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
 def test_no_recording_has_withheld_frames_or_new_scenes(recordings_dir, name):
-    operator_stages = stages()
-    for stage in operator_stages:
-        stage.start()
-    for frame in frames(clip(recordings_dir, name)):
-        for stage in operator_stages:
-            frame = stage.apply(frame)
+    for frame in run_all(frames(clip(recordings_dir, name))):
         assert (frame.withheld, frame.new_scene) == (None, None)
 
 
+@pytest.mark.recordings
+def test_many_faults_in_one_stream_are_each_found_and_it_goes_on(recordings_dir):
+    images = list(clip(recordings_dir, "cutting"))
+    other = resized(clip(recordings_dir, "heart")[:20], images[0])
+    given = frames([*images[:20], images[20] // 30, *[images[20]] * 10, *images[20:50], *other, *images[50:70]])
+    given[15] = given[15].with_fields(pts_ns=given[11].pts_ns)
+    given[35:] = [frame.with_fields(pts_ns=frame.pts_ns + 10**15) for frame in given[35:]]
+    passed = run_all(given)
+    reasons = [frame.withheld for frame in passed]
+    assert (reasons[15], reasons[20], reasons[22], reasons[30]) == ("out of order", "black", "duplicate", "frozen")
+    assert [(k, frame.new_scene) for k, frame in enumerate(passed) if frame.new_scene] == [
+        (62, "cut"),
+        (82, "returned"),
+    ]
+    assert sum(reason is not None for reason in reasons) == 1 + 1 + 10 + 2
+    times = [frame.pts_ns for frame in passed]
+    assert times == sorted(times) and times[-1] < 4 * 10**9
+
+
 def test_a_restart_forgets_everything(compute):
-    operator = StageOp(None, stages=stages())
+    operator = StageOp(None, stages=all_stages())
     for _ in range(2):
         operator.start()
         for frame in frames(texture(1, 12)):
             (passed,) = compute(operator, frame=frame)
             assert passed is frame
-    assert [stage.counts().frames for stage in operator.stages] == [12] * 4
+    assert {stage.counts().frames for stage in operator.stages} == {12}
+
+
+def test_stages_can_be_left_out_by_name():
+    names = [type(stage).__name__ for stage in all_stages(without=("highlights", "exposure"))]
+    assert len(names) == 7 and "HighlightStage" not in names and "ExposureStage" not in names
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(1, 50), st.integers(1, 50), st.integers(0, 2**32))
+def test_no_frame_of_any_content_raises_in_any_stage(height, width, seed):
+    rng = np.random.default_rng(seed)
+    operator_stages = all_stages()
+    for k in range(10):
+        size = (height, width) if k < 7 else (width, height)
+        with np.errstate(all="ignore"):
+            depth = np.array(10.0 ** rng.uniform(-50, 50, size), np.float32)
+        depth[rng.random(size) < 0.3] = rng.choice([np.nan, np.inf, -1.0])
+        frame = Frame(
+            seq=k,
+            pts_ns=int(rng.integers(-(2**62), 2**62)),
+            arrived_ns=int(rng.integers(0, 2**62)) if rng.random() < 0.5 else None,
+            image=rng.integers(0, rng.integers(1, 257), (*size, 3), np.uint8),
+            depth=depth if rng.random() < 0.5 else None,
+            mask=rng.integers(0, 2, size, np.uint8) if rng.random() < 0.5 else None,
+            status=FrameStatus.DAMAGED if rng.random() < 0.1 else FrameStatus.LIVE,
+        )
+        for stage in operator_stages:
+            frame = stage.apply(frame)
+        assert frame.loss_mask is None or set(np.unique(frame.loss_mask)) <= {0, 1}
 
 
 def test_masks_of_the_loss_add_up():
@@ -159,3 +221,40 @@ def test_masks_of_the_loss_add_up():
     masked = dataclasses.replace(both, mask=other)
     assert np.array_equal(tissue_of(masked), one & other)
     assert tissue_of(dataclasses.replace(masked, loss_mask=None)) is other
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize(
+    "stage, name, what",
+    [
+        (FieldOfViewStage, "sinus", "limited"),
+        (HighlightStage, "heart", "frames with highlights"),
+        (StripStage, "cutting", "strip or text"),
+    ],
+)
+def test_pixels_that_do_not_count_are_added_to_the_mask_of_the_loss(recordings_dir, stage, name, what):
+    images = clip(recordings_dir, name)
+    before = np.ones(images[0].shape[:2], np.uint8)
+    before[:9] = 0
+    made = stage()
+    passed = run(made, frames(images, loss_mask=before))
+    assert not passed[-1].loss_mask[:9].any() and passed[-1].loss_mask.sum() < before.sum()
+    assert made.counts().found[what] > 0
+
+
+def test_blur_is_withheld_and_each_scene_has_its_own_sharpness():
+    soft = [cv2.GaussianBlur(image, (0, 0), 3) for image in texture(1, 40)]
+    given = frames([*texture(1, 20), *soft[20:30], *texture(1, 40)[30:]])
+    assert {frame.withheld for frame in run(SharpnessStage(), given)[20:30]} == {"blur"}
+    given[20] = given[20].with_fields(new_scene="cut")
+    assert {frame.withheld for frame in run(SharpnessStage(), given)[:30]} == {None}
+
+
+def test_both_eyes_of_interlaced_video_are_repaired():
+    images = [np.roll(image, 6 * k, axis=1) for k, image in enumerate(texture(1, 20, 320, 256))]
+    for image, later in itertools.pairwise(images):
+        image[1::2] = later[1::2]
+    stage = InterlacingStage()
+    passed = run(stage, [frame.with_fields(right_image=frame.image) for frame in frames(images)])
+    assert np.array_equal(passed[15].image, passed[15].right_image) and not np.array_equal(passed[15].image, images[15])
+    assert stage.counts().found["de-interlaced"] > 10

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from operators.errors import OutputError, StorageFull
+from operators.errors import StorageFull
 from operators.outcome import OutcomeBuilder
 from operators.sinks.video import DisplayResult, VideoSinkOp
 from operators.storage import StorageReserve
@@ -79,13 +79,16 @@ def test_a_full_disk_stops_the_video_while_it_can_still_be_finished(tmp_path, re
     assert len(frames_of(tmp_path / "out.mp4")) == 2
 
 
-def test_a_frame_of_another_size_is_refused(tmp_path, rendered, frame, compute):
+@pytest.mark.parametrize("size", [(400, 500), (9, 700), (300, 8)])
+def test_a_frame_of_another_size_is_fitted_into_the_video(tmp_path, rendered, frame, compute, size):
     operator = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0)
     operator.start()
     compute(operator, rendered=rendered(0))
-    with pytest.raises(OutputError, match="they must be equal"):
-        compute(operator, rendered=rendered(frame=frame(1, image=np.zeros((400, 500, 3), np.uint8))))
+    compute(operator, rendered=rendered(frame=frame(1, image=np.full((*size, 3), 200, np.uint8))))
     operator.stop()
+    first, second = frames_of(tmp_path / "out.mp4")
+    assert first.shape == second.shape
+    assert 150 < second.max() <= 255
 
 
 def test_what_it_contributes(tmp_path, rendered, compute):

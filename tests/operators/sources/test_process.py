@@ -135,6 +135,15 @@ def test_a_process_that_says_nothing_is_replaced(stand_in):
     assert is_gone(first), "one that is stopped is ended, too"
 
 
+def test_a_source_that_is_stuck_in_its_driver_gets_another_process(stand_in):
+    source = stand_in("frames=1,block", stuck_after_s=1.5)
+    source.open()
+    assert read(source).seq == 0
+    until(lambda: source.state is SourceState.STALLED)
+    assert source.state_sentence.startswith("stand-in has given no frame for")
+    assert read(source).seq == 1 and source.counts()["process_restarts"] == 1
+
+
 def test_one_that_never_gives_a_frame_is_given_up_with_a_sentence(stand_in, monkeypatch):
     monkeypatch.setattr(process, "MOST_FAILURES", 3)
     source = stand_in("crash=SIGABRT")

@@ -113,10 +113,10 @@ def synthesize(
 
     Raises InvalidSetting for arguments out of range, and for an `out` that holds anything else, is a link or the root of a disk.
     """
-    _check_arguments(frames, width_px, height_px, fps, seed, camera)
+    check_arguments(frames, width_px, height_px, fps, seed, camera)
     target = Path(out)
     check_target(target)
-    threads = _threads_that_fit(width_px, height_px)
+    threads = threads_that_fit(width_px, height_px)
     target.parent.mkdir(parents=True, exist_ok=True)
     with PartialFolder(target) as partial:
         scene = SyntheticScene.from_seed(seed, width_px, height_px, frames / fps, camera == "moving")
@@ -129,7 +129,7 @@ def synthesize(
     return target
 
 
-def _check_arguments(frames: int, width_px: int, height_px: int, fps: float, seed: int, camera: str) -> None:
+def check_arguments(frames: int, width_px: int, height_px: int, fps: float, seed: int, camera: str) -> None:
     if not 1 <= frames <= 100_000:
         raise InvalidSetting(f"frames must be 1 to 100000, got {frames}")
     if not (32 <= width_px <= 4096 and 32 <= height_px <= 4096):
@@ -142,7 +142,7 @@ def _check_arguments(frames: int, width_px: int, height_px: int, fps: float, see
         raise InvalidSetting(f"camera must be 'fixed' or 'moving', got {camera!r}")
 
 
-def _threads_that_fit(width_px: int, height_px: int) -> int:
+def threads_that_fit(width_px: int, height_px: int) -> int:
     """How many frames are rendered at once. Raises InvalidSetting where the memory is too small for the scene and one frame."""
     texture, frame = SCENE_BYTES * max(width_px, height_px) ** 2, FRAME_BYTES * width_px * height_px
     threads = min(8, os.cpu_count() or 1)

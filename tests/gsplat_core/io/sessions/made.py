@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsplat_core.io.sessions import SessionInfo, SessionWriter
-from gsplat_core.io.sessions.schedule import Observed, Published
+from gsplat_core.io.sessions.schedule import Observed, Rehearsed
 from gsplat_core.io.sessions.session_file import camera_record
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.cameras import Camera
@@ -26,7 +26,7 @@ def new_frame(seq: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX, **
     pose = np.eye(4)
     pose[:3, 3] = rng.normal(size=3)
     depth = rng.normal(50, 9, size).astype(np.float32)
-    depth[0, :3] = np.nan, np.inf, -0.0
+    depth[0, 0], depth[-1, -1], depth[0, -1] = np.nan, np.inf, -0.0
     known = {
         "seq": seq,
         "pts_ns": seq * 33_333_333 + 5,
@@ -74,5 +74,7 @@ def write_frames(writer: SessionWriter, frames: list[Frame]) -> None:
         prepared = frame.with_fields(loss_mask=np.ones_like(frame.mask), exposure=(1.0, 2.0, 3.0))
         writer.prepared(prepared, frame)
         writer.line(Observed(seq=frame.seq, steps=3, train=True))
-        writer.line(Published(seq=frame.seq, model_version=frame.seq + 1))
-        writer.shown(Shown(frame, frame.image[::-1], frame.seq + 1, shown_ns=10**15 + frame.seq + 7, state="live"))
+        writer.line(Rehearsed(steps=2))
+        writer.shown(
+            Shown(frame, frame.image[::-1], frame.seq + 1, frame.image, shown_ns=10**15, age_ns=7, state="live")
+        )

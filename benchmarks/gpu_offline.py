@@ -1,0 +1,116 @@
+"""How good offline reconstruction is on held-out frames, and how soon, on an NVIDIA GPU.
+
+    python benchmarks/gpu_offline.py RECORDING... [--device cuda] [--fields basis hexplane] [--seconds 15]
+    python benchmarks/gpu_offline.py RECORDING --device cpu --scale 0.25 --steps 500
+
+`Reconstructor.fit` as `intrasplat reconstruct` calls it: `ReconstructorConfig.offline`, the same settings for every recording, the
+protocol's held-out frames never trained on. `--steps` is the number of optimiser steps; with `--seconds` it is what fits into that time,
+measured by a short run before. One JSON line for each moment that is evaluated: seconds of training so far (loading, warm-up of the
+kernels and evaluation not counted), mean and worst tissue PSNR over the held-out frames, and over as many training frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsplat_core.io.recordings import is_heldout, open_recording
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.reconstructor import Reconstructor
+from operators.applications.replay import ReplaySettings
+
+MOMENTS = (0.1, 0.25, 0.5, 0.75, 1.0)
+"""Shares of the steps after which it is evaluated."""
+TRIAL_STEPS = 600
+
+
+@dataclass
+class Clock:
+    """Seconds of training, without those of evaluation."""
+
+    device: torch.device
+    total_s: float = 0.0
+    _since: float = field(default_factory=time.perf_counter)
+
+    def pause(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize()
+        self.total_s += time.perf_counter() - self._since
+
+    def go_on(self) -> None:
+        self._since = time.perf_counter()
+
+
+def quality(learning: Reconstructor, frames: list[Frame], camera: Camera) -> tuple[float, float]:
+    """Mean and worst tissue PSNR of some frames, as they would be shown: in bytes."""
+    model = learning.snapshot()
+    values = []
+    for frame in frames:
+        seen = camera if frame.pose is None else camera.with_pose(frame.pose)
+        image = render(model.at(frame.time_s), seen).image
+        shown = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+        values.append(psnr_tissue_db(shown, frame.image, frame.mask))
+    return sum(values) / len(values), min(values)
+
+
+def trained(
+    frames: list[Frame], camera: Camera, config: ReconstructorConfig, steps: int, device: torch.device, line: dict
+) -> float:
+    """One `fit`, evaluated on the way where `line` says what it is; returns the seconds per step."""
+    learning = Reconstructor(config, camera, device=device)
+    seen = [frame for frame in frames if not is_heldout(frame.seq)]
+    held = [frame for frame in frames if is_heldout(frame.seq)]
+    moments = {max(1, round(steps * share)) for share in MOMENTS} if line else set()
+    clock = Clock(device)
+
+    def after_step(step: int, loss: Tensor) -> None:
+        if step in moments:
+            clock.pause()
+            mean, worst = quality(learning, held, camera)
+            result = {"seconds": clock.total_s, "steps": step, "held_out_db": mean, "worst_db": worst}
+            result["training_db"] = quality(learning, seen[3::7], camera)[0]
+            rounded = {name: round(value, 2) for name, value in result.items()}
+            print(json.dumps(line | rounded | {"gaussians": learning.gaussians}), flush=True)
+            clock.go_on()
+
+    learning.fit(seen, steps, after_step)
+    clock.pause()
+    return clock.total_s / steps
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", type=Path, nargs="+")
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--fields", nargs="*", default=["basis"])
+    parser.add_argument("--scale", type=float, default=1.0)
+    parser.add_argument("--steps", type=int, default=20_000)
+    parser.add_argument("--seconds", type=float)
+    options = parser.parse_args()
+    device = torch.device(options.device)
+    for path in options.recordings:
+        recording = open_recording(path, scale=options.scale)
+        frames = list(recording)
+        for name in options.fields:
+            settings = ReplaySettings(path, Path("unused"), field=name)
+            config = settings.reconstructor_config(recording.width_px * recording.height_px, offline=True)
+            steps = options.steps
+            trial_s = trained(frames, recording.camera, config, min(TRIAL_STEPS, steps), device, {})
+            if options.seconds:
+                steps = max(1, round(options.seconds / trial_s))
+            line = {"recording": recording.name, "field": name}
+            trained(frames, recording.camera, config, steps, device, line)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,181 @@
+"""A recorder's strips and text at the borders: what is drawn into the picture and does not move with the tissue.
+
+Drawn things have sharp edges that stay at the same pixels while everything else moves. Near each border the mean of the brightness gradient over
+time is kept, and how much it varies: a long straight edge along the border that stays is the edge of a strip, which reaches from there to the
+border; strong edges that stay and lie close together are text.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.endoscope.reduced import luma
+from gsplat_core.endoscope.setting_ranges import check_settings
+from gsplat_core.value_ranges import IntegerIn, NumberIn
+
+SMALLEST_PX = 64
+"""In smaller pictures nothing is looked for."""
+
+
+@dataclass(frozen=True)
+class StripSettings:
+    """What counts as drawn into the picture. Raises InvalidSetting out of range."""
+
+    band: float = 0.08
+    """How far from a border strips and text are looked for, in shares of the picture's height or width."""
+    every: int = 3
+    """One frame in so many is looked at ..."""
+    first_after: int = 12
+    """... and after so many of those, and again each time, it is decided."""
+    remembered: int = 40
+    """Means go over about so many of them."""
+    edge_levels: float = 10.0
+    """A strip's edge is a step of at least so many levels ..."""
+    edge_steadiness: float = 2.5
+    """... and of this many times its mean deviation from frame to frame ..."""
+    edge_share: float = 0.15
+    """... along at least this share of the border, without a break."""
+    whole_share: float = 0.6
+    """A strip that is seen along this share of the border goes along all of it."""
+    text_levels: float = 25.0
+    """Text has steps of at least so many levels ..."""
+    text_steadiness: float = 5.0
+    """... so steady ..."""
+    text_length: float = 0.02
+    """... over at least this share of the picture's width, and a third of it in height."""
+
+    def __post_init__(self) -> None:
+        share, count, levels = NumberIn(0.001, 0.5), IntegerIn(1, 10_000), NumberIn(0.1, 255.0)
+        check_settings(
+            self,
+            band=share,
+            every=count,
+            first_after=count,
+            remembered=count,
+            edge_levels=levels,
+            edge_steadiness=levels,
+            edge_share=NumberIn(0.01, 1.0),
+            whole_share=NumberIn(0.01, 1.0),
+            text_levels=levels,
+            text_steadiness=levels,
+            text_length=share,
+        )
+
+
+class StripDetector:
+    """Follows a stream, one call a frame; keeps the mean gradient near each border."""
+
+    def __init__(self, settings: StripSettings | None = None) -> None:
+        self.settings = settings or StripSettings()
+        self.mask: NDArray[np.uint8] | None = None
+        """uint8 [H, W]: 0 on strips and text; None without any. The same array until it changes; not to be written to."""
+        self._shape: tuple[int, ...] = ()
+        self._bands: list[_Band] = []
+        self._frames = 0
+        self._before: NDArray[np.bool_] | None = None
+
+    def observe(self, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
+        """`mask` after this frame, RGB uint8 [H, W, 3], which must be a usable one."""
+        if image.shape != self._shape:
+            self._shape, self._frames, self.mask, self._before = image.shape, 0, None, None
+            self._bands = []
+            if min(image.shape[:2]) >= SMALLEST_PX:
+                depths = [max(8, round(self.settings.band * side)) for side in image.shape[:2]]
+                self._bands = [_Band(turns, depths[turns % 2]) for turns in range(4)]
+        if self._bands and self._frames % self.settings.every == 0:
+            for band in self._bands:
+                band.add(image, self.settings)
+            looked_at = self._frames // self.settings.every + 1
+            if looked_at % self.settings.first_after == 0:
+                self._decide()
+        self._frames += 1
+        return self.mask
+
+    def _decide(self) -> None:
+        drawn = np.zeros(self._shape[:2], bool)
+        for band in self._bands:
+            band.mark(drawn, self.settings)
+        # Twice in a row, so that tissue that rested for a while is not taken for a strip.
+        before, self._before = self._before, drawn
+        found = (
+            drawn if before is None else drawn & cv2.dilate(before.view(np.uint8), np.ones((5, 5), np.uint8)).view(bool)
+        )
+        if before is None or not found.any():
+            self.mask = None
+        elif self.mask is None or not np.array_equal(self.mask == 0, found):
+            self.mask = (~found).view(np.uint8)
+
+
+class _Band:
+    """The part of the picture near one border, turned so that the border is its last row."""
+
+    def __init__(self, turns: int, depth_px: int) -> None:
+        self._turns, self._depth_px = turns, depth_px
+        self._mean: NDArray[np.float32] | None = None
+        """Mean gradient over time, [2, depth, length]: across the border and along it."""
+        self._deviation: NDArray[np.float32] = np.zeros(0, np.float32)
+        self._count = 0
+
+    def _of(self, plane: NDArray) -> NDArray:
+        """A view of the band in a picture."""
+        return np.rot90(plane, self._turns)[-self._depth_px :]
+
+    def add(self, image: NDArray[np.uint8], settings: StripSettings) -> None:
+        """Take a frame into the means."""
+        grey = luma(np.ascontiguousarray(self._of(image))).astype(np.float32)
+        gradient = np.zeros((2, *grey.shape), np.float32)
+        gradient[0, 1:] = grey[1:] - grey[:-1]
+        gradient[1, :, 1:] = grey[:, 1:] - grey[:, :-1]
+        self._count += 1
+        if self._mean is None:
+            self._mean, self._deviation = gradient, np.zeros_like(gradient)
+            return
+        share = 1 / min(self._count, settings.remembered)
+        difference = gradient - self._mean
+        self._mean += share * difference
+        self._deviation += share * (np.abs(difference) - self._deviation)
+
+    def mark(self, drawn: NDArray[np.bool_], settings: StripSettings) -> None:
+        """Set what is drawn near this border in a picture's plane [H, W]."""
+        if self._mean is None:
+            return
+        strength = np.abs(self._mean)
+        steadiness = strength / (self._deviation + 1.0)
+        self._of(drawn)[:] |= self._strips(strength[0], steadiness[0], settings) | _text(strength, steadiness, settings)
+
+    def _strips(
+        self, strength: NDArray[np.float32], steadiness: NDArray[np.float32], settings: StripSettings
+    ) -> NDArray[np.bool_]:
+        edges = (strength >= settings.edge_levels) & (steadiness >= settings.edge_steadiness)
+        depth, length = edges.shape
+        least = round(settings.edge_share * length)
+        # An edge that is tilted by a pixel, or broken by letters, is one edge.
+        joined = cv2.morphologyEx(
+            cv2.dilate(edges.astype(np.uint8), np.ones((3, 1), np.uint8)), cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8)
+        )
+        runs = cv2.morphologyEx(joined, cv2.MORPH_OPEN, np.ones((1, max(3, least)), np.uint8))
+        seen = runs.any(axis=0)
+        first = np.where(seen, runs.argmax(axis=0), depth)
+        if seen.mean() >= settings.whole_share:
+            # The rest of its edge cannot be told from what is behind it.
+            first = np.where(seen, first, int(np.median(first[seen])))
+        return np.arange(depth)[:, None] >= first
+
+
+def _text(strength: NDArray[np.float32], steadiness: NDArray[np.float32], settings: StripSettings) -> NDArray[np.bool_]:
+    steady = ((strength >= settings.text_levels) & (steadiness >= settings.text_steadiness)).any(axis=0)
+    joined = cv2.morphologyEx(np.asarray(steady, np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
+    least = settings.text_length * max(steady.shape)
+    wide = statistics[:, cv2.CC_STAT_WIDTH] >= least
+    high = statistics[:, cv2.CC_STAT_HEIGHT] >= max(3.0, least / 3)
+    dense = (
+        statistics[:, cv2.CC_STAT_AREA] >= 0.4 * statistics[:, cv2.CC_STAT_WIDTH] * statistics[:, cv2.CC_STAT_HEIGHT]
+    )
+    chosen = wide & high & dense
+    chosen[0] = False
+    return np.asarray(cv2.dilate(chosen[labels].view(np.uint8), np.ones((5, 5), np.uint8)).view(bool))

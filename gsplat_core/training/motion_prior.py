@@ -1,0 +1,171 @@
+"""What is assumed about motion after the newest frame: how the model is shown between frames, and where training on the next one starts.
+
+A `MotionPrior` sees each frame before the model is trained on it, and is asked for the velocity after it. Others than those of `MOTION_PRIORS`
+are a module and a line there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsplat_core.deformation.field import DeformationField
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.layout import COLOUR, LOG_SCALE, POSITION, RAW_COLUMNS
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.depth_from_motion import DepthFromMotion
+from gsplat_core.training.image_motion import ImageMotion, typical_px
+from gsplat_core.training.motion_priors import MOTION_PRIORS
+from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.surface_motion import SurfaceMotion
+from gsplat_core.transfers import tensor_of
+
+HORIZON_S = 0.15
+"""How long after the newest frame its motion goes on; then the model holds still."""
+LONGEST_GAP_S = 0.15
+"""Frames further apart do not show a velocity."""
+DAMPING = 0.6
+"""The share of the last frame's motion that the next one is expected to have: the best constant over the recordings at hand."""
+UNCERTAINTY = 0.1
+"""Variance of where a Gaussian will be, in squares of the length of its last motion."""
+MOST_WIDENED = 0.7
+"""Bound of what is added to a log-scale from one frame to the next."""
+SUDDEN = 5.0
+"""A motion so many times the usual one, and more than `SUDDEN_PX`, is a jump of the picture and does not go on."""
+SUDDEN_PX = 1.0
+USUAL_DECAY = 0.1
+"""How fast the usual motion follows the newest one."""
+
+
+class MotionPrior(Protocol):
+    """One stream's assumption about motion. Its memory and the time of a call do not grow with the stream."""
+
+    def observe(self, frame: Frame, time_s: float, camera: Camera, step: TrainingStep) -> None:
+        """Take the next frame before the model is trained on it; the field covers `time_s` already. The scene may be moved to where the
+        frame shows it."""
+
+    def velocity(self, step: TrainingStep) -> Tensor | None:
+        """What the raw parameters change by per second after the newest frame, [N, 16]; None for nothing."""
+
+    @property
+    def newest_s(self) -> float:
+        """Time of the newest frame that was observed."""
+
+    def forget(self) -> None:
+        """A new scene begins."""
+
+
+class FlowPrior:
+    """The motion between the last two frames goes on, damped. It is measured in the pictures, as optical flow of the tissue.
+
+    That is more exact than the model's own past: bumps in time average over several frames.
+    """
+
+    def __init__(self, config: ReconstructorConfig) -> None:
+        self._starts_there, self._finds_depth = config.start_from_motion, config.depth_from_motion
+        self._image_motion = ImageMotion()
+        self.forget()
+
+    def forget(self) -> None:
+        """See `MotionPrior.forget`."""
+        self._image_motion.forget()
+        self._depth = DepthFromMotion()
+        self._camera: Camera | None = None
+        self._motion: SurfaceMotion | None = None
+        self._interval_s = 0.0
+        self._usual_px: float | None = None
+        self._is_sudden = False
+        self.newest_s = 0.0
+
+    def observe(self, frame: Frame, time_s: float, camera: Camera, step: TrainingStep) -> None:
+        """See `MotionPrior.observe`."""
+        before, before_s = self._camera, self.newest_s
+        self._camera, self.newest_s = camera, time_s
+        self._motion = None
+        flow = self._image_motion.follow(frame.image, _followed(frame))
+        if flow is None or before is None or camera.model != "pinhole":
+            return
+        self._interval_s = time_s - before_s
+        self._judge(typical_px(flow))
+        self._motion = SurfaceMotion(tensor_of(flow, step.gaussians.device), before, camera)
+        if self._finds_depth and frame.pose is not None and frame.depth is None:
+            self._depth.apply(step, self._motion, before_s)
+        if self._starts_there:
+            self._start_there(step, before_s, time_s)
+
+    def velocity(self, step: TrainingStep) -> Tensor | None:
+        """See `MotionPrior.velocity`."""
+        if self._motion is None or self._is_sudden or not 0 < self._interval_s <= LONGEST_GAP_S:
+            return None
+        with torch.no_grad():
+            deltas = step.field.deltas(self.newest_s)
+            moved = self._motion.arrived(step.gaussians.means + deltas[:, POSITION])
+            velocity = moved.new_zeros(moved.shape[0], RAW_COLUMNS)
+            velocity[:, POSITION] = DAMPING * moved
+            velocity[:, LOG_SCALE] = widened(step.gaussians.log_scales + deltas[:, LOG_SCALE], moved)
+        return velocity / self._interval_s
+
+    def _judge(self, moved_px: float) -> None:
+        """Whether the motion is a jump; learn the usual one."""
+        usual = moved_px if self._usual_px is None else self._usual_px
+        self._is_sudden = moved_px > max(SUDDEN * usual, SUDDEN_PX)
+        self._usual_px = usual + USUAL_DECAY * (min(moved_px, SUDDEN * usual) - usual)
+
+    def _start_there(self, step: TrainingStep, before_s: float, time_s: float) -> None:
+        """Move the scene at `time_s` to its state at `before_s` and on by the flow, in place of what the bumps go on with."""
+        assert self._motion is not None
+        with torch.no_grad():
+            held = step.field.deltas(before_s)
+            change = held - step.field.deltas(time_s)
+            change[:, POSITION] += self._motion.ahead(step.gaussians.means + held[:, POSITION])
+            step.field.move_at(time_s, change[:, : COLOUR.stop])
+
+
+def widened(log_scales: Tensor, moved: Tensor) -> Tensor:
+    """What makes Gaussians [N, 3] as wide as the places [N, 3] where they may be by the next frame: added to their log-scales.
+
+    The picture that is nearest to all that may come is their mean, and the mean of a Gaussian over normally distributed places is a wider
+    one. The spread is taken in proportion to the last motion.
+    """
+    variance = UNCERTAINTY * moved.square().sum(dim=1, keepdim=True)
+    return (0.5 * torch.log1p(variance * torch.exp(-2 * log_scales))).clamp(max=MOST_WIDENED)
+
+
+def _followed(frame: Frame) -> NDArray[np.uint8] | None:
+    """Where the frame shows tissue that can be followed; None: everywhere."""
+    if frame.mask is None or frame.loss_mask is None:
+        return frame.mask if frame.loss_mask is None else frame.loss_mask
+    return frame.mask & frame.loss_mask
+
+
+def no_prior(config: ReconstructorConfig) -> None:
+    """The field's bumps go on as they do."""
+
+
+def new_motion_prior(config: ReconstructorConfig, field: DeformationField) -> MotionPrior | None:
+    """The prior that is configured, where the field can be continued. Raises InvalidSetting for an unknown name."""
+    prior: MotionPrior | None = MOTION_PRIORS[config.motion_prior](config)
+    return prior if field.continues else None
+
+
+@contextmanager
+def continued(step: TrainingStep, prior: MotionPrior | None) -> Iterator[None]:
+    """For the time of a copy for publishing the scene goes on after the newest frame as the prior says; training knows nothing of it."""
+    if prior is None:
+        yield
+        return
+    # Also without a velocity: slots whose fields have a continuation from the start need no other memory later.
+    velocity = prior.velocity(step)
+    still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
+    step.field.continue_with(still if velocity is None else velocity, prior.newest_s, HORIZON_S)
+    try:
+        yield
+    finally:
+        step.field.continuation = None

@@ -1,0 +1,111 @@
+"""Training on all frames of a recording at once: their order, the learning rates' decay, smoothing, and when Gaussians are split."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.training.densification import densify, shares_of
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.step import TrainingStep
+
+SMOOTH_EVERY = 20
+"""Steps from one smoothing to the next: it touches all columns, a step only those near its time."""
+MOST_AT_ONCE = 0.5
+"""Of the way to the neighbours' mean."""
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How `Reconstructor.fit` goes through its steps. Raises InvalidSetting for a value out of its range."""
+
+    final_rate: float = 0.02
+    """What is left of every learning rate at the end, as a share; on the way there they follow half a cosine."""
+    smoothing: float = 0.9
+    """How far, in a pass over all frames, what the field learned for each time is moved to the mean of its neighbours in time, times the
+    factor of the learning rates: a frame between two others is then shown between them, not with the noise of both. 0: not at all."""
+    densify_rounds: int = 10
+    """How often Gaussians that nobody sees are dropped and those with the largest error are split; 0: never."""
+    densify_until: float = 0.7
+    """Share of the steps after which the last of these rounds is; the rounds are spread evenly."""
+    densify_frames: int = 16
+    """Frames, chosen at random for each round, in which the error is looked for."""
+
+    def __post_init__(self) -> None:
+        for name in ("final_rate", "densify_until"):
+            if not 0 < getattr(self, name) <= 1:
+                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be above 0 and at most 1")
+        if not 0 <= self.smoothing < math.inf:
+            raise InvalidSetting(f"smoothing is {self.smoothing}; it must be at least 0")
+        if self.densify_rounds < 0 or self.densify_frames < 1:
+            raise InvalidSetting(
+                f"densify_rounds is {self.densify_rounds} and densify_frames {self.densify_frames}; they must be at least 0 and 1"
+            )
+
+    def rate_at(self, share: float) -> float:
+        """The factor of the learning rates after this share of the steps."""
+        return self.final_rate + (1 - self.final_rate) * 0.5 * (1 + math.cos(math.pi * share))
+
+    def rounds(self, steps: int) -> list[int]:
+        """After how many of the steps each round of densification is."""
+        return [round(steps * self.densify_until * (k + 1) / self.densify_rounds) for k in range(self.densify_rounds)]
+
+
+class OfflineTraining:
+    """The steps of one `fit`."""
+
+    def __init__(
+        self,
+        step: TrainingStep,
+        observations: Sequence[Observation],
+        settings: FitSettings,
+        *,
+        most_gaussians: int,
+        seed: int,
+    ) -> None:
+        self._step, self._observations, self._settings = step, observations, settings
+        self._first_count, self._most = step.gaussians.count, most_gaussians
+        self._random = np.random.default_rng(seed)
+        self._order: list[int] = []
+        self._rate = 1.0
+
+    def __call__(self, steps: int, progress: Callable[[int, Tensor], None] | None) -> Tensor:
+        """Take `steps` steps; `progress` is called after each one. Returns the last one's loss, a tensor [] on the device."""
+        rounds = self._settings.rounds(steps)
+        loss = torch.zeros(())
+        for number in range(steps):
+            while rounds and number >= rounds[0] > 0:
+                self._densify(1 - (len(rounds) - 1) / self._settings.densify_rounds)
+                rounds.pop(0)
+            self._rate = self._settings.rate_at(number / steps)
+            loss = self._step(self._next(), rate_scale=self._rate)
+            if (number + 1) % SMOOTH_EVERY == 0 and self._settings.smoothing:
+                self._smooth()
+            if progress is not None:
+                progress(number + 1, loss)
+        self._step.settle(self._observations[-1], rate_scale=self._rate)
+        return loss
+
+    def _next(self) -> Observation:
+        """Every observation once in random order, then again."""
+        if not self._order:
+            self._order = self._random.permutation(len(self._observations)).tolist()
+        return self._observations[self._order.pop()]
+
+    def _smooth(self) -> None:
+        """As much as belongs to the steps since the last time."""
+        amount = self._settings.smoothing * self._rate * SMOOTH_EVERY / len(self._observations)
+        self._step.field.smooth_in_time(min(amount, MOST_AT_ONCE))
+
+    def _densify(self, share: float) -> None:
+        """A round; `share` of all rounds is over with it, and their number grows from the first to the most along with that."""
+        self._step.settle(self._observations[-1], rate_scale=self._rate)
+        chosen = self._random.permutation(len(self._observations))[: self._settings.densify_frames]
+        shares = shares_of(self._step, [self._observations[int(index)] for index in chosen])
+        densify(self._step, shares, round(self._first_count + (self._most - self._first_count) * share))

@@ -1,0 +1,135 @@
+"""What a live run needs to be recorded: the recorder, and the lines that say how the model was trained."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import TypeAdapter
+
+from gsplat_core.io.sessions import SessionInfo
+from gsplat_core.io.sessions.schedule import Grown, Observed, ReconstructorMade, Rehearsed, SceneBegun, ScheduleLine
+from gsplat_core.io.sessions.session_file import camera_record
+from gsplat_core.training.live import LiveReconstructor
+from operators.graph import Application, Operator
+from operators.output_folder import RECORDINGS
+from operators.schedule import ScheduleEvent, ScheduleListener
+from operators.sinks.recorder import RecordFramesOp, RecordPicturesOp, RecordPreparationOp
+from operators.sinks.session_recorder import SessionRecorder
+from operators.sources.source import SourceDescription
+from operators.storage import StorageReserve
+
+if TYPE_CHECKING:
+    from operators.applications.live_settings import LiveSettings
+
+RECORDING_RESERVE_BYTES = 64 * 2**20
+"""Room that a recording leaves on the disk, beside what finishing the run needs."""
+
+
+def new_recording_folder(out: Path) -> Path:
+    """Where a run that starts now and writes its results into `out` is recorded. The folder itself is made when the recording begins."""
+    base = out / RECORDINGS / datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    folder, more = base, 1
+    while folder.exists():
+        folder, more = base.with_name(f"{base.name}-{more}"), more + 1
+    return folder
+
+
+def new_recorder(
+    folder: Path, source: SourceDescription, settings: LiveSettings, room_to_finish: Callable[[], int]
+) -> SessionRecorder:
+    """A recorder for a run; it is opened when the graph starts."""
+    info = SessionInfo(
+        source=source.name[:1000],
+        utc=datetime.now(UTC).isoformat(),
+        fps=source.fps,
+        camera=camera_record(source.camera),
+        fields=tuple(sorted(source.fields & {"mask", "depth", "right_image", "pose"})),  # type: ignore[arg-type]
+        settings={"device": settings.device, "scale": settings.scale, "seed": settings.seed},
+        keeps_bytes=settings.recording.keep_bytes,
+        keeps_s=settings.recording.keep_s,
+    )
+    reserve = StorageReserve(folder, lambda: RECORDING_RESERVE_BYTES + room_to_finish())
+    return SessionRecorder(folder, info, settings.recording, reserve=reserve)
+
+
+class RunRecording:
+    """Puts the recording of a live run into its graph. Without a folder to record into it changes nothing."""
+
+    def __init__(
+        self, graph: Application, settings: LiveSettings, source: SourceDescription, room: Callable[[], int]
+    ) -> None:
+        """room: bytes on the disk that finishing the run needs."""
+        self._graph, self._settings = graph, settings
+        self.recorder: SessionRecorder | None = None
+        if settings.record is not None:
+            self.recorder = new_recorder(settings.record, source, settings, room)
+
+    def behind_gate(self) -> list[Operator]:
+        """What records each frame as it comes through the out-of-body gate."""
+        if self.recorder is None:
+            return []
+        return [RecordFramesOp(self._graph, name="recorded_frames", recorder=self.recorder)]
+
+    def behind_analysis(self) -> list[Operator]:
+        """What records each frame as it goes into training."""
+        if self.recorder is None:
+            return []
+        return [RecordPreparationOp(self._graph, name="recorded_preparation", recorder=self.recorder)]
+
+    def pictures_of(self, display: Operator) -> None:
+        """Record what `display` shows."""
+        if self.recorder is not None:
+            pictures = RecordPicturesOp(self._graph, name="recorded_pictures", recorder=self.recorder)
+            self._graph.add_flow(display, pictures, {("shown", "shown")}, policy="drop_oldest", capacity=8)
+
+    @property
+    def listener(self) -> ScheduleListener | None:
+        """Writes every call that changes the model."""
+        if self.recorder is None:
+            return None
+        recorder = self.recorder
+        return lambda event: recorder.line(_line(event))
+
+    def made_by(self, make: Callable[[], LiveReconstructor]) -> Callable[[], LiveReconstructor]:
+        """`make`, and write what was made."""
+        if self.recorder is None:
+            return make
+        recorder, settings = self.recorder, self._settings
+
+        def made() -> LiveReconstructor:
+            reconstructor = make()
+            recorder.line(
+                ReconstructorMade(
+                    device=settings.device,
+                    seed=settings.seed,
+                    renderer=settings.renderer,
+                    config=_json(reconstructor.config),
+                    training=_json(settings.training),
+                    camera=camera_record(reconstructor.camera),
+                )
+            )
+            return reconstructor
+
+        return made
+
+
+def _line(event: ScheduleEvent) -> ScheduleLine:
+    if event.kind == "rehearse":
+        return Rehearsed(steps=event.steps)
+    assert event.seq is not None, f"{event.kind} is of a frame"
+    if event.kind == "begin_scene":
+        return SceneBegun(seq=event.seq)
+    if event.kind == "grow":
+        return Grown(seq=event.seq)
+    return Observed(seq=event.seq, steps=event.steps, train=event.train)
+
+
+def _json(settings: Any) -> dict[str, Any]:
+    """The fields of a dataclass, in what JSON has."""
+    assert dataclasses.is_dataclass(settings)
+    values: dict[str, Any] = TypeAdapter(type(settings)).dump_python(settings, mode="json")
+    return values

@@ -1,0 +1,94 @@
+"""Replaying a recorded session as it was: its frames as training was given them, its calls, its settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import TypeAdapter, ValidationError
+
+from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.io.recordings import open_recording
+from gsplat_core.io.sessions import SessionReader, is_session
+from gsplat_core.io.sessions.schedule import ReconstructorMade
+from gsplat_core.io.sessions.session_file import camera_of
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
+from operators.applications.limits import check_seed
+from operators.compare_shown import CompareShownOp
+from operators.graph import Application
+from operators.scheduled_reconstruct import ScheduledReconstructOp
+from operators.sources.session import SessionSource
+
+if TYPE_CHECKING:
+    from operators.applications.replay import ReplaySettings
+
+
+@dataclass(frozen=True)
+class FollowedSession:
+    """A session whose schedule is followed."""
+
+    reader: SessionReader
+    source: SessionSource
+    made: ReconstructorMade
+    config: ReconstructorConfig
+    training: LiveTraining
+    device: str
+
+    def new_reconstructor(self) -> LiveReconstructor:
+        """One as the session had it."""
+        return LiveReconstructor(
+            self.config,
+            camera_of(self.made.camera),
+            live=self.training,
+            seed=self.made.seed,
+            recording_digest=self.source.description.digest,
+            device=self.device,
+        )
+
+    def reconstruct_op(self, graph: Application, name: str) -> ScheduledReconstructOp:
+        """The operator that trains."""
+        return ScheduledReconstructOp(
+            graph, name=name, make_reconstructor=self.new_reconstructor, schedule=self.reader.schedule
+        )
+
+    def compare_op(self, graph: Application, name: str) -> CompareShownOp:
+        """The operator that says whether the pictures are the same."""
+        return CompareShownOp(graph, name=name, shown=self.reader.digests)
+
+
+def followed_session(settings: ReplaySettings, notes: list[str]) -> FollowedSession | None:
+    """The session, where `settings.recording` is one that can be replayed as it was; None: it is a recording like any other.
+
+    Why a session cannot be followed is added to `notes`. Raises InvalidSetting for a schedule with settings that this version does not take.
+    """
+    path = Path(settings.recording)
+    if settings.ignore_schedule or not is_session(path):
+        return None
+    reader = SessionReader(path)
+    made = reader.made
+    why = None
+    if made is None:
+        why = "its beginning is not there any more, or it has no schedule"
+    elif settings.scale != 1 or settings.heldout or settings.steps_per_frame is not None:
+        why = "scale, held-out frames or steps per frame were given, which it does not have"
+    if made is None or why is not None:
+        notes.append(
+            f"the session's schedule is not followed, so that pictures differ from those that it showed: {why}"
+        )
+        return None
+    try:
+        config = TypeAdapter(ReconstructorConfig).validate_python(made.config)
+        training = TypeAdapter(LiveTraining).validate_python(made.training)
+        check_seed(made.seed)
+        camera_of(made.camera)
+    except (ValidationError, InvalidInput, InvalidSetting) as error:
+        first = " ".join(str(error).split())[:200]
+        raise InvalidSetting(
+            f"{path}: its schedule has settings that this version does not take ({first}); give --ignore-schedule"
+        ) from error
+    if made.device != settings.device:
+        notes.append(f"the session ran on {made.device}: on {settings.device} its pictures come out otherwise")
+    source = SessionSource(reader, open_recording(path), max_frames=settings.max_frames)
+    return FollowedSession(reader, source, made, config, training, settings.device)

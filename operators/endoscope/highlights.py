@@ -1,0 +1,31 @@
+"""Stage: specular highlights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsplat_core.endoscope.highlights import HighlightSettings, without_highlights
+from gsplat_core.scene.frames import Frame
+from operators.endoscope.stage import Stage, StageCounts, left_out
+
+
+@dataclass(frozen=True)
+class HighlightCounts(StageCounts):
+    """Frames with highlights."""
+
+
+class HighlightStage(Stage):
+    """Leaves specular highlights out of the loss."""
+
+    counts_type = HighlightCounts
+
+    def __init__(self, settings: HighlightSettings | None = None) -> None:
+        self.settings = settings or HighlightSettings()
+        super().__init__()
+
+    def annotate(self, frame: Frame) -> Frame:
+        kept = None if frame.withheld is not None else without_highlights(frame.image, self.settings)
+        if kept is None:
+            return frame
+        self.found["frames with highlights"] += 1
+        return left_out(frame, kept)

@@ -1,0 +1,36 @@
+"""Stage: a recorder's strips and burnt-in text."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsplat_core.endoscope.strip import StripDetector, StripSettings
+from gsplat_core.scene.frames import Frame, FrameStatus
+from operators.endoscope.stage import Stage, StageCounts, left_out
+
+
+@dataclass(frozen=True)
+class StripCounts(StageCounts):
+    """Frames with a strip or text."""
+
+
+class StripStage(Stage):
+    """Leaves strips and text at the borders out of the loss. Withheld and damaged frames have those of the one before."""
+
+    counts_type = StripCounts
+
+    def __init__(self, settings: StripSettings | None = None) -> None:
+        self.settings = settings or StripSettings()
+        super().__init__()
+
+    def reset(self) -> None:
+        self._detector = StripDetector(self.settings)
+
+    def annotate(self, frame: Frame) -> Frame:
+        if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
+            self._detector.observe(frame.image)
+        mask = self._detector.mask
+        if mask is None or mask.shape != frame.image.shape[:2]:
+            return frame
+        self.found["strip or text"] += 1
+        return left_out(frame, mask)

@@ -1,0 +1,130 @@
+"""Keeps pictures from outside of the body out of everything that comes after: the recorder, the network, training and the display."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.endoscope.out_of_body import BodyGate
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.scene.frames import Frame
+from operators.graph import Operator, OperatorSpec
+from operators.outcome import OutcomeBuilder
+
+log = logging.getLogger(__name__)
+
+Policy = Literal["withhold", "off"]
+"""What is done with frames from outside: nothing of the picture goes on, or they pass like others and nothing is judged."""
+WITHHELD = "out of body"
+"""`Frame.withheld` of such a frame."""
+NOT_EXAMINED = "could not be examined"
+
+
+class Gate(Protocol):
+    """Decides picture by picture whether a stream is inside of the body."""
+
+    def judge(self, image: NDArray[np.uint8]) -> str | None:
+        """None where the picture, RGB uint8 [H, W, 3], was taken inside, otherwise why not."""
+        ...
+
+    def close(self) -> None:
+        """Count the present picture as taken outside."""
+        ...
+
+
+@dataclass(frozen=True)
+class OutOfBodyFrames:
+    """What the gate did."""
+
+    policy: Policy
+    passed: int
+    """Frames that went on as they came."""
+    withheld: Mapping[str, int] = field(default_factory=dict)
+    """Frames whose picture was replaced, by reason."""
+
+
+class OutOfBodyGateOp(Operator):
+    """Replaces the pictures that were not clearly taken inside of the body. It belongs directly after the source.
+
+    A frame that is withheld is black, has no right picture, depth, pose or mask, is left out of every loss, and says so in `withheld`. Black
+    rather than pixelated: from blocks that change with every frame a moving scene can be put together again, and black holds nothing.
+    A picture that cannot be examined counts as taken outside.
+
+    Inputs:
+        frame: `Frame`.
+
+    Outputs:
+        frame: `Frame`.
+
+    Params:
+        policy: "withhold", or "off": every frame passes and none is judged.
+    """
+
+    policy: Policy
+
+    def __init__(self, fragment: Any, *args: Any, gate: Gate | None = None, **kwargs: Any) -> None:
+        self._given = gate
+        self._gate: Gate = gate or BodyGate()
+        self._passed = 0
+        self._withheld: Counter[str] = Counter()
+        super().__init__(fragment, *args, **kwargs)
+        if self.policy not in get_args(Policy):
+            raise InvalidSetting(f"out-of-body policy is {self.policy!r}; choose {' or '.join(get_args(Policy))}")
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("frame", type=Frame)
+        spec.output("frame", type=Frame)
+        spec.param("policy", "withhold")
+
+    def start(self) -> None:
+        self._gate = self._given or BodyGate()
+        self._passed, self._withheld = 0, Counter()
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        frame = op_input.receive("frame")
+        reason = None if self.policy == "off" else self._judge(frame)
+        if reason is None:
+            self._passed += 1
+        else:
+            self._withheld[reason] += 1
+            frame = withheld(frame)
+        op_output.emit(frame, "frame")
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """See `Contributor`."""
+        outcome.add(OutOfBodyFrames(self.policy, self._passed, dict(self._withheld)))
+        if self._withheld:
+            reasons = ", ".join(f"{reason}: {count}" for reason, count in self._withheld.most_common())
+            outcome.note(
+                f"{self._withheld.total()} frames were withheld because they may show the outside of the body ({reasons})"
+            )
+
+    def _judge(self, frame: Frame) -> str | None:
+        try:
+            return self._gate.judge(frame.image)
+        except Exception:
+            if NOT_EXAMINED not in self._withheld:
+                log.warning("frame %d could not be examined and is withheld", frame.seq, exc_info=True)
+            self._gate.close()
+            return NOT_EXAMINED
+
+
+def withheld(frame: Frame) -> Frame:
+    """The frame without anything that shows what the picture showed."""
+    size = frame.image.shape[:2]
+    right = None if frame.right_image is None else np.zeros_like(frame.right_image)
+    return frame.with_fields(
+        image=np.zeros_like(frame.image),
+        right_image=right,
+        depth=None,
+        mask=np.ones(size, np.uint8),
+        loss_mask=np.zeros(size, np.uint8),
+        pose=None,
+        withheld=WITHHELD,
+    )

@@ -1,0 +1,141 @@
+"""A folder that another program writes images into, one by one."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.recordings.decoded import Picture
+from gsplat_core.io.recordings.image_files import decode_picture
+from gsplat_core.io.recordings.plain_files import UnreadableFile
+from gsplat_core.scene.frames import Frame, FrameStatus
+from operators.errors import SourceUnavailable
+from operators.sources.address import Address
+from operators.sources.new_files import NewFiles
+from operators.sources.options import MAX_FPS, SourceOptions
+from operators.sources.steady_clock import SteadyClock
+from operators.sources.stream import DEFAULT_FPS, StreamSource
+
+LOOK_S = 0.01
+OPEN_S = 10.0
+"""How long the first image may take."""
+UNREADABLE_AFTER_S = 2.0
+"""An image that cannot be read and has not changed for so long is passed over."""
+
+
+class FolderSource(StreamSource):
+    """Images (PNG, JPEG) in the order of their names, each as soon as it is whole: one that is being written is waited for.
+
+    A program that writes under another name and renames the file when it is done is read without delay, and so is one whose files end with
+    their format's end mark. What is there already is passed over but for the newest image.
+    """
+
+    def __init__(
+        self, path: str, fps: float | None, options: SourceOptions, *, every: bool = False, open_s: float = OPEN_S
+    ) -> None:
+        """every: begin with the first image that is there. Raises SourceUnavailable without a folder, or without an image within `open_s`."""
+        super().__init__(options)
+        self._folder, self._every = Path(path), every
+        self._name = f"folder {self._folder.name or path}"
+        self._files = self._begin()
+        self._unreadable: tuple[str, object, float] | None = None
+        until_s = time.monotonic() + open_s
+        while (picture := self._next()) is None:
+            if time.monotonic() > until_s:
+                raise SourceUnavailable(
+                    f"no whole image came into {path} within {open_s:g} s. Start what writes there."
+                )
+            time.sleep(LOOK_S)
+        self._first: Picture | None = picture
+        self._rate = fps
+        self.describe(self._name, (picture.image.shape[1], picture.image.shape[0]), fps)
+
+    def pictures(self) -> Iterator[Frame]:
+        """See `StreamSource`."""
+        clock = SteadyClock(self._rate or DEFAULT_FPS)
+        first, self._first = self._first, None
+        if first is None:
+            self._files = self._begin()
+        seq = 0
+        while not self.wait(0 if first else LOOK_S):
+            try:
+                picture, first = first or self._next(), None
+                while picture is not None:
+                    yield self._frame(seq, clock, picture)
+                    seq += 1
+                    picture = self._next()
+            except OSError as error:
+                self.lost(f"{self._name} cannot be looked at ({error.strerror}); it is looked for again")
+                self.wait(10 * LOOK_S)
+            if self._files.late:
+                self.count("out_of_order", self._files.late)
+                self._files.late = 0
+
+    def _frame(self, seq: int, clock: SteadyClock, picture: Picture) -> Frame:
+        now_ns = time.monotonic_ns()
+        return Frame(
+            seq=seq,
+            pts_ns=clock.time_ns(now_ns),
+            image=picture.image,
+            arrived_ns=now_ns,
+            status=FrameStatus.LIVE if picture.damage is None else FrameStatus.DAMAGED,
+            damage=picture.damage,
+        )
+
+    def _begin(self) -> NewFiles:
+        files = NewFiles(self._folder)
+        if not self._folder.is_dir():
+            raise SourceUnavailable(f"{self._folder} is no folder. Make it before something writes there.")
+        try:
+            if not self._every:
+                files.skip_to_newest()
+        except OSError as error:
+            raise SourceUnavailable(
+                f"{self._folder} cannot be read: {error.strerror}. Check its permissions."
+            ) from error
+        return files
+
+    def _next(self) -> Picture | None:
+        """The next image; None when there is none, or when it is not whole yet."""
+        while (path := self._files.next()) is not None:
+            try:
+                if path.is_symlink():
+                    raise UnreadableFile("it is a link")
+                picture = decode_picture(path)
+            except UnreadableFile:
+                if self._may_become_whole(path):
+                    return None
+                self.count("unreadable")
+            else:
+                self._files.taken()
+                return picture
+            self._files.taken()
+        return None
+
+    def _may_become_whole(self, path: Path) -> bool:
+        """Whether a file that cannot be read has changed lately. It is left alone until it changes again or is given up."""
+        try:
+            about = os.lstat(path)
+        except FileNotFoundError:
+            return False
+        changed, now_s = (about.st_size, about.st_mtime_ns), time.monotonic()
+        known = self._unreadable
+        if known is None or known[:2] != (path.name, changed):
+            self._unreadable = path.name, changed, now_s
+            return True
+        return now_s - known[2] < UNREADABLE_AFTER_S
+
+
+def folder_source(rest: str, options: SourceOptions) -> FolderSource:
+    """`folder:/path/of/images?fps=30&every=0`. Raises InvalidSetting and SourceUnavailable."""
+    address = Address.parse("folder", rest)
+    fps = address.number("fps", options.fps, 0.01, MAX_FPS)
+    every = address.flag("every")
+    open_s = address.number("open_s", OPEN_S, 0.1, 600.0)
+    address.refuse_others()
+    if not address.place:
+        raise InvalidSetting("folder: say which: folder:/path/of/images")
+    return FolderSource(address.place, fps, options, every=every, open_s=open_s)

@@ -1,0 +1,211 @@
+"""Raw frames on a pipe: what `ffmpeg -f rawvideo`, `ffmpeg -f yuv4mpegpipe` or `gst-launch … ! fdsink` write for a capture card."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import select
+import stat
+import time
+from collections.abc import Iterator
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.scene.frames import Frame
+from operators.errors import SourceLost, SourceUnavailable
+from operators.sources.address import Address
+from operators.sources.options import MAX_FPS, SourceOptions
+from operators.sources.raw_pictures import RawFormat
+from operators.sources.steady_clock import SteadyClock
+from operators.sources.stream import DEFAULT_FPS, StreamSource
+from operators.sources.y4m import FRAME, MOST_HEADER_BYTES, Y4mHeader
+
+LOOK_S = 0.05
+HEADER_TIMEOUT_S = 30.0
+"""How long the first line of a stream that describes itself may take."""
+PIPE_BYTES = 1 << 20
+"""What a pipe is asked to hold: a frame takes fewer reads then."""
+
+
+class Ended(Exception):
+    """The writer has closed the pipe, or the source is being closed."""
+
+
+class PipeSource(StreamSource):
+    """Frames from a pipe of the file system or from standard input.
+
+    A writer of a named pipe may go and another one come: the state is `RECONNECTING` in between. When standard input ends, so does the source.
+    """
+
+    def __init__(self, path: str, layout: RawFormat | None, fps: float | None, options: SourceOptions) -> None:
+        """path: of a named pipe, or `-`. layout: None for a stream that describes itself, whose first line is waited for here.
+
+        Raises SourceUnavailable when there is no such pipe or no such line, InvalidSetting for what the line says.
+        """
+        super().__init__(options)
+        self._path, self._again = path, path != "-"
+        self._name = "standard input" if path == "-" else f"pipe {os.path.basename(path)}"
+        self._fd = self._opened()
+        self._raw = layout
+        self._describes_itself = layout is None
+        self._fps = fps
+        self._buffer = bytearray(0)
+        self._pending = b""
+        try:
+            if self._raw is None:
+                self._read_header(time.monotonic() + HEADER_TIMEOUT_S)
+        except Ended:
+            self._let_go()
+            raise SourceUnavailable(
+                f"{self._name} gave no header within {HEADER_TIMEOUT_S:g} s. Start what writes to it."
+            ) from None
+        except InvalidSetting:
+            self._let_go()
+            raise
+        assert self._raw is not None
+        self.describe(self._name, (self._raw.width_px, self._raw.height_px), self._fps)
+
+    def open(self) -> None:
+        """See `FrameSource`."""
+        if self._fd < 0:
+            self._fd = self._opened()
+        super().open()
+
+    def close(self) -> None:
+        """See `FrameSource`."""
+        super().close()
+        self._let_go()
+
+    def pictures(self) -> Iterator[Frame]:
+        """See `StreamSource`."""
+        seq = given = 0
+        clock = SteadyClock(self.description.fps)
+        while not self.wait(0):
+            try:
+                for data in self._frames_of_a_writer():
+                    now_ns = time.monotonic_ns()
+                    assert self._raw is not None
+                    yield Frame(seq, clock.time_ns(now_ns), self._raw.picture(data), arrived_ns=now_ns)
+                    seq += 1
+            except Ended:
+                if not self._again:
+                    return
+                if seq > given:
+                    self.lost(f"nobody writes to {self._name} any more; another writer is waited for")
+                given, self._pending = seq, b""
+                self.wait(LOOK_S)
+                if self._describes_itself:
+                    self._raw = None
+
+    def _frames_of_a_writer(self) -> Iterator[memoryview]:
+        """The bytes of one frame after another. Raises Ended when the writer is gone, SourceLost when it is out of step."""
+        if self._raw is None:
+            self._read_header(None)
+        assert self._raw is not None
+        while True:
+            if self._describes_itself:
+                line = self._line(None)
+                if not line.startswith(FRAME):
+                    raise SourceLost(
+                        f"{self._name} is out of step: {line[:16]!r} stands where a frame begins. Start its writer again."
+                    )
+            yield self._exactly(self._raw.frame_bytes)
+
+    def _read_header(self, until_s: float | None) -> None:
+        header = Y4mHeader.parse(self._line(until_s))
+        self._raw = RawFormat(header.format, header.width_px, header.height_px)
+        self._fps = self._fps or header.fps
+
+    def _line(self, until_s: float | None) -> bytes:
+        """Up to the next line end, which is taken, too."""
+        while b"\n" not in self._pending:
+            if len(self._pending) > MOST_HEADER_BYTES:
+                raise InvalidSetting(
+                    f"{self._name} does not describe itself (it begins with {self._pending[:16]!r}); say ?size=640x512&format=rgb24"
+                )
+            self._pending += self._some(1, until_s)
+        line, _, self._pending = self._pending.partition(b"\n")
+        return line
+
+    def _exactly(self, count: int) -> memoryview:
+        """So many bytes, in a buffer that the next call writes to."""
+        if len(self._buffer) != count:
+            self._buffer = bytearray(count)
+        view = memoryview(self._buffer)
+        got = min(len(self._pending), count)
+        view[:got], self._pending = self._pending[:got], self._pending[got:]
+        while got < count:
+            self._wait_for_data(None)
+            try:
+                more = os.readv(self._fd, [view[got:]])
+            except BlockingIOError:
+                continue
+            if more == 0:
+                if got:
+                    self.count("cut_off")
+                raise Ended
+            got += more
+        return view
+
+    def _some(self, count: int, until_s: float | None) -> bytes:
+        while True:
+            self._wait_for_data(until_s)
+            with contextlib.suppress(BlockingIOError):
+                data = os.read(self._fd, count)
+                if data:
+                    return data
+                # At the beginning a named pipe has nobody who writes to it yet.
+                if until_s is None or not self._again or self._pending or self.wait(LOOK_S):
+                    raise Ended
+
+    def _wait_for_data(self, until_s: float | None) -> None:
+        while not select.select([self._fd], [], [], LOOK_S)[0]:
+            if self.wait(0) or (until_s is not None and time.monotonic() > until_s):
+                raise Ended
+        if self.wait(0) or (until_s is not None and time.monotonic() > until_s):
+            raise Ended
+
+    def _opened(self) -> int:
+        if self._path == "-":
+            try:
+                fd = os.dup(0)
+            except OSError as error:
+                raise SourceUnavailable("standard input is closed. Pipe frames into the program.") from error
+            if os.isatty(fd):
+                os.close(fd)
+                raise SourceUnavailable("standard input is a terminal. Pipe frames into the program.")
+            return fd
+        try:
+            fd = os.open(self._path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        except (OSError, ValueError) as error:
+            raise SourceUnavailable(
+                f"{self._path}: {getattr(error, 'strerror', error)}. Make the pipe with mkfifo."
+            ) from error
+        if not stat.S_ISFIFO(os.fstat(fd).st_mode):
+            os.close(fd)
+            raise SourceUnavailable(f"{self._path} is no pipe. Make one with mkfifo, or give a recording by its path.")
+        with contextlib.suppress(OSError, AttributeError):  # it works with less
+            fcntl.fcntl(fd, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+        return fd
+
+    def _let_go(self) -> None:
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+
+def pipe_source(rest: str, options: SourceOptions) -> PipeSource:
+    """`pipe:-?size=640x512&format=rgb24&fps=30`, `pipe:/path/of/a/fifo`. Raises InvalidSetting and SourceUnavailable."""
+    address = Address.parse("pipe", rest)
+    size, name = address.size(), address.text("format")
+    fps = address.number("fps", options.fps, 0.01, MAX_FPS)
+    address.refuse_others()
+    if not address.place:
+        raise InvalidSetting("pipe: say which: pipe:- for standard input, or pipe:/path/of/a/fifo")
+    if size is None:
+        if name not in (None, "y4m"):
+            raise InvalidSetting(f"pipe: raw frames in {name!r:.60} need their size: ?size=640x512&format={name:.60}")
+        return PipeSource(address.place, None, fps, options)
+    if name in (None, "y4m"):
+        raise InvalidSetting("pipe: raw frames need their format as well as their size: ?size=640x512&format=rgb24")
+    return PipeSource(address.place, RawFormat(str(name), *size), fps or DEFAULT_FPS, options)

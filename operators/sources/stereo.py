@@ -1,0 +1,207 @@
+"""Two eyes: lying in one picture, or coming from two sources."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.recordings.calibration import default_camera
+from gsplat_core.scene.frames import Frame
+from operators.sources.live import LiveSource
+from operators.sources.options import StereoLayout
+from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
+
+MOST_KEPT = 8
+"""Right pictures that wait for their left one."""
+
+
+class SplitSource:
+    """A `FrameSource` whose pictures hold both eyes: `image` becomes the left or upper half of them, `right_image` the other one.
+
+    Both eyes have the size of a half; a sender that squeezes them is not stretched. What else a frame has belongs to the left eye.
+    """
+
+    def __init__(self, source: FrameSource, layout: StereoLayout) -> None:
+        """Raises InvalidSetting where there is a right picture already, or a camera that is not that of one eye."""
+        self._source, self._layout = source, layout
+        self.description = self._described(source.description)
+
+    @property
+    def state(self) -> SourceState:
+        """See `FrameSource`."""
+        return self._source.state
+
+    @property
+    def state_sentence(self) -> str:
+        """See `ReportingSource`."""
+        return self._source.state_sentence if isinstance(self._source, ReportingSource) else ""
+
+    def counts(self) -> Mapping[str, int]:
+        """See `ReportingSource`."""
+        return self._source.counts() if isinstance(self._source, ReportingSource) else {}
+
+    def open(self) -> None:
+        """See `FrameSource`."""
+        self._source.open()
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """See `FrameSource`."""
+        frame = self._source.read(timeout_s)
+        return None if frame is None else self._split(frame)
+
+    def close(self) -> None:
+        """See `FrameSource`."""
+        self._source.close()
+
+    def _split(self, frame: Frame) -> Frame:
+        width_px, height_px = self._half(frame.width_px, frame.height_px)
+
+        def left(plane: NDArray) -> NDArray:
+            return np.ascontiguousarray(plane[:height_px, :width_px])
+
+        beside = self._layout == "side_by_side"
+        right = frame.image[:, width_px : 2 * width_px] if beside else frame.image[height_px : 2 * height_px]
+        return replace(
+            frame,
+            image=left(frame.image),
+            right_image=np.ascontiguousarray(right[:height_px, :width_px]),
+            depth=None if frame.depth is None else left(frame.depth),
+            mask=None if frame.mask is None else left(frame.mask),
+        )
+
+    def _half(self, width_px: int, height_px: int) -> tuple[int, int]:
+        # A picture of one pixel has no halves; it is given to both eyes rather than to none.
+        if self._layout == "side_by_side":
+            return max(1, width_px // 2), height_px
+        return width_px, max(1, height_px // 2)
+
+    def _described(self, about: SourceDescription) -> SourceDescription:
+        if "right_image" in about.fields:
+            raise InvalidSetting(f"{about.name} has a right picture for each frame; leave out stereo={self._layout}")
+        width_px, height_px = self._half(about.width_px, about.height_px)
+        sides = (about.width_px, width_px) if self._layout == "side_by_side" else (about.height_px, height_px)
+        if sides[0] != 2 * sides[1]:
+            raise InvalidSetting(
+                f"{about.name} has pictures of {about.width_px}x{about.height_px} px, which are not two eyes {self._layout.replace('_', ' ')}"
+            )
+        camera = about.camera
+        if camera == default_camera(about.width_px, about.height_px):
+            camera = default_camera(width_px, height_px)
+        elif camera.K[0, 2] < width_px and camera.K[1, 2] < height_px:
+            camera = replace(camera, width_px=width_px, height_px=height_px)
+        else:
+            raise InvalidSetting(
+                f"the calibration of {about.name} is not that of its left eye: the principal point ({camera.K[0, 2]:g}, {camera.K[1, 2]:g}) "
+                f"lies outside of {width_px}x{height_px} px"
+            )
+        return replace(
+            about,
+            width_px=width_px,
+            height_px=height_px,
+            camera=camera,
+            fields=about.fields | {"right_image"},
+            digest=None,
+        )
+
+
+class JoinedSource(LiveSource):
+    """Two sources as one: each frame of the left one with that frame of the right one which came at nearly the same moment.
+
+    A left frame waits for its right one for half a frame's duration at most, and then goes without (`without_right`): losing an eye never
+    takes the picture away.
+    """
+
+    def __init__(
+        self, left: FrameSource, right: FrameSource, *, waiting: int = 2, apart_s: float | None = None
+    ) -> None:
+        """apart_s: how far two frames of a pair may be apart; by default half a frame's duration. Raises InvalidSetting when the sizes differ."""
+        super().__init__(waiting=waiting, stalled_after_s=math.inf)
+        self._left, self._right = left, right
+        about, other = left.description, right.description
+        if (about.width_px, about.height_px) != (other.width_px, other.height_px):
+            raise InvalidSetting(
+                f"the left eye has {about.width_px}x{about.height_px} px and the right one {other.width_px}x{other.height_px}; "
+                "they must have one size"
+            )
+        self._apart_ns = round((apart_s or 0.5 / about.fps) * 1e9)
+        self.description = replace(
+            about,
+            name=f"{about.name} and {other.name}",
+            fields=about.fields | {"right_image"},
+            digest=None,
+            notes=tuple(dict.fromkeys((*about.notes, *other.notes))),
+        )
+
+    @property
+    def state(self) -> SourceState:
+        """See `FrameSource`: that of the left eye, while this source is open."""
+        state = super().state
+        return self._left.state if state is SourceState.LIVE and not self._ready else state
+
+    @property
+    def state_sentence(self) -> str:
+        """See `ReportingSource`."""
+        eyes = [("left", self._left), ("right", self._right)]
+        said = [f"{name} eye: {eye.state_sentence}" for name, eye in eyes if isinstance(eye, ReportingSource)]
+        return "; ".join(said) or super().state_sentence
+
+    def counts(self) -> Mapping[str, int]:
+        """See `ReportingSource`: its own, and those of the two sources behind their names."""
+        counts = Counter(super().counts())
+        for name, eye in (("left", self._left), ("right", self._right)):
+            if isinstance(eye, ReportingSource):
+                counts.update({f"{name} {reason}": times for reason, times in eye.counts().items()})
+        return dict(counts)
+
+    def frames(self) -> Iterator[Frame]:
+        """The left frames, with their right ones."""
+        self._left.open()
+        self._right.open()
+        kept: deque[Frame] = deque(maxlen=MOST_KEPT)
+        while not self.wait(0):
+            frame = self._left.read(0.05)
+            if frame is None:
+                if self._left.state is SourceState.ENDED:
+                    return
+                continue
+            yield self._paired(frame, kept)
+
+    def close(self) -> None:
+        """See `FrameSource`."""
+        super().close()
+        self._left.close()
+        self._right.close()
+
+    def _paired(self, frame: Frame, kept: deque[Frame]) -> Frame:
+        at_ns = moment_ns(frame)
+        until_s = time.monotonic() + self._apart_ns * 1e-9
+        while not kept or moment_ns(kept[-1]) < at_ns:
+            right = self._right.read(max(0.0, until_s - time.monotonic()))
+            if right is None:
+                break
+            kept.append(right)
+        best = min(kept, key=lambda each: abs(moment_ns(each) - at_ns), default=None)
+        if best is None or abs(moment_ns(best) - at_ns) > self._apart_ns:
+            self.count("without_right")
+            return frame
+        while kept and moment_ns(kept[0]) <= moment_ns(best):
+            kept.popleft()
+        if best.image.shape != frame.image.shape:
+            self.count("right_of_another_size")
+            return frame
+        if frame.damage is None and best.damage is not None:
+            # What is learned from the two eyes together is wrong when one of them is.
+            return replace(frame, right_image=best.image, damage=f"right eye: {best.damage}", status=best.status)
+        return replace(frame, right_image=best.image)
+
+
+def moment_ns(frame: Frame) -> int:
+    """When a frame came in, by the clock that all sources of a machine share; its own time where it is not live."""
+    return frame.pts_ns if frame.arrived_ns is None else frame.arrived_ns

@@ -1,0 +1,110 @@
+"""A stream from somewhere else: its camera is assumed, its numbers and times are put right, its frames are resized where that is asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.recordings.calibration import default_camera
+from gsplat_core.io.recordings.frame_files import resize_area, resize_nearest
+from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame, FrameStatus
+from operators.sources.live import STALLED_AFTER_S, LiveSource
+from operators.sources.options import SourceOptions
+from operators.sources.order import FrameOrder
+from operators.sources.source import SourceDescription
+
+DEFAULT_FPS = 30.0
+MIN_SIDE_PX = 8
+
+
+class StreamSource(LiveSource):
+    """A `LiveSource` of frames from a sender that is not ours: a subclass calls `describe` and gives `pictures()`, frames as they come."""
+
+    def __init__(self, options: SourceOptions, *, stalled_after_s: float = STALLED_AFTER_S) -> None:
+        """options: `scale`, `max_frames`, `waiting`, and `speed` where it is infinite: then nothing is dropped, and the sender waits."""
+        super().__init__(
+            waiting=options.waiting,
+            stalled_after_s=stalled_after_s,
+            drops=math.isfinite(options.speed),
+            order=FrameOrder(),
+        )
+        self.options = options
+
+    def describe(
+        self,
+        name: str,
+        size: tuple[int, int],
+        fps: float | None,
+        *,
+        camera: Camera | None = None,
+        fields: frozenset[str] = frozenset(),
+    ) -> None:
+        """Set `description`: size in pixels as the frames come, the rate where it is known, the camera where it is known.
+
+        Raises InvalidSetting for frames that are too large, or too small at the options' scale.
+        """
+        check_size(name, *size)
+        notes = []
+        if fps is None:
+            notes.append(f"{name}: the frame rate is not stated. {DEFAULT_FPS:g} frames/s are assumed.")
+        if camera is None:
+            camera = default_camera(*size)
+            notes.append(
+                f"{name}: there is no calibration; a pinhole with f = {camera.K[0, 0]:.1f} px and no camera motion is assumed. "
+                "Lengths have no scale."
+            )
+        camera = camera.scaled(self.options.scale)
+        check_size(name, camera.width_px, camera.height_px, least=MIN_SIDE_PX if self.options.scale != 1 else 1)
+        self.description = SourceDescription(
+            name=name,
+            width_px=camera.width_px,
+            height_px=camera.height_px,
+            fps=fps or DEFAULT_FPS,
+            camera=camera,
+            fields=fields,
+            frame_count=self.options.max_frames,
+            notes=tuple(notes),
+        )
+
+    def pictures(self) -> Iterator[Frame]:
+        """The frames as they come, with the sender's numbers and times; called in the reader's thread."""
+        raise NotImplementedError(f"{type(self).__name__} has no pictures method")
+
+    def frames(self) -> Iterator[Frame]:
+        """See `LiveSource`."""
+        for given, frame in enumerate(self.pictures(), start=1):
+            if frame.status is FrameStatus.DAMAGED:
+                # As in recordings: no pixel of a damaged picture is known to be tissue.
+                frame = replace(frame, mask=np.zeros(frame.image.shape[:2], np.uint8))
+            yield resized(frame, self.options.scale)
+            if given == self.options.max_frames:
+                return
+
+
+def check_size(name: str, width_px: int, height_px: int, least: int = 1) -> None:
+    """Raises InvalidSetting for frames of a size that nobody can work with."""
+    if min(width_px, height_px) < least or width_px * height_px > MAX_PIXELS:
+        raise InvalidSetting(
+            f"{name}: frames of {width_px}x{height_px} px cannot be used; both sides must be at least {least} px, and at most"
+            f" {MAX_PIXELS} pixels are possible"
+        )
+
+
+def resized(frame: Frame, scale: float) -> Frame:
+    """A frame at another size: images by the mean over areas, mask and depth by the nearest pixel."""
+    if scale == 1:
+        return frame
+    size = max(1, round(frame.width_px * scale)), max(1, round(frame.height_px * scale))
+    return replace(
+        frame,
+        image=resize_area(frame.image, *size),
+        right_image=None if frame.right_image is None else resize_area(frame.right_image, *size),
+        depth=None if frame.depth is None else resize_nearest(frame.depth, *size),
+        mask=None if frame.mask is None else resize_nearest(frame.mask, *size),
+    )

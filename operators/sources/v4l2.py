@@ -1,0 +1,56 @@
+"""A camera or capture card of this machine through Video4Linux."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+
+from gsplat_core.errors import InvalidSetting
+from operators.errors import SourceUnavailable
+from operators.sources.address import Address
+from operators.sources.connection import Place
+from operators.sources.options import MAX_FPS, SourceOptions
+from operators.sources.url import ConnectedSource
+
+_DEVICE = re.compile(r"/dev/video\d{1,4}")
+_FORMATS = ("auto", "mjpeg", "h264", "yuyv422", "uyvy422", "nv12", "yuv420p", "rgb24", "bgr24", "gray")
+READ_S = 5.0
+
+
+def v4l2_source(rest: str, options: SourceOptions) -> ConnectedSource:
+    """`v4l2:/dev/video0?size=1920x1080&fps=60&format=mjpeg`; what is left out is what the driver has set.
+
+    A camera that is pulled out is looked for again. Raises InvalidSetting, and SourceUnavailable where there is no such device.
+    """
+    address = Address.parse("v4l2", rest)
+    size, fps = address.size(), address.number("fps", options.fps, 0.01, MAX_FPS)
+    name = address.choice("format", "auto", _FORMATS)
+    address.refuse_others()
+    asked = {
+        "video_size": None if size is None else f"{size[0]}x{size[1]}",
+        "framerate": None if fps is None else f"{fps:g}",
+        "input_format": None if name == "auto" else name,
+    }
+    device = device_of(address.place)
+    place = Place(
+        device, {option: value for option, value in asked.items() if value is not None}, "v4l2", read_s=READ_S
+    )
+    return ConnectedSource(place, f"camera {device}", options)
+
+
+def device_of(path: str) -> str:
+    """The device behind a path: `/dev/video0`, or a link to one as in `/dev/v4l/by-id/`. Raises InvalidSetting and SourceUnavailable."""
+    device = os.path.realpath(path) if path.startswith("/dev/") and "\0" not in path else path
+    # Opening a device has effects: nothing but a camera is opened.
+    if not _DEVICE.fullmatch(device):
+        raise InvalidSetting(f"v4l2: {path!r:.200} is no camera; give /dev/video0, or a link to one in /dev/v4l/by-id")
+    try:
+        mode = os.stat(device).st_mode
+    except OSError as error:
+        raise SourceUnavailable(
+            f"there is no camera {device} ({error.strerror}). Plug it in, and look at /dev/video*."
+        ) from error
+    if not stat.S_ISCHR(mode):
+        raise SourceUnavailable(f"{device} is no camera: it is no device.")
+    return device

@@ -1,0 +1,169 @@
+"""Frames from another program over ZeroMQ (`zeromq_publisher.FramePublisher` sends them)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from functools import partial
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.scene.frames import Frame
+from operators.errors import SourceUnavailable
+from operators.sources.address import Address
+from operators.sources.options import MAX_FPS, SourceOptions
+from operators.sources.stream import StreamSource
+from operators.sources.zeromq_address import connected, keys_from, require_encryption
+from operators.sources.zeromq_message import MOST_BYTES, BadMessage, unpacked
+
+LOOK_MS = 50
+NEW_SOCKET_S = 2.0
+"""After so long without a connection, a new socket tries."""
+OPEN_S = 10.0
+"""How long the first frame may take: it says how large the pictures are."""
+
+
+class ZeroMqSource(StreamSource):
+    """Subscribes to a publisher of frames. ZeroMQ makes the connection again by itself; `state` says when it is lost.
+
+    A message that is no frame is dropped and counted (`bad_messages`).
+    """
+
+    def __init__(
+        self, endpoint: str, curve: dict[int, bytes], fps: float | None, options: SourceOptions, open_s: float = OPEN_S
+    ) -> None:
+        """curve: ZeroMQ's options for encryption. Raises InvalidSetting, and SourceUnavailable when no frame comes within `open_s`."""
+        require_encryption(endpoint, bool(curve))
+        super().__init__(options)
+        self._endpoint, self._curve = endpoint, curve
+        self._name = f"zmq+{endpoint}"
+        self._connect()
+        try:
+            first = self._first(time.monotonic() + open_s)
+        except BaseException:
+            self._disconnect()
+            raise
+        size = first.width_px, first.height_px
+        fields = frozenset(
+            name for name in ("right_image", "depth", "mask", "pose") if getattr(first, name) is not None
+        )
+        try:
+            self.describe(self._name, size, fps, fields=fields)
+        except InvalidSetting:
+            self._disconnect()
+            raise
+
+    def open(self) -> None:
+        """See `FrameSource`."""
+        if self._socket is None:
+            self._connect()
+        super().open()
+
+    def close(self) -> None:
+        """See `FrameSource`."""
+        super().close()
+        self._disconnect()
+
+    def pictures(self) -> Iterator[Frame]:
+        """See `StreamSource`."""
+        while not self.wait(0):
+            frame = self._next()
+            if frame is not None:
+                yield frame
+
+    def _first(self, until_s: float) -> Frame:
+        while time.monotonic() < until_s:
+            frame = self._next()
+            if frame is not None:
+                return frame
+        bad = self.counts().get("bad_messages", 0)
+        what = f"{bad} messages came, and none is a frame" if bad else "no frame came"
+        raise SourceUnavailable(f"{self._name} cannot be opened: {what}. Start what sends to it, and check the keys.")
+
+    def _next(self) -> Frame | None:
+        """The next frame; None when none came while it was looked for."""
+        assert self._socket is not None and self._monitor is not None
+        found = dict(self._poller.poll(LOOK_MS))
+        now_s = time.monotonic()
+        if self._monitor in found and recv_monitor_message(self._monitor)["event"] == zmq.EVENT_DISCONNECTED:
+            self._lost_s = now_s
+            self.lost(f"the connection to {self._name} is lost; it is being made again")
+        if self._socket not in found:
+            if now_s - self._lost_s > NEW_SOCKET_S:  # never where it is infinite
+                # A sender that breaks the protocol, as by a message that is too large, is not connected to again by the same socket.
+                self._disconnect()
+                self._connect()
+            return None
+        self._lost_s = math.inf
+        message = self._socket.recv(copy=False)
+        now_ns = time.monotonic_ns()
+        if self._socket.getsockopt(zmq.RCVMORE):  # a frame is one part
+            while self._socket.getsockopt(zmq.RCVMORE):
+                self._socket.recv(copy=False)
+            self.count("bad_messages")
+            return None
+        try:
+            seq, pts_ns, arrays = unpacked(message.buffer)
+        except BadMessage:
+            self.count("bad_messages")
+            return None
+        return Frame(seq=seq, pts_ns=pts_ns, arrived_ns=now_ns, **arrays)  # type: ignore[arg-type]
+
+    def _connect(self) -> None:
+        options = {
+            zmq.RCVHWM: self.options.waiting,
+            zmq.MAXMSGSIZE: MOST_BYTES,
+            zmq.RECONNECT_IVL: 250,
+            zmq.RECONNECT_IVL_MAX: 2000,
+            zmq.HEARTBEAT_IVL: 1000,
+            zmq.HEARTBEAT_TIMEOUT: 3000,
+            zmq.SUBSCRIBE: b"",
+            **self._curve,
+        }
+        self._lost_s = math.inf
+        self._context, socket = connected(zmq.SUB, self._endpoint, bind=False, options=options)
+        self._socket: zmq.Socket | None = socket
+        self._monitor: zmq.Socket | None = socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        self._poller: zmq.Poller = zmq.Poller()
+        self._poller.register(socket, zmq.POLLIN)
+        self._poller.register(self._monitor, zmq.POLLIN)
+
+    def _disconnect(self) -> None:
+        socket, self._socket = self._socket, None
+        if socket is None:
+            return
+        socket.disable_monitor()
+        if self._monitor is not None:
+            self._monitor.close(0)
+            self._monitor = None
+        socket.close(0)
+        self._context.term()
+
+
+def zeromq_source(transport: str, rest: str, options: SourceOptions) -> ZeroMqSource:
+    """`zmq+tcp://127.0.0.1:5555?fps=30`, `zmq+ipc:///run/frames`; beyond this machine with `server=FILE` and `client=FILE`, certificates.
+
+    Raises InvalidSetting and SourceUnavailable.
+    """
+    address = Address.parse(f"zmq+{transport}", rest)
+    fps = address.number("fps", options.fps, 0.01, MAX_FPS)
+    open_s = address.number("open_s", OPEN_S, 0.1, 600.0)
+    server, client = address.text("server"), address.text("client")
+    address.refuse_others()
+    curve: dict[int, bytes] = {}
+    if server is not None:
+        curve[zmq.CURVE_SERVERKEY] = keys_from(server)[0]
+        public, secret = zmq.curve_keypair() if client is None else keys_from(client)
+        if secret is None:
+            raise InvalidSetting(f"{client} has no secret key; give the file that ends in .key_secret")
+        curve |= {zmq.CURVE_PUBLICKEY: public, zmq.CURVE_SECRETKEY: secret}
+    elif client is not None:
+        raise InvalidSetting("client=… needs server=…, the file with the sender's public key")
+    return ZeroMqSource(f"{transport}://{address.place}", curve, fps, options, open_s)
+
+
+tcp_source = partial(zeromq_source, "tcp")
+ipc_source = partial(zeromq_source, "ipc")

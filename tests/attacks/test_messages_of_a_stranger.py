@@ -1,0 +1,215 @@
+"""ZeroMQ messages that are no frames, or say that they are larger than they are."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import struct
+import threading
+import time
+import tracemalloc
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import zmq
+
+from operators.sources import zeromq_message
+from operators.sources.registry import SourceOptions, open_source
+from operators.sources.shared_memory import BadHeader, FrameReader, FrameWriter, new_memory
+from operators.sources.wire import description_from, frame_from, parsed
+from operators.sources.zeromq_message import HEADER, BadMessage, packed, unpacked
+
+GOOD = packed(1, 2, {"image": np.full((4, 6, 3), 5, np.uint8)})
+
+
+@contextmanager
+def opened(address):
+    """A source that is open inside."""
+    source = open_source(address, SourceOptions(waiting=64))
+    source.open()
+    yield source
+    source.close()
+
+
+def next_frame(source):
+    end = time.monotonic() + 30
+    while (frame := source.read(0.1)) is None:
+        assert time.monotonic() < end, source.state_sentence
+    return frame
+
+
+class Bomb:
+    """Would write a file if it were unpickled."""
+
+    def __reduce__(self):
+        return (open, ("unpickled", "w"))
+
+
+def header(magic=b"ISPF", version=1, bits=0, width=6, height=4, seq=0, pts=0):
+    return HEADER.pack(magic, version, bits, width, height, seq, pts)
+
+
+BAD = {
+    "nothing": b"",
+    "half a header": GOOD[:31],
+    "a pickle": pickle.dumps(Bomb()),
+    "another magic": header(magic=b"ISPG") + bytes(72),
+    "another version": header(version=2) + bytes(72),
+    "unknown arrays": header(bits=16) + bytes(72),
+    "no pixels": header(width=0) + bytes(72),
+    "four thousand million pixels": header(width=2**32 - 1, height=2**32 - 1) + bytes(72),
+    "sides whose product overflows": header(width=2**31, height=2) + bytes(72),
+    "cut off": GOOD[:-1],
+    "too long": GOOD + b"\x00",
+    "a mask that is not there": header(bits=4) + bytes(72),
+    "a number out of range": header(seq=2**64 - 1) + bytes(72),
+    "a time out of range": header(pts=-(2**63)) + bytes(72),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_frame_is_refused_before_anything_is_allocated(name):
+    tracemalloc.start()
+    with pytest.raises(BadMessage):
+        unpacked(memoryview(BAD[name]))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 100_000
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_messages_with_bytes_changed_are_frames_or_refused(seed):
+    rng = random.Random(seed)
+    for _ in range(300):
+        data = bytearray(GOOD)
+        for _ in range(rng.randint(1, 4)):
+            data[rng.randrange(40)] = rng.randrange(256)
+        try:
+            seq, pts_ns, arrays = unpacked(memoryview(bytes(data)))
+        except BadMessage:
+            continue
+        assert arrays["image"].nbytes == len(data) - 32 and 0 <= seq < 2**62 and abs(pts_ns) < 2**62
+
+
+def test_a_sender_of_nonsense_takes_nothing_down(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with zmq.Context() as context, context.socket(zmq.PUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        port = socket.bind_to_random_port("tcp://127.0.0.1")
+        stop = threading.Event()
+
+        def send():
+            k = 0
+            while not stop.wait(0.002):
+                for bad in BAD.values():
+                    socket.send(bad)
+                socket.send_multipart([GOOD, GOOD])
+                socket.send(packed(k, k * 10**7, {"image": np.full((4, 6, 3), 5, np.uint8)}))
+                k += 1
+
+        thread = threading.Thread(target=send, daemon=True)
+        thread.start()
+        try:
+            with opened(f"zmq+tcp://127.0.0.1:{port}") as source:
+                assert all((next_frame(source).image == 5).all() for _ in range(5))
+                assert source.counts()["bad_messages"] > 5
+        finally:
+            stop.set()
+            thread.join()
+    assert not (tmp_path / "unpickled").exists()
+
+
+def test_a_message_larger_than_any_frame_is_never_received(monkeypatch):
+    monkeypatch.setattr("operators.sources.zeromq.MOST_BYTES", 10_000)
+    with zmq.Context() as context, context.socket(zmq.PUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        port = socket.bind_to_random_port("tcp://127.0.0.1")
+        stop = threading.Event()
+
+        def send():
+            k = 0
+            while not stop.wait(0.005):
+                socket.send(
+                    bytes(20_000) if k % 50 == 49 else packed(k, k * 10**7, {"image": np.zeros((4, 6, 3), np.uint8)})
+                )
+                k += 1
+
+        thread = threading.Thread(target=send, daemon=True)
+        thread.start()
+        try:
+            with opened(f"zmq+tcp://127.0.0.1:{port}") as source:
+                while source.counts().get("reconnections", 0) < 1:
+                    next_frame(source)
+                assert next_frame(source).image.shape == (4, 6, 3), "the connection was made again"
+                assert "bad_messages" not in source.counts()
+        finally:
+            stop.set()
+            thread.join()
+
+
+def test_nothing_of_ours_unpickles():
+    for module in (zeromq_message,):
+        assert "pickle" not in vars(module)
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        None,
+        [],
+        [["image", 0, [4, 6, 3]]] * 9,
+        [["image", -64, [4, 6, 3]]],
+        [["image", 2**40, [4, 6, 3]]],
+        [["image", 10_000, [4, 6, 3]]],
+        [["image", 0.5, [4, 6, 3]]],
+        [["image", 0, [2**31, 2**31, 3]]],
+        [["image", 0, [4, 6]]],
+        [["image", 0, [4, 6, 4]]],
+        [["image", 0, [True, 6, 3]]],
+        [["image", 0, [0, 6, 3]]],
+        [["image", 0, "4x6"]],
+        [["secret", 0, [4, 6]]],
+        [["pose", 0, [3, 3]]],
+    ],
+)
+def test_a_process_that_says_nonsense_of_its_memory_is_refused(found):
+    fd = new_memory()
+    writer, reader = FrameWriter(fd), FrameReader(fd)
+    writer.grow({"image": np.zeros((4, 6, 3), np.uint8)})
+    with pytest.raises((BadHeader, ValueError, TypeError)):
+        reader.read(found)
+    reader.close()
+    os.close(fd)
+
+
+@pytest.mark.parametrize("data", [b"", b"[]", b"{", b'{"kind": 3}', struct.pack("<I", 7), b"\xff\xfe", b'{"kind"'])
+def test_what_is_no_message_of_a_process_is_refused(data):
+    with pytest.raises(BadHeader):
+        parsed(data)
+
+
+def test_what_describes_no_source_and_no_frame_is_refused():
+    for content in (
+        {},
+        {"camera": {}},
+        {"camera": {"K": [[1]], "width_px": 1, "height_px": 1}, "fields": [], "notes": []},
+    ):
+        with pytest.raises(BadHeader):
+            description_from(content)
+    planes = {"image": np.zeros((4, 6, 3), np.uint8)}
+    right = {"seq": 0, "pts_ns": 0, "arrived_ns": 0, "status": "live", "damage": None}
+    assert frame_from(right, planes).seq == 0
+    for wrong in (
+        {"seq": "0"},
+        {"seq": 2**70},
+        {"pts_ns": 0.5},
+        {"status": "dead"},
+        {"damage": 3},
+        {"arrived_ns": "now"},
+    ):
+        with pytest.raises(BadHeader):
+            frame_from({**right, **wrong}, planes)
+    with pytest.raises(BadHeader):
+        frame_from(right, {"image": np.zeros((4, 6), np.uint8)})

@@ -1,0 +1,77 @@
+"""Smoothing along time: towards the mean of the neighbours, both ends held, in place, for each kind of field."""
+
+import pytest
+import torch
+
+from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
+from gsplat_core.deformation.smoothing import ROWS_AT_ONCE, towards_neighbours_
+from gsplat_core.errors import InvalidInput
+
+
+@pytest.mark.parametrize("amount", [0.0, 0.3, 1.0])
+def test_moves_towards_the_mean_of_both_neighbours(amount):
+    values = torch.randn(3, 6, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = values.clone()
+    expected[:, 1:-1] += amount * ((values[:, :-2] + values[:, 2:]) / 2 - values[:, 1:-1])
+    towards_neighbours_(values, amount)
+    torch.testing.assert_close(values, expected)
+
+
+def test_what_changes_evenly_stays_and_what_is_too_short_too():
+    even = torch.arange(5.0)[None, :, None] * torch.tensor([1.0, -2.0])
+    towards_neighbours_(even, 0.5)
+    assert torch.equal(even, torch.arange(5.0)[None, :, None] * torch.tensor([1.0, -2.0]))
+    for length in (0, 1, 2):
+        short = torch.ones(2, length, 3)
+        towards_neighbours_(short, 0.5)
+        assert torch.equal(short, torch.ones(2, length, 3))
+    towards_neighbours_(torch.ones(0, 5, 3), 0.5)
+
+
+def test_many_rows_are_taken_in_parts():
+    values = torch.zeros(ROWS_AT_ONCE + 3, 3, 1)
+    values[:, 1] = 1
+    towards_neighbours_(values, 0.25)
+    assert torch.equal(values[:, 1], torch.full_like(values[:, 1], 0.75))
+
+
+def test_a_basis_field_smooths_its_weights_and_nothing_else():
+    field = BasisField(4, (0.0, 1.0), bumps=9)
+    with torch.no_grad():
+        field.weights[:, 4] = 1.0
+    centers, widths, address = field.centers.clone(), field.log_widths.clone(), field.weights.data_ptr()
+    field.smooth_in_time(0.4)
+    torch.testing.assert_close(field.weights[0, :, 0], torch.tensor([0, 0, 0, 0.2, 0.6, 0.2, 0, 0, 0]))
+    assert torch.equal(field.centers, centers)
+    assert torch.equal(field.log_widths, widths)
+    assert field.weights.data_ptr() == address  # captured graphs stay valid
+
+
+def test_a_field_that_forgets_is_refused():
+    field = BasisField(2, (0.0, 0.5), bumps=5)
+    field.keep_last(1.0)
+    with pytest.raises(InvalidInput, match="order of time"):
+        field.smooth_in_time(0.1)
+
+
+def test_a_hexplane_smooths_its_time_planes_along_time_alone(make_gaussians):
+    field = HexPlaneField(
+        make_gaussians(5), (0.0, 1.0), channels=4, resolution=(6, 5, 4, 7), levels=(1, 2), width=8, depth=1
+    )
+    with torch.no_grad():
+        for planes in field.planes:
+            for plane in planes.values():
+                plane.normal_(generator=torch.Generator().manual_seed(1))
+    before = {name: tensor.clone() for name, tensor in field.state_dict().items()}
+    field.smooth_in_time(0.5)
+    for name, tensor in field.state_dict().items():
+        if name.endswith(("xt", "yt", "zt")):
+            rows = before[name]
+            torch.testing.assert_close(tensor[1:-1], rows[1:-1] / 2 + (rows[:-2] + rows[2:]) / 4)
+            assert torch.equal(tensor[[0, -1]], rows[[0, -1]])
+        else:
+            assert torch.equal(tensor, before[name])
+
+
+def test_a_field_without_times_is_left_alone():
+    DeformationField((0.0, 1.0)).smooth_in_time(0.5)

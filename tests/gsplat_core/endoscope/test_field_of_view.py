@@ -1,0 +1,165 @@
+"""The field of view is found where there is one, stays as it is, and is found again when it changes."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsplat_core.endoscope.field_of_view import FieldOfView, FieldOfViewSettings
+from gsplat_core.errors import InvalidSetting
+from tests.gsplat_core.endoscope.clips import clip, texture
+
+HEIGHT, WIDTH = 256, 320
+
+
+def disc(centre=(160, 128), radius=120, height=HEIGHT, width=WIDTH):
+    y, x = np.mgrid[:height, :width]
+    return (x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius**2
+
+
+def seen_through(field, seed=1, count=40, level=5):
+    images = []
+    for image in texture(seed, count, field.shape[1], field.shape[0]):
+        image = image.copy()
+        image[~field] = level
+        images.append(image)
+    return images
+
+
+def masks(images, settings=None):
+    view = FieldOfView(settings)
+    return [view.observe(image) for image in images]
+
+
+def overlap(mask, field):
+    inside = mask.astype(bool)
+    return (inside & field).sum() / (inside | field).sum()
+
+
+FIELDS = {
+    "disc": disc(),
+    "disc cut off above and below": disc(radius=150),
+    "disc at one side": disc((120, 128), 110),
+    "octagon": disc(radius=10**6) & (np.add.outer(np.arange(256), np.arange(320)) > 60)
+    & (np.add.outer(np.arange(256), -np.arange(320)) > -260) & (np.add.outer(np.arange(256), np.arange(320)) < 514)
+    & (np.add.outer(np.arange(256), -np.arange(320)) < 196),
+    "between bars": np.outer(np.ones(256, bool), (np.arange(320) > 40) & (np.arange(320) < 280)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("shape", FIELDS)
+@pytest.mark.parametrize("level", [0, 22])
+def test_a_field_is_found_in_the_first_frame_and_stays(shape, level):
+    found = masks(seen_through(FIELDS[shape], count=65, level=level))
+    assert overlap(found[0], FIELDS[shape]) > 0.92
+    assert (found[0].astype(bool) & ~FIELDS[shape]).mean() < 0.004
+    assert found[-1] is found[0]
+
+
+def test_video_that_fills_the_picture_has_no_limited_field():
+    assert set(map(type, masks(texture(2, 65, WIDTH, HEIGHT)))) == {type(None)}
+
+
+def dark_cave(image, centre, radius=50):
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    far = np.hypot(x - centre[0], y - centre[1]) / radius
+    return (image * np.clip(far - 0.2, 0.02, 1)[..., None]).astype(np.uint8)
+
+
+@pytest.mark.parametrize("centre", [(160, 128), (200, 60), (260, 128)])
+def test_a_dark_cave_in_the_middle_or_at_the_rim_takes_nothing_away(centre):
+    found = masks([dark_cave(image, centre) for image in seen_through(disc(), count=65)])
+    assert overlap(found[-1], disc()) > 0.91
+
+
+@pytest.mark.parametrize("centre", [(160, 128), (0, 128), (320, 256)])
+def test_a_dark_cave_in_a_full_picture_is_no_surround(centre):
+    images = [dark_cave(image, centre, 90) for image in texture(3, 65, WIDTH, HEIGHT)]
+    assert masks(images)[-1] is None
+
+
+@pytest.mark.parametrize("colour", [(10, 10, 12), (190, 195, 200)])
+def test_a_tool_at_the_rim_takes_nothing_away(colour):
+    images = seen_through(disc(), count=95)
+    for image in images[20:]:
+        tool = np.zeros((HEIGHT, WIDTH), bool)
+        tool[110:150, :130] = True
+        image[tool & disc()] = colour
+    assert overlap(masks(images)[-1], disc()) > 0.91
+
+
+def test_text_in_the_surround_is_not_in_the_field():
+    images = seen_through(disc(), count=35)
+    for image in images:
+        cv2.putText(image, "12:34", (4, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1)
+    assert overlap(masks(images)[-1], disc()) > 0.92
+
+
+def test_a_larger_field_is_taken_soon_and_a_smaller_one_after_a_while():
+    small, large = disc(radius=80), disc(radius=120)
+    found = masks([*seen_through(small, count=60), *seen_through(large, count=60), *seen_through(small, count=150)])
+    assert overlap(found[59], small) > 0.91 and overlap(found[119], large) > 0.92
+    assert overlap(found[140], large) > 0.91 and overlap(found[-1], small) > 0.91
+
+
+def test_a_field_that_is_gone_is_gone_after_a_while():
+    found = masks([*seen_through(disc(), count=30), *texture(4, 160, WIDTH, HEIGHT)])
+    assert found[29] is not None and found[-1] is None
+
+
+def test_another_size_is_looked_at_anew():
+    other = disc((64, 64), 60, 128, 128)
+    view = FieldOfView()
+    for image in [*seen_through(disc(), count=5), *seen_through(other, count=5)]:
+        mask = view.observe(image)
+    assert mask.shape == (128, 128) and overlap(mask, other) > 0.91
+
+
+@pytest.mark.recordings
+def test_in_sinus_it_is_the_valid_mask(recordings_dir):
+    valid = cv2.imread(str(recordings_dir / "sinus" / "valid_mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+    found = masks(clip(recordings_dir, "sinus"))
+    assert overlap(found[0], valid) > 0.95 and overlap(found[-1], valid) > 0.95
+
+
+@pytest.mark.recordings
+def test_in_colon_the_four_corners_are_left_out(recordings_dir):
+    mask = masks(clip(recordings_dir, "colon"))[-1]
+    assert 0.85 < mask.mean() < 0.93
+    assert not mask[[2, 2, -3, -3], [2, -3, 2, -3]].any() and mask[[0, 223, 223, 445], [223, 0, 445, 223]].all()
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", ["cutting", "heart"])
+def test_recordings_that_fill_the_picture_have_none(recordings_dir, name):
+    assert set(map(type, masks(clip(recordings_dir, name)))) == {type(None)}
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize(
+    "name",
+    ["hamlyn_pair/f7_dynamic_deint_L_0100.png", "hamlyn_pair/f7_dynamic_deint_R_0100.png", "scared_pair/left.png"],
+)
+def test_a_dark_surrounding_of_the_tissue_is_no_field(recordings_dir, name):
+    image = cv2.imread(str(recordings_dir / name))
+    assert masks([image] * 3)[-1] is None
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32))
+def test_no_picture_of_any_size_raises(height, width, seed):
+    rng = np.random.default_rng(seed)
+    view = FieldOfView(FieldOfViewSettings(window_frames=2))
+    for _ in range(7):
+        image = rng.integers(0, rng.integers(1, 257), (height, width, 3), np.uint8)
+        image[:, : rng.integers(0, width)] = 0
+        mask = view.observe(image)
+        assert mask is None or mask.shape == (height, width)
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(InvalidSetting, match="window_frames"):
+        FieldOfViewSettings(window_frames=0)

@@ -1,0 +1,107 @@
+"""Reflections are left out, and nothing that is merely bright."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsplat_core.endoscope.highlights import HighlightSettings, without_highlights
+from gsplat_core.errors import InvalidSetting
+from tests.gsplat_core.endoscope.clips import PLACES, clip, texture
+
+SPOTS = [(40, 50, 6), (90, 100, 3), (120, 20, 9)]
+
+
+def with_spots(image, colour=(255, 252, 250)):
+    image = image.copy()
+    for x, y, radius in SPOTS:
+        cv2.circle(image, (x, y), radius, colour, -1, cv2.LINE_AA)
+    return image
+
+
+def spots(height=128, width=160, grown=0):
+    field = np.zeros((height, width), np.uint8)
+    for x, y, radius in SPOTS:
+        cv2.circle(field, (x, y), radius + grown, 1, -1)
+    return field.astype(bool)
+
+
+def test_reflections_are_left_out_with_a_narrow_rim():
+    kept = without_highlights(with_spots(texture(1, 1)[0])).astype(bool)
+    assert not (kept & spots()).any()
+    assert kept[~spots(grown=4)].all()
+
+
+def test_tissue_without_reflections_is_kept_whole():
+    assert without_highlights(texture(1, 1)[0]) is None
+
+
+def test_a_saturated_colour_is_tissue():
+    assert without_highlights(with_spots(texture(1, 1)[0], (255, 235, 60))) is None
+
+
+def test_pale_tissue_that_is_bright_all_over_is_kept():
+    pale = np.clip(texture(2, 1)[0].astype(np.float32) * 0.12 + np.array([225, 190, 180]), 0, 255).astype(np.uint8)
+    assert without_highlights(pale) is None
+
+
+def test_an_overexposed_half_is_not_a_highlight():
+    image = texture(3, 1)[0].copy()
+    image[:, 60:] = 250
+    kept = without_highlights(image)
+    assert kept is None or kept[:, 80:].all()
+
+
+def test_a_white_picture_has_none():
+    assert without_highlights(np.full((64, 64, 3), 255, np.uint8)) is None
+
+
+def test_a_large_picture_has_the_same_ones():
+    image = with_spots(texture(1, 1)[0])
+    large = cv2.resize(image, (1600, 1280), interpolation=cv2.INTER_CUBIC)
+    small, found = (1 - without_highlights(each) for each in (image, large))
+    again = cv2.resize(small, (1600, 1280), interpolation=cv2.INTER_NEAREST)
+    assert (again & found).sum() / (again | found).sum() > 0.8
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", PLACES)
+def test_in_recordings_they_are_small_and_white(recordings_dir, name):
+    for image in clip(recordings_dir, name)[::10]:
+        kept = without_highlights(image)
+        assert kept is not None and 0.95 < kept.mean() < 1
+        whitest = image.min(axis=2) >= 215
+        # What is nearly white and small goes; of a large overexposed wall (sinus, colon) nothing must.
+        if name in ("cutting", "heart"):
+            assert (kept[whitest] == 0).mean() > 0.85
+
+
+@pytest.mark.recordings
+def test_the_overexposed_wall_of_sinus_stays(recordings_dir):
+    for image in clip(recordings_dir, "sinus")[20::5]:
+        assert image[300, 480].min() > 180
+        assert without_highlights(image)[260:360, 440:500].mean() > 0.9
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(1, 60), st.integers(1, 60), st.integers(0, 2**32), st.booleans())
+def test_no_picture_of_any_size_raises(height, width, seed, bright):
+    rng = np.random.default_rng(seed)
+    kept = without_highlights(rng.integers(128 if bright else 0, 256, (height, width, 3), np.uint8))
+    assert kept is None or (kept.shape == (height, width) and kept.max() <= 1)
+
+
+@pytest.mark.parametrize("shape", [(1, 3000), (3000, 1), (801, 799)])
+def test_long_pictures_are_no_exception(shape):
+    image = np.zeros((*shape, 3), np.uint8)
+    image[shape[0] // 2, shape[1] // 2] = 255
+    kept = without_highlights(image)
+    assert kept is None or kept.shape == shape
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(InvalidSetting, match="most"):
+        HighlightSettings(most=2.0)

@@ -1,0 +1,105 @@
+"""Interlaced video is found and repaired; progressive video is never touched."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsplat_core.endoscope.interlacing import Deinterlacer, InterlacingSettings, comb_share, without_combs
+from gsplat_core.errors import InvalidSetting
+from tests.gsplat_core.endoscope.clips import PLACES, clip, texture
+
+DEFAULTS = InterlacingSettings()
+
+
+def woven(images):
+    """As a camera that takes the even lines of one picture and the odd lines of the next."""
+    result = [image.copy() for image in images[:-1]]
+    for image, later in zip(result, images[1:], strict=True):
+        image[1::2] = later[1::2]
+    return result
+
+
+def psnr_db(images, true):
+    error = np.mean([np.square(a.astype(float) - b).mean() for a, b in zip(images, true, strict=True)])
+    return 10 * np.log10(255**2 / error)
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", PLACES)
+def test_progressive_video_is_not_touched(recordings_dir, name):
+    deinterlacer = Deinterlacer()
+    for image in clip(recordings_dir, name):
+        assert deinterlacer.process(image) is image
+        assert comb_share(image, DEFAULTS) == 0
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", PLACES)
+def test_interlaced_video_is_found_and_comes_nearer_to_its_even_field(recordings_dir, name):
+    images = clip(recordings_dir, name)
+    deinterlacer, given_images = Deinterlacer(), woven(images)
+    repaired = [deinterlacer.process(image) for image in given_images]
+    assert deinterlacer.interlaced
+    late = slice(len(images) // 2, len(images) - 1)
+    assert psnr_db(repaired[late], images[late]) > psnr_db(given_images[late], images[late]) + 4
+    assert all(np.array_equal(after[::2], before[::2]) for after, before in zip(repaired, given_images, strict=True))
+
+
+def test_where_nothing_moves_interlaced_video_keeps_its_lines():
+    images = [image.copy() for image in texture(1, 20, 320, 256)]
+    for image in images:
+        image[:, :160] = images[0][:, :160]
+    image = woven(images)[10]
+    changed = (without_combs(image, DEFAULTS.stand_out_levels) != image).any(axis=2)
+    assert changed[:, 170:].mean() > 5 * changed[:, :150].mean()
+
+
+@pytest.mark.parametrize("pattern", ["lines", "noise", "chequers"])
+def test_a_single_odd_picture_does_not_make_a_stream_interlaced(pattern):
+    rows, columns = np.indices((256, 320))
+    odd = {
+        "lines": np.where(rows % 2, 200, 40),
+        "noise": np.random.default_rng(0).integers(0, 256, rows.shape),
+        "chequers": np.where((rows + columns) % 2, 200, 40),
+    }[pattern]
+    picture = np.repeat(odd[..., None], 3, axis=2).astype(np.uint8)
+    images, deinterlacer = [*texture(2, 20, 320, 256)[:10], picture, *texture(2, 20, 320, 256)[10:]], Deinterlacer()
+    assert all(deinterlacer.process(image) is image for image in images)
+
+
+def test_sensor_noise_is_no_comb():
+    rng = np.random.default_rng(0)
+    for image in texture(3, 20, 320, 256):
+        noisy = np.clip(image + rng.normal(0, 12, image.shape), 0, 255).astype(np.uint8)
+        assert comb_share(noisy, DEFAULTS) < DEFAULTS.comb_share
+
+
+def test_a_stream_that_has_become_progressive_is_left_alone_again():
+    images = [np.roll(image, 5 * k, axis=1) for k, image in enumerate(texture(4, 30, 320, 256))]
+    deinterlacer = Deinterlacer(InterlacingSettings(forgotten_frames=15))
+    for image in woven(images):
+        deinterlacer.process(image)
+    assert deinterlacer.interlaced
+    passed = [deinterlacer.process(image) is image for image in images]
+    assert passed[15:] == [True] * 15
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(1, 70), st.integers(1, 70), st.integers(0, 2**32))
+def test_no_picture_of_any_size_raises(height, width, seed):
+    rng = np.random.default_rng(seed)
+    deinterlacer = Deinterlacer(InterlacingSettings(combed_frames=1))
+    for k in range(4):
+        image = rng.integers(0, 256, (height, width, 3), np.uint8)
+        image[1::2] //= 1 + k
+        assert deinterlacer.process(image).shape == image.shape
+        assert without_combs(cv2.flip(image, 1), 0).shape == image.shape
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(InvalidSetting, match="comb_ratio"):
+        InterlacingSettings(comb_ratio=0.5)

@@ -1,0 +1,128 @@
+"""A model from elsewhere makes the program open no other file, load no library and read without bound."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from gsplat_core.endoscope import onnx_file
+from gsplat_core.endoscope.onnx_file import has_external_data, read_model
+from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
+from gsplat_core.errors import InvalidSetting
+
+from .networks import external_weights, grey_network
+
+
+@pytest.mark.parametrize("location", ["weights.bin", "../weights.bin", "/etc/hostname", ""])
+def test_weights_in_another_file_are_refused_wherever_it_lies(tmp_path, location):
+    (tmp_path / "weights.bin").write_bytes(np.zeros(3, np.float32).tobytes())
+    path = external_weights(tmp_path / "net.onnx", location)
+    with pytest.raises(InvalidSetting, match=r"keeps data in other files, which are not opened;.*external_data=False"):
+        OnnxToolFinder(path)
+
+
+def external() -> TensorProto:
+    tensor = numpy_helper.from_array(np.zeros(3, np.float32), "w")
+    tensor.external_data.add(key="location", value="elsewhere")
+    return tensor
+
+
+def inside_attribute() -> bytes:
+    node = helper.make_node("Constant", [], ["c"], value=external())
+    return helper.make_model(helper.make_graph([node], "g", [], [])).SerializeToString()
+
+
+def inside_branch() -> bytes:
+    branch = helper.make_graph([], "branch", [], [], initializer=[external()])
+    node = helper.make_node("If", ["x"], ["y"], then_branch=branch, else_branch=branch)
+    return helper.make_model(helper.make_graph([node], "g", [], [])).SerializeToString()
+
+
+def inside_function() -> bytes:
+    node = helper.make_node("Constant", [], ["c"], value=external())
+    function = helper.make_function("local", "F", [], ["c"], [node], [helper.make_opsetid("", 17)])
+    return helper.make_model(helper.make_graph([], "g", [], []), functions=[function]).SerializeToString()
+
+
+def inside_sparse() -> bytes:
+    model = helper.make_model(helper.make_graph([], "g", [], []))
+    model.graph.sparse_initializer.add().values.CopyFrom(external())
+    return model.SerializeToString()
+
+
+@pytest.mark.parametrize("make", [inside_attribute, inside_branch, inside_function, inside_sparse])
+def test_data_elsewhere_are_seen_wherever_they_are_named(make):
+    assert has_external_data(make())
+
+
+def test_a_whole_model_is_whole(tmp_path):
+    assert not has_external_data(grey_network(tmp_path / "net.onnx").read_bytes())
+
+
+def test_operators_of_other_libraries_are_refused(tmp_path):
+    node = helper.make_node("Steal", ["image"], ["mask"], domain="my.ops")
+    graph = helper.make_graph(
+        [node],
+        "g",
+        [helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 32, 32])],
+        [helper.make_tensor_value_info("mask", TensorProto.FLOAT, None)],
+    )
+    opsets = [helper.make_opsetid("", 17), helper.make_opsetid("my.ops", 1)]
+    path = tmp_path / "net.onnx"
+    path.write_bytes(helper.make_model(graph, opset_imports=opsets, ir_version=8).SerializeToString())
+    with pytest.raises(InvalidSetting, match=r"cannot be loaded \(.*my\.ops"):
+        OnnxToolFinder(path)
+
+
+def test_a_file_that_is_too_large_is_not_read_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr(onnx_file, "MOST_BYTES", 1000)
+    path = tmp_path / "net.onnx"
+    path.write_bytes(bytes(1001))
+    with pytest.raises(InvalidSetting, match="is larger than 0 MiB; give a smaller one"):
+        read_model(path)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x00", b"hello world", b"\x3a\xff", b"\x3a\x05ab", b"\xff" * 40, b"\x0b", bytes(200)]
+)
+def test_bytes_that_are_no_model_are_refused(tmp_path, data):
+    path = tmp_path / "net.onnx"
+    path.write_bytes(data)
+    with pytest.raises(InvalidSetting, match=r"is no ONNX model|cannot be loaded"):
+        OnnxToolFinder(path)
+
+
+def test_a_model_cut_anywhere_is_refused(tmp_path):
+    data = grey_network(tmp_path / "net.onnx").read_bytes()
+    path = tmp_path / "cut.onnx"
+    for end in range(0, len(data) - 1, 7):
+        path.write_bytes(data[:end])
+        with pytest.raises(InvalidSetting):
+            OnnxToolFinder(path)
+
+
+def field(number: int, payload: bytes) -> bytes:
+    """A field of a protobuf message, with its length."""
+    length, coded = len(payload), b""
+    while length > 0x7F:
+        coded += bytes([length & 0x7F | 0x80])
+        length >>= 7
+    return bytes([number << 3 | 2]) + coded + bytes([length]) + payload
+
+
+def test_graphs_inside_each_other_without_end_are_refused():
+    graph = b""
+    for _ in range(80):
+        graph = field(1, field(5, field(6, graph)))  # a node's attribute that is a graph
+    with pytest.raises(ValueError, match="graphs inside each other more than 64 deep"):
+        has_external_data(field(7, graph))
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(
+        InvalidSetting, match=r"tool network .*missing\.onnx cannot be read \(No such file or directory\)"
+    ):
+        OnnxToolFinder(tmp_path / "missing.onnx")
+    with pytest.raises(InvalidSetting, match="cannot be read"):
+        OnnxToolFinder(tmp_path)

@@ -1,0 +1,227 @@
+"""A user's network finds tools whatever form its output has; what does not fit is refused with a sentence, and NaN is tool."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+
+import numpy as np
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
+from gsplat_core.errors import InvalidInput, InvalidSetting
+
+from .networks import GREY, conv, grey_network, write
+
+HEIGHT, WIDTH = 64, 80
+
+
+def picture(height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    """Red tissue with a grey tool on its right half."""
+    image = np.full((height, width, 3), (200, 60, 50), np.uint8)
+    image[:, width // 2 :] = 128
+    return image
+
+
+def check(mask: np.ndarray, height: int = HEIGHT, width: int = WIDTH) -> None:
+    """The left half is tissue, the right one tool, but for a pixel or two between them."""
+    assert mask.shape == (height, width) and mask.dtype == np.uint8
+    assert mask[:, : width // 2 - 2].min() == 1 and mask[:, width // 2 + 2 :].max() == 0
+
+
+@pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (32, 40), (50, 33), ("height", "width")])
+@pytest.mark.parametrize("image_size", [(HEIGHT, WIDTH), (512, 640), (31, 47)])
+def test_logits_of_any_size_become_a_mask_of_the_picture(tmp_path, size, image_size):
+    finder = OnnxToolFinder(grey_network(tmp_path / "net.onnx", size=size))
+    mask = finder.find(picture(*image_size))
+    margin = max(2, round(2 * image_size[1] / (size[1] if isinstance(size[1], int) else 32)))
+    assert mask[:, : image_size[1] // 2 - margin].all() and not mask[:, image_size[1] // 2 + margin :].any()
+
+
+def test_probabilities_are_recognised_and_the_threshold_is_the_users(tmp_path):
+    nodes, parts = conv(*GREY, output="logits")
+    nodes.append(helper.make_node("Sigmoid", ["logits"], ["mask"]))
+    check(OnnxToolFinder(write(tmp_path / "a.onnx", nodes, parts)).find(picture()))
+    # The tool's probability is sigmoid(3) = 0.95.
+    strict = write(tmp_path / "b.onnx", nodes, parts, metadata={"threshold": 0.97})
+    assert OnnxToolFinder(strict).find(picture()).all()
+
+
+def test_stated_logits_are_not_taken_for_probabilities(tmp_path):
+    nodes, parts = conv([[-0.1, 0.05, 0.05]], [0.4])
+    low = write(tmp_path / "net.onnx", nodes, parts, metadata={"values": "probability"})
+    assert OnnxToolFinder(low).find(picture()).all()
+    low = write(tmp_path / "net.onnx", nodes, parts, metadata={"values": "logits"})
+    assert not OnnxToolFinder(low).find(picture()).any()
+
+
+@pytest.mark.parametrize(
+    ("tools", "expected"), [(None, "not red"), ((1,), "not red"), ((0,), "red"), ((1, 2), "not red")]
+)
+def test_scores_of_classes(tmp_path, tools, expected):
+    nodes, parts = conv([[20, -10, -10], [-20, 10, 10], [0, 0, 0]], [-3, 3, -9])
+    metadata = {} if tools is None else {"tool_classes": tools}
+    mask = OnnxToolFinder(write(tmp_path / "net.onnx", nodes, parts, metadata=metadata)).find(picture())
+    check(mask if expected == "not red" else 1 - mask)
+
+
+def test_one_channel_can_be_that_of_tissue(tmp_path):
+    check(1 - OnnxToolFinder(grey_network(tmp_path / "net.onnx", metadata={"tool_classes": [0]})).find(picture()))
+
+
+@pytest.mark.parametrize("squeeze", [False, True])
+def test_a_map_of_classes(tmp_path, squeeze):
+    nodes, parts = conv([[20, -10, -10], [-20, 10, 10]], [-3, 3], output="scores")
+    nodes.append(helper.make_node("ArgMax", ["scores"], ["map" if squeeze else "mask"], axis=1, keepdims=0))
+    if squeeze:
+        nodes.append(helper.make_node("Squeeze", ["map"], ["mask"]))
+    path = write(tmp_path / "net.onnx", nodes, parts, output_type=TensorProto.INT64)
+    check(OnnxToolFinder(path).find(picture()))
+
+
+def test_half_precision(tmp_path):
+    nodes, parts = conv(*GREY)
+    parts = [numpy_helper.from_array(numpy_helper.to_array(part).astype(np.float16), part.name) for part in parts]
+    path = write(tmp_path / "net.onnx", nodes, parts, input_type=TensorProto.FLOAT16, output_type=TensorProto.FLOAT16)
+    check(OnnxToolFinder(path).find(picture()))
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_normalisation_and_order_of_channels_come_from_the_model_or_from_a_file_beside_it(tmp_path, beside):
+    """What is in the file beside goes before what is in the model."""
+    settings = {"white": 255, "mean": [10, 20, 30], "std": [2, 4, 5], "channels": "bgr", "values": "logits"}
+    # Blue first: the value is zero for one colour, and both sides of it are tried.
+    nodes, parts = conv([[1.0, 0.0, 0.0]], [-(150 - 30) / 5])
+    path = write(tmp_path / "net.onnx", nodes, parts, metadata={"white": 9.0} if beside else settings)
+    if beside:
+        (tmp_path / "net.onnx.json").write_text(json.dumps(settings))
+    finder = OnnxToolFinder(path)
+    assert finder.settings.white == 255
+    assert finder.find(np.full((40, 40, 3), (0, 0, 149), np.uint8)).all()
+    assert not finder.find(np.full((40, 40, 3), (255, 255, 151), np.uint8)).any()
+
+
+def test_a_stated_size_is_used_where_the_model_takes_any(tmp_path):
+    """The mask is as coarse as the size, which is how it shows."""
+    finder = OnnxToolFinder(grey_network(tmp_path / "net.onnx", size=("h", "w"), metadata={"size": [16, 16]}))
+    image = np.full((160, 160, 3), (200, 60, 50), np.uint8)
+    image[100:102, 100:102] = 128  # too small to be seen in a sixteenth
+    assert finder.find(image).all()
+    assert not OnnxToolFinder(grey_network(tmp_path / "b.onnx", size=("h", "w"))).find(image).all()
+
+
+@pytest.mark.parametrize("classes", [1, 3])
+def test_nan_is_tool_everywhere_and_is_stated_once(tmp_path, caplog, classes):
+    rows, bias = [[-20.0, 10.0, 10.0]] * classes, [3.0] * classes
+    nodes, parts = conv(rows, bias, output="raw")
+    nodes.append(helper.make_node("Sqrt", ["raw"], ["mask"]))  # of a negative number where the picture is red
+    finder = OnnxToolFinder(write(tmp_path / "net.onnx", nodes, parts, metadata={"values": "logits"}))
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            assert not finder.find(picture()).any()
+    assert finder.not_finite == 2 and len(caplog.records) == 1 and "gave NaN" in caplog.text
+    assert finder.find(np.full((40, 40, 3), 128, np.uint8)).shape == (40, 40) and finder.not_finite == 2
+
+
+def refused(path) -> str:
+    with pytest.raises(InvalidSetting) as caught:
+        OnnxToolFinder(path)
+    assert str(path) in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("shape", "sentence"),
+    [
+        ([1, 4, 32, 40], r"takes tensor(float) [1, 4, 32, 40]; it must take one picture"),
+        ([1, 32, 40, 3], "it must take one picture"),
+        ([2, 3, 32, 40], "it must take one picture"),
+        ([3, 32, 40], "it must take one picture"),
+        ([1, 3, 5000, 40], "takes pictures of 5000x40; at most 4096x4096 are given"),
+    ],
+)
+def test_inputs_of_another_shape_are_refused(tmp_path, shape, sentence):
+    node = helper.make_node("Identity", ["image"], ["mask"])
+    assert sentence in refused(write(tmp_path / "net.onnx", [node], [], input_shape=shape))
+
+
+def test_inputs_of_another_type_or_number_are_refused(tmp_path):
+    node = helper.make_node("Identity", ["image"], ["mask"])
+    path = write(tmp_path / "a.onnx", [node], [], input_type=TensorProto.UINT8, output_type=TensorProto.UINT8)
+    assert "takes tensor(uint8)" in refused(path)
+    two = helper.make_node("Add", ["image", "more"], ["mask"])
+    assert "has 2 inputs" in refused(write(tmp_path / "b.onnx", [two], [], more_inputs=["more"]))
+
+
+@pytest.mark.parametrize(
+    ("operator", "options", "sentence"),
+    [
+        ("GlobalAveragePool", {}, "gives float32 [1, 3, 1, 1]"),
+        ("Flatten", {}, "gives float32 [1, 3840]"),
+        ("ReduceMean", {"keepdims": 0}, "gives float32 []"),
+        ("Shape", {}, "gives int64 [4]"),
+    ],
+)
+def test_outputs_that_are_no_mask_are_refused(tmp_path, operator, options, sentence):
+    kind = TensorProto.INT64 if operator == "Shape" else TensorProto.FLOAT
+    node = helper.make_node(operator, ["image"], ["mask"], **options)
+    path = write(tmp_path / "net.onnx", [node], [], output_type=kind)
+    assert sentence in refused(path) and "it must give a mask" in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "sentence"),
+    [
+        ({"tool_classes": [1]}, None),
+        ({"tool_classes": [2]}, "has 2 classes and tool_classes are [2]"),
+        ({"tool_classes": [0, 1]}, "name at least one of 0 to 1 and not all"),
+        ({"tool_classes": []}, "tool_classes"),
+        ({"std": [0, 1, 1]}, "std.0: Input should be greater than 0"),
+        ({"mean": [1]}, "mean"),
+        ({"white": "255"}, "white: Input should be a valid number"),
+        ({"size": [0, 99999]}, "size.0"),
+        ({"threads": 1000}, "threads"),
+        ({"treshold": 0.4}, "treshold: Extra inputs are not permitted"),
+        ({"output": "depth"}, "has no output 'depth', only mask"),
+        ([], "the object"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(tmp_path, metadata, sentence):
+    path = grey_network(tmp_path / "net.onnx", metadata=metadata)
+    if sentence is None:
+        OnnxToolFinder(path)
+    else:
+        assert sentence in refused(path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "NaN", '{"mean": [NaN, 0, 0]}', "[" * 10_000, "x" * 100_000])
+def test_a_broken_file_of_settings_is_refused(tmp_path, text):
+    path = grey_network(tmp_path / "net.onnx")
+    (tmp_path / "net.onnx.json").write_text(text)
+    refused(path)
+
+
+def test_a_network_that_fails_on_a_picture_says_so(tmp_path):
+    """It takes any size by what it declares, and one only in truth."""
+    shape = numpy_helper.from_array(np.array([1, 3, 64, 64], np.int64), "shape")
+    node = helper.make_node("Reshape", ["image", "shape"], ["mask"])
+    assert "failed on a picture of 256x320" in refused(write(tmp_path / "net.onnx", [node], [shape], size=("h", "w")))
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((8, 8), np.uint8), np.zeros((8, 8, 3), np.float32), np.zeros((0, 8, 3), np.uint8)]
+)
+def test_other_arrays_are_refused(tmp_path, image):
+    finder = OnnxToolFinder(grey_network(tmp_path / "net.onnx"))
+    with pytest.raises(InvalidInput, match=r"image must be RGB uint8 \[H, W, 3\]"):
+        finder.find(image)
+
+
+def test_without_the_runtime_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(
+        InvalidSetting, match=r"needs the package onnxruntime .*install intrasplat with the extra `onnx`"
+    ):
+        OnnxToolFinder(grey_network(tmp_path / "net.onnx"))

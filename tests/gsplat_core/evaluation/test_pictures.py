@@ -1,0 +1,72 @@
+"""What is scored is what a model shows: at the frame's time, from its pose, with its exposure."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.evaluation.pictures import PictureMaker
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.model import Model
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.reconstructor import Reconstructor
+
+WIDTH, HEIGHT = 24, 16
+CAMERA = Camera.from_focal(30.0, WIDTH, HEIGHT)
+
+
+def waves(seq=0, **fields):
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    planes = np.stack([np.sin(x / 3 + seq), np.cos(y / 2), np.sin((x + y) / 4)], -1)
+    return Frame(seq, seq * 40_000_000, np.rint(128 + 90 * planes).astype(np.uint8), **fields)
+
+
+def model(version=3):
+    gaussians = gaussians_from_frame(waves(), CAMERA, 120, sh_degree=0, default_depth_mm=50.0)
+    return Model(version, gaussians, None, CAMERA, (0.0, 1.0))
+
+
+def test_the_picture_is_the_models_rounded_to_bytes():
+    picture = PictureMaker(CAMERA)(model(), waves())
+    wanted = model().render(0.0)
+    np.testing.assert_allclose(picture.unrounded, wanted.image.clamp(0, 1).numpy(), atol=1e-6)
+    assert np.abs(picture.image / 255 - picture.unrounded).max() <= 0.5 / 255 + 1e-6
+    np.testing.assert_allclose(picture.depth, wanted.depth.numpy(), rtol=1e-5)
+    assert picture.model_version == 3
+
+
+def test_the_frames_pose_and_exposure_are_used():
+    make = PictureMaker(CAMERA)
+    plain = make(model(), waves())
+    pose = np.eye(4)
+    pose[0, 3] = 4.0
+    moved = make(model(), waves(pose=pose))
+    assert np.abs(moved.unrounded - plain.unrounded).max() > 0.05
+    dim = make(model(), waves(exposure=(0.5, 1.0, 0.25)))
+    np.testing.assert_allclose(dim.unrounded, plain.unrounded * np.float32([0.5, 1.0, 0.25]), atol=1e-6)
+    bright = make(model(), waves(exposure=(100.0, 1.0, 1.0)))
+    assert bright.unrounded.max() <= 1
+
+
+def test_pictures_stay_as_they_are_when_the_next_one_is_made():
+    make = PictureMaker(CAMERA)
+    first = make(model(), waves())
+    kept = first.image.copy(), first.unrounded.copy(), first.depth.copy()
+    make(model(4), waves(exposure=(0.1, 0.1, 0.1)))
+    for before, now in zip(kept, (first.image, first.unrounded, first.depth), strict=True):
+        np.testing.assert_array_equal(before, now)
+
+
+@pytest.mark.cuda
+def test_a_gpu_shows_the_same_of_a_model_and_of_what_is_published(gpu):
+    learning = Reconstructor(ReconstructorConfig(gaussians=64, max_gaussians=80), CAMERA, device=gpu)
+    make = PictureMaker(CAMERA, gpu)
+    for seq in range(4):
+        learning.observe(waves(seq), steps=2)
+        shown = make(learning.publish(), waves(seq))
+        again = PictureMaker(CAMERA)(learning.snapshot().to("cpu"), waves(seq))
+        assert np.abs(shown.image.astype(int) - again.image.astype(int)).max() <= 1
+    assert torch.cuda.is_available()

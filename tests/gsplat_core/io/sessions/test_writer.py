@@ -1,0 +1,186 @@
+"""Segments of bounded size, the removal of old ones, frames of changing size, jumping clocks."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from hashlib import sha256
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.io.recordings import open_recording
+from gsplat_core.io.sessions import SessionReader, SessionWriter, WriterOptions
+from gsplat_core.io.sessions.reader import prepared_of
+from gsplat_core.io.sessions.records import DeletedLine, PreparedLine, ShownLine
+from gsplat_core.io.sessions.schedule import Observed
+from gsplat_core.io.sessions.writer import Shown
+from gsplat_core.scene.frames import Frame, FrameStatus
+from tests.gsplat_core.io.sessions.made import Clock, new_frame, same_frame, session_info
+
+
+def frames_of(folder) -> list[Frame]:
+    return [frame for _, frame in SessionReader(folder).frames() if frame is not None]
+
+
+def test_every_field_comes_back_to_the_bit(session, frames):
+    found = frames_of(session)
+    assert all(same_frame(a, b) for a, b in zip(found, frames, strict=True))
+    assert {frame.status for frame in found} == {FrameStatus.REPLAY}
+    lines = [line for line, _ in SessionReader(session).frames()]
+    assert [line.arrived_ns for line in lines] == [frame.arrived_ns for frame in frames]
+
+
+def test_what_training_was_given_comes_back_to_the_bit(session, frames):
+    arrived = {frame.seq: frame for frame in frames_of(session)}
+    seen = 0
+    for segment in SessionReader(session).segments:
+        with segment.open() as pictures:
+            for line in segment.lines():
+                if isinstance(line, PreparedLine):
+                    frame = prepared_of(line, arrived[line.seq], pictures)
+                    assert frame is not None
+                    wanted = frames[line.seq].with_fields(
+                        loss_mask=np.ones_like(frames[line.seq].mask), exposure=(1.0, 2.0, 3.0)
+                    )
+                    assert same_frame(frame, wanted)
+                    assert line.same == ("image", "right_image", "mask", "depth")
+                    seen += 1
+    assert seen == len(frames)
+
+
+def test_the_digest_of_a_shown_picture_is_that_of_its_bytes(session, frames):
+    lines = [line for _, line in SessionReader(session).lines() if isinstance(line, ShownLine)]
+    for line, frame in zip(lines, frames, strict=True):
+        assert line.sha256 == sha256(np.ascontiguousarray(frame.image[::-1])).hexdigest()
+        assert (line.model_version, line.state, line.age_ns) == (frame.seq + 1, "live", 7)
+
+
+@pytest.mark.parametrize(("shown", "exact"), [("lossless", True), ("vp9", False), ("digest", None)])
+def test_what_is_kept_of_shown_pictures(tmp_path, shown, exact):
+    rng = np.random.default_rng(1)
+    smooth = np.clip(
+        np.add.outer(np.arange(40), np.arange(49))[..., None] * 2 + rng.integers(0, 3, (40, 49, 3)), 0, 255
+    )
+    frame = new_frame(0, 40, 49)
+    writer = SessionWriter(tmp_path / "s", session_info(), WriterOptions(shown=shown))
+    writer.shown(Shown(frame, smooth.astype(np.uint8), 1))
+    writer.close("end")
+    (segment,) = SessionReader(tmp_path / "s").segments
+    (line,) = (line for line in segment.lines() if isinstance(line, ShownLine))
+    with segment.open() as pictures:
+        found, damage = pictures.of(line)
+    assert damage is None
+    if exact is None:
+        assert found == {}
+    else:
+        difference = np.abs(found["shown"].astype(int) - smooth)
+        assert found["shown"].shape == (40, 49, 3)
+        assert difference.max() == 0 if exact else 0 < difference.mean() < 6
+
+
+def test_segments_end_when_they_are_large_and_no_frame_is_lost_between_them(record):
+    frames = [new_frame(seq) for seq in range(20)]
+    folder = record(frames, WriterOptions(segment_bytes=20_000))
+    reader = SessionReader(folder)
+    assert len(reader.segments) > 3
+    assert all(same_frame(a, b) for a, b in zip(frames_of(folder), frames, strict=True))
+    assert {segment.ends.why for segment in reader.segments if segment.ends} == {"bytes", "end"}
+
+
+def test_the_oldest_segments_are_removed_and_the_recording_says_so(record):
+    frames = [new_frame(seq) for seq in range(40)]
+    folder = record(frames, WriterOptions(segment_bytes=20_000, keep_bytes=60_000))
+    reader = SessionReader(folder)
+    on_disk = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    assert on_disk < 90_000
+    found = frames_of(folder)
+    assert [frame.seq for frame in found] == list(range(found[0].seq, 40))
+    assert found[0].seq > 20
+    numbers = [line.segment for _, line in reader.lines() if isinstance(line, DeletedLine)]
+    assert numbers and numbers[-1] + 1 == int(reader.segments[0].folder.name)
+    assert any("those before it were removed" in note for note in open_recording(folder).notes)
+
+
+def test_old_segments_are_removed_by_age(tmp_path):
+    clock = Clock()
+    writer = SessionWriter(tmp_path / "s", session_info(), WriterOptions(segment_s=1, keep_s=3.5, clock=clock))
+    for seq in range(10):
+        writer.frame(new_frame(seq))
+        clock.now_ns += 10**9
+    writer.close("end")
+    assert [frame.seq for frame in frames_of(tmp_path / "s")] == [5, 6, 7, 8, 9]
+
+
+def test_a_second_recording_does_not_go_into_the_folder_of_the_first(tmp_path):
+    SessionWriter(tmp_path / "s", session_info()).close("end")
+    with pytest.raises(FileExistsError):
+        SessionWriter(tmp_path / "s", session_info())
+
+
+def test_frames_may_change_their_size_back_and_forth(tmp_path):
+    sizes = [(16, 24), (16, 24), (33, 17), (16, 24), (9, 8), (33, 17), (3, 1), (1, 1), (1, 5)]
+    frames = [new_frame(seq, *size) for seq, size in enumerate(sizes)]
+    writer = SessionWriter(tmp_path / "s", session_info())
+    for frame in frames:
+        writer.frame(frame)
+        writer.shown(Shown(frame, frame.image, 1))
+    writer.close("end")
+    assert all(same_frame(a, b) for a, b in zip(frames_of(tmp_path / "s"), frames, strict=True))
+    recording = open_recording(tmp_path / "s")
+    assert [frame.seq for frame in recording] == [0, 1, 3]
+    assert any("6 of 9 frames have another size" in note for note in recording.notes)
+
+
+def test_a_frame_of_every_size_does_not_open_files_without_end(tmp_path):
+    writer = SessionWriter(tmp_path / "s", session_info())
+    frames = [new_frame(seq, 8 + seq, 8) for seq in range(40)]
+    for frame in frames:
+        writer.frame(frame)
+    writer.close("end")
+    assert len(SessionReader(tmp_path / "s").segments) >= 3
+    assert all(same_frame(a, b) for a, b in zip(frames_of(tmp_path / "s"), frames, strict=True))
+
+
+@pytest.mark.parametrize(
+    "times_ns",
+    [
+        [0, 1, 2, 3],
+        [5 * 10**9, 0, 10**9, 10**9],
+        [0, 10**17, 10**17 + 1, 2 * 10**17],
+        [-(10**15), 0, -5, 10**18],
+    ],
+    ids=["nanoseconds", "backwards", "years ahead", "negative"],
+)
+def test_times_come_back_whatever_the_clock_does(tmp_path, times_ns):
+    frames = [new_frame(seq, pts_ns=time_ns) for seq, time_ns in enumerate(times_ns)]
+    writer = SessionWriter(tmp_path / "s", session_info())
+    for frame in frames:
+        writer.frame(frame)
+    writer.close("end")
+    assert all(same_frame(a, b) for a, b in zip(frames_of(tmp_path / "s"), frames, strict=True))
+
+
+def test_a_line_of_a_later_version_is_left_out(session, tmp_path, frames):
+
+    folder = tmp_path / "session"
+    shutil.copytree(session, folder)
+    log = folder / "segments/000000/log.jsonl"
+    lines = log.read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join([lines[0], b'{"event":"thought","of":"tomorrow"}\n', *lines[1:]]))
+    assert len(frames_of(folder)) == len(frames)
+    assert sum(isinstance(line, Observed) for _, line in SessionReader(folder).lines()) == len(frames)
+
+
+def test_a_log_is_plain_json(session):
+    for line in (session / "segments/000000/log.jsonl").read_text().splitlines():
+        assert next(iter(json.loads(line))) == "event"
+
+
+@pytest.mark.parametrize(
+    "options", [{"segment_bytes": 0}, {"segment_s": -1}, {"keep_bytes": -1}, {"sync_s": float("nan")}]
+)
+def test_options_out_of_their_range_are_refused(options):
+    with pytest.raises(InvalidInput, match=next(iter(options))):
+        WriterOptions(**options)

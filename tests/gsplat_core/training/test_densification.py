@@ -1,0 +1,140 @@
+"""Densification: whose share of picture and error is whose, what is split, what is dropped, and that both halves move as one."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.deformation import BasisField
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.densification import UNSEEN_PX, Shares, densify, halves, shares_of
+from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.step import TrainingStep
+
+
+@pytest.fixture(params=[False, True], ids=["exact", "preallocated"])
+def step(make_frame, camera, request):
+    gaussians = gaussians_from_frame(make_frame(), camera, 120, sh_degree=0, default_depth_mm=60.0)
+    config = ReconstructorConfig(
+        field="basis", gaussians=120, max_gaussians=300, squared_error=True, preallocate=request.param
+    )
+    return TrainingStep(gaussians, BasisField(gaussians.count, (0.0, 1.0), bumps=6), config, camera)
+
+
+def test_the_shares_add_up_to_the_picture_and_to_its_error(step, make_frame, camera):
+    mask = np.ones((camera.height_px, camera.width_px), np.uint8)
+    mask[:, :13] = 0
+    seen = Observation.of(make_frame(2, shift_px=1, mask=mask), camera)
+    shares = shares_of(step, [seen])
+    image, alpha, _ = render(step.at(seen.time_s), camera)
+    tissue = seen.mask > 0
+    off = (image - seen.image / 255).abs().mean(-1)
+    assert shares.seen_px.sum().item() == pytest.approx(alpha[tissue].sum().item(), rel=1e-4)
+    assert shares.error.sum().item() == pytest.approx((alpha * off)[tissue].sum().item(), rel=1e-4)
+
+
+def test_of_several_pictures_the_errors_add_up_and_the_best_view_counts(step, make_frame, camera):
+    one, other = (Observation.of(make_frame(seq, shift_px=seq), camera) for seq in (0, 3))
+    both, first, second = shares_of(step, [one, other]), shares_of(step, [one]), shares_of(step, [other])
+    torch.testing.assert_close(both.error, first.error + second.error)
+    torch.testing.assert_close(both.seen_px, torch.maximum(first.seen_px, second.seen_px))
+
+
+def test_dark_tissue_counts_as_much_as_bright(step, make_frame, camera):
+    seen = Observation.of(make_frame(), camera)
+    expected = shares_of(step, [seen]).seen_px
+    step.gaussians.sh.fill_(-10.0)  # below black: the picture's gradient is zero there
+    torch.testing.assert_close(shares_of(step, [seen]).seen_px, expected)
+
+
+def test_gaussians_that_nobody_sees_go_and_those_with_the_largest_error_are_split(step, make_frame, camera):
+    count = step.gaussians.count
+    seen, error = torch.ones(count), torch.zeros(count)
+    seen[7] = UNSEEN_PX / 2
+    error[[3, 11]] = torch.tensor([1.0, 2.0])
+    before = step.gaussians.means.clone()
+    densify(step, Shares(seen, error), count + 1)
+    assert step.gaussians.count == step.field.count == count + 1
+    after = step.gaussians.means
+    parents = before[[11, 3]]  # the worst first
+    untouched = [index for index in range(count) if index not in (3, 7, 11)]
+    assert all((after == before[index]).all(dim=1).any() for index in untouched)
+    assert not any((after == before[index]).all(dim=1).any() for index in (3, 7, 11))
+    torch.testing.assert_close((after[[11, 3]] + after[-2:]) / 2, parents)
+    assert (step.gaussians.means[-2:] - parents).norm(dim=1).min() > 0
+    step(Observation.of(make_frame(1), camera))  # optimiser and field fit the new number
+
+
+def test_nothing_is_split_beyond_the_number_asked_for_nor_more_than_once(step):
+    count = step.gaussians.count
+    shares = Shares(torch.ones(count), torch.arange(count).float())
+    densify(step, shares, count)
+    assert step.gaussians.count == count
+    densify(step, shares, 5 * count)
+    assert step.gaussians.count == 2 * count
+
+
+def test_a_scene_that_nobody_sees_is_left_as_it_is(step):
+    count = step.gaussians.count
+    densify(step, Shares(torch.zeros(count), torch.zeros(count)), 2 * count)
+    assert step.gaussians.count == count
+
+
+def test_both_halves_move_as_their_parent_did(step, make_frame, camera):
+    with torch.no_grad():
+        step.field.weights.normal_(std=0.3, generator=torch.Generator().manual_seed(0))
+    count = step.gaussians.count
+    moved = step.field.deltas(0.4).detach()
+    step.split(torch.tensor([5, 9]), halves)
+    deltas = step.field.deltas(0.4).detach()
+    assert torch.equal(deltas[:count], moved)
+    assert torch.equal(deltas[count:], moved[[5, 9]])
+
+
+def test_halves_lie_along_the_longest_axis_and_cover_their_parent():
+    turn = torch.tensor([[np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)]], dtype=torch.float32)  # 45 degrees about z
+    parent = Gaussians(
+        means=torch.tensor([[1.0, 2.0, 3.0]]),
+        quats=3 * turn,
+        log_scales=torch.log(torch.tensor([[0.1, 0.8, 0.2]])),
+        logit_opacities=torch.tensor([1.5]),
+        sh=torch.full((1, 1, 3), 0.3),
+    )
+    first, second = halves(parent)
+    across = (second.means - first.means)[0]
+    torch.testing.assert_close(across.abs(), torch.tensor([0.8, 0.8, 0.0]) / 2**0.5, atol=1e-6, rtol=0)
+    assert across[0] * across[1] < 0  # the turned y axis points to -x, +y
+    torch.testing.assert_close((first.means + second.means) / 2, parent.means)
+    for half in (first, second):
+        torch.testing.assert_close(half.scales, torch.tensor([[0.1, 0.5, 0.2]]))
+        for name in ("quats", "logit_opacities", "sh"):
+            assert torch.equal(half.tensors()[name], parent.tensors()[name])
+
+
+def test_two_halves_look_like_their_parent(step, camera):
+    middle = step.gaussians.means[:, :2].norm(dim=1).argmin()
+    one = step.gaussians.select(middle[None])
+    whole = render(one, camera).alpha
+    both = render(Gaussians.append(*halves(one)), camera).alpha
+    assert whole.sum() > 5
+    assert (both - whole).abs().sum() < 0.25 * whole.sum()
+
+
+def test_the_same_seed_gives_the_same_gaussians(make_frame, camera):
+    seen = [Observation.of(make_frame(seq, shift_px=seq / 2), camera) for seq in range(3)]
+
+    def densified():
+        gaussians = gaussians_from_frame(make_frame(), camera, 120, sh_degree=0, default_depth_mm=60.0)
+        config = dataclasses.replace(ReconstructorConfig(field="basis", gaussians=120))
+        made = TrainingStep(gaussians, BasisField(gaussians.count, (0.0, 1.0), bumps=6), config, camera)
+        for one in seen:
+            made(one)
+        densify(made, shares_of(made, seen), 150)
+        return made.gaussians
+
+    first, second = densified(), densified()
+    assert all(torch.equal(a, b) for a, b in zip(first.tensors().values(), second.tensors().values(), strict=True))

@@ -1,0 +1,122 @@
+"""Offline training: its schedule, that every frame is seen equally often, and when Gaussians are added."""
+
+import dataclasses
+import itertools
+import math
+from collections import Counter
+
+import pytest
+import torch
+
+from gsplat_core.deformation import BasisField
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY, FitSettings
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.step import TrainingStep
+
+CONFIG = ReconstructorConfig(field="basis", gaussians=300, max_gaussians=500, squared_error=True)
+
+
+def test_rates_fall_from_all_to_what_is_left():
+    settings = FitSettings(final_rate=0.1)
+    rates = [settings.rate_at(share / 10) for share in range(11)]
+    assert rates[0] == 1
+    assert rates[5] == pytest.approx(0.55)
+    assert rates[10] == pytest.approx(0.1)
+    assert rates == sorted(rates, reverse=True)
+
+
+def test_rounds_are_spread_evenly_up_to_their_share_of_the_steps():
+    assert FitSettings(densify_rounds=4, densify_until=0.8).rounds(1000) == [200, 400, 600, 800]
+    assert FitSettings(densify_rounds=0).rounds(1000) == []
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"final_rate": 0},
+        {"final_rate": 1.5},
+        {"final_rate": math.nan},
+        {"densify_until": 0},
+        {"smoothing": -0.1},
+        {"smoothing": math.inf},
+        {"densify_rounds": -1},
+        {"densify_frames": 0},
+    ],
+)
+def test_settings_out_of_their_range_are_refused(values):
+    with pytest.raises(InvalidSetting, match=next(iter(values))):
+        FitSettings(**values)
+
+
+def fitted(camera, frames, steps, **settings):
+    learning = Reconstructor(CONFIG, camera)
+    counts = []
+    learning.fit(frames, steps, lambda *_: counts.append(learning.gaussians), FitSettings(**settings))
+    return learning, counts
+
+
+def test_gaussians_grow_round_by_round_to_the_most_allowed(tissue_video, camera):
+    learning, counts = fitted(camera, tissue_video(4), 40, densify_rounds=4, densify_until=0.8)
+    grown = [step for step, (before, after) in enumerate(itertools.pairwise(counts), 1) if after > before]
+    assert grown == [8, 16, 24, 32]
+    assert counts[-1] == learning.gaussians == CONFIG.max_gaussians
+    assert learning.snapshot().field.count == CONFIG.max_gaussians
+
+
+def test_fewer_steps_than_rounds_still_end(tissue_video, camera):
+    for steps in (1, 2, 3):
+        _, counts = fitted(camera, tissue_video(2), steps, densify_rounds=10)
+        assert len(counts) == steps
+
+
+def test_without_rounds_the_gaussians_stay(tissue_video, camera):
+    _, counts = fitted(camera, tissue_video(3), 6, densify_rounds=0)
+    assert set(counts) == {counts[0]}
+
+
+def test_every_frame_is_trained_on_equally_often(tissue_video, camera, monkeypatch):
+    seen = Counter()
+    take = TrainingStep.__call__
+
+    def counted(self, observation, rate_scale=1.0):
+        seen[observation.seq] += 1
+        return take(self, observation, rate_scale)
+
+    monkeypatch.setattr(TrainingStep, "__call__", counted)
+    fitted(camera, tissue_video(5), 15)
+    assert seen == dict.fromkeys(range(5), 3)
+
+
+def test_smoothing_brings_neighbours_in_time_together(tissue_video, camera):
+    def roughness(smoothing):
+        learning, _ = fitted(camera, tissue_video(12), 60, densify_rounds=0, smoothing=smoothing)
+        weights = learning.snapshot().field.weights
+        return float(weights.diff(dim=1).square().sum() / weights.square().sum())
+
+    assert roughness(2.0) < 0.8 * roughness(0.0)
+
+
+def test_smoothing_never_goes_beyond_the_neighbours(tissue_video, camera, monkeypatch):
+    amounts = []
+    monkeypatch.setattr(BasisField, "smooth_in_time", lambda self, amount: amounts.append(amount))
+    fitted(camera, tissue_video(2), 100, smoothing=5.0)
+    assert len(amounts) == 100 // SMOOTH_EVERY
+    assert max(amounts) == MOST_AT_ONCE
+    fitted(camera, tissue_video(2), 100, smoothing=0.0)
+    assert len(amounts) == 100 // SMOOTH_EVERY
+
+
+def test_densification_helps_where_the_first_frame_was_too_coarse(tissue_video, camera):
+    frames = tissue_video(5)
+    config = dataclasses.replace(CONFIG, gaussians=60, max_gaussians=240)
+
+    def error(rounds):
+        learning = Reconstructor(config, camera)
+        learning.fit(frames, 150, settings=FitSettings(densify_rounds=rounds))
+        model = learning.snapshot()
+        target = torch.from_numpy(frames[2].image) / 255
+        return float((model.render(frames[2].time_s).image - target).square().mean())
+
+    assert error(5) < 0.7 * error(0)

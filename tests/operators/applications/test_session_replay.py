@@ -1,0 +1,178 @@
+"""A live session is recorded and replayed: with the recorded calls every picture comes out again, to the byte."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.recordings import open_recording, synthesize
+from gsplat_core.io.sessions import SessionReader, WriterOptions
+from gsplat_core.io.sessions.schedule import Observed, Rehearsed, SceneBegun
+from gsplat_core.scene.frames import Frame
+from operators.applications.live import LiveApplication
+from operators.applications.live_settings import LiveSettings
+from operators.applications.live_start import warm_up
+from operators.applications.replay import ReplaySettings, replay
+from operators.applications.result import RunOutcome
+from operators.applications.session import Session
+from operators.compare_shown import ShownComparison
+from operators.metrics import QualityResult
+from operators.sinks.recorder import RecordingResult
+from operators.sources.source import SourceDescription
+from operators.sources.threaded import ThreadedSource
+
+FRAMES = 14
+
+
+class _Scope(ThreadedSource):
+    """Frames of a recording in real time, with what happens to a scope."""
+
+    def __init__(self, recording, change) -> None:
+        super().__init__(ahead=1)
+        self._recording, self._change = recording, change
+        self.description = SourceDescription(
+            "scope", recording.width_px, recording.height_px, 20.0, recording.camera, recording.fields
+        )
+
+    def frames(self) -> Iterator[Frame]:
+        for frame in self._recording:
+            time.sleep(0.05)
+            yield self._change(frame.with_fields(arrived_ns=time.monotonic_ns()))
+
+
+def as_it_is(frame: Frame) -> Frame:
+    return frame
+
+
+def eventful(frame: Frame) -> Frame:
+    """A cut, a blurred frame, another exposure, a highlight, and at the end another size."""
+    if frame.seq == 4:
+        return frame.with_fields(withheld="blur")
+    if frame.seq == 6:
+        return frame.with_fields(new_scene="cut")
+    if frame.seq >= 10:
+        image = np.ascontiguousarray(frame.image[:40, :56])
+        mask = None if frame.mask is None else np.ascontiguousarray(frame.mask[:40, :56])
+        return frame.with_fields(image=image, mask=mask, depth=None, right_image=None)
+    loss_mask = np.ones(frame.image.shape[:2], np.uint8)
+    loss_mask[:5, frame.seq] = 0
+    return frame.with_fields(exposure=(1.0 + frame.seq / 50, 0.9, 1.0), loss_mask=loss_mask)
+
+
+def record(folder: Path, change, options: WriterOptions | None = None) -> RunOutcome:
+    recording = open_recording(synthesize(folder / "synthetic", frames=FRAMES, width_px=64, height_px=48))
+    (folder / "live").mkdir()
+    settings = LiveSettings(
+        source="scope", out=folder / "live", record=folder / "session", recording=options or WriterOptions(), seed=3
+    )
+    source = _Scope(recording, change)
+    graph = LiveApplication(source, settings, warm_up(settings, source))
+    return Session(graph, settings.stated(), command="live").execute()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """A session in several segments; read only."""
+    folder = tmp_path_factory.mktemp("recorded")
+    record(folder, as_it_is, WriterOptions(segment_bytes=60_000))
+    assert len(list((folder / "session/segments").iterdir())) > 2
+    return folder
+
+
+@pytest.fixture
+def session(recorded, tmp_path) -> Path:
+    """A folder with a copy of it."""
+    shutil.copytree(recorded / "session", tmp_path / "session")
+    return tmp_path
+
+
+def replayed(folder: Path, **settings) -> RunOutcome:
+    shutil.rmtree(folder / "replay", ignore_errors=True)
+    return replay(ReplaySettings(recording=folder / "session", out=folder / "replay", **settings))
+
+
+@pytest.mark.parametrize("change", [as_it_is, eventful])
+def test_every_picture_comes_out_again(tmp_path, change):
+    live = record(tmp_path, change)
+    recorded = live.find(RecordingResult)
+    assert recorded is not None and recorded.recorded.lost == {}
+    lines = [line for _, line in SessionReader(tmp_path / "session").lines()]
+    assert len({line.steps for line in lines if isinstance(line, Observed | Rehearsed)}) > 1, "training was not timed"
+    scenes = [line.seq for line in lines if isinstance(line, SceneBegun)]
+    assert bool(scenes) == (change is eventful)
+    outcome = replayed(tmp_path)
+    comparison = outcome.find(ShownComparison)
+    assert comparison is not None
+    assert comparison.different == 0
+    assert comparison.same >= 5
+    assert any("byte for byte" in note for note in outcome.notes)
+
+
+def test_without_the_schedule_the_pictures_are_others(session):
+    with_it, without = replayed(session), replayed(session, ignore_schedule=True)
+    digests = [outcome.find(QualityResult).frames_sha256 for outcome in (with_it, without)]
+    assert digests[0] != digests[1]
+    assert without.find(ShownComparison) is None
+
+
+def test_another_call_gives_other_pictures(session):
+    """The comparison can fail: one step more in one call, and it does."""
+    logs = sorted((session / "session/segments").glob("*/log.jsonl"))
+    log = next(path for path in logs if '"event":"observe"' in path.read_text())
+    before, steps, after = re.split(r'("event":"observe","seq":\d+,"steps":)', log.read_text(), maxsplit=1)
+    count, rest = after.split(",", 1)
+    log.write_text(f"{before}{steps}{int(count) + 1},{rest}")
+    outcome = replayed(session)
+    comparison = outcome.find(ShownComparison)
+    assert comparison is not None and comparison.different > 0
+    assert any(f"the first of frame {comparison.first_different}" in note for note in outcome.notes)
+
+
+def test_a_cut_session_gives_the_same_pictures_up_to_there(session):
+    segments = sorted((session / "session/segments").iterdir())
+    (image,) = segments[1].glob("image_*.mkv")
+    before = [line.seq for line in SessionReader(session / "session").frame_lines()]
+    with image.open("r+b") as file:
+        file.truncate(image.stat().st_size // 2)
+    there = {line.seq for line in SessionReader(session / "session").frame_lines()}
+    cut = next(seq for seq in before if seq not in there)
+    outcome = replayed(session)
+    comparison = outcome.find(ShownComparison)
+    assert comparison is not None and comparison.same > 0
+    assert comparison.first_different is None or comparison.first_different > cut
+    assert any("is not in its recording" in note for note in outcome.notes)
+
+
+@pytest.mark.parametrize("options", [{"scale": 0.5}, {"heldout": True}, {"steps_per_frame": 3}])
+def test_what_the_session_did_not_have_is_replayed_like_any_recording(session, options):
+    outcome = replayed(session, **options)
+    assert outcome.find(ShownComparison) is None
+    assert any("schedule is not followed" in note for note in outcome.notes)
+    assert outcome.find(QualityResult).frames == FRAMES
+
+
+def test_a_session_whose_beginning_was_removed_is_replayed_like_any_recording(session):
+    shutil.rmtree(session / "session/segments/000000")
+    outcome = replayed(session)
+    assert any("schedule is not followed" in note for note in outcome.notes)
+
+
+def test_settings_of_another_version_are_refused_with_a_sentence(session):
+    log = session / "session/segments/000000/log.jsonl"
+    log.write_text(log.read_text().replace('"sh_degree":0', '"sh_degree":77'))
+    with pytest.raises(InvalidSetting, match="--ignore-schedule"):
+        replayed(session)
+
+
+def test_only_the_beginning_can_be_replayed(session):
+    outcome = replayed(session, max_frames=5)
+    comparison = outcome.find(ShownComparison)
+    assert comparison is not None and comparison.different == 0
+    assert comparison.same + comparison.not_shown <= 5

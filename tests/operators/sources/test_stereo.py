@@ -1,0 +1,163 @@
+"""Two eyes in one picture, and two sources as one."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.recordings import open_recording, synthesize
+from gsplat_core.io.recordings.calibration import default_camera
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import FrameStatus
+from operators.sources.live import LiveSource
+from operators.sources.registry import SourceOptions, open_source
+from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
+from operators.sources.stereo import JoinedSource, SplitSource
+
+SOON_S = 10.0
+MS = 1_000_000
+
+
+class Given(LiveSource):
+    """Gives frames from a list, and waits where the list has an event."""
+
+    def __init__(self, script, camera, name="eye", **about):
+        super().__init__(waiting=64)
+        self.script = script
+        self.description = SourceDescription(name, camera.width_px, camera.height_px, 25.0, camera, **about)
+
+    def frames(self):
+        for step in self.script:
+            if isinstance(step, threading.Event):
+                step.wait(SOON_S)
+            else:
+                yield step
+
+
+def all_of(source):
+    found = []
+    source.open()
+    while (frame := source.read(SOON_S)) is not None:
+        found.append(frame)
+    source.close()
+    return found
+
+
+@pytest.mark.parametrize(("layout", "size"), [("side_by_side", (12, 16)), ("top_bottom", (24, 8))])
+def test_a_picture_is_split_into_two_eyes(frame, layout, size):
+    whole = default_camera(24, 16)
+    mask, depth = np.ones((16, 24), np.uint8), np.full((16, 24), 50, np.float32)
+    given = [frame(k, mask=mask, depth=depth) for k in range(3)]
+    source = SplitSource(Given(given, whole), layout)
+    assert isinstance(source, FrameSource) and isinstance(source, ReportingSource)
+    about = source.description
+    assert (about.width_px, about.height_px) == size and about.fields == {"right_image"}
+    assert about.camera == default_camera(*size), "the camera of one eye"
+    for split, full in zip(all_of(source), given, strict=True):
+        axis = 1 if layout == "side_by_side" else 0
+        np.testing.assert_array_equal(np.concatenate([split.image, split.right_image], axis), full.image)
+        assert split.mask.shape == split.depth.shape == size[::-1] and split.image.flags.c_contiguous
+    assert source.state is SourceState.ENDED and source.counts() == {}
+
+
+def test_a_calibration_of_the_left_eye_is_kept_and_one_of_both_is_refused():
+    left = Camera(np.array([[30.0, 0, 6], [0, 30, 8], [0, 0, 1]]), 24, 16)
+    assert SplitSource(Given([], left), "side_by_side").description.camera.K.tolist() == left.K.tolist()
+    both = Camera.from_focal(30.0, 24, 16)
+    with pytest.raises(InvalidSetting, match=r"not that of its left eye: the principal point \(12, 8\)"):
+        SplitSource(Given([], both), "side_by_side")
+
+
+def test_what_has_no_two_halves_is_refused():
+    with pytest.raises(InvalidSetting, match="not two eyes side by side"):
+        SplitSource(Given([], default_camera(25, 16)), "side_by_side")
+    with pytest.raises(InvalidSetting, match="has a right picture for each frame"):
+        SplitSource(Given([], default_camera(24, 16), fields=frozenset({"right_image"})), "top_bottom")
+
+
+def at(frame, index, ms, **fields):
+    return frame(index, pts_ns=index, arrived_ns=round(ms * MS), **fields)
+
+
+def test_two_sources_are_joined_by_the_moment_at_which_their_frames_came(camera, frame):
+    left = Given([at(frame, k, 1000 + 40 * k) for k in range(5)], camera, "left")
+    right = Given([at(frame, 10 + k, 1003 + 40 * k) for k in range(5)], camera, "right")
+    source = JoinedSource(left, right, waiting=64)
+    assert isinstance(source, FrameSource) and source.description.name == "left and right"
+    joined = all_of(source)
+    assert [each.seq for each in joined] == list(range(5)) and source.counts() == {}
+    for k, each in enumerate(joined):
+        np.testing.assert_array_equal(each.right_image, frame(10 + k).image)
+
+
+def test_an_eye_that_is_missing_takes_no_picture_away(camera, frame):
+    left = Given([at(frame, k, 1000 + 40 * k) for k in range(5)], camera)
+    right = Given([at(frame, 10, 1000), at(frame, 13, 1120), at(frame, 99, 5000)], camera)
+    source = JoinedSource(left, right, waiting=64)
+    joined = all_of(source)
+    assert [each.right_image is not None for each in joined] == [True, False, False, True, False]
+    assert source.counts()["without_right"] == 3
+
+
+def test_damage_to_either_eye_is_damage_and_another_size_is_left_out(camera, frame):
+    torn = {"status": FrameStatus.DAMAGED, "damage": "torn"}
+    left = Given([at(frame, k, 1000 + 40 * k) for k in range(2)], camera)
+    small = at(frame, 1, 1040, image=np.zeros((4, 4, 3), np.uint8))
+    source = JoinedSource(left, Given([at(frame, 0, 1000, **torn), small], camera), waiting=64)
+    first, second = all_of(source)
+    assert (first.status, first.damage) == (FrameStatus.DAMAGED, "right eye: torn")
+    assert second.right_image is None and source.counts() == {"right_of_another_size": 1}
+
+
+def test_eyes_of_two_sizes_are_refused(camera):
+    with pytest.raises(InvalidSetting, match="the left eye has 24x16 px and the right one 12x16"):
+        JoinedSource(Given([], camera), Given([], Camera.from_focal(30.0, 12, 16)))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return synthesize(tmp_path_factory.mktemp("recordings") / "tiny", frames=4, width_px=64, height_px=48, stereo=False)
+
+
+def test_addresses_say_how_the_eyes_come(folder, tmp_path):
+    (tmp_path / "double").mkdir()
+    import cv2
+
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / "double" / f"{k:06d}.png"), np.full((32, 96, 3), 50 + k, np.uint8))
+    for address, options in (
+        (f"realtime:{tmp_path}/double?speed=max&stereo=side_by_side", None),
+        (f"realtime:{tmp_path}/double?stereo=side_by_side&speed=max", None),
+        (tmp_path / "double", SourceOptions(stereo="side_by_side")),
+    ):
+        source = open_source(address, options)
+        assert (source.description.width_px, source.description.height_px) == (48, 32)
+        assert [each.right_image.shape for each in all_of(source)] == [(32, 48, 3)] * 3
+    joined = open_source(f"stereo:realtime:{folder}?speed=max|realtime:{folder}?speed=max")
+    left = list(open_recording(folder))
+    assert [each.right_image is not None for each in all_of(joined)] and joined.description.camera == open_recording(
+        folder
+    ).camera
+    assert len(left) == 4
+
+
+@pytest.mark.parametrize(
+    ("address", "what"),
+    [
+        ("stereo:a", "1 sources are named; give stereo:LEFT|RIGHT"),
+        ("stereo:a|b|c", "3 sources are named"),
+        ("realtime:x?stereo=both", "stereo is 'both'; choose side_by_side or top_bottom"),
+    ],
+)
+def test_addresses_that_are_wrong_are_sentences(address, what):
+    with pytest.raises(InvalidSetting, match=what.replace("|", r"\|")):
+        open_source(address)
+
+
+def test_a_path_may_have_such_words_in_it(tmp_path):
+    path = tmp_path / "take?stereo=side_by_side"
+    synthesize(path, frames=1, width_px=64, height_px=48, stereo=False)
+    assert open_source(path).description.width_px == 64

@@ -1,0 +1,131 @@
+"""Two chains look at a frame at once; the first one decides what goes on."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from gsplat_core.scene.frames import Frame
+from operators.graph import Operator
+from operators.outcome import OutcomeBuilder
+from operators.side_by_side import SideBySideOp
+
+
+class Changes(Operator):
+    """Gives each frame other fields."""
+
+    def __init__(self, fragment, change, **kwargs):
+        self.change = change
+        self.running = False
+        super().__init__(fragment, **kwargs)
+
+    def setup(self, spec):
+        spec.input("frame", type=Frame)
+        spec.output("frame", type=Frame)
+
+    def start(self):
+        self.running = True
+
+    def stop(self):
+        self.running = False
+
+    def compute(self, op_input, op_output, context):
+        op_output.emit(self.change(op_input.receive("frame")), "frame")
+
+    def contribute(self, outcome):
+        outcome.note(self.name)
+
+
+def fields(**values):
+    return lambda frame: frame.with_fields(**values)
+
+
+@pytest.fixture
+def make():
+    made = []
+
+    def build(first, second, then=()):
+        chains = {
+            name: [Changes(None, change, name=f"{name}{k}") for k, change in enumerate(changes)]
+            for name, changes in (("first", first), ("second", second), ("then", then))
+        }
+        operator = SideBySideOp(None, name="both", **chains)
+        operator.start()
+        made.append(operator)
+        return operator
+
+    yield build
+    for operator in made:
+        operator.stop()
+
+
+def half(frame, value):
+    """1 everywhere but in the upper (0) or the lower (1) half."""
+    plane = np.ones(frame.image.shape[:2], np.uint8)
+    rows = len(plane) // 2
+    plane[value * rows : (value + 1) * rows] = 0
+    return plane
+
+
+def test_what_both_chains_find_goes_on(make, frame, compute):
+    one = frame()
+    operator = make([fields(loss_mask=half(one, 0))], [fields(mask=half(one, 1), loss_mask=half(one, 1))])
+    (out,) = compute(operator, frame=one)
+    assert np.array_equal(out.mask, half(one, 1))
+    assert not out.loss_mask.any()
+
+
+def test_nothing_of_the_second_chain_goes_on_with_a_withheld_frame(make, frame, compute):
+    one = frame()
+    black = fields(image=np.zeros_like(one.image), withheld="out of body")
+    operator = make([black], [fields(mask=half(one, 1))])
+    (out,) = compute(operator, frame=one)
+    assert (out.withheld, out.mask) == ("out of body", None)
+    assert not out.image.any()
+
+
+def test_the_third_chain_sees_what_both_found(make, frame, compute):
+    one = frame()
+    seen = []
+    operator = make([fields(new_scene="cut")], [fields(mask=half(one, 0))], [lambda f: seen.append(f) or f])
+    compute(operator, frame=one)
+    assert (seen[0].new_scene, seen[0].mask.sum()) == ("cut", half(one, 0).sum())
+
+
+def test_the_chains_run_at_the_same_time(make, frame, compute):
+    meet = threading.Barrier(2, timeout=20)
+
+    def wait(found):
+        meet.wait()
+        return found
+
+    assert len(compute(make([wait], [wait]), frame=frame())) == 1
+
+
+@pytest.mark.parametrize("failing", ["first", "second"])
+def test_an_error_of_either_chain_is_raised_and_the_next_frame_goes_through(make, frame, compute, failing):
+    calls = []
+
+    def fails_once(found):
+        calls.append(found.seq)
+        if len(calls) == 1:
+            raise ValueError("broken")
+        return found
+
+    operator = make(*(([fails_once], []) if failing == "first" else ([], [fails_once])))
+    with pytest.raises(ValueError, match="broken"):
+        compute(operator, frame=frame(0))
+    (out,) = compute(operator, frame=frame(1))
+    assert out.seq == 1
+
+
+def test_its_parts_are_started_stopped_and_contribute(make):
+    operator = make([fields()], [fields()], [fields()])
+    assert all(part.running for part in operator.parts)
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    assert outcome.notes == ("first0", "second0", "then0")
+    operator.stop()
+    assert not any(part.running for part in operator.parts)

@@ -1,0 +1,76 @@
+"""`live --record` as a whole program: killed, interrupted, started again, and replayed."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import pytest
+
+from gsplat_core.io.recordings import open_recording, synthesize
+from services.reports.schema import RunReport
+
+
+@pytest.fixture(scope="module")
+def scope(tmp_path_factory):
+    return synthesize(
+        tmp_path_factory.mktemp("recordings") / "scope", frames=8, width_px=64, height_px=48, stereo=False
+    )
+
+
+def recording_under_way(start, source, out):
+    """A live run that has recorded a few frames."""
+    process = start("live", source, "--loop", "--out", out, "--record", "--json")
+    recordings = out / "recordings"
+    for _ in range(1200):
+        logs = [path.read_bytes() for path in recordings.glob("*/segments/000000/log.jsonl")]
+        if any(log.count(b'"shown"') > 5 for log in logs):
+            return process
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+    process.kill()
+    pytest.fail("nothing was recorded within a minute")
+
+
+def replayed(intrasplat, folder, out):
+    done = intrasplat("replay", folder, "--out", out, "--json")
+    assert done.code == 0, done.err
+    return RunReport.read(out / "report.json")
+
+
+def test_a_killed_session_is_replayed_and_stays_when_the_next_one_is_recorded(scope, tmp_path, start, intrasplat):
+    out = tmp_path / "out"
+    process = recording_under_way(start, scope, out)
+    process.kill()
+    process.communicate(timeout=60)
+    (killed,) = (out / "recordings").iterdir()
+    frames = open_recording(killed).frame_count
+    assert frames > 5
+    notes = replayed(intrasplat, killed, tmp_path / "replay").notes
+    assert any("byte for byte" in note for note in notes), notes
+
+    done = intrasplat("live", scope, "--seconds", "2", "--out", out, "--record", "--json")
+    assert done.code == 0, done.err
+    recordings = sorted((out / "recordings").iterdir())
+    assert killed in recordings and len(recordings) == 2
+    assert open_recording(killed).frame_count == frames
+    assert any("frames were recorded in" in note for note in RunReport.read(out / "report.json").notes)
+    assert (out / "model").is_dir()
+
+
+def test_an_interrupted_session_is_complete(scope, tmp_path, start, intrasplat):
+    process = recording_under_way(start, scope, tmp_path / "out")
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert "Traceback" not in stderr
+    (folder,) = (tmp_path / "out" / "recordings").iterdir()
+    assert open_recording(folder).notes == ()
+    assert intrasplat("validate", folder).code == 0
+    notes = replayed(intrasplat, folder, tmp_path / "replay").notes
+    assert any("byte for byte" in note for note in notes), notes
+
+
+def test_without_a_folder_that_stays_nothing_is_recorded(scope, intrasplat):
+    done = intrasplat("live", scope, "--record", "--seconds", "1")
+    assert done.code == 2
+    assert "--out" in done.err and "Traceback" not in done.err
