@@ -42,7 +42,8 @@ def watch(field: BasisField, time_s: float, newest_s: float, steps: int = 2, rat
     """What the reconstructor does with a frame."""
     field.cover(time_s, newest_s)
     for _ in range(steps):
-        field.adam_step(time_s, field.deltas(time_s).detach() - wave(field.count, time_s), rates)
+        target = wave(field.count, time_s).to(field.weights.device)
+        field.adam_step(time_s, field.deltas(time_s).detach() - target, rates)
 
 
 def addresses(field: BasisField) -> list[tuple[int, tuple[int, ...]]]:
@@ -258,7 +259,7 @@ def test_snapshots_of_a_ring_stay_at_their_addresses(make_gaussians, device):
     slots = SnapshotSlots(device, most=1, rows=40)
     newest, layouts = 0.0, set()
     for frame in range(120):
-        watch_on(field, frame * FRAME_S, newest)
+        watch(field, frame * FRAME_S, newest)
         newest = frame * FRAME_S
         snapshot = slots.publish(
             gaussians, field, version=1, camera=Camera.from_focal(30.0, 32, 24), time_window_s=field.time_window_s
@@ -269,12 +270,6 @@ def test_snapshots_of_a_ring_stay_at_their_addresses(make_gaussians, device):
         torch.testing.assert_close(saved.deltas(newest), field.deltas(newest).detach(), rtol=0, atol=1e-6)
         del snapshot
     assert len(layouts) == 1
-
-
-def watch_on(field: BasisField, time_s: float, newest_s: float) -> None:
-    field.cover(time_s, newest_s)
-    target = wave(field.count, time_s).to(field.weights.device)
-    field.adam_step(time_s, field.deltas(time_s).detach() - target, RATES)
 
 
 @pytest.mark.parametrize("history_s", [0.0, -1.0, float("nan"), float("inf")])

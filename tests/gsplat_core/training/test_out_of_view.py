@@ -67,19 +67,19 @@ def test_a_scope_that_is_back_after_a_minute_finds_what_it_left(device, rows):
     """With room for all of it, and with room for two pictures only, so that most of it is archived meanwhile."""
     made = reconstructor(rows, device)
     watch(made, there_and_on(0, [0] * 30), steps=8)
-    watch(made, there_and_on(30, range(0, 384, 8)))
-    at = frame_at(78, 376)
-    watch(made, [at.with_fields(seq=78 + k, pts_ns=at.pts_ns + k * 3 * 10**9) for k in range(20)], steps=2)
+    watch(made, there_and_on(30, range(0, 380, 4)))
+    at = frame_at(125, 376)
+    watch(made, [at.with_fields(seq=125 + k, pts_ns=at.pts_ns + k * 3 * 10**9) for k in range(20)], steps=2)
     assert (made.kept()["archived"] > 200) == (rows == 700)
     assert made.gaussians <= rows
     back = [frame_at(200 + k, 0, time_s=70 + k / 30) for k in range(3)]
     shown = []
     for frame in back:
-        watch(made, [frame], steps=12)
+        watch(made, [frame], steps=20)
         shown.append(score(made, frame))
     assert max(shown) > 33
     fresh = reconstructor(rows, device)
-    watch(fresh, back, steps=12)
+    watch(fresh, back, steps=20)
     assert made.gaussians <= rows and shown[-1] > score(fresh, back[-1])
 
 
