@@ -29,4 +29,6 @@ done
 if [ -d "${RECORDINGS:-}/cutting" ]; then
   echo replay_gpu
   "$python" benchmarks/replay_gpu.py "$RECORDINGS/cutting" | tee "$out/replay_gpu.jsonl"
+  echo gpu_offline
+  "$python" benchmarks/gpu_offline.py "$RECORDINGS/cutting" "$RECORDINGS/sinus" --fields basis hexplane --seconds 15 | tee "$out/gpu_offline.jsonl"
 fi

@@ -2,19 +2,21 @@
 
     python benchmarks/gpu_offline.py RECORDING... [--device cuda] [--fields basis hexplane] [--seconds 15]
     python benchmarks/gpu_offline.py RECORDING --device cpu --scale 0.25 --steps 500
+    python benchmarks/gpu_offline.py RECORDING --set smoothing=0 --set smoothing=2,bump_spacing_s=0.05
 
 `Reconstructor.fit` as `intrasplat reconstruct` calls it: `ReconstructorConfig.offline`, the same settings for every recording, the
 protocol's held-out frames never trained on. `--steps` is the number of optimiser steps; with `--seconds` it is what fits into that time,
-measured by a short run before. One JSON line for each moment that is evaluated: seconds of training so far (loading, warm-up of the
+measured by a short run before. Each `--set` is a run with other values of `ReconstructorConfig` or `FitSettings`. One JSON line for each moment that is evaluated: seconds of training so far (loading, warm-up of the
 kernels and evaluation not counted), mean and worst tissue PSNR over the held-out frames, and over as many training frames.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -26,6 +28,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.offline import FitSettings
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.replay import ReplaySettings
 
@@ -63,11 +66,30 @@ def quality(learning: Reconstructor, frames: list[Frame], camera: Camera) -> tup
     return sum(values) / len(values), min(values)
 
 
+@dataclass(frozen=True)
+class Settings:
+    """What a run trains with."""
+
+    config: ReconstructorConfig
+    fit: FitSettings
+
+    def changed(self, values: str) -> Settings:
+        """With the values of one `--set`: name=value,…"""
+        config, fit = self.config, self.fit
+        for one in filter(None, values.split(",")):
+            name, value = one.split("=")
+            if hasattr(config, name):
+                config = replace(config, **{name: json.loads(value)})
+            else:
+                fit = replace(fit, **{name: json.loads(value)})
+        return Settings(config, fit)
+
+
 def trained(
-    frames: list[Frame], camera: Camera, config: ReconstructorConfig, steps: int, device: torch.device, line: dict
+    frames: list[Frame], camera: Camera, settings: Settings, steps: int, device: torch.device, line: dict
 ) -> float:
     """One `fit`, evaluated on the way where `line` says what it is; returns the seconds per step."""
-    learning = Reconstructor(config, camera, device=device)
+    learning = Reconstructor(settings.config, camera, device=device)
     seen = [frame for frame in frames if not is_heldout(frame.seq)]
     held = [frame for frame in frames if is_heldout(frame.seq)]
     moments = {max(1, round(steps * share)) for share in MOMENTS} if line else set()
@@ -83,7 +105,7 @@ def trained(
             print(json.dumps(line | rounded | {"gaussians": learning.gaussians}), flush=True)
             clock.go_on()
 
-    learning.fit(seen, steps, after_step)
+    learning.fit(seen, steps, after_step, settings.fit)
     clock.pause()
     return clock.total_s / steps
 
@@ -96,20 +118,24 @@ def main() -> None:
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--seconds", type=float)
+    parser.add_argument("--set", action="append", metavar="NAME=VALUE,…")
     options = parser.parse_args()
     device = torch.device(options.device)
     for path in options.recordings:
         recording = open_recording(path, scale=options.scale)
         frames = list(recording)
-        for name in options.fields:
-            settings = ReplaySettings(path, Path("unused"), field=name)
-            config = settings.reconstructor_config(recording.width_px * recording.height_px, offline=True)
+        for name, values in itertools.product(options.fields, options.set or [""]):
+            asked = ReplaySettings(path, Path("unused"), field=name)
+            config = asked.reconstructor_config(recording.width_px * recording.height_px, offline=True)
+            settings = Settings(config, FitSettings()).changed(values)
             steps = options.steps
-            trial_s = trained(frames, recording.camera, config, min(TRIAL_STEPS, steps), device, {})
+            trial = settings.changed("densify_rounds=0").changed(f"gaussians={settings.config.max_gaussians}")
+            for _ in range(2):  # kernels are loaded by the first one
+                trial_s = trained(frames, recording.camera, trial, min(TRIAL_STEPS, steps), device, {})
             if options.seconds:
                 steps = max(1, round(options.seconds / trial_s))
-            line = {"recording": recording.name, "field": name}
-            trained(frames, recording.camera, config, steps, device, line)
+            line = {"recording": recording.name, "field": name} | ({"set": values} if values else {})
+            trained(frames, recording.camera, settings, steps, device, line)
 
 
 if __name__ == "__main__":

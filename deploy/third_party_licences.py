@@ -26,7 +26,7 @@ The packages that `requirements.lock` installs on Linux with Python {python}, an
 
 OpenCV's wheel carries FFmpeg's libraries, which are under the LGPL 2.1. PyAV (`av`) is under the BSD licence; its wheel carries
 FFmpeg's libraries, which state LGPL 3 or later, and beside them x264 and x265, which are under the GPL 2 or later. IntraSplat uses
-of them FFmpeg's demuxers, muxer and decoders, libvpx and dav1d (both BSD). It does not use x264 and x265 (its tests do), but whoever
+of them FFmpeg's demuxers, muxers, decoders and FFV1 encoder, libvpx and dav1d (both BSD). It does not use x264 and x265 (its tests do), but whoever
 passes the wheel on, in a container image for example, passes them on too. Without them: build PyAV against an FFmpeg of your own.
 
 NVIDIA's packages come with torch. `make cuda` also installs NVIDIA's compiler (`requirements-cuda.lock`), under NVIDIA's own licence;

@@ -34,6 +34,8 @@ class ClockSettings:
     """A frame is to be shown so long after it has come; None: `auto_share` of the time between frames, at most `auto_most_ms`."""
     auto_share: float = 0.6
     auto_most_ms: float = 18.3
+    least_share: float = 0.33
+    """Training gets so much of the time between frames, though a frame that had to wait is shown later for it."""
     at_least_steps: int = 5
     """Steps that every frame gets, though it is shown late: fewer would change nothing that can be seen."""
     at_most_steps: int = 80
@@ -48,8 +50,9 @@ class ClockSettings:
     def __post_init__(self) -> None:
         if self.budget_ms is not None and not 0 < self.budget_ms <= 10_000:
             raise InvalidSetting(f"budget-ms is {self.budget_ms}; it must be auto, or between 0 and 10000 milliseconds")
-        if not 0 < self.auto_share <= 1:
-            raise InvalidSetting(f"auto_share is {self.auto_share}; it must be in (0, 1]")
+        for name in ("auto_share", "least_share"):
+            if not 0 < getattr(self, name) <= 1:
+                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be in (0, 1]")
         if not 0 < self.at_least_steps <= self.at_most_steps:
             raise InvalidSetting(
                 f"at_least_steps is {self.at_least_steps} and at_most_steps {self.at_most_steps}; they must be in order"
@@ -77,9 +80,11 @@ class FrameClock:
         settings = self.settings
         arrived_ns = self.now_ns() if frame.arrived_ns is None else frame.arrived_ns
         self._learn_interval(arrived_ns)
-        show_after_ns = settings.first_ms * 1e6 if first else self.show_after_ns
+        until_ns = arrived_ns + (settings.first_ms * 1e6 if first else self.show_after_ns) - self.display_ns
+        if settings.budget_ms is None and not first:
+            until_ns = max(until_ns, self.now_ns() + settings.least_share * self.interval_ns)
         return Budget.until(
-            (arrived_ns + show_after_ns - self.display_ns) * 1e-9,
+            until_ns * 1e-9,
             at_least=settings.first_at_least_steps if first else settings.at_least_steps,
             at_most=settings.first_at_most_steps if first else settings.at_most_steps,
             clock=lambda: self.now_ns() * 1e-9,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -51,6 +52,7 @@ class SourceOp(Operator):
     Params:
         source: opened by `start()` and closed by `stop()`.
         stop_requested: asked before each frame; when it answers True the stream ends there and the frames in flight are finished.
+        seconds: end the stream so long after `start()`, whether or not frames come; None: when the source ends.
     """
 
     def __init__(
@@ -59,9 +61,12 @@ class SourceOp(Operator):
         *args: Any,
         source: FrameSource,
         stop_requested: Callable[[], bool] = lambda: False,
+        seconds: float | None = None,
         **kwargs: Any,
     ) -> None:
         self.source = source
+        self.seconds = seconds
+        self._until_s = math.inf
         self.stop_requested = stop_requested
         self.emitted = 0
         self.reached_end = False
@@ -79,6 +84,7 @@ class SourceOp(Operator):
         self.damaged = DamagedFrames()
         self._states = _TimeInStates()
         self.source.open()
+        self._until_s = math.inf if self.seconds is None else time.monotonic() + self.seconds
 
     def stop(self) -> None:
         self.source.close()
@@ -125,7 +131,7 @@ class SourceOp(Operator):
     def _next(self) -> Frame | None:
         """The next frame; None when there is none yet, or none any more."""
         for _ in range(round(PATIENCE_S / LOOK_S)):
-            if self.stop_requested():
+            if self.stop_requested() or time.monotonic() > self._until_s:
                 self.stop_execution()
                 return None
             frame = self.source.read(LOOK_S)

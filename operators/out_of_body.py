@@ -99,6 +99,8 @@ class OutOfBodyGateOp(Operator):
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
         outcome.add(OutOfBodyFrames(self.policy, self._passed, dict(self._withheld)))
+        if self.policy == "off":
+            outcome.note("no picture was examined for showing the outside of the body: the gate was off")
         if self._withheld:
             reasons = ", ".join(f"{reason}: {count}" for reason, count in self._withheld.most_common())
             outcome.note(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,11 @@ from operators.outcome import Contributor, OutcomeBuilder
 
 
 class SideBySideOp(Operator):
-    """Runs two chains of operators on each frame, then a third one on what both have found.
+    """Runs chains of operators on each frame, all at once, then a last one on what they have found together.
 
-    Each operator of a chain takes a `Frame` at its input `frame` and gives it with more fields at its output `frame`. The first chain decides:
-    its frame goes on, and takes over from the second chain what that adds to it, its tool mask and the pixels that are left out of the
-    loss. Of a frame that the first chain withholds nothing is taken over, for the second chain has seen the picture as it came.
+    Each operator of a chain takes a `Frame` at its input `frame` and gives it with more fields at its output `frame`. The first chain's frame
+    goes on, with the fields of `TAKEN_OVER` that the others add. Where the gate withholds the frame its own goes on instead, which
+    shows nothing of the picture.
 
     Inputs:
         frame: `Frame`.
@@ -27,53 +28,66 @@ class SideBySideOp(Operator):
         frame: `Frame`.
 
     Params:
-        first, second, then: operators that are in no graph of their own; this operator starts and stops them and contributes what they
-            contribute.
+        gate: a chain whose first operator may withhold a frame from everything that comes after; the other chains see its picture all the
+            same.
+        first: the chain whose frame goes on.
+        beside: further chains.
+        then: the last chain.
+        All operators are in no graph of their own: this one starts and stops them and contributes what they contribute.
     """
 
     def __init__(
         self,
         fragment: Any,
         *args: Any,
+        gate: Sequence[Operator],
         first: Sequence[Operator],
-        second: Sequence[Operator],
+        beside: Sequence[Sequence[Operator]] = (),
         then: Sequence[Operator] = (),
         **kwargs: Any,
     ) -> None:
-        self.first, self.second, self.then = tuple(first), tuple(second), tuple(then)
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="second chain")
+        self.gate, self.first, self.then = tuple(gate), tuple(first), tuple(then)
+        self.beside = tuple(tuple(part) for part in beside)
+        self._pool: ThreadPoolExecutor | None = None
         super().__init__(fragment, *args, **kwargs)
 
     @property
     def parts(self) -> tuple[Operator, ...]:
         """All operators of all chains."""
-        return self.first + self.second + self.then
+        return (*self.gate, *self.first, *chain.from_iterable(self.beside), *self.then)
 
     def setup(self, spec: OperatorSpec) -> None:
         spec.input("frame", type=Frame)
         spec.output("frame", type=Frame)
 
     def start(self) -> None:
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="second chain")
+        self._pool = ThreadPoolExecutor(1 + len(self.beside), thread_name_prefix=self.name)
         for operator in self.parts:
             operator.initialize()
             operator.start()
 
     def stop(self) -> None:
-        self._beside.shutdown()
+        if self._pool is not None:
+            self._pool.shutdown()
         for operator in self.parts:
             operator.stop()
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        assert self._pool is not None
         frame: Frame = op_input.receive("frame")
-        beside = self._beside.submit(through, self.second, frame)
+        others = [self._pool.submit(through, part, frame) for part in (self.gate, *self.beside)]
         try:
             decided = through(self.first, frame)
         finally:
-            # Whatever the first chain raises, the second one is out of the way of the next frame.
-            found = beside.result()
-        merged = decided if decided.withheld is not None else with_findings(decided, found)
-        op_output.emit(through(self.then, merged), "frame")
+            # Whatever the first chain raises, the others are out of the way of the next frame.
+            wait(others)
+        gated, *found = [other.result() for other in others]
+        if gated.withheld is None:
+            for each in (gated, *found):
+                decided = with_findings(decided, each)
+        else:
+            decided = gated.with_fields(seq=decided.seq, pts_ns=decided.pts_ns)
+        op_output.emit(through(self.then, decided), "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
@@ -82,18 +96,22 @@ class SideBySideOp(Operator):
                 operator.contribute(outcome)
 
 
+TAKEN_OVER = ("mask", "rehearsal_mask", "flow", "flow_since")
+"""Fields that a frame takes over from another chain where it has none of its own."""
+
+
 def with_findings(decided: Frame, found: Frame) -> Frame:
-    """The frame with the tool mask that the other one has, and without the pixels that either leaves out of the loss."""
-    mask = found.mask if decided.mask is None else decided.mask
-    left_out = decided.loss_mask
+    """The frame with what the other one has besides, and without the pixels that either leaves out of the loss."""
+    added = {name: getattr(found, name) for name in TAKEN_OVER if getattr(decided, name) is None}
     if found.loss_mask is not None:
-        left_out = found.loss_mask if left_out is None else np.minimum(left_out, found.loss_mask)
-    return decided.with_fields(mask=mask, loss_mask=left_out)
+        own = decided.loss_mask
+        added["loss_mask"] = found.loss_mask if own is None else np.minimum(own, found.loss_mask)
+    return decided.with_fields(**added)
 
 
-def through(chain: Sequence[Operator], frame: Frame) -> Frame:
+def through(operators: Sequence[Operator], frame: Frame) -> Frame:
     """The frame as it comes out of a chain."""
-    for operator in chain:
+    for operator in operators:
         port: Any = _Passing(frame)
         operator.metadata = {}
         operator.compute(port, port, port)

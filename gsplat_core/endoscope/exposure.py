@@ -13,17 +13,15 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.reduced import reduced, reduced_mask
+from gsplat_core.endoscope.exposure_samples import Reference, Sample, ratio, sample_of, share_with
 from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 Gains = tuple[float, float, float]
 UNCHANGED: Gains = (1.0, 1.0, 1.0)
-WIDTH_PX, HEIGHT_PX = 32, 24
 
 
 @dataclass(frozen=True)
@@ -34,6 +32,8 @@ class ExposureSettings:
     """A difference from the present gain up to here is ignored while the gain is held."""
     drift_zone: float = 0.1
     """The same for a slower change, which shows against older references: the tissue has moved since."""
+    more_pixels: float = 1.5
+    """So many times as many pixels must agree with a change as with none."""
     anchor_zone: float = 0.15
     """A gain that has settled is at most this far from what the scene's first frames say, where they can still be compared."""
     release: float = 0.04
@@ -69,6 +69,7 @@ class ExposureSettings:
             self,
             dead_zone=share,
             drift_zone=share,
+            more_pixels=NumberIn(0.0, 100.0),
             anchor_zone=share,
             release=NumberIn(0.0, 1.0),
             settled_change=share,
@@ -86,23 +87,6 @@ class ExposureSettings:
         )
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """A reduced picture: logarithms of its channels, and where they can be compared."""
-
-    logs: NDArray[np.float32]
-    """[pixels, 3]"""
-    valid: NDArray[np.bool_]
-    """[pixels, 3]"""
-
-
-@dataclass(frozen=True)
-class _Reference:
-    sample: _Sample
-    log_gain: NDArray[np.float64]
-    """[3]"""
-
-
 class ExposureEstimator:
     """Follows the gains of a stream; one call a frame, in order.
 
@@ -115,11 +99,11 @@ class ExposureEstimator:
         self.settings = settings or ExposureSettings()
         self.following = False
         """Whether the exposure is changing now."""
-        self._anchor: _Reference | None = None
+        self._anchor: Reference | None = None
         """The scene's first frame."""
-        self._references: deque[_Reference] = deque(maxlen=self.settings.references)
-        self._young: deque[_Reference] = deque(maxlen=self.settings.young_references)
-        self._previous: _Reference | None = None
+        self._references: deque[Reference] = deque(maxlen=self.settings.references)
+        self._young: deque[Reference] = deque(maxlen=self.settings.young_references)
+        self._previous: Reference | None = None
         self._log_gain = np.zeros(3)
         self._steady = 0
         self._since_reference = 0
@@ -140,28 +124,19 @@ class ExposureEstimator:
 
     def observe(self, image: NDArray[np.uint8], kept: NDArray[np.generic] | None, pts_ns: int) -> Gains:
         """Gains of the frame `image`, RGB uint8 [H, W, 3]; `kept` [H, W] is 0 where it is not tissue, and `pts_ns` its time."""
-        sample = self._sample(image, kept)
+        sample = sample_of(image, kept, self.settings.darkest, self.settings.brightest)
         if self._previous is None:
-            self._anchor = _Reference(sample, self._log_gain)
+            self._anchor = Reference(sample, self._log_gain)
             self._references.append(self._anchor)
         elif self.following:
             self._follow(sample)
         else:
             self._hold(sample, pts_ns)
-        self._previous = _Reference(sample, self._log_gain)
+        self._previous = Reference(sample, self._log_gain)
         self._last_pts_ns = pts_ns
         return self.gains
 
-    def _sample(self, image: NDArray[np.uint8], kept: NDArray[np.generic] | None) -> _Sample:
-        # Averaged from 8-bit values in floats: at 32x24 in 8 bits a step of 1 % in a dark channel would be lost.
-        small = reduced(image, 4 * WIDTH_PX, 4 * HEIGHT_PX).astype(np.float32)
-        small = np.asarray(cv2.resize(small, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA), np.float32)
-        valid = (small > self.settings.darkest) & (small < self.settings.brightest)
-        if kept is not None:
-            valid &= reduced_mask(kept, WIDTH_PX, HEIGHT_PX)[..., None]
-        return _Sample(np.log(np.maximum(small, 1.0)).reshape(-1, 3), valid.reshape(-1, 3))
-
-    def _hold(self, sample: _Sample, pts_ns: int) -> None:
+    def _hold(self, sample: Sample, pts_ns: int) -> None:
         assert self._previous is not None
         settings = self.settings
         self._since_reference += 1
@@ -175,24 +150,28 @@ class ExposureEstimator:
                 self._since_reference = 0
                 if len(self._young) == self._young.maxlen:
                     self._references.append(self._young.popleft())
-                self._young.append(_Reference(sample, self._log_gain))
+                self._young.append(Reference(sample, self._log_gain))
             return
         self._young.clear()
         self.following, self._steady = True, 0
 
-    def _changed(self, sample: _Sample, references: Iterable[_Reference], zone: float, clear: float) -> bool:
+    def _changed(self, sample: Sample, references: Iterable[Reference], zone: float, clear: float) -> bool:
         """Whether the references show another gain than the present one, clearly beside how unlike they are; takes it on if so."""
         found = self._compare(sample, references)
         if found is None:
             return False
-        measured, spread = found
+        measured, spread, best = found
         change = np.abs(measured - self._log_gain).max()
         if change <= max(zone, clear * spread):
+            return False
+        # A tool that covers half of the picture moves the mean, and leaves tissue beside it as it was.
+        same = share_with(sample, best.sample, self._log_gain - best.log_gain)
+        if share_with(sample, best.sample, measured - best.log_gain) < self.settings.more_pixels * same:
             return False
         self._set(measured)
         return True
 
-    def _follow(self, sample: _Sample) -> None:
+    def _follow(self, sample: Sample) -> None:
         assert self._previous is not None
         found = self._compare(sample, [self._previous, *self._references])
         if found is None:
@@ -204,12 +183,12 @@ class ExposureEstimator:
         self._since_reference += 1
         if self._since_reference >= self.settings.reference_every:
             self._since_reference = 0
-            self._references.append(_Reference(sample, self._log_gain))
+            self._references.append(Reference(sample, self._log_gain))
         if self._steady >= self.settings.settled_frames:
             self.following = False
             self._settle(sample)
 
-    def _settle(self, sample: _Sample) -> None:
+    def _settle(self, sample: Sample) -> None:
         """Changes that were too small to follow, and errors of those that were not, must not add up."""
         assert self._anchor is not None
         found = self._compare(sample, [self._anchor])
@@ -218,11 +197,16 @@ class ExposureEstimator:
             self._set(np.clip(self._log_gain, found[0] - zone, found[0] + zone))
         self._release()
 
-    def _compare(self, sample: _Sample, references: Iterable[_Reference]) -> tuple[NDArray[np.float64], float] | None:
-        """Logarithms of the gains by the references that look most like the frame, and how unlike the best is; None where none can tell."""
+    def _compare(
+        self, sample: Sample, references: Iterable[Reference]
+    ) -> tuple[NDArray[np.float64], float, Reference] | None:
+        """Logarithms of the gains by the references that look most like the frame, how unlike the best is, and that one.
+
+        None where no reference can tell.
+        """
         alike = []
         for reference in references:
-            shift, spread = _ratio(sample, reference.sample, 1)
+            shift, spread = ratio(sample, reference.sample, 1)
             if spread <= self.settings.most_unlike:
                 alike.append((spread, reference, shift))
         if not alike:
@@ -231,7 +215,7 @@ class ExposureEstimator:
         total, weights = np.zeros(3), np.zeros(3)
         for spread, reference, green in alike[:3]:
             for channel in range(3):
-                shift, own = (green, spread) if channel == 1 else _ratio(sample, reference.sample, channel)
+                shift, own = (green, spread) if channel == 1 else ratio(sample, reference.sample, channel)
                 weight = 0.0 if own > self.settings.most_unlike else 1 / (own + 0.01) ** 2
                 total[channel] += weight * (shift + reference.log_gain[channel])
                 weights[channel] += weight
@@ -241,7 +225,7 @@ class ExposureEstimator:
         measured = total / np.maximum(weights, 1e-9)
         # A channel that is clipped or dark throughout changes as the others do.
         others = float((measured - self._log_gain)[known].mean())
-        return np.where(known, measured, self._log_gain + others), alike[0][0]
+        return np.where(known, measured, self._log_gain + others), alike[0][0], alike[0][1]
 
     def _forget(self, pts_ns: int) -> None:
         if self._last_pts_ns is not None and self._log_gain.any():
@@ -256,18 +240,3 @@ class ExposureEstimator:
     def _set(self, log_gain: NDArray[np.float64]) -> None:
         most = math.log(self.settings.largest_gain)
         self._log_gain = np.clip(log_gain, -most, most)
-
-
-def _ratio(sample: _Sample, reference: _Sample, channel: int) -> tuple[float, float]:
-    """How much brighter the sample is in a channel, as a logarithm, and the median distance of the pixels from that; infinite if too few."""
-    both = sample.valid[:, channel] & reference.valid[:, channel]
-    difference = (sample.logs[:, channel] - reference.logs[:, channel])[both]
-    if len(difference) < len(both) // 20:
-        return 0.0, math.inf
-    shift = float(np.median(difference))
-    spread = float(np.median(np.abs(difference - shift)))
-    # The mean of those near the median: what moved, or is a tool, lies further away on one side.
-    for _ in range(2):
-        near = np.abs(difference - shift) <= max(2 * spread, 0.02)
-        shift = float(difference[near].mean()) if near.any() else shift
-    return shift, spread

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.endoscope.small_picture import averaged
 from gsplat_core.errors import InvalidInput
 
 LONG_SIDE_PX = 96
@@ -77,9 +78,8 @@ def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
         return None
     scale = min(1.0, LONG_SIDE_PX / max(height, width))
     size = max(8, round(width * scale)), max(8, round(height * scale))
-    step = max(1, max(height, width) // (2 * LONG_SIDE_PX))
     # Averaging leaves little of noise, whose colours would look varied.
-    small = cv2.resize(np.ascontiguousarray(image[::step, ::step]), size, interpolation=cv2.INTER_AREA)
+    small = averaged(image, size)
     small = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0), np.uint8)
     brightness = np.asarray(cv2.max(cv2.max(small[..., 0], small[..., 1]), small[..., 2]), np.uint8)
     seen = brightness >= DARKEST

@@ -17,6 +17,8 @@ from gsplat_core.endoscope.reduced import luma
 from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
+LONG_SIDE_PX = 800
+"""Of longer pictures only every second, third, … pixel is looked at."""
 SMALLEST_PX = 64
 """In smaller pictures nothing is looked for."""
 
@@ -27,9 +29,9 @@ class StripSettings:
 
     band: float = 0.08
     """How far from a border strips and text are looked for, in shares of the picture's height or width."""
-    every: int = 3
-    """One frame in so many is looked at ..."""
-    first_after: int = 12
+    every: int = 4
+    """One frame in so many is looked at, the borders one after another ..."""
+    first_after: int = 10
     """... and after so many of those, and again each time, it is decided."""
     remembered: int = 40
     """Means go over about so many of them."""
@@ -75,28 +77,39 @@ class StripDetector:
         """uint8 [H, W]: 0 on strips and text; None without any. The same array until it changes; not to be written to."""
         self._shape: tuple[int, ...] = ()
         self._bands: list[_Band] = []
+        self._small: tuple[int, int] = (0, 0)
+        """Height and width of the picture that is looked at: every `_step`-th pixel."""
+        self._step = 1
         self._frames = 0
         self._before: NDArray[np.bool_] | None = None
 
     def observe(self, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
         """`mask` after this frame, RGB uint8 [H, W, 3], which must be a usable one."""
         if image.shape != self._shape:
-            self._shape, self._frames, self.mask, self._before = image.shape, 0, None, None
-            self._bands = []
-            if min(image.shape[:2]) >= SMALLEST_PX:
-                depths = [max(8, round(self.settings.band * side)) for side in image.shape[:2]]
-                self._bands = [_Band(turns, depths[turns % 2]) for turns in range(4)]
-        if self._bands and self._frames % self.settings.every == 0:
-            for band in self._bands:
-                band.add(image, self.settings)
-            looked_at = self._frames // self.settings.every + 1
-            if looked_at % self.settings.first_after == 0:
+            self._start(image.shape)
+        if self._bands:
+            some = image[:: self._step, :: self._step]
+            turn, slice_of = divmod(self._frames, self.settings.every)
+            # A border at a time, so that no frame takes much longer than another.
+            for band in self._bands[slice_of :: self.settings.every]:
+                band.add(some, self.settings)
+            if slice_of == self.settings.every - 1 and (turn + 1) % self.settings.first_after == 0:
                 self._decide()
         self._frames += 1
         return self.mask
 
+    def _start(self, shape: tuple[int, ...]) -> None:
+        self._shape, self._frames, self.mask, self._before = shape, 0, None, None
+        self._step = -(-max(shape) // LONG_SIDE_PX)
+        self._bands = []
+        if min(shape[:2]) >= SMALLEST_PX:
+            height, width = (-(-side // self._step) for side in shape[:2])
+            self._small = (height, width)
+            depths = [max(8, round(self.settings.band * side)) for side in self._small]
+            self._bands = [_Band(turns, depths[turns % 2]) for turns in range(4)]
+
     def _decide(self) -> None:
-        drawn = np.zeros(self._shape[:2], bool)
+        drawn = np.zeros(self._small, bool)
         for band in self._bands:
             band.mark(drawn, self.settings)
         # Twice in a row, so that tissue that rested for a while is not taken for a strip.
@@ -106,8 +119,12 @@ class StripDetector:
         )
         if before is None or not found.any():
             self.mask = None
-        elif self.mask is None or not np.array_equal(self.mask == 0, found):
-            self.mask = (~found).view(np.uint8)
+            return
+        kept = (~found).view(np.uint8)
+        if self._step > 1:
+            kept = np.asarray(cv2.resize(kept, self._shape[1::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+        if self.mask is None or not np.array_equal(self.mask, kept):
+            self.mask = kept
 
 
 class _Band:

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.tool_regions import Regions, neighbourhood, tool_regions, whole_tools
+from gsplat_core.endoscope.small_picture import averaged
+from gsplat_core.endoscope.tool_regions import SHARP_EDGE, Regions, neighbourhood, tool_regions, whole_tools
 from gsplat_core.errors import InvalidInput
 
 Plane = NDArray[np.float32]
@@ -36,8 +37,8 @@ OTHER_SCENE = 0.7
 """A frame whose distribution differs by this much (0..2, sum of absolute differences) is of another scene: everything starts again."""
 EXPECTED_VALLEY, VALLEY_SPREAD, HIGHEST_VALLEY = 0.15, 0.3, 0.33
 """Where the threshold is looked for: with correct white balance grey lies at 0 and pale tissue at 0.3."""
-NO_VALLEY = 0.1
-"""The threshold where the distribution has no valley, so that only what is really grey can be a tool."""
+NO_VALLEY, SHARPER_EDGE = 0.25, 0.8
+"""The threshold where the distribution has no valley, pale tissue included; a tool's outline must then be sharper than otherwise."""
 CLEAR_VALLEY = 1.15
 """How much lower than both its peaks a valley must be."""
 SMALLEST_SHARE = 0.003
@@ -100,8 +101,9 @@ class ToolFinder:
             self.reset()
             return np.zeros(view.redness.shape, np.bool_)
         redness = self._stretched(view.redness, lit)
-        threshold = valley(self._histogram)
-        regions = Regions(redness, threshold, view.brightness, view.inside, self._previous)
+        threshold, clear = valley(self._histogram)
+        sharp = SHARP_EDGE if clear else SHARPER_EDGE
+        regions = Regions(redness, threshold, view.brightness, view.inside, self._previous, sharp)
         tools = whole_tools(regions, tool_regions(regions))
         if self._previous is not None and self._held < HELD_FRAMES and tools.sum() < 0.4 * self._previous.sum():
             self._held += 1
@@ -113,7 +115,9 @@ class ToolFinder:
     def _stretched(self, redness: Plane, lit: Flags) -> Plane:
         """Redness with the scene's contrast taken out, after the running distribution has taken in this frame's."""
         values = redness[lit]
-        reach = float(np.partition(values, int(0.75 * (values.size - 1)))[int(0.75 * (values.size - 1))])
+        some = values[::4]
+        at = int(0.75 * (some.size - 1))
+        reach = float(np.partition(some, at)[at])
         stretch = RED_SCENE / min(max(reach, PALEST_SCENE), RED_SCENE)
         histogram = _histogram(values * np.float32(stretch))
         if self._histogram is not None and np.abs(histogram - self._histogram).sum() > OTHER_SCENE:
@@ -132,9 +136,7 @@ def view_of(image: NDArray[np.uint8]) -> View:
     height, width = image.shape[:2]
     scale = min(1.0, LONG_SIDE_PX / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    # Twice the rows and columns that are needed are averaged; taking the others in would change little and cost more.
-    step = max(1, max(height, width) // (2 * LONG_SIDE_PX))
-    small = cv2.resize(np.ascontiguousarray(image[::step, ::step]), size, interpolation=cv2.INTER_AREA)
+    small = averaged(image, size)
     red, green, blue = cv2.split(small)
     brightness = np.asarray(cv2.max(cv2.max(red, green), blue), np.uint8)
     inside = field_of_view(brightness)
@@ -159,10 +161,10 @@ def field_of_view(brightness: NDArray[np.uint8]) -> Flags:
     return cv2.erode(inside, neighbourhood(3), borderType=cv2.BORDER_CONSTANT, borderValue=1).astype(np.bool_)
 
 
-def valley(histogram: NDArray[np.float64] | None) -> float:
-    """The redness between a grey peak of a distribution and the rest; NO_VALLEY where there is no clear one."""
+def valley(histogram: NDArray[np.float64] | None) -> tuple[float, bool]:
+    """The redness between a grey peak of a distribution and the rest, and True; NO_VALLEY and False where there is no clear one."""
     if histogram is None:
-        return NO_VALLEY
+        return NO_VALLEY, False
     kernel = cv2.getGaussianKernel(21, 2.5)[:, 0]
     density = np.convolve(np.pad(histogram, 10, mode="edge"), kernel, "valid")
     at = LOWEST + (np.arange(BINS) + 0.5) * (HIGHEST - LOWEST) / BINS
@@ -171,7 +173,8 @@ def valley(histogram: NDArray[np.float64] | None) -> float:
     clear = np.minimum(np.minimum(left, right), 0.02) / (density + 4e-4)
     clear[(np.cumsum(histogram) < SMALLEST_SHARE) | (at > HIGHEST_VALLEY)] = 0
     best = int(np.argmax(clear * np.exp(-0.5 * ((at - EXPECTED_VALLEY) / VALLEY_SPREAD) ** 2)))
-    return float(at[best]) if clear[best] > CLEAR_VALLEY else NO_VALLEY
+    found = bool(clear[best] > CLEAR_VALLEY)
+    return (float(at[best]) if found else NO_VALLEY), found
 
 
 def _histogram(values: Plane) -> NDArray[np.float64]:

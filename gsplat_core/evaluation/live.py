@@ -7,6 +7,7 @@ scored, and a viewer of a source that stopped sees what was shown last: nothing 
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,9 +18,10 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.ages import AgeHistogram, Ages
-from gsplat_core.evaluation.scores import Record, Score, ScoreSums, measures, why_left_out
+from gsplat_core.evaluation.baselines import BaselineScore
+from gsplat_core.evaluation.scores import Record, Score, ScoreSums, finite, measures, why_left_out
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.metrics import FrameQuality, frame_quality
+from gsplat_core.training.metrics import FrameQuality, ScoredMean, frame_quality, psnrs_db
 
 MOST_BEHIND = 8
 """Lateness is counted up to so many frames; what is later counts as this many."""
@@ -53,6 +55,10 @@ class Live:
     score: Score
     settled: Score
     """Without the first second."""
+    previous: BaselineScore
+    """The raw frame before, shown instead, over the same frames and pixels: what `score` is to be compared with."""
+    settled_previous: BaselineScore
+    """The same for `settled`."""
     age_when_shown: Ages | None
     """From a frame's arrival to the moment when its picture was shown."""
     age_on_screen: Ages | None
@@ -72,6 +78,8 @@ class LiveSums:
         """record: given each scored frame's figures."""
         self._record = record
         self._score, self._settled = ScoreSums(), ScoreSums()
+        self._before = ScoredMean(), ScoredMean()
+        self._settled_before = ScoredMean(), ScoredMean()
         self._when_shown, self._on_screen = AgeHistogram(), AgeHistogram()
         self._behind: Counter[int] = Counter()
         self._states: Counter[str] = Counter()
@@ -83,18 +91,35 @@ class LiveSums:
         known = state in self._states or len(self._states) < _MAX_STATES
         self._states[state if known else "other"] += 1
 
-    def frame(self, quality: FrameQuality, time_s: float, behind: int, age_ms: float) -> None:
-        """What was on the screen when the next frame came, against frame `quality.seq` of that time: so many frames older, and so old then."""
+    def frame(
+        self, quality: FrameQuality, time_s: float, behind: int, age_ms: float, before_db: tuple[float, float]
+    ) -> None:
+        """What was on the screen when the next frame came, against frame `quality.seq` of that time: so many frames older, and so old then.
+
+        before_db: what the raw frame before scores instead, over tissue and over the whole frame; NaN where there is none.
+        """
         if self._first_s is None:
             self._first_s = time_s
         self._on_screen.add(age_ms)
         self._behind[min(max(behind, 0), MOST_BEHIND)] += 1
         self._score.take(quality)
-        if time_s - self._first_s >= SETTLING_S:
+        settled = time_s - self._first_s >= SETTLING_S
+        for means in (self._before, self._settled_before) if settled else (self._before,):
+            for mean, value in zip(means, before_db, strict=True):
+                mean.add(value)
+        if settled:
             self._settled.take(quality)
         if self._record is not None:
             own = {"seq": quality.seq, "time_s": time_s, "trained": True, "model_version": 0}
-            self._record({**own, **measures(quality), "age_ms": age_ms, "behind": behind})
+            self._record(
+                {
+                    **own,
+                    **measures(quality),
+                    "age_ms": age_ms,
+                    "behind": behind,
+                    "previous_frame_db": finite(before_db[0]),
+                }
+            )
 
     def leave_out(self, reason: str) -> None:
         """A frame that is not scored."""
@@ -106,6 +131,8 @@ class LiveSums:
         return Live(
             score=self._score.score,
             settled=self._settled.score,
+            previous=_baseline(self._before),
+            settled_previous=_baseline(self._settled_before),
             age_when_shown=self._when_shown.ages(),
             age_on_screen=self._on_screen.ages(),
             in_time=self._behind[0],
@@ -127,6 +154,7 @@ def evaluate_live(frames: Iterable[Frame], shown: Iterable[Shown], *, record: Re
     """
     sums = LiveSums(record)
     screen = _Screen(shown, sums)
+    before: Frame | None = None
     for frame, following in pairwise(_in_order(frames)):
         assert following.arrived_ns is not None
         picture = screen.at(following.arrived_ns)
@@ -142,9 +170,20 @@ def evaluate_live(frames: Iterable[Frame], shown: Iterable[Shown], *, record: Re
         else:
             quality = frame_quality(frame.seq, picture.image, frame.image, frame.mask)
             age_ms = (following.arrived_ns - picture.arrived_ns) / _NS_PER_MS
-            sums.frame(quality, frame.time_s, frame.seq - picture.seq, age_ms)
+            sums.frame(quality, frame.time_s, frame.seq - picture.seq, age_ms, _copy_db(before, frame))
+        before = frame
     screen.rest()
     return sums.live
+
+
+def _copy_db(before: Frame | None, frame: Frame) -> tuple[float, float]:
+    if before is None or before.image.shape != frame.image.shape:
+        return math.nan, math.nan
+    return psnrs_db(before.image, frame.image, frame.mask)
+
+
+def _baseline(means: tuple[ScoredMean, ScoredMean]) -> BaselineScore:
+    return BaselineScore(means[0].mean, means[1].mean, means[0].count)
 
 
 class _Screen:

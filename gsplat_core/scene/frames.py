@@ -47,7 +47,13 @@ class Frame:
     arrived_ns: int | None = None
     """When a live frame came in, in nanoseconds of `time.monotonic_ns`; None where time plays no part."""
     loss_mask: NDArray[np.uint8] | None = None
-    """[H, W]; 0 = left out of the loss though it may be tissue: highlights, outside of the field of view. None: nothing is left out."""
+    """[H, W]; 0 = left out of the loss though it may be tissue: outside of the field of view, a recorder's strip. None: nothing is left out."""
+    rehearsal_mask: NDArray[np.uint8] | None = None
+    """[H, W]; 0 = left out of the loss of what lasts, and still shown: highlights, which move with the light and not with the tissue."""
+    flow: NDArray[np.float32] | None = None
+    """Optical flow from an earlier picture to this one, [h, w, 2] (see `gsplat_core.training.image_motion.ImageMotion.raw_flow`)."""
+    flow_since: int | None = None
+    """`seq` of that earlier frame."""
     exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """How bright red, green and blue of this picture are beside the scene's own colours, which are those of the stream's first frames."""
     withheld: str | None = None
@@ -66,7 +72,8 @@ class Frame:
             raise InvalidInput(
                 f"frame {self.seq}: right image {list(self.right_image.shape)} differs from left {list(image.shape)}"
             )
-        for name, plane in (("depth", self.depth), ("mask", self.mask), ("loss_mask", self.loss_mask)):
+        planes = {name: getattr(self, name) for name in ("depth", "mask", "loss_mask", "rehearsal_mask")}
+        for name, plane in planes.items():
             if plane is not None and plane.shape != size:
                 raise InvalidInput(f"frame {self.seq}: {name} is {list(plane.shape)}, the image is {list(size)}")
         if self.pose is not None and self.pose.shape != (4, 4):

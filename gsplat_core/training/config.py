@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import get_args
 
 from gsplat_core.deformation.rates import FieldRates, check_rates
 from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.motion_priors import MOTION_PRIORS
 
 
@@ -71,6 +73,8 @@ class ReconstructorConfig:
     """Distance of the plane on which a recording without depth starts."""
     motion_prior: str = "bumps"
     """What is assumed about motion after the newest frame: a name in `MOTION_PRIORS`."""
+    motion_detail: Detail = "full"
+    """How closely a motion prior looks at pictures; `half` where it has to be quick."""
     start_from_motion: bool = False
     """Whether a motion prior moves the scene to where a new frame shows it, before the first step on that frame."""
     depth_from_motion: bool = False
@@ -87,6 +91,8 @@ class ReconstructorConfig:
             if getattr(self, name) < 1:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 1")
         MOTION_PRIORS.check(self.motion_prior)
+        if self.motion_detail not in get_args(Detail):
+            raise InvalidSetting(f"motion_detail is {self.motion_detail!r}; choose {' or '.join(get_args(Detail))}")
         if not 0 <= self.sh_degree <= 4:
             raise InvalidSetting(f"sh_degree is {self.sh_degree}; it must be 0 to 4")
         if self.max_gaussians < self.gaussians:

@@ -105,14 +105,17 @@ class LiveReconstructor(Reconstructor):
         """How long so many rehearsal steps usually take, together with those that are still under way; 0 before anything was timed."""
         return (steps + REHEARSED_IN_FLIGHT) * (self._step_s or 0.0) * 1e9
 
+    _follows_at_once = False
+
     def grow(self, frame: Frame) -> None:
-        """Add Gaussians where `frame`, the newest one that was trained on, shows tissue that the model does not cover. `observe` leaves
-        that for the time after the frame was shown."""
+        """What `observe` leaves for the time after `frame`, the newest one that was trained on, was shown: Gaussians are added where it
+        shows tissue that the model does not cover, those out of view make room and come back, and the motion prior sees the frame."""
         assert self._step is not None
         observation = self._window.newest
         if self._out_of_view is not None:
             self._out_of_view.follow(self._step, observation)
         super()._grow(frame, observation)
+        self._follow(frame, observation)
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
         pass

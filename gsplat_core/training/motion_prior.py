@@ -20,6 +20,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.layout import COLOUR, LOG_SCALE, POSITION, RAW_COLUMNS
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.damping import Damping
 from gsplat_core.training.depth_from_motion import DepthFromMotion
 from gsplat_core.training.image_motion import ImageMotion, typical_px
 from gsplat_core.training.motion_priors import MOTION_PRIORS
@@ -31,9 +32,7 @@ HORIZON_S = 0.15
 """How long after the newest frame its motion goes on; then the model holds still."""
 LONGEST_GAP_S = 0.15
 """Frames further apart do not show a velocity."""
-DAMPING = 0.6
-"""The share of the last frame's motion that the next one is expected to have: the best constant over the recordings at hand."""
-UNCERTAINTY = 0.1
+UNCERTAINTY = 0.05
 """Variance of where a Gaussian will be, in squares of the length of its last motion."""
 MOST_WIDENED = 0.7
 """Bound of what is added to a log-scale from one frame to the next."""
@@ -63,20 +62,23 @@ class MotionPrior(Protocol):
 
 
 class FlowPrior:
-    """The motion between the last two frames goes on, damped. It is measured in the pictures, as optical flow of the tissue.
+    """The motion between the last two frames goes on, as much of it as went on before. It is measured in the pictures, as optical flow of the tissue.
 
     That is more exact than the model's own past: bumps in time average over several frames.
     """
 
     def __init__(self, config: ReconstructorConfig) -> None:
         self._starts_there, self._finds_depth = config.start_from_motion, config.depth_from_motion
-        self._image_motion = ImageMotion()
+        self._image_motion = ImageMotion(config.motion_detail)
+        self._newest_seq: int | None = None
         self.forget()
 
     def forget(self) -> None:
         """See `MotionPrior.forget`."""
+        self._newest_seq = None
         self._image_motion.forget()
         self._depth = DepthFromMotion()
+        self._damping = Damping()
         self._camera: Camera | None = None
         self._motion: SurfaceMotion | None = None
         self._interval_s = 0.0
@@ -88,8 +90,10 @@ class FlowPrior:
         """See `MotionPrior.observe`."""
         before, before_s = self._camera, self.newest_s
         self._camera, self.newest_s = camera, time_s
-        self._motion = None
-        flow = self._image_motion.follow(frame.image, _followed(frame))
+        last, last_interval_s, self._motion = self._usable_motion(), self._interval_s, None
+        known = frame.flow if frame.flow_since == self._newest_seq else None
+        self._newest_seq = frame.seq
+        flow = self._image_motion.follow(frame.image, _followed(frame), known)
         if flow is None or before is None or camera.model != "pinhole":
             return
         self._interval_s = time_s - before_s
@@ -97,20 +101,33 @@ class FlowPrior:
         self._motion = SurfaceMotion(tensor_of(flow, step.gaussians.device), before, camera)
         if self._finds_depth and frame.pose is not None and frame.depth is None:
             self._depth.apply(step, self._motion, before_s)
+        if last is not None and self._usable_motion() is not None:
+            self._learn_damping(step, last, last_interval_s, before_s)
         if self._starts_there:
             self._start_there(step, before_s, time_s)
 
     def velocity(self, step: TrainingStep) -> Tensor | None:
         """See `MotionPrior.velocity`."""
-        if self._motion is None or self._is_sudden or not 0 < self._interval_s <= LONGEST_GAP_S:
+        motion = self._usable_motion()
+        if motion is None:
             return None
         with torch.no_grad():
             deltas = step.field.deltas(self.newest_s)
-            moved = self._motion.arrived(step.gaussians.means + deltas[:, POSITION])
+            moved = motion.arrived(step.gaussians.means + deltas[:, POSITION])
             velocity = moved.new_zeros(moved.shape[0], RAW_COLUMNS)
-            velocity[:, POSITION] = DAMPING * moved
+            velocity[:, POSITION] = self._damping.damped(moved)
             velocity[:, LOG_SCALE] = widened(step.gaussians.log_scales + deltas[:, LOG_SCALE], moved)
         return velocity / self._interval_s
+
+    def _usable_motion(self) -> SurfaceMotion | None:
+        """The newest motion where it says how the next frame will be."""
+        return self._motion if 0 < self._interval_s <= LONGEST_GAP_S and not self._is_sudden else None
+
+    def _learn_damping(self, step: TrainingStep, last: SurfaceMotion, last_interval_s: float, before_s: float) -> None:
+        assert self._motion is not None
+        with torch.no_grad():
+            points = step.gaussians.means + step.field.deltas(before_s)[:, POSITION]
+            self._damping.learn(last.arrived(points) / last_interval_s, self._motion.ahead(points) / self._interval_s)
 
     def _judge(self, moved_px: float) -> None:
         """Whether the motion is a jump; learn the usual one."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -29,6 +29,14 @@ class Observation:
     """uint8 [H, W]; 1 = tissue."""
     depth: Tensor | None
     """float32 [H, W] in millimetres; 0 = unknown."""
+    rehearsal_mask: Tensor | None = None
+    """uint8 [H, W]; 0 = left out when the frame is trained on again later."""
+
+    def to_rehearse(self) -> Observation:
+        """The frame as it is trained on again later."""
+        if self.rehearsal_mask is None:
+            return self
+        return replace(self, mask=self.mask & self.rehearsal_mask, rehearsal_mask=None)
 
     @staticmethod
     def of(frame: Frame, camera: Camera, device: torch.device | str = "cpu") -> Observation:
@@ -54,6 +62,7 @@ class Observation:
             image=tensor_of(image, device),
             mask=tensor_of(mask.astype(np.uint8, copy=False), device),
             depth=None if frame.depth is None else tensor_of(known_depth(frame.depth), device),
+            rehearsal_mask=None if frame.rehearsal_mask is None else tensor_of(frame.rehearsal_mask, device),
         )
 
 
@@ -73,7 +82,7 @@ class ObservationWindow:
 
     def add(self, observation: Observation) -> None:
         """Make `observation` the newest; the oldest leaves a full window."""
-        self._frames.append(observation)
+        self._frames.append(observation.to_rehearse())
 
     @property
     def newest(self) -> Observation:

@@ -68,12 +68,14 @@ class Reconstructor:
         """The frame whose steps are queued; whether their splats fitted the tile lists is not known yet."""
         self._in_flight = StepsInFlight(self.device)
         self._step_s: float | None = None
-        """How long a step took lately, where budgets are timed."""
         self._version = 0
         self._slots = SnapshotSlots(self.device, rows=self._fixed_rows)
         self._usual_first_loss = math.inf
         self._first_time_s = 0.0
         self._last_time_s = 0.0
+
+    _follows_at_once = True
+    """Whether the motion prior sees a frame before the model is trained on it."""
 
     @property
     def gaussians(self) -> int:
@@ -127,8 +129,8 @@ class Reconstructor:
         self._window.forget_before(self._step.field.time_window_s[0])
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
-        if self._prior is not None:
-            self._prior.observe(frame, observation.time_s, observation.camera, self._step)
+        if self._follows_at_once:
+            self._follow(frame, observation)
         self._window.add(observation)
         if not first:
             self._grow(frame, observation)
@@ -170,10 +172,7 @@ class Reconstructor:
         return ObserveReport(observation.seq, spending.made + extra, HostCopy(loss), self.gaussians, spending.ending)
 
     def _settle(self) -> None:
-        """Wait for the queued steps, and take again those whose splats did not fit the tile lists.
-
-        With a number of steps this is done when the next frame comes: until then the host prepares it while a GPU trains.
-        """
+        """Wait for the queued steps, and take again those whose splats did not fit the tile lists."""
         if self._step is not None and self._unsettled is not None:
             self._step.settle(self._unsettled)
         self._unsettled = None
@@ -222,13 +221,9 @@ class Reconstructor:
         self._last_time_s = observations[-1][1].time_s
         for frame, observation in observations[1:]:
             self._grow(frame, observation)
-        training = OfflineTraining(
-            self._step,
-            [observation for _, observation in observations],
-            settings or FitSettings(),
-            most_gaussians=self.config.max_gaussians,
-            seed=self._seed,
-        )
+        seen = [observation for _, observation in observations]
+        most = self.config.max_gaussians
+        training = OfflineTraining(self._step, seen, settings or FitSettings(), most_gaussians=most, seed=self._seed)
         loss = training(steps, progress)
         return ObserveReport(observations[-1][0].seq, steps, HostCopy(loss), self.gaussians)
 
@@ -281,6 +276,11 @@ class Reconstructor:
         self._prior = None if end_s is not None else new_motion_prior(self.config, field)
         if self.device.type == "cuda" and SnapshotSlots.can_hold(field):
             self._coverage = CapturedCoverage(self.camera, self.device, self._fixed_rows)
+
+    def _follow(self, frame: Frame, observation: Observation) -> None:
+        """Let the motion prior see the next frame."""
+        if self._prior is not None and self._step is not None:
+            self._prior.observe(frame, observation.time_s, observation.camera, self._step)
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
         """Add Gaussians where the frame shows tissue that the model does not cover."""

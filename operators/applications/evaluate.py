@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
@@ -18,14 +20,15 @@ from gsplat_core.evaluation.retention import Retention, Return, evaluate_retenti
 from gsplat_core.evaluation.scores import Record
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.model import Model
+from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded
-from operators.applications.evaluated import EvaluatedRun, SeenFrames, fitting_source, frame_tolerance_s
+from operators.applications.evaluated import EvaluatedRun, Playback, SeenFrames, fitting_source, frame_tolerance_s
 from operators.applications.evaluation import PROTOCOLS, WITHOUT_LEARNING, CausalRun, Evaluation, EvaluationSettings
 from operators.applications.limits import check_picture
 from operators.applications.live_log import is_live_log, read_live_log
 from operators.applications.memory import render_bytes, replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
-from operators.applications.replay import ReplaySettings, new_reconstructor
+from operators.applications.replay import ReplaySettings
 from operators.frame_log import FRAMES_FILE, FrameLog, read_frames
 from operators.sources.source import FrameSource
 
@@ -48,9 +51,10 @@ def evaluate(
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device)
     scale = settings.scale if settings.scale is not None or run is None else run.scale
-    source, scale, notes = fitting_source(settings.recording, model, scale, settings.max_frames)
+    fps = None if run is None else run.fps
+    source, scale, playback, notes = fitting_source(settings.recording, model, scale, settings.max_frames, fps)
     check_picture(source.description.camera, scale)
-    work = _Work(model, run, settings, source, scale, folder, progress, stop_requested)
+    work = _Work(model, run, settings, source, playback, scale, folder, progress, stop_requested)
     work.notes += [*source.description.notes, *notes]
     return work.done()
 
@@ -64,18 +68,20 @@ class _Work:
         run: EvaluatedRun | None,
         settings: EvaluationSettings,
         source: FrameSource,
+        playback: Playback,
         scale: float,
         folder: Path,
         progress: ProgressCallback | None,
         stop_requested: Callable[[], bool],
     ) -> None:
         self.model, self.run, self.settings, self.source = model, run, settings, source
+        self.playback = playback
         self.scale, self.folder, self.progress, self.stop_requested = scale, folder, progress, stop_requested
         self.notes: list[str] = []
         self.logs: dict[str, Path] = {}
         description = source.description
         self.camera = description.camera
-        tolerance_s = frame_tolerance_s(description.fps)
+        tolerance_s = frame_tolerance_s(description.fps / playback.stretch)
         self.window_s = model.time_window_s[0] - tolerance_s, model.time_window_s[1] + tolerance_s
 
     def done(self) -> Evaluation:
@@ -141,11 +147,16 @@ class _Work:
         if places is None:
             poses = "pose" in self.source.description.fields
             places = tuple(find_places(self._frames("places"))) if poses else ()
+        end_s = self.model.time_window_s[1]
+        if math.isinf(self.playback.round_s):
+            description = self.source.description
+            end_s = min(end_s, ((description.frame_count or 1) - 1) / description.fps * self.playback.stretch)
+        from_s = min([end_s - self.settings.last_s, *(place.first[0] for place in places)])
         with self._log("retention") as record:
             return evaluate_retention(
-                self._frames("retention"),
+                self._frames("retention", from_s),
                 self._of_final_model(),
-                window_s=(self.model.time_window_s[0], min(self.model.time_window_s[1], self._last_time_s())),
+                window_s=(self.model.time_window_s[0], end_s),
                 last_s=self.settings.last_s,
                 places=places,
                 record=record,
@@ -155,14 +166,16 @@ class _Work:
         settings = self._learning_settings()
         description = self.source.description
         config = settings.reconstructor_config(description.width_px * description.height_px)
+        if self.settings.motion_prior is not None:
+            prior = self.settings.motion_prior
+            config = replace(config, motion_prior=prior, start_from_motion=True, depth_from_motion=True)
         if settings.device == "cpu":
             require_memory(replay_bytes(description, config), "the causal protocol", "give a smaller --scale")
+        learning = Reconstructor(config, self.camera, seed=settings.seed, device=settings.device)
         pictures = PictureMaker(self.camera, settings.device, self.settings.renderer)
         with self._log("causal") as record, seeded(settings.seed, settings.device):
-            score = evaluate_causal(
-                self._frames("causal"), new_reconstructor(settings, self.source), pictures, record=record
-            )
-        return CausalRun(score, config.chosen_field, config.steps_per_frame, settings.seed)
+            score = evaluate_causal(self._frames("causal"), learning, pictures, record=record)
+        return CausalRun(score, config.chosen_field, config.steps_per_frame, settings.seed, config.motion_prior)
 
     def _learning_settings(self) -> ReplaySettings:
         """How the causal protocol learns: as the run did."""
@@ -212,13 +225,12 @@ class _Work:
         pictures = PictureMaker(camera, settings.device, settings.renderer)
         return lambda frame: pictures(model, frame)
 
-    def _last_time_s(self) -> float:
-        description = self.source.description
-        assert description.frame_count is not None
-        return (description.frame_count - 1) / description.fps
-
-    def _frames(self, stage: str) -> SeenFrames:
-        return SeenFrames(self.source, self.window_s[1], self.stop_requested, self._progress(stage))
+    def _frames(self, stage: str, from_s: float = -math.inf) -> SeenFrames:
+        """The frames that the model has seen; of a looped recording one round, or all of them from a time on."""
+        until_s = self.window_s[1]
+        if math.isinf(from_s):
+            until_s = min(until_s, self.playback.round_s - 0.5 / self.source.description.fps * self.playback.stretch)
+        return SeenFrames(self.source, from_s, until_s, self.playback, self.stop_requested, self._progress(stage))
 
     def _progress(self, stage: str) -> Callable[[int], None]:
         total = self.source.description.frame_count or 0

@@ -15,7 +15,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
 from operators.applications.finishing import FirstFrames
 from operators.sources.registry import SourceOptions, open_source
-from operators.sources.source import FrameSource
+from operators.sources.source import FrameSource, SourceDescription
 
 SAME_CAMERA = 1e-3
 """How far focal lengths and principal points may be apart, as a share of the picture's width."""
@@ -33,24 +33,55 @@ class EvaluatedRun:
     scale: float
     heldout: bool
     """Whether the protocol's held-out frames were kept from training."""
+    fps: float | None = None
+    """The rate at which a live run played; None: the recording's own."""
+
+
+@dataclass(frozen=True)
+class Playback:
+    """How a stream's times follow from those of the recording that it played, as `RealtimeSource` does it."""
+
+    stretch: float = 1.0
+    """Of all times: a recording of 30 frames/s that is played at 60 is over in half of its time."""
+    round_s: float = math.inf
+    """How long one round of a looped recording takes; infinite where it is not looped."""
+
+    def times(self, frame: Frame, turn: int, frames: int) -> Frame:
+        """The frame with its number and time in a round, counted from 0, of a recording of so many frames."""
+        if turn == 0 and self.stretch == 1:
+            return frame
+        offset_ns = round(turn * self.round_s * 1e9) if turn else 0
+        return frame.with_fields(seq=frame.seq + turn * frames, pts_ns=offset_ns + round(frame.pts_ns * self.stretch))
 
 
 @dataclass(frozen=True)
 class SeenFrames:
-    """The frames of a source up to the end of a model's time, and one frame more; read from the beginning each time they are iterated."""
+    """The frames of a source from one time to another; read from the beginning each time they are iterated."""
 
     source: FrameSource
+    from_s: float
     until_s: float
+    playback: Playback = Playback()
     stop_requested: Callable[[], bool] = lambda: False
     progress: Callable[[int], None] = lambda done: None
 
     def __iter__(self) -> Iterator[Frame]:
-        count = self.source.description.frame_count
-        for done, frame in enumerate(FirstFrames(self.source, count or 2**62), start=1):
-            if self.stop_requested() or frame.time_s > self.until_s:
+        count = self.source.description.frame_count or 2**62
+        looped = math.isfinite(self.playback.round_s)
+        turn = math.floor(self.from_s / self.playback.round_s) if looped and self.from_s > 0 else 0
+        done = 0
+        while turn == 0 or turn * self.playback.round_s <= self.until_s:
+            for frame in FirstFrames(self.source, count):
+                frame = self.playback.times(frame, turn, count)
+                if self.stop_requested() or frame.time_s > self.until_s:
+                    return
+                done += 1
+                self.progress(done)
+                if frame.time_s >= self.from_s:
+                    yield frame
+            if not looped:
                 return
-            yield frame
-            self.progress(done)
+            turn += 1
 
 
 def frame_tolerance_s(fps: float) -> float:
@@ -60,9 +91,11 @@ def frame_tolerance_s(fps: float) -> float:
 
 
 def fitting_source(
-    address: Path | str, model: Model, scale: float | None, max_frames: int | None
-) -> tuple[FrameSource, float, list[str]]:
-    """The recording at the model's size; returns it, its scale, and in sentences what a reader of the figures must know.
+    address: Path | str, model: Model, scale: float | None, max_frames: int | None, fps: float | None = None
+) -> tuple[FrameSource, float, Playback, list[str]]:
+    """The recording at the model's size; returns it, its scale, how it was played, and in sentences what a reader of the figures must know.
+
+    fps: the rate at which a live run played it.
 
     scale: of the frames; None takes the one that the model was made at.
 
@@ -93,7 +126,8 @@ def fitting_source(
             "the model was made from other files than these: the figures say how well it shows a recording that it was not made from,"
             " unless only files beside the pictures have changed"
         )
-    return source, scale, [*notes, *_about_time(model, source)]
+    playback, more = _playback(model, description, fps, max_frames is not None)
+    return source, scale, playback, [*notes, *more]
 
 
 def _check_camera(made: Camera, seen: Camera, name: str) -> None:
@@ -118,21 +152,35 @@ def _check_camera(made: Camera, seen: Camera, name: str) -> None:
         )
 
 
-def _about_time(model: Model, source: FrameSource) -> list[str]:
-    """What to say about the frames that lie outside of the model's time. Raises InvalidSetting when all do."""
-    description = source.description
+def _playback(
+    model: Model, description: SourceDescription, fps: float | None, shortened: bool
+) -> tuple[Playback, list[str]]:
+    """How the recording's times became the model's, and what to say about it. shortened: whether only its beginning is read.
+
+    Raises InvalidSetting when they have no time in common."""
     assert description.frame_count is not None
+    stretch = 1.0 if fps is None else description.fps / fps
     start_s, end_s = model.time_window_s
-    length_s = (description.frame_count - 1) / description.fps
-    tolerance_s = frame_tolerance_s(description.fps)
-    if start_s > length_s + tolerance_s:
-        raise InvalidSetting(
-            f"the model has seen {start_s:.2f} to {end_s:.2f} s, and {description.name} ends at {length_s:.2f} s; they have no time in common"
+    round_s = description.frame_count / description.fps * stretch
+    tolerance_s = frame_tolerance_s(description.fps / stretch)
+    notes = [f"the run played the recording at {fps:g} frames/s; times are the run's"] if fps and stretch != 1 else []
+    if fps is not None and not shortened and end_s - tolerance_s > round_s:
+        notes.append(
+            f"the run looped the recording: retention is of the last of {end_s / round_s:.1f} rounds, the baselines are of one"
         )
-    notes = []
-    seen = math.floor((end_s + tolerance_s) * description.fps) + 1
+        return Playback(stretch, round_s), notes
+    if start_s > round_s + tolerance_s:
+        raise InvalidSetting(
+            f"the model has seen {start_s:.2f} to {end_s:.2f} s, and the frames of {description.name} end at {round_s:.2f} s; they have no time"
+            " in common"
+        )
+    if end_s - tolerance_s > round_s:
+        notes.append(
+            f"the model has seen {start_s:.2f} to {end_s:.2f} s, and the frames that are evaluated end at {round_s:.2f} s"
+        )
+    seen = math.floor((end_s + tolerance_s) * description.fps / stretch) + 1
     if seen < description.frame_count:
         notes.append(
             f"the model has seen {start_s:.2f} to {end_s:.2f} s: the first {seen} of the {description.frame_count} frames are evaluated"
         )
-    return notes
+    return Playback(stretch), notes

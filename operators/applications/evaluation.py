@@ -14,6 +14,7 @@ from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.places import Visits
 from gsplat_core.evaluation.retention import LAST_S, Retention, Return
 from gsplat_core.evaluation.scores import Score
+from gsplat_core.training.motion_priors import MOTION_PRIORS
 from operators.applications.limits import check_max_frames, check_scale, check_steps
 from operators.sources.source import SourceDescription
 
@@ -36,6 +37,8 @@ class EvaluationSettings:
     max_frames: int | None = None
     steps_per_frame: int | None = None
     """Of the causal protocol; None takes the run's."""
+    motion_prior: str | None = None
+    """Of the causal protocol: a name in MOTION_PRIORS; None takes the default."""
     last_s: float = LAST_S
     """How much of the stream's end retention renders again."""
     places: tuple[Visits, ...] | None = None
@@ -45,6 +48,8 @@ class EvaluationSettings:
         for name in self.protocols:
             if name not in PROTOCOLS:
                 raise InvalidSetting(f"protocol is {name!r}; choose among {', '.join(PROTOCOLS)}")
+        if self.motion_prior is not None:
+            MOTION_PRIORS.check(self.motion_prior)
         if self.scale is not None:
             check_scale(self.scale)
         if self.steps_per_frame is not None:
@@ -62,6 +67,7 @@ class CausalRun:
     field: str
     steps_per_frame: int
     seed: int
+    motion_prior: str
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,9 @@ class LiveApplication(Application):
         """Wire the operators; see the module's picture."""
         settings, out = self.settings, self.settings.out
         reserve = StorageReserve(out, self.room_to_finish)
-        self.source_op = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
+        self.source_op = SourceOp(
+            self, name="source", source=self.frame_source, stop_requested=self._stop_requested, seconds=settings.seconds
+        )
         recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
         analysis = analysis_operator(
             self, settings.tool_mask, settings.out_of_body, recording.behind_gate(), recording.behind_analysis()

@@ -33,14 +33,11 @@ def analysis_operator(
     return SideBySideOp(
         fragment,
         name="analysis",
-        first=[
+        gate=[
             OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body),
-            *behind_gate,
-            StageOp(fragment, name="picture", stages=new_stages(PICTURE_STAGES, without=[BESIDE])),
-        ],
-        second=[
-            new_tool_mask(fragment, tool_mask),
             StageOp(fragment, name="highlights", stages=new_stages(PICTURE_STAGES, without=others)),
         ],
-        then=[StageOp(fragment, name="tissue", stages=new_stages(TISSUE_STAGES)), *behind],
+        first=[StageOp(fragment, name="picture", stages=new_stages(PICTURE_STAGES, without=[BESIDE]))],
+        beside=[[new_tool_mask(fragment, tool_mask)]],
+        then=[*behind_gate, StageOp(fragment, name="tissue", stages=new_stages(TISSUE_STAGES)), *behind],
     )

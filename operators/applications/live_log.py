@@ -31,6 +31,8 @@ class _Line:
     """Of the picture when it was shown."""
     state: str
     withheld: str | None
+    previous_frame_db: float
+    """What the raw frame before scored instead; NaN where it was not measured."""
     quality: FrameQuality
 
 
@@ -65,7 +67,8 @@ def read_live_log(path: Path, record: Record | None = None) -> Live:
         else:
             content_ns = line.shown_ns - line.age_ms * _NS_PER_MS
             on_screen_ms = (following.arrived_ns - content_ns) / _NS_PER_MS
-            sums.frame(line.quality, line.time_s, line.seq - line.shown_seq, on_screen_ms)
+            before_db = line.previous_frame_db, math.nan
+            sums.frame(line.quality, line.time_s, line.seq - line.shown_seq, on_screen_ms, before_db)
         for _ in range(following.seq - line.seq - 1):
             sums.leave_out(NOT_SCORED)
     return sums.live
@@ -84,6 +87,7 @@ def _lines(path: Path) -> Iterator[_Line]:
             age_ms=_finite(entry, "age_ms", path),
             state=str(entry.get("state", "live")),
             withheld=None if entry.get("withheld") is None else str(entry["withheld"]),
+            previous_frame_db=_measure(entry, "previous_frame_db"),
             quality=FrameQuality(seq, *(_measure(entry, name) for name in MEASURES)),
         )
         if before is not None and (seq <= before.seq or line.arrived_ns < before.arrived_ns):

@@ -10,6 +10,7 @@ from typing import get_args
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.sessions import WriterOptions
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.live import LiveTraining
 from operators.applications.limits import check_max_frames, check_scale, check_seed
 from operators.applications.replay import PIXELS_PER_GAUSSIAN
@@ -23,6 +24,7 @@ LIVE_WINDOW_FRAMES = 150
 LIVE_BUMP_SPACING_S = 0.1
 LIVE_HISTORY_S = 6.0
 """How much of the past stays deformable: what the window holds at 30 frames a second, and the last 5 s rendered again."""
+LIVE_MOTION_DETAIL: Detail = "half"
 LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
 """Beside L1: follows motion better. On a CPU a step takes half as long again with it, and steps are what is short there."""
 
@@ -85,6 +87,8 @@ class LiveSettings:
             bump_spacing_s=LIVE_BUMP_SPACING_S,
             history_s=LIVE_HISTORY_S,
             preallocate=True,
+            motion_prior="flow",
+            motion_detail=LIVE_MOTION_DETAIL,
             ssim_weight=LIVE_SSIM_WEIGHT[self.device],
         )
         most = max(64, pixels // PIXELS_PER_GAUSSIAN)

@@ -9,13 +9,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import cv2
-import numpy as np
 
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.budget import Budget
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.live import LiveReconstructor
 from operators.applications.device import seeded
 from operators.applications.live_settings import LiveSettings
+from operators.applications.warm_reconstructor import noise, warm_reconstructor
 from operators.display import labelled
 from operators.messages import DeformedScene, PictureState
 from operators.rasterize import Rasterizer
@@ -25,9 +26,6 @@ SWITCH_INTERVAL_S = 0.0002
 """How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
 OPENCV_THREADS = 2
 """More of them take longer to start than small pictures take to look at."""
-WARM_FRAMES = 4
-WARM_STEPS = {"cpu": 3, "cuda": 40}
-"""Optimiser steps on each picture before the first frame."""
 
 
 def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveReconstructor:
@@ -54,22 +52,16 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> WarmParts:
     """Do everything once that takes long the first time: kernels are loaded, graphs captured, memory is taken, threads are started. The
     stream's first frame then has to wait for none of it."""
     camera = source.description.camera
-    noise = np.random.default_rng(0).integers(0, 256, (camera.height_px, camera.width_px, 3), np.uint8)
     rasterizer = Rasterizer(settings.renderer)
+
+    def draw(frame: Frame, model: Model | Snapshot) -> object:
+        scene = DeformedScene(frame, model, camera, trained=True)
+        return scene, rasterizer.draw(scene)
+
     with seeded(settings.seed, settings.device):
         reconstructor = new_live_reconstructor(settings, source)
-        pictures = []
-        for seq in range(WARM_FRAMES):
-            frame = Frame(seq, seq * 33_000_000, noise)
-            # Budgets in time, so that the length of a step is known.
-            reconstructor.observe(frame, budget=Budget.until(0.0, at_least=WARM_STEPS[settings.device]))
-            # All of them are held: every snapshot and piece of page-locked memory that a run needs is made.
-            scene = DeformedScene(frame, reconstructor.publish(), camera, trained=True)
-            pictures.append((scene, rasterizer.draw(scene)))
-            reconstructor.rehearse(2)
-            reconstructor.grow(frame)
-        reconstructor.forget()
-    labelled(noise, PictureState.LIVE, 0)
+        warm_reconstructor(reconstructor, draw)
+    labelled(noise(camera), PictureState.LIVE, 0)
     return WarmParts(reconstructor, rasterizer)
 
 

@@ -15,7 +15,9 @@ from gsplat_core.io.sessions.schedule import ReconstructorMade
 from gsplat_core.io.sessions.session_file import camera_of
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.live import LiveReconstructor, LiveTraining
+from operators.applications.device import seeded
 from operators.applications.limits import check_seed
+from operators.applications.warm_reconstructor import warm_reconstructor
 from operators.compare_shown import CompareShownOp
 from operators.graph import Application
 from operators.scheduled_reconstruct import ScheduledReconstructOp
@@ -37,15 +39,18 @@ class FollowedSession:
     device: str
 
     def new_reconstructor(self) -> LiveReconstructor:
-        """One as the session had it."""
-        return LiveReconstructor(
-            self.config,
-            camera_of(self.made.camera),
-            live=self.training,
-            seed=self.made.seed,
-            recording_digest=self.source.description.digest,
-            device=self.device,
-        )
+        """One as the session had it, warmed up like that one."""
+        with seeded(self.made.seed, self.device):
+            reconstructor = LiveReconstructor(
+                self.config,
+                camera_of(self.made.camera),
+                live=self.training,
+                seed=self.made.seed,
+                recording_digest=self.source.description.digest,
+                device=self.device,
+            )
+            warm_reconstructor(reconstructor)
+        return reconstructor
 
     def reconstruct_op(self, graph: Application, name: str) -> ScheduledReconstructOp:
         """The operator that trains."""

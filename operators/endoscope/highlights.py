@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from gsplat_core.endoscope.highlights import HighlightSettings, without_highlights
 from gsplat_core.scene.frames import Frame
-from operators.endoscope.stage import Stage, StageCounts, left_out
+from operators.endoscope.stage import Stage, StageCounts
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class HighlightCounts(StageCounts):
 
 
 class HighlightStage(Stage):
-    """Leaves specular highlights out of the loss."""
+    """Leaves specular highlights out of what lasts: they are fitted where they are shown, and not rehearsed."""
 
     counts_type = HighlightCounts
 
@@ -28,4 +28,4 @@ class HighlightStage(Stage):
         if kept is None:
             return frame
         self.found["frames with highlights"] += 1
-        return left_out(frame, kept)
+        return frame.with_fields(rehearsal_mask=kept)

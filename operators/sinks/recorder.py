@@ -16,7 +16,8 @@ from gsplat_core.scene.frames import Frame
 from operators.graph import Operator, OperatorSpec
 from operators.messages import ShownPicture
 from operators.outcome import OutcomeBuilder
-from operators.sinks.session_recorder import Recorded, SessionRecorder, stated
+from operators.sinks.recorded import Recorded, stated
+from operators.sinks.session_recorder import SessionRecorder
 from operators.storage import mebibytes
 
 

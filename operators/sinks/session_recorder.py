@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
+import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +24,8 @@ from gsplat_core.io.sessions.session_file import SESSION_FILE
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
 from operators.errors import OutputError
-from operators.storage import StorageReserve, mebibytes, storage_errors
+from operators.sinks.recorded import Recorded
+from operators.storage import StorageReserve, storage_errors
 
 QUEUE_BYTES = 256 * 2**20
 """Pictures that may wait to be written: about three seconds of 640x512 at 30 frames/s."""
@@ -33,10 +36,13 @@ MOST_LINES = 100_000
 MOST_ARRIVED = 64
 """Frames that came in and may still be prepared for training."""
 CLOSE_S = 10.0
-"""How long `close` waits for what is in the queue."""
+"""How long `close` waits while nothing more of what is in the queue is written."""
+MOST_CLOSE_S = 60.0
+"""How long it waits at most."""
 NICENESS = 10
 """How far the thread steps back behind the graph where both want the processor."""
 _SLOW = "writing is too slow"
+_UNFIT = "no recording can hold it"
 What = Literal["frame", "prepared", "shown"]
 
 
@@ -58,25 +64,6 @@ class _Part:
         if self.what is None or not 0 <= self.seq <= MOST_NS:
             return None
         return LostLine(seq=self.seq, what=self.what, why=why)
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """What a recording has become so far."""
-
-    folder: Path
-    frames: int = 0
-    """Frames that came in and were written."""
-    shown: int = 0
-    """Shown pictures that were written."""
-    lost: Mapping[str, int] | None = None
-    """What was not written, by kind and reason: `frame: the disk is too slow`."""
-    bytes: int = 0
-    """What it takes on the disk."""
-    deleted_segments: int = 0
-    """Older segments that were removed to keep within the bounds."""
-    ended: str | None = None
-    """Why it ended before the session did; None: it did not."""
 
 
 class SessionRecorder:
@@ -170,7 +157,7 @@ class SessionRecorder:
     def close(self, why: str = "the session ended") -> None:
         """Write what is in the queue and finish the files; without effect when it is not open.
 
-        Waits at most `CLOSE_S`. Raises what went wrong in the thread, unless it was the disk.
+        Waits while it is being written, but at most `MOST_CLOSE_S`. Raises what went wrong in the thread, unless it was the disk.
         """
         thread, self._thread = self._thread, None
         if thread is None:
@@ -179,7 +166,10 @@ class SessionRecorder:
             self._closing = True
             self._why = why
             self._changed.notify_all()
-        thread.join(CLOSE_S)
+        begun, left = time.monotonic(), -1
+        while thread.is_alive() and time.monotonic() - begun < MOST_CLOSE_S and left != len(self._waiting):
+            left = len(self._waiting)
+            thread.join(CLOSE_S)
         with self._changed:
             if thread.is_alive():
                 self._end(
@@ -221,7 +211,7 @@ class SessionRecorder:
 
     def _run(self, writer: SessionWriter) -> None:
         """The life of the thread."""
-        if hasattr(os, "setpriority"):
+        if sys.platform == "linux":  # elsewhere it means the whole process
             with suppress(OSError):  # a system that does not allow it lets the thread run as all others do
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
         try:
@@ -261,7 +251,7 @@ class SessionRecorder:
             if wrong is None:
                 self._written[what] += 1
             else:
-                self._lost[f"{what}: {wrong}"] += 1
+                self._lost[f"{what}: {_UNFIT}"] += 1  # the line says why, which differs from frame to frame
 
     def _give_up(self, writer: SessionWriter, why: str) -> None:
         with self._changed:
@@ -271,25 +261,9 @@ class SessionRecorder:
 
 def _bytes(frame: Frame, arrived: Frame | None = None) -> int:
     """Of the frame's pictures, but for those that wait already as those of `arrived`."""
-    planes = ("image", "right_image", "depth", "mask", "loss_mask")
+    planes = ("image", "right_image", "depth", "mask", "loss_mask", "rehearsal_mask")
     mine = {id(plane): plane.nbytes for name in planes if (plane := getattr(frame, name)) is not None}
     others = () if arrived is None else (id(getattr(arrived, name)) for name in planes)
     for key in others:
         mine.pop(key, None)
     return sum(mine.values())
-
-
-def stated(recorded: Recorded) -> list[str]:
-    """What a reader of the results must know about a recording."""
-    said = [
-        f"{count} times the recording in {recorded.folder} lost something ({what})"
-        for what, count in sorted((recorded.lost or {}).items())
-        if not what.endswith("has ended")
-    ]
-    if recorded.ended is not None:
-        said.append(f"the recording ended before the session, with {mebibytes(recorded.bytes)}: {recorded.ended}")
-    if recorded.deleted_segments:
-        said.append(
-            f"{recorded.deleted_segments} older segments of the recording were removed to keep it within its bounds"
-        )
-    return said

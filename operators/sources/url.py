@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -13,6 +14,9 @@ from operators.sources.connection import Connection, ConnectionFailed, Place
 from operators.sources.options import SourceOptions
 from operators.sources.stream import StreamSource
 from operators.sources.url_address import UrlAddress
+
+FRESH_S = 1.0
+"""A connection that was made longer before it is read is made anew."""
 
 
 class ConnectedSource(StreamSource):
@@ -32,12 +36,17 @@ class ConnectedSource(StreamSource):
             raise SourceUnavailable(
                 f"{name} cannot be opened: {error}. Check the address, and that it is sending."
             ) from None
+        self._connected_s = time.monotonic()
         self.describe(name, self._connection.size, self._connection.fps)
 
     def pictures(self) -> Iterator[Frame]:
         """See `StreamSource`."""
         backoff = Backoff()
         connection, self._connection = self._connection, None
+        if connection is not None and not connection.has_an_end and time.monotonic() - self._connected_s > FRESH_S:
+            # What has piled up since would come as if it were new.
+            connection.close()
+            connection = None
         while True:
             try:
                 connection = connection or Connection(self._place)

@@ -80,7 +80,8 @@ class UrlAddress:
         options = {
             "protocol_whitelist": PROTOCOLS[self.scheme],
             "format_whitelist": FORMATS,
-            "analyzeduration": "1000000",  # µs
+            "analyzeduration": f"{round(0.9 * self.open_s * 1e6)}",  # µs: sizes may come with the next key frame only
+            "probesize": "50000000",
             "max_delay": "100000",  # µs; how long RTP packets that are missing are waited for
         }
         if self.scheme in ("rtsp", "rtsps"):

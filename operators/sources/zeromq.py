@@ -69,6 +69,8 @@ class ZeroMqSource(StreamSource):
 
     def pictures(self) -> Iterator[Frame]:
         """See `StreamSource`."""
+        for _ in range(2 * self.options.waiting):  # what has waited since the source was made is no longer new
+            self._next(0)
         while not self.wait(0):
             frame = self._next()
             if frame is not None:
@@ -83,10 +85,10 @@ class ZeroMqSource(StreamSource):
         what = f"{bad} messages came, and none is a frame" if bad else "no frame came"
         raise SourceUnavailable(f"{self._name} cannot be opened: {what}. Start what sends to it, and check the keys.")
 
-    def _next(self) -> Frame | None:
+    def _next(self, look_ms: int = LOOK_MS) -> Frame | None:
         """The next frame; None when none came while it was looked for."""
         assert self._socket is not None and self._monitor is not None
-        found = dict(self._poller.poll(LOOK_MS))
+        found = dict(self._poller.poll(look_ms))
         now_s = time.monotonic()
         if self._monitor in found and recv_monitor_message(self._monitor)["event"] == zmq.EVENT_DISCONNECTED:
             self._lost_s = now_s

@@ -34,6 +34,7 @@ def evaluation_settings(recording: Path, options: EvaluateOptions) -> Evaluation
         scale=options.scale,
         max_frames=options.max_frames,
         steps_per_frame=options.steps_per_frame,
+        motion_prior=options.motion_prior,
         places=None if options.place is None else tuple(_place(text) for text in options.place),
     )
 

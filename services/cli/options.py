@@ -30,7 +30,7 @@ def _path_option(name: str, help_text: str) -> Any:
 
 
 RecordingArgument = Annotated[
-    Path, _path_argument("RECORDING", "A video, or a folder with video.mp4, images/ or cameras.json.")
+    Path, _path_argument("RECORDING", "A video, or a folder with video.mp4, images/, cameras.json or session.json.")
 ]
 SourceArgument = Annotated[
     str,
@@ -104,6 +104,9 @@ class EvaluateOptions:
     max_frames: MaxFramesOption = None
     steps_per_frame: Annotated[
         int | None, typer.Option(help="Optimiser steps per frame of causal.", show_default="the run's")
+    ] = None
+    motion_prior: Annotated[
+        str | None, typer.Option(help="What causal assumes about motion: bumps or flow.", show_default="bumps")
     ] = None
     place: PlaceOption = None
 

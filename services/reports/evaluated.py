@@ -64,4 +64,5 @@ def _run(folder: Path, report: RunReport) -> EvaluatedRun:
         steps_per_frame=run.steps_per_frame,
         scale=run.scale,
         heldout=report.quality.heldout is not None,
+        fps=report.recording.fps if run.command == "live" else None,
     )

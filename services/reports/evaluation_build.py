@@ -15,6 +15,7 @@ from gsplat_core.evaluation.baselines import (
     TRAIN_MEAN,
     BaselineScore,
 )
+from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.retention import PlaceScore
 from gsplat_core.scene.model import Model
 from operators.applications.evaluated import EvaluatedRun
@@ -65,7 +66,7 @@ def build_evaluation(
         evaluated=_evaluated(path, model, run, settings, evaluation),
         heldout=None if evaluation.heldout is None else HeldOutFacts.model_validate(asdict(evaluation.heldout)),
         causal=None if evaluation.causal is None else CausalFacts.model_validate(asdict(evaluation.causal)),
-        live=None if evaluation.live is None else OnScreenFacts.model_validate(asdict(evaluation.live)),
+        live=None if evaluation.live is None else _live(evaluation.live),
         retention=None
         if retention is None
         else RetentionFacts(
@@ -126,6 +127,11 @@ def write_evaluation(report: EvaluationReport, folder: Path) -> EvaluationReport
     return report
 
 
+def _live(live: Live) -> OnScreenFacts:
+    facts = {name: value for name, value in asdict(live).items() if name in OnScreenFacts.model_fields}
+    return OnScreenFacts.model_validate(facts)
+
+
 def _place(place: PlaceScore) -> PlaceFacts:
     return PlaceFacts(
         first_s=place.visits.first,
@@ -146,6 +152,9 @@ def _baselines(evaluation: Evaluation) -> Iterator[BaselineFacts]:
     for name in (PREVIOUS_FRAME, NEIGHBOUR_MEAN, HALF_WAY, TRAIN_MEAN):
         if name in measured.heldout:
             yield _baseline(name, LABELS[name], "heldout", measured.heldout[name])
+    if evaluation.live is not None:
+        yield _baseline(PREVIOUS_FRAME, LABELS[PREVIOUS_FRAME], "live", evaluation.live.previous)
+        yield _baseline(PREVIOUS_FRAME, LABELS[PREVIOUS_FRAME], "settled", evaluation.live.settled_previous)
     if evaluation.retention is not None:
         yield _baseline("last_frame", "The stream's last frame, frozen", "last", evaluation.retention.frozen)
 

@@ -6,7 +6,7 @@ from services.reports.charts import NARROW, Chart, Line
 from services.reports.evaluation_schema import EvaluationReport
 
 _LINES = {
-    "live": ("Live", (("psnr_tissue_db", "Previous frame shown instead", "base"),)),
+    "live": ("Live", (("previous_frame_db", "Previous frame shown instead", "base"),)),
     "causal": (
         "Causal prediction",
         (
@@ -47,7 +47,7 @@ def _chart(report: EvaluationReport, protocol: str) -> str:
     for key, label, style in baselines:
         points = [
             (entry["time_s"], entry[key])
-            for entry in report.series.get("baselines", [])
+            for entry in (own if protocol == "live" else report.series.get("baselines", []))
             if entry.get(key) is not None and first_s <= entry["time_s"] <= last_s  # type: ignore[operator]
         ]
         if points:

@@ -43,10 +43,18 @@ def measured(report: EvaluationReport) -> list[Measured]:
                 "Live",
                 "what was on the screen when the next frame came",
                 report.live.score,
-                named("every", "previous_frame"),
+                named("live", "previous_frame"),
             )
         )
-        found.append(Measured("settled", "Live, settled", "the same without the first second", report.live.settled, ()))
+        found.append(
+            Measured(
+                "settled",
+                "Live, settled",
+                "the same without the first second",
+                report.live.settled,
+                named("settled", "previous_frame"),
+            )
+        )
     if report.causal is not None:
         found.append(
             Measured(

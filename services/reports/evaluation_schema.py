@@ -37,8 +37,8 @@ class BaselineFacts(Part):
 
     name: str
     label: str
-    frames_of: Literal["every", "heldout", "last"]
-    """Which frames it is scored on: every one that has it, the held-out ones, the last seconds."""
+    frames_of: Literal["every", "heldout", "last", "live", "settled"]
+    """Which frames it is scored on: every one that has it, the held-out ones, the last seconds, those that the live figures are of."""
     psnr_tissue_db: Decibels
     psnr_frame_db: Decibels
     frames: Count
@@ -71,6 +71,7 @@ class CausalFacts(Part):
     field: str
     steps_per_frame: int
     seed: int
+    motion_prior: str
 
 
 class AgeFacts(Part):

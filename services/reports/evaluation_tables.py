@@ -199,7 +199,9 @@ def facts_section(report: EvaluationReport) -> str:
     }
     if report.causal is not None:
         causal = report.causal
-        facts["Causal learning"] = f"{causal.steps_per_frame} steps a frame, {causal.field} field, seed {causal.seed}"
+        facts["Causal learning"] = (
+            f"{causal.steps_per_frame} steps a frame, {causal.field} field, motion prior {causal.motion_prior}, seed {causal.seed}"
+        )
     rows = _rows(facts)
     digests = {"Recording": recording.digest, "Model": model.sha256}
     rows += "".join(

@@ -15,6 +15,7 @@ import pytest
 
 from gsplat_core.errors import RecordingError, UserError
 from gsplat_core.io.recordings import open_recording, validate_recording
+from gsplat_core.io.recordings.matroska import whole_clusters
 from gsplat_core.io.sessions import SessionReader, SessionWriter
 from gsplat_core.scene.frames import FrameStatus
 from operators.applications.replay import ReplaySettings
@@ -214,6 +215,19 @@ def test_bits_that_flip_anywhere_raise_nothing(session, whole, rng):
                 wanted = new_frame(frame.seq)
                 assert frame.status is FrameStatus.DAMAGED or same_frame(frame, wanted), f"{name} {k}"
         (session / name).write_bytes((whole / name).read_bytes())
+
+
+@pytest.mark.parametrize("track", ["image", "prepared_loss_mask"])
+def test_what_is_damaged_is_not_given_to_training_as_whole(session, track):
+    path = session / f"segments/000000/{track}_24x16.mkv"
+    data = bytearray(path.read_bytes())
+    with path.open("rb") as file:
+        ends = [cluster.end for cluster in whole_clusters(file, len(data), check_sums=True)]
+    data[ends[2] - 20] ^= 0x40
+    path.write_bytes(data)
+    found = list(SessionReader(session).prepared())
+    assert [frame.status is FrameStatus.DAMAGED for frame in found] == [False, False, True, False, False]
+    assert not found[2].mask.any()
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,15 @@ def test_training_ends_early_enough_to_show_the_picture_in_time(clock, frame, fa
     assert (budget.at_least, budget.at_most) == (clock.settings.at_least_steps, clock.settings.at_most_steps)
 
 
-def test_the_budget_of_a_late_frame_is_already_over(clock, frame, fake_time):
+def test_a_late_frame_still_gets_its_least_share(clock, frame, fake_time):
+    arrived_ns = fake_time.ns
+    fake_time.pass_ms(200)
+    left_s = clock.budget(frame(0, arrived_ns=arrived_ns)).deadline_s - fake_time.ns * 1e-9
+    assert left_s == pytest.approx(clock.settings.least_share * clock.interval_ns * 1e-9)
+
+
+def test_a_fixed_budget_that_is_over_is_over(frame, fake_time):
+    clock = FrameClock(ClockSettings(budget_ms=12.0), 30.0, fake_time)
     arrived_ns = fake_time.ns
     fake_time.pass_ms(200)
     assert clock.budget(frame(0, arrived_ns=arrived_ns)).deadline_s < fake_time.ns * 1e-9

@@ -107,6 +107,12 @@ def test_a_source_that_gives_nothing_can_be_stopped(camera):
     assert app.sink.seen == [] and not result(app).reached_end and source.closed == 1
 
 
+def test_the_stream_ends_when_its_time_is_over_whether_or_not_frames_come(camera, frame):
+    app = Stream(Scripted([None] * 100_000, camera), seconds=0.05)
+    app.run()
+    assert app.sink.seen == [] and not result(app).reached_end
+
+
 @pytest.mark.parametrize("second", [0, 1])
 def test_numbers_that_do_not_increase_are_a_fault_of_the_source(camera, frame, second):
     with pytest.raises(OperatorFailed, match=f"frame {second} came after frame 1; a source's numbers must increase"):

@@ -99,6 +99,7 @@ def test_off_lets_everything_pass_and_says_so(frame, compute):
     passed, outcome = run(FakeGate(), frames, compute, policy="off")
     assert passed[0] is frames[0] and passed[1] is frames[1]
     assert outcome.find(OutOfBodyFrames) == OutOfBodyFrames("off", 2, {})
+    assert outcome.notes == ("no picture was examined for showing the outside of the body: the gate was off",)
 
 
 def test_by_default_it_withholds_until_there_is_evidence(frame, compute):

@@ -46,12 +46,12 @@ def fields(**values):
 def make():
     made = []
 
-    def build(first, second, then=()):
+    def build(first=(), second=(), then=(), gate=()):
         chains = {
             name: [Changes(None, change, name=f"{name}{k}") for k, change in enumerate(changes)]
-            for name, changes in (("first", first), ("second", second), ("then", then))
+            for name, changes in (("gate", gate), ("first", first), ("second", second), ("then", then))
         }
-        operator = SideBySideOp(None, name="both", **chains)
+        operator = SideBySideOp(None, name="all", beside=[chains.pop("second")], **chains)
         operator.start()
         made.append(operator)
         return operator
@@ -77,13 +77,18 @@ def test_what_both_chains_find_goes_on(make, frame, compute):
     assert not out.loss_mask.any()
 
 
-def test_nothing_of_the_second_chain_goes_on_with_a_withheld_frame(make, frame, compute):
+def test_nothing_of_a_frame_goes_on_that_the_gate_withholds(make, frame, compute):
     one = frame()
     black = fields(image=np.zeros_like(one.image), withheld="out of body")
-    operator = make([black], [fields(mask=half(one, 1))])
+    operator = make([fields(new_scene="cut")], [fields(mask=half(one, 1))], gate=[black])
     (out,) = compute(operator, frame=one)
-    assert (out.withheld, out.mask) == ("out of body", None)
+    assert (out.withheld, out.mask, out.new_scene) == ("out of body", None, None)
     assert not out.image.any()
+
+
+def test_a_time_that_was_repaired_stays_so_behind_the_gate(make, frame, compute):
+    operator = make([fields(pts_ns=77)], gate=[fields(withheld="out of body")])
+    assert compute(operator, frame=frame())[0].pts_ns == 77
 
 
 def test_the_third_chain_sees_what_both_found(make, frame, compute):
@@ -126,6 +131,6 @@ def test_its_parts_are_started_stopped_and_contribute(make):
     assert all(part.running for part in operator.parts)
     outcome = OutcomeBuilder()
     operator.contribute(outcome)
-    assert outcome.notes == ("first0", "second0", "then0")
+    assert set(outcome.notes) == {"first0", "second0", "then0"}
     operator.stop()
     assert not any(part.running for part in operator.parts)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import synthesize
 from services.cli.app import run
 from services.reports.evaluation_schema import EvaluationReport
@@ -103,6 +104,14 @@ def test_reports_are_written_and_the_table_is_printed(intrasplat, long, offline,
     assert not (out / "evaluation-causal.jsonl").exists(), "a new evaluation replaces the earlier one whole"
 
 
+def test_the_motion_prior_of_the_prediction_can_be_chosen(intrasplat, long, offline):
+    few = ("--protocol", "causal", "--steps-per-frame", 2, "--max-frames", 5)
+    flow, plain = (evaluated(intrasplat, offline, long, *few, *more) for more in (("--motion-prior", "flow"), ()))
+    assert flow.causal is not None and plain.causal is not None
+    assert (flow.causal.motion_prior, plain.causal.motion_prior) == ("flow", "bumps")
+    assert flow.series["causal"] != plain.series["causal"]
+
+
 def test_a_prediction_depends_on_nothing_that_comes_later(intrasplat, long, offline, tmp_path):
     whole = evaluated(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2)
     start = evaluated(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2, "--max-frames", 6)
@@ -159,6 +168,7 @@ def test_the_size_of_the_model_is_taken_unless_another_one_is_asked_for(intraspl
         (["--scale", "0"], "scale must be a positive number"),
         (["--steps-per-frame", "0"], "steps_per_frame"),
         (["--max-frames", "0"], "max_frames"),
+        (["--motion-prior", "magic"], "magic"),
         (["--device", "abacus"], "is not known"),
         (["--renderer", "crayon"], "crayon"),
     ],
@@ -228,3 +238,24 @@ def test_a_long_series_is_summed_up(intrasplat, long, offline, monkeypatch):
     assert [len(report.series[name]) for name in ("baselines", "retention")] == [4, 4]
     (own,) = report.series["retention"][:1]
     assert own["frames"] == 3 and own["psnr_tissue_min_db"] <= own["psnr_tissue_db"]
+
+
+def test_a_live_run_that_looped_faster_than_the_recording_is_seen_at_its_own_times(intrasplat, long, offline, tmp_path):
+    """As `live --loop --fps 60` would leave it: the model's time is 2.5 rounds of 0.2 s."""
+    folder = shutil.copytree(offline, tmp_path / "live")
+    manifest = json.loads((folder / "model" / "manifest.json").read_text())
+    manifest["time_window_s"] = [0.0, 0.5 - 1 / 60]
+    (folder / "model" / "manifest.json").write_text(json.dumps(manifest))
+    content = json.loads((folder / "report.json").read_text())
+    content["run"]["command"], content["recording"]["fps"] = "live", 60.0
+    content["model"]["sha256"] = load_bundle(folder / "model").sha256()
+    (folder / "report.json").write_text(json.dumps(content))
+    report = evaluated(intrasplat, folder, long, "--protocol", "retention")
+    assert any("played the recording at 60 frames/s" in note for note in report.notes)
+    assert any("last of 2.4 rounds" in note or "last of 2.5 rounds" in note for note in report.notes)
+    series = report.series["retention"]
+    assert [entry["seq"] for entry in series] == list(range(30)), "twelve frames a round, the third round half"
+    assert series[-1]["time_s"] == pytest.approx(29 / 60, abs=1e-3)
+    assert [entry["seq"] for entry in report.series["baselines"]] == list(range(1, 12))
+    alone = evaluated(intrasplat, folder / "model", long, "--protocol", "retention", "--max-frames", 6)
+    assert any("frames that are evaluated end" in note for note in alone.notes)

@@ -29,6 +29,7 @@ CODINGS: Mapping[str, Coding] = {
     "right_image": "colour",
     "mask": "grey",
     "loss_mask": "grey",
+    "rehearsal_mask": "grey",
     "depth": "float",
     "shown": "colour",
 }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from array import array
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,7 @@ from gsplat_core.io.recordings.findings import printable
 from gsplat_core.io.sessions.log import Line
 from gsplat_core.io.sessions.records import FrameLine, PreparedLine, ShownLine
 from gsplat_core.io.sessions.schedule import SCHEDULE_LINES, ReconstructorMade, ScheduleLine
-from gsplat_core.io.sessions.segment_reader import SegmentPictures, SegmentReader, fits, mask_of_nothing
+from gsplat_core.io.sessions.segment_reader import FIELDS, SegmentPictures, SegmentReader, mask_of_nothing
 from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SESSION_FILE, read_session_file
 from gsplat_core.scene.frames import Frame, FrameStatus
 
@@ -40,32 +39,24 @@ class SessionReader:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.info = read_session_file(folder)
-        self.segments = [SegmentReader(path) for path in _segment_folders(folder)]
+        self.segments: list[SegmentReader] = []
+        last = -1
+        for path in _segment_folders(folder):
+            self.segments.append(SegmentReader(path, last))
+            last = self.segments[-1].seqs[-1] if self.segments[-1].seqs else last
+        playable = [segment for segment in self.segments if segment.seqs]
+        self.first = playable[0].first if playable else None
+        """The line of the first frame that can be read."""
+        self.fields = frozenset(FIELDS).intersection(*(segment.fields for segment in playable))
+        """Which of the optional fields every frame that can be read has."""
         self.notes: list[str] = []
         """What is missing, in sentences."""
-        self.fields: set[str] = {"right_image", "mask", "depth", "pose"}
-        """Which of these every frame that can be read has."""
-        self.first: FrameLine | None = None
-        """The line of the first frame that can be read."""
-        self._there: list[array] = []
-        last = -1
-        for segment in self.segments:
-            seqs = array("q")
-            for line in segment.lines():
-                if isinstance(line, FrameLine) and line.seq > last and fits(line.tracks, line.height_px, line.width_px):
-                    if not segment.there(line):
-                        break  # it plays up to there; what was written later is not whole either
-                    seqs.append(line.seq)
-                    last = line.seq
-                    self.first = self.first or line
-                    self.fields &= {*line.tracks, *(["pose"] if line.pose is not None else [])}
-            self._there.append(seqs)
         self._take_notes()
 
     @property
     def frame_count(self) -> int:
         """How many frames can be read."""
-        return sum(len(seqs) for seqs in self._there)
+        return sum(len(segment.seqs) for segment in self.segments)
 
     def lines(self) -> Iterator[tuple[SegmentReader, Line]]:
         """Every line of every segment, in order, with its segment."""
@@ -75,22 +66,22 @@ class SessionReader:
 
     def frame_lines(self) -> Iterator[FrameLine]:
         """The lines of the frames that can be read."""
-        for segment, seqs in zip(self.segments, self._there, strict=True):
-            yield from _of(segment, seqs)
+        for segment in self.segments:
+            yield from _of(segment)
 
     def frames(self) -> Iterator[tuple[FrameLine, Frame | None]]:
         """The frames that came in, in order, each with its line. A frame that turns out to be damaged says so in its status; None in its
         place: its image cannot be decoded at all."""
-        for segment, seqs in zip(self.segments, self._there, strict=True):
+        for segment in self.segments:
             with segment.open() as pictures:
-                for line in _of(segment, seqs):
+                for line in _of(segment):
                     yield line, frame_of(line, pictures)
 
     def prepared(self) -> Iterator[Frame]:
         """The frames as training was given them, in that order; one that cannot be read is left out."""
         arrived: OrderedDict[int, Frame] = OrderedDict()
-        for segment, seqs in zip(self.segments, self._there, strict=True):
-            there = set(seqs)
+        for segment in self.segments:
+            there = set(segment.seqs)
             with segment.open() as pictures:
                 for line in segment.lines():
                     if isinstance(line, FrameLine) and line.seq in there:
@@ -110,8 +101,8 @@ class SessionReader:
         """How many frames `prepared` gives, unless pictures turn out to be damaged."""
         count = 0
         arrived: set[int] = set()
-        for segment, seqs in zip(self.segments, self._there, strict=True):
-            arrived.update(seqs)
+        for segment in self.segments:
+            arrived.update(segment.seqs)
             for line in segment.lines():
                 if isinstance(line, PreparedLine) and line.seq in arrived and segment.there(line):
                     arrived.discard(line.seq)
@@ -140,26 +131,26 @@ class SessionReader:
     def _take_notes(self) -> None:
         if not self.segments:
             self.notes.append("the session has no segment: nothing was recorded")
-        for segment, seqs in zip(self.segments, self._there, strict=True):
+        for segment in self.segments:
             name = printable(segment.folder.name)
             if segment.begins is None:
                 self.notes.append(f"segment {name} cannot be read: its log is cut off at its beginning")
-            elif len(seqs) < segment.named:
+            elif len(segment.seqs) < segment.named:
                 self.notes.append(
-                    f"segment {name} is cut off: {len(seqs)} of the {segment.named} frames that it names are there"
+                    f"segment {name} is cut off: {len(segment.seqs)} of the {segment.named} frames that it names are there"
                 )
             elif segment.ends is None:
                 self.notes.append(
-                    f"segment {name} has no end: the program that recorded it was ended; it has {len(seqs)} frames"
+                    f"segment {name} has no end: the program that recorded it was ended; it has {len(segment.seqs)} frames"
                 )
         first = self.segments[0] if self.segments else None
         if first is not None and first.folder.name != "000000":
             self.notes.append(f"the recording begins with segment {first.folder.name}: those before it were removed")
 
 
-def _of(segment: SegmentReader, seqs: array) -> Iterator[FrameLine]:
-    """The lines of those frames of a segment; numbers rise, and a line that repeats one is not ours."""
-    wanted = iter(seqs)
+def _of(segment: SegmentReader) -> Iterator[FrameLine]:
+    """The lines of a segment's frames that can be read; numbers rise, and a line that repeats one is not ours."""
+    wanted = iter(segment.seqs)
     due = next(wanted, None)
     for line in segment.lines():
         if isinstance(line, FrameLine) and line.seq == due:
@@ -174,13 +165,15 @@ def frame_of(line: FrameLine, pictures: SegmentPictures) -> Frame | None:
 
 
 def prepared_of(line: PreparedLine, arrived: Frame, pictures: SegmentPictures) -> Frame | None:
-    """What training was given of a frame; None where it cannot be decoded."""
+    """What training was given of a frame, damaged where a part of it, or the frame itself, is; None where there is no image at all."""
     planes, damage = pictures.of(line)
     for track in line.same:
         plane = getattr(arrived, track, None)
         if plane is not None:
             planes[track] = plane
-    return None if damage is not None else _frame(line, planes, line.damage)
+    if line.status != FrameStatus.DAMAGED.value and arrived.status is FrameStatus.DAMAGED:
+        damage = damage or arrived.damage
+    return _frame(line, planes, line.damage or damage)
 
 
 def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], damage: str | None) -> Frame | None:
@@ -200,6 +193,7 @@ def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], dama
             depth=planes.get("depth"),
             mask=planes.get("mask"),
             loss_mask=planes.get("loss_mask"),
+            rehearsal_mask=planes.get("rehearsal_mask"),
             pose=None if line.pose is None else np.array(line.pose).reshape(4, 4),
             status=status,
             damage=damage,

@@ -37,7 +37,7 @@ Pose = Annotated[tuple[Number, ...], Field(min_length=16, max_length=16), AfterV
 """[4, 4] row by row, OpenCV axes."""
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
-TrackName = Literal["image", "right_image", "mask", "loss_mask", "depth", "shown"]
+TrackName = Literal["image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth", "shown"]
 Tracks = dict[TrackName, Count]
 """For each track that has a picture for this line, the time in milliseconds at which it lies in the track's file."""
 

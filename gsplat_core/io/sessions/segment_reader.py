@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,10 +15,11 @@ from numpy.typing import NDArray
 from gsplat_core.io.recordings.image_files import MAX_PIXELS
 from gsplat_core.io.recordings.plain_files import UnreadableFile
 from gsplat_core.io.sessions.log import LOG_FILE, Line, read_log
-from gsplat_core.io.sessions.records import FrameLine, PreparedLine, SegmentBegins, SegmentEnds, ShownLine, Tracks
+from gsplat_core.io.sessions.records import FrameLine, PreparedLine, SegmentBegins, SegmentEnds, ShownLine
 from gsplat_core.io.sessions.segment_writer import Stage, track_file
 from gsplat_core.io.sessions.track_reader import TrackIndex, TrackReader
 
+FIELDS = ("right_image", "mask", "depth", "pose")
 MOST_OPEN = 128
 """Files of one segment; a log that names more is not ours."""
 
@@ -25,17 +27,22 @@ MOST_OPEN = 128
 class SegmentReader:
     """A segment's lines, and the pictures that belong to them."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, after_seq: int = -1) -> None:
+        """after_seq: the last frame of the segments before."""
         self.folder = folder
         self.begins: SegmentBegins | None = None
         self.ends: SegmentEnds | None = None
         """None where the log is cut off, or the recording goes on."""
         self.named = 0
         """Frames that the log names."""
-        self.poses = True
-        """Whether all frames that are there have a pose."""
+        self.seqs = array("q")
+        """The frames that can be read, in order."""
+        self.first: FrameLine | None = None
+        """The line of the first of them."""
+        self.fields = frozenset(FIELDS)
+        """Which of the optional fields all of them have."""
         self._indices: dict[str, TrackIndex | None] = {}
-        self._look()
+        self._look(after_seq)
 
     def lines(self) -> Iterator[Line]:
         """All lines, in order, as far as the log can be read."""
@@ -49,7 +56,7 @@ class SegmentReader:
     def there(self, line: FrameLine | PreparedLine | ShownLine) -> bool:
         """Whether every picture that a line names is in its file, whole."""
         return all(
-            (index := self._index(_file(line, track))) is not None and time in index.times
+            (index := self._index(_file(line, track))) is not None and time in index
             for track, time in line.tracks.items()
         )
 
@@ -61,8 +68,8 @@ class SegmentReader:
         """The files of this segment that are read."""
         return sorted([self.folder / LOG_FILE, *(index.path for index in self._indices.values() if index is not None)])
 
-    def _look(self) -> None:
-        """Read the log once: how it begins and ends, and which files it names."""
+    def _look(self, after_seq: int) -> None:
+        """Read the log once: how it begins and ends, which files it names, and which of its frames are there."""
         lines = self.lines()
         first = next(lines, None)
         if not isinstance(first, SegmentBegins):
@@ -70,12 +77,15 @@ class SegmentReader:
         self.begins = first
         last: Line = first
         named: set[str] = set()
+        frames: list[FrameLine] = []
         for last in lines:
             if isinstance(last, FrameLine | PreparedLine | ShownLine):
-                self.named += isinstance(last, FrameLine)
                 named.update(_file(last, track) for track in last.tracks)
                 if len(named) > MOST_OPEN:
                     break
+                if isinstance(last, FrameLine):
+                    frames.append(last)
+        self.named = len(frames)
         self.ends = last if isinstance(last, SegmentEnds) else None
         for name in sorted(named)[:MOST_OPEN]:
             try:
@@ -83,6 +93,18 @@ class SegmentReader:
                 self._indices[name] = TrackIndex(self.folder / name, check_sums=self.ends is None)
             except (UnreadableFile, OSError):
                 self._indices[name] = None
+        self._find_frames(frames, after_seq)
+
+    def _find_frames(self, frames: list[FrameLine], after_seq: int) -> None:
+        for line in frames:
+            if line.seq <= after_seq or "image" not in line.tracks or line.height_px * line.width_px > MAX_PIXELS:
+                continue
+            if not self.there(line):
+                break  # it plays up to there; what was written later is not whole either
+            after_seq = line.seq
+            self.seqs.append(line.seq)
+            self.first = self.first or line
+            self.fields &= {*line.tracks, *(["pose"] if line.pose is not None else [])}
 
     def _index(self, name: str) -> TrackIndex | None:
         return self._indices.get(name)
@@ -132,11 +154,6 @@ class SegmentPictures:
 def _file(line: FrameLine | PreparedLine | ShownLine, track: str) -> str:
     stage: Stage = "prepared_" if isinstance(line, PreparedLine) else ""
     return track_file(stage, track, line.height_px, line.width_px)
-
-
-def fits(tracks: Tracks, height_px: int, width_px: int) -> bool:
-    """Whether a frame line can make a frame: it has an image, of a size that is taken."""
-    return "image" in tracks and height_px * width_px <= MAX_PIXELS
 
 
 def mask_of_nothing(height_px: int, width_px: int) -> NDArray[np.uint8]:

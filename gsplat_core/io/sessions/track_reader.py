@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from array import array
+from bisect import bisect_left
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -20,6 +22,7 @@ from gsplat_core.io.recordings.video_index import open_container
 from gsplat_core.io.sessions.coding import CODINGS, Coding, decoded
 
 _CODECS = ("ffv1", "vp9")
+_MOST_MS = 2**62
 MOST_PICTURES = 1_000_000
 """In one file: nine hours at 30 pictures/s, where segments last minutes."""
 
@@ -32,17 +35,23 @@ class TrackIndex:
         clusters are noticed when they are decoded. Raises UnreadableFile, OSError."""
         self.path, self.checked = path, check_sums
         self.end = 0
-        times: list[int] = []
+        self._times = array("q")
         if path.is_symlink():
             raise UnreadableFile("it is a link")
         with open_plain(path) as file:
             size = file.seek(0, io.SEEK_END)
             for cluster in islice(whole_clusters(file, size, check_sums=check_sums), MOST_PICTURES):
-                if not cluster.intact:
+                rising = cluster.time < _MOST_MS and (not self._times or cluster.time > self._times[-1])
+                if not cluster.intact or not rising:  # our writer's times rise
                     break
-                times.append(cluster.time)
+                self._times.append(cluster.time)
                 self.end = cluster.end
-        self.times = frozenset(times)
+
+    def __contains__(self, time_ms: object) -> bool:
+        """Whether there is a picture at a time."""
+        assert isinstance(time_ms, int)
+        at = bisect_left(self._times, time_ms)
+        return at < len(self._times) and self._times[at] == time_ms
 
     def damaged(self) -> frozenset[int]:
         """The times of pictures whose checksum is wrong. Raises UnreadableFile, OSError."""

@@ -32,7 +32,7 @@ from gsplat_core.io.sessions.segment_writer import SegmentWriter, Stage
 from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SessionInfo, write_session_file
 from gsplat_core.scene.frames import Frame
 
-_PLANES: tuple[TrackName, ...] = ("image", "right_image", "mask", "loss_mask", "depth")
+_PLANES: tuple[TrackName, ...] = ("image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth")
 _DTYPES = {"depth": np.float32}
 _DELETING = ".deleted-"
 

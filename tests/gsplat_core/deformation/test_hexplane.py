@@ -5,6 +5,8 @@ import torch
 
 from gsplat_core.deformation import HexPlaneField
 from gsplat_core.deformation.hexplane import PLANE_NAMES, TIME_PLANES
+from gsplat_core.deformation.hexplane_kind import KIND, MOST_ROWS
+from gsplat_core.deformation.kind import NewField
 from gsplat_core.errors import InvalidInput
 
 WINDOW = (2.0, 4.0)
@@ -142,3 +144,15 @@ def test_frame_deltas_are_what_forward_adds(make_gaussians, count):
 def test_frame_time_is_clamped_to_the_window(make_gaussians):
     field = small_field(make_gaussians(3))
     assert [field.frame_time(t) for t in (1.0, 2.0, 3.0, 4.0, 9.0)] == [-1.0, -1.0, 0.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(("end_s", "rows"), [(6.0, 61), (1.0, 2), (1e6, MOST_ROWS)])
+def test_where_the_end_is_known_time_rows_are_as_fine_as_motion_has_to_be(make_gaussians, end_s, rows):
+    field = KIND.made_for(NewField(make_gaussians(5), 1.0, end_s, spacing_s=1 / 12))
+    assert field.resolution[3] == rows
+    assert field.time_window_s == (1.0, end_s)
+
+
+def test_online_a_field_has_its_default_size(make_gaussians):
+    field = KIND.made_for(NewField(make_gaussians(5), 1.0, None, spacing_s=0.2))
+    assert field.config() == HexPlaneField(make_gaussians(5), (1.0, 1.2)).config()

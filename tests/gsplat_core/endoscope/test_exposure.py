@@ -105,6 +105,17 @@ def test_a_tool_that_comes_in_changes_nothing():
     assert (gains_of(images) == 1).all()
 
 
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", STILL)
+@pytest.mark.parametrize("share", [0.3, 0.5])
+@pytest.mark.parametrize("colour", [(150, 155, 160), (30, 30, 32), (225, 228, 230)])
+def test_a_tool_that_comes_in_fast_without_a_mask_changes_nothing(recordings_dir, name, share, colour):
+    images = [image.copy() for image in clip(recordings_dir, name)[:50]]
+    for k, image in enumerate(images):
+        image[:, : int(image.shape[1] * share * np.clip((k - 12) / 4, 0, 1))] = colour
+    assert (gains_of(images) == 1).all()
+
+
 def test_what_is_left_out_is_not_looked_at():
     kept = np.ones(texture(3, 1)[0].shape[:2], np.uint8)
     kept[:, :120] = 0

@@ -13,7 +13,7 @@ from gsplat_core.errors import InvalidSetting
 from tests.gsplat_core.endoscope.clips import PLACES, clip, texture
 
 HEIGHT, WIDTH = 256, 320
-FRAMES = 2 * 12 * 3 + 4
+FRAMES = 2 * 10 * 4 + 4
 
 
 def last_mask(images, options=None):

@@ -45,8 +45,8 @@ def test_no_tool_is_found_where_there_is_none(recordings_dir, name, most):
     ("picture", "most"),
     [
         ("hamlyn_pair/f7_dynamic_deint_L_0100.png", 0.0),
-        ("scared_pair/left.png", 0.04),
-        ("scared_raw/Left_Image.png", 0.04),
+        ("scared_pair/left.png", 0.01),
+        ("scared_raw/Left_Image.png", 0.01),
     ],
 )
 def test_single_pictures_have_few_false_tools(recordings_dir, picture, most):

@@ -93,6 +93,13 @@ def test_the_first_second_is_left_out_of_the_settled_figures(frame, decibels):
     assert found.score.worst_db == pytest.approx(decibels(20), abs=1e-6)
 
 
+def test_the_previous_frame_is_scored_on_the_same_frames(frame, decibels):
+    found = evaluate_live(arriving(frame, [100, 110, 130, 130]), [shown(0, 41, 100), shown(2, 5, 130)])
+    assert found.score.left_out == {NOTHING_SHOWN: 1}
+    assert found.previous.psnr_tissue_db == pytest.approx((decibels(10) + decibels(20)) / 2, abs=1e-6)
+    assert (found.previous.frames, found.settled_previous.psnr_tissue_db) == (2, None)
+
+
 def test_withheld_frames_are_not_scored(frame):
     frames = [*arriving(frame, [100])[:1], *arriving(frame, [0, 110, 120, 130], withheld="blur")[1:]]
     found = evaluate_live(frames, [shown(0, 10, 100)])

@@ -65,3 +65,14 @@ def test_rates_in_pixels_alone_are_scaled_to_the_scene():
 @pytest.mark.parametrize(("field", "chosen"), [("auto", "basis"), ("basis", "basis"), ("hexplane", "hexplane")])
 def test_auto_stands_for_the_basis_field(field, chosen):
     assert ReconstructorConfig(field=field).chosen_field == chosen
+
+
+@pytest.mark.parametrize("field", ["auto", "hexplane"])
+def test_offline_there_are_more_gaussians_finer_motion_and_the_error_that_psnr_measures(field):
+    online, offline = ReconstructorConfig(field=field), ReconstructorConfig.offline(field)
+    assert offline.field == field
+    assert offline.gaussians > online.gaussians
+    assert offline.max_gaussians > offline.gaussians
+    assert offline.bump_spacing_s < online.bump_spacing_s
+    assert offline.squared_error
+    assert not online.squared_error

@@ -12,7 +12,7 @@ from gsplat_core.training.image_motion import ImageMotion, typical_px
 
 def texture(shift_x: float, shift_y: float, size: tuple[int, int] = (96, 128)) -> NDArray[np.uint8]:
     """The same smooth random picture, moved."""
-    noise = np.random.default_rng(0).uniform(0, 255, (200, 240, 3)).astype(np.float32)
+    noise = np.random.default_rng(0).uniform(0, 255, (size[0] + 104, size[1] + 112, 3)).astype(np.float32)
     smooth = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.0), np.empty(0), 0, 255, cv2.NORM_MINMAX)
     height, width = size
     moved = cv2.warpAffine(smooth, np.array([[1, 0, shift_x - 40], [0, 1, shift_y - 40]], np.float32), (width, height))
@@ -27,6 +27,15 @@ def test_a_shift_is_measured(shift: tuple[float, float]) -> None:
     assert flow is not None and flow.shape == (24, 32, 2)
     assert np.abs(np.median(flow.reshape(-1, 2), axis=0) - shift).max() < 0.1
     assert abs(typical_px(flow) - np.hypot(*shift)) < 0.15
+
+
+@pytest.mark.parametrize("size", [(96, 128), (420, 501)])
+def test_the_quick_search_measures_in_pixels_of_the_full_picture(size: tuple[int, int]) -> None:
+    motion = ImageMotion("half")
+    motion.follow(texture(0, 0, size), None)
+    flow = motion.follow(texture(3, -2, size), None)
+    assert flow is not None and flow.shape == (round(size[0] / 4), round(size[1] / 4), 2)
+    assert np.abs(np.median(flow.reshape(-1, 2), axis=0) - (3, -2)).max() < 0.2
 
 
 def test_what_is_not_tissue_moves_as_the_tissue_around_it() -> None:

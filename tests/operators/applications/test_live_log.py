@@ -24,6 +24,7 @@ def line(seq, psnr_db=30.0, shown_seq=None, after_ms=9, **fields):
         "psnr_tissue_db": psnr_db,
         "psnr_frame_db": None if psnr_db is None else psnr_db + 1,
         "ssim": None,
+        "previous_frame_db": 25.0 + seq,
         "arrived_ns": (1000 + 40 * seq) * MS,
         "shown_seq": shown_seq,
         "shown_ns": (1000 + 40 * shown_seq + after_ms) * MS,
@@ -56,6 +57,7 @@ def test_frames_and_the_pictures_that_were_on_the_screen(log):
     assert (found.age_when_shown.count, found.age_when_shown.max_ms) == (2, 30), "the picture of frame 0 was shown once"
     assert found.age_on_screen.max_ms == pytest.approx(80)
     assert found.states == {"live": 1, "stale": 1}
+    assert (found.previous.psnr_tissue_db, found.previous.psnr_frame_db, found.previous.frames) == (26.0, None, 3)
     assert [entry["behind"] for entry in entries] == [0, 1, 0]
 
 

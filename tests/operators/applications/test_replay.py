@@ -10,6 +10,7 @@ import torch
 from gsplat_core.errors import InvalidSetting, RecordingMissing
 from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.io.bundle import load_bundle
+from gsplat_core.training.config import ReconstructorConfig
 from operators.applications import replay as replay_module
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.result import RunOutcome
@@ -155,3 +156,10 @@ def test_a_small_frame_gets_no_more_gaussians_than_it_can_show(tiny, tmp_path):
     settings = ReplaySettings(tiny, tmp_path / "out")
     assert settings.reconstructor_config(64 * 48).gaussians == 64 * 48 // 4
     assert settings.reconstructor_config(640 * 512).gaussians == settings.reconstructor_config().gaussians
+
+
+def test_offline_a_small_frame_gets_no_more_gaussians_than_it_can_show(tiny, tmp_path):
+    settings = ReplaySettings(tiny, tmp_path / "out", field="hexplane")
+    small = settings.reconstructor_config(64 * 48, offline=True)
+    assert (small.gaussians, small.max_gaussians) == (64 * 48 // 4, 64 * 48 // 2)
+    assert settings.reconstructor_config(1280 * 1024, offline=True) == ReconstructorConfig.offline("hexplane")

@@ -115,6 +115,29 @@ def test_every_picture_comes_out_again(tmp_path, change):
     assert any("byte for byte" in note for note in outcome.notes)
 
 
+def leaving_the_body(frame: Frame) -> Frame:
+    """Frames 5 to 8 show a blue room."""
+    if 5 <= frame.seq <= 8:
+        room = np.empty_like(frame.image)
+        room[...] = 20, 60, 230
+        return frame.with_fields(image=room, right_image=room)
+    return frame
+
+
+def test_what_the_out_of_body_gate_holds_back_is_not_recorded(tmp_path):
+    record(tmp_path, leaving_the_body)
+    reader = SessionReader(tmp_path / "session")
+    frames = [frame for _, frame in reader.frames()] + list(reader.prepared())
+    withheld = {frame.seq for frame in frames if frame.withheld == "out of body"}
+    assert {5, 6, 7, 8} <= withheld < set(range(FRAMES))
+    for frame in frames:
+        assert frame.image[..., 2].mean() < 150, f"frame {frame.seq} shows the room"
+        if frame.seq in withheld:
+            assert not frame.image.any() and not frame.right_image.any() and frame.depth is None
+    comparison = replayed(tmp_path).find(ShownComparison)
+    assert comparison is not None and comparison.different == 0 and comparison.same > 0
+
+
 def test_without_the_schedule_the_pictures_are_others(session):
     with_it, without = replayed(session), replayed(session, ignore_schedule=True)
     digests = [outcome.find(QualityResult).frames_sha256 for outcome in (with_it, without)]

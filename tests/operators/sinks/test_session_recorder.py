@@ -21,7 +21,8 @@ from gsplat_core.io.sessions.schedule import Observed
 from gsplat_core.io.sessions.writer import Shown
 from operators.errors import OutputError, StorageFull
 from operators.sinks import session_recorder
-from operators.sinks.session_recorder import SessionRecorder, stated
+from operators.sinks.recorded import stated
+from operators.sinks.session_recorder import SessionRecorder
 from operators.storage import StorageReserve
 from tests.gsplat_core.io.sessions.made import new_frame, same_frame, session_info
 
@@ -221,8 +222,9 @@ def test_a_frame_that_no_recording_can_hold_is_counted(tmp_path):
     recorder.frame(new_frame(2))
     recorder.close()
     assert [frame.seq for frame in frames_of(tmp_path)] == [0, 2]
-    (what,) = recorder.recorded.lost or {}
-    assert what.startswith("frame: ")
+    assert recorder.recorded.lost == {"frame: no recording can hold it": 1}
+    (line,) = (line for _, line in SessionReader(tmp_path / "s").lines() if isinstance(line, LostLine))
+    assert line.seq == 1 and "pose" in line.why
 
 
 def test_a_bug_in_the_thread_is_raised_where_it_is_closed(tmp_path, monkeypatch):
@@ -243,6 +245,22 @@ def test_a_disk_that_does_not_answer_is_given_up(tmp_path, gate, monkeypatch):
     recorder.frame(new_frame(0))
     recorder.close()
     assert recorder.recorded.ended is not None and "does not answer" in recorder.recorded.ended
+
+
+def test_what_is_being_written_is_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(session_recorder, "CLOSE_S", 1.0)
+    written = SessionWriter.frame
+
+    def slow(self, frame):
+        time.sleep(0.1)
+        written(self, frame)
+
+    monkeypatch.setattr(SessionWriter, "frame", slow)
+    recorder = recorder_in(tmp_path)
+    for seq in range(16):
+        recorder.frame(new_frame(seq))
+    recorder.close()
+    assert (recorder.recorded.frames, recorder.recorded.ended) == (16, None)
 
 
 def test_a_folder_with_a_recording_is_refused(tmp_path):

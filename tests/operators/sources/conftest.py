@@ -15,18 +15,24 @@ SOON_S = 30.0
 _HAS_SERVER = "import gi; gi.require_version('GstRtspServer', '1.0'); gi.require_version('Gst', '1.0')"
 
 
-def free_port() -> int:
+def a_free_port(kind: int = socket.SOCK_STREAM) -> int:
     """A port of this machine that nobody listens on."""
-    with socket.socket() as probe:
+    with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+@pytest.fixture
+def free_port():
+    """Ports of this machine that nobody listens on."""
+    return a_free_port
 
 
 class RtspServer:
     """GStreamer's RTSP server in a process of its own, which may be killed and started again on the same port."""
 
     def __init__(self, python: str) -> None:
-        self.python, self.port = python, free_port()
+        self.python, self.port = python, a_free_port()
         self.process: subprocess.Popen | None = None
 
     def start(self, login: str | None = None) -> None:

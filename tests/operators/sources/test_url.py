@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import http.server
+import itertools
 import os
 import signal
+import socket
 import threading
 import time
 
@@ -81,6 +83,15 @@ def test_a_server_that_is_killed_and_comes_back_after_five_seconds(rtsp_server, 
     assert stream.source.state is SourceState.LIVE and stream.source.counts()["reconnections"] == 1
     assert after.seq > before.seq and after.pts_ns - before.pts_ns > 5e9, "five seconds have passed"
     assert stream.frame().seq > after.seq
+
+
+def test_what_piled_up_before_the_source_was_opened_is_not_shown(rtsp_server, reading):
+    rtsp_server.start()
+    source = open_source(rtsp_server.url("camera"), HERE)
+    first = source._connection
+    time.sleep(1.5)
+    assert reading(source).frame() and first._container is None, "it was connected to anew"
+    assert source.counts().get("reconnections", 0) == 0
 
 
 def test_a_server_that_hangs_is_a_stall_and_then_a_lost_connection(rtsp_server, reading):
@@ -162,6 +173,32 @@ def test_a_video_by_http_ends_with_its_last_frame(web, tmp_path, reading):
     assert [stream.frame().seq for _ in range(30)] == list(range(30))
     assert stream.source.read(SOON_S) is None and stream.source.state is SourceState.ENDED
     assert stream.source.state_sentence.endswith("has given its last frame")
+
+
+def test_a_transport_stream_by_udp_that_is_joined_in_its_middle(reading, free_port):
+    port, stop = free_port(socket.SOCK_DGRAM), threading.Event()
+
+    def send():
+        with av.open(f"udp://127.0.0.1:{port}?pkt_size=1316", "w", format="mpegts") as out:
+            stream = out.add_stream("libx264", rate=25, options={"tune": "zerolatency", "g": "10"})
+            stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+            k = 0
+            while not stop.wait(0.04):
+                frame = av.VideoFrame.from_ndarray(moving(k), format="rgb24")
+                frame.pts = k
+                out.mux(stream.encode(frame))
+                k += 1
+
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    try:
+        stream = reading(open_source(f"udp://127.0.0.1:{port}", HERE))
+        frames = [stream.frame() for _ in range(20)]
+    finally:
+        stop.set()
+        thread.join()
+    assert all(frame.image.shape == (120, 160, 3) for frame in frames) and frames[-1].damage is None
+    assert [b.seq - a.seq for a, b in itertools.pairwise(frames)][-5:] == [1] * 5
 
 
 def test_max_frames_ends_a_stream(web, tmp_path, reading):

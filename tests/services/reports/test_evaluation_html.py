@@ -70,7 +70,7 @@ def content():
             "score": score(38.5, left_out={"damaged": 2}), "unrounded_db": 38.52,
             "depth": {"mae_mm": 1.5, "rmse_mm": 2.5, "relative": 0.03, "scaled_rmse_mm": 1.25, "covered": 0.995, "frames": 7},
         },
-        "causal": {"score": score(39.25), "field": "basis", "steps_per_frame": 40, "seed": 0},
+        "causal": {"score": score(39.25), "field": "basis", "steps_per_frame": 40, "seed": 0, "motion_prior": "flow"},
         "live": {
             "score": score(42.5), "settled": score(43.5), "age_when_shown": ages(), "age_on_screen": ages(3),
             "in_time": 5, "behind": {0: 5, 1: 1, 8: 1}, "states": {"live": 8, "stale": 1},
@@ -83,13 +83,14 @@ def content():
         "baselines": [
             *copies(), baseline("half_velocity_flow", "every", 38.25), baseline("previous_frame", "heldout", 37.25),
             baseline("half_way_flow", "heldout", 41.75, sees_future=True), baseline("last_frame", "last", 20.5),
+            baseline("previous_frame", "live", 37.0), baseline("previous_frame", "settled", 37.5),
         ],
         "left_out": {"withheld": 1},
         "notes": ["no <mask>"],
         "outputs": {},
         "series": {
             "baselines": entries(half_velocity_flow_db=31.0, previous_frame_db=30.0, half_way_flow_db=34.0),
-            "causal": entries(), "heldout": entries(), "live": entries(age_ms=40.0, behind=0), "retention": entries(),
+            "causal": entries(), "heldout": entries(), "live": entries(age_ms=40.0, behind=0, previous_frame_db=29.0), "retention": entries(),
         },
         "series_frames_per_entry": {"causal": 12},
     }  # fmt: skip
@@ -112,9 +113,9 @@ def test_nothing_is_fetched_from_anywhere_and_nothing_can_be_injected(report):
 def test_each_protocol_stands_beside_its_baselines(report):
     text = render_evaluation(report)
     for said in (
-        "42.50", "39.25", "38.50", "36.50", "+1.00 dB", "+5.50 dB", "-3.25 dB", "+16.00 dB", "41.75", "(sees the future)", "37.00",
+        "42.50", "39.25", "38.50", "36.50", "+1.00 dB", "+5.50 dB", "+6.00 dB", "-3.25 dB", "+16.00 dB", "41.75", "(sees the future)", "37.00",
         "Held out: not scored 2 (damaged)", "Baselines: not scored 1 (withheld)", "1.500 mm", "99.5 %",
-        "31.50, –, 33.50", "1 by 1, 1 by 8 or more", "Each point is the mean of 12 frames.", "40 steps a frame", "43.50",
+        "31.50, –, 33.50", "1 by 1, 1 by 8 or more", "Each point is the mean of 12 frames.", "40 steps a frame, basis field, motion prior flow", "43.50",
     ):  # fmt: skip
         assert said in text, said
     assert text.count("<svg") == 5 and text.count("Research use only, not a medical device.") >= 2

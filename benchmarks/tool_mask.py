@@ -1,0 +1,152 @@
+"""How well tools are found, how many are found where there are none, whether the out-of-body gate lets a recording pass, and what both cost.
+
+One JSON line for each recording, on one core: `iou` (tool class, mean and minimum over the frames with a tool, where the recording has
+masks), `recall`, `found_share` (pixels called tool: false ones where there is no tool), `withheld` (frames that the gate did not let
+pass) and processor time a frame, which other programs on the machine change less than the clock's. With --copies also for changed copies of the first recording: tint, brightness, noise, smoke, size.
+
+Usage: python benchmarks/tool_mask.py RECORDING... [--frames 200] [--method builtin|onnx:PATH] [--copies]
+A picture file is a recording of one frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
+from gsplat_core.endoscope.out_of_body import BodyGate
+from gsplat_core.endoscope.tools import ToolFinder
+from gsplat_core.io.recordings import open_recording
+from operators.tool_mask import MaskFinder
+
+Image = NDArray[np.uint8]
+Change = Callable[[Image], Image]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", type=Path, nargs="+")
+    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--method", default="builtin")
+    parser.add_argument("--copies", action="store_true")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    finder: MaskFinder = ToolFinder()
+    if arguments.method.startswith("onnx:"):
+        finder = OnnxToolFinder(Path(arguments.method.removeprefix("onnx:")))
+    for path in arguments.recordings:
+        report(path.name if path.is_file() else path.resolve().name, measured(path, arguments.frames, finder))
+    for name, change in (changes() if arguments.copies else {}).items():
+        path = arguments.recordings[0]
+        report(f"{path.resolve().name}, {name}", measured(path, arguments.frames, finder, change))
+    return 0
+
+
+def frames(path: Path) -> Iterator[tuple[Image, Image | None]]:
+    """Pictures, and masks where there are any."""
+    if path.is_file() and path.suffix.lower() in (".png", ".jpg", ".jpeg"):
+        read = cv2.imread(str(path))
+        assert read is not None, path
+        yield np.ascontiguousarray(read[..., ::-1]), None
+        return
+    for frame in open_recording(path):
+        yield frame.image, frame.mask
+
+
+def measured(path: Path, count: int, finder: MaskFinder, change: Change = lambda image: image) -> dict[str, object]:
+    """The figures of one recording."""
+    finder.reset()
+    gate = BodyGate()
+    ious, recalls, shares, find_ms, judge_ms, withheld = [], [], [], [], [], 0
+    for image, mask in islice(frames(path), count):
+        image = change(image)
+        start = time.thread_time()
+        found = finder.find(image) == 0
+        middle = time.thread_time()
+        withheld += gate.judge(image) is not None
+        judge_ms.append(1e3 * (time.thread_time() - middle))
+        find_ms.append(1e3 * (middle - start))
+        shares.append(float(found.mean()))
+        # A mask with the field of view's border in it is no tool mask; the synthetic recordings' and `masks/` are.
+        if mask is not None and (mask == 0).any() and has_tool_masks(path):
+            tool = cv2.resize(mask, image.shape[1::-1], interpolation=cv2.INTER_NEAREST) == 0
+            ious.append(float((found & tool).sum() / (found | tool).sum()))
+            recalls.append(float((found & tool).sum() / tool.sum()))
+    figures: dict[str, object] = {"frames": len(shares), "found_share": round(float(np.mean(shares)), 4)}
+    if ious:
+        figures |= {"iou": round(float(np.mean(ious)), 3), "iou_min": round(min(ious), 3)}
+        figures["recall"] = round(float(np.mean(recalls)), 3)
+    figures |= {"withheld": withheld, "find_ms_p50": round(float(np.median(find_ms)), 2)}
+    return figures | {
+        "find_ms_p95": round(float(np.quantile(find_ms, 0.95)), 2),
+        "judge_ms_p50": round(float(np.median(judge_ms)), 2),
+    }
+
+
+def has_tool_masks(path: Path) -> bool:
+    """Whether the masks beside a recording are of tools."""
+    return (path / "masks").is_dir()
+
+
+def changes() -> dict[str, Change]:
+    """What may be different about another scope's picture of the same scene."""
+    noise = np.random.default_rng(0)
+    return {
+        "hue +12 degrees": lambda image: hue(image, 6),
+        "hue -12 degrees": lambda image: hue(image, -6),
+        "half as bright": gains(0.5, 0.5, 0.5),
+        "a third as bright": gains(0.3, 0.3, 0.3),
+        "brighter by 1.4": gains(1.4, 1.4, 1.4),
+        "gamma 0.7": lambda image: gamma(image, 0.7),
+        "gamma 1.5": lambda image: gamma(image, 1.5),
+        "warm": gains(1.15, 1.0, 0.85),
+        "cold": gains(0.75, 1.0, 1.1),
+        "green": gains(0.95, 1.1, 0.95),
+        "magenta": gains(1.05, 0.9, 1.05),
+        "half size": lambda image: resized(image, 0.5),
+        "1.5 times the size": lambda image: resized(image, 1.5),
+        "noise": lambda image: np.clip(image + noise.normal(0, 12, image.shape), 0, 255).astype(np.uint8),
+        "blurred": lambda image: np.asarray(cv2.GaussianBlur(image, (0, 0), 4), np.uint8),
+        "smoke 40 %": lambda image: (0.6 * image + 0.4 * 170).astype(np.uint8),
+        "smoke 60 %": lambda image: (0.4 * image + 0.6 * 170).astype(np.uint8),
+    }
+
+
+def gains(red: float, green: float, blue: float) -> Change:
+    """Each channel times a factor."""
+    return lambda image: np.clip(image * np.array([red, green, blue]), 0, 255).astype(np.uint8)
+
+
+def gamma(image: Image, exponent: float) -> Image:
+    """Another tone curve."""
+    return (255 * (image / 255) ** exponent + 0.5).astype(np.uint8)
+
+
+def hue(image: Image, steps: int) -> Image:
+    """All hues turned by so many times two degrees."""
+    hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV).astype(np.int16)
+    hsv[..., 0] = (hsv[..., 0] + steps) % 180
+    return np.asarray(cv2.cvtColor(hsv.astype(np.uint8), cv2.COLOR_HSV2RGB), np.uint8)
+
+
+def resized(image: Image, factor: float) -> Image:
+    """Another size."""
+    return np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def report(recording: str, figures: dict[str, object]) -> None:
+    """One line."""
+    print(json.dumps({"recording": recording, **figures}), flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

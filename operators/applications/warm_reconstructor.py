@@ -1,0 +1,45 @@
+"""A reconstructor that has done everything once before its first frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
+from gsplat_core.training.budget import Budget
+from gsplat_core.training.live import LiveReconstructor
+
+WARM_FRAMES = 4
+WARM_STEPS = {"cpu": 3, "cuda": 40}
+"""Optimiser steps on each picture before the first frame."""
+
+
+def warm_reconstructor(
+    reconstructor: LiveReconstructor, draw: Callable[[Frame, Model | Snapshot], object] = lambda *_: None
+) -> None:
+    """Train on noise and forget it; `draw` is given each picture and its model.
+
+    Replay of a recorded session does the same: a GPU's tile lists, which noise has made longer, decide which steps are taken again.
+    """
+    image = noise(reconstructor.camera)
+    drawn: list[object] = []
+    for seq in range(WARM_FRAMES):
+        frame = Frame(seq, seq * 33_000_000, image)
+        # Budgets in time, so that the length of a step is known.
+        reconstructor.observe(frame, budget=Budget.until(0.0, at_least=WARM_STEPS[reconstructor.device.type]))
+        # All of them are held: every snapshot and piece of page-locked memory that a run needs is made.
+        model = reconstructor.publish()
+        drawn.append((model, draw(frame, model)))
+        reconstructor.rehearse(2)
+        reconstructor.grow(frame)
+    reconstructor.forget()
+
+
+def noise(camera: Camera) -> NDArray[np.uint8]:
+    """A picture of the camera's size that is like no other."""
+    return np.random.default_rng(0).integers(0, 256, (camera.height_px, camera.width_px, 3), np.uint8)

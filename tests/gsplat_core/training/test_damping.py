@@ -1,0 +1,39 @@
+"""Which share of the last motion is expected to go on."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsplat_core.training.damping import AT_FIRST, Damping
+
+
+def share_of(damping: Damping) -> float:
+    return float(damping.damped(torch.ones(1, 3))[0, 0])
+
+
+def test_it_starts_with_a_constant() -> None:
+    assert share_of(Damping()) == pytest.approx(AT_FIRST)
+
+
+@pytest.mark.parametrize(("ratio", "learned"), [(1.0, 1.0), (0.3, 0.3), (0.0, 0.0), (-0.4, 0.0), (50.0, 1.0)])
+def test_it_learns_the_share_within_its_bounds(ratio: float, learned: float) -> None:
+    damping, last = Damping(), torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
+    for _ in range(60):
+        damping.learn(last, ratio * last)
+    assert share_of(damping) == pytest.approx(learned, abs=1e-3)
+
+
+def test_motion_that_is_noise_is_not_continued() -> None:
+    damping, random = Damping(), torch.Generator().manual_seed(1)
+    for _ in range(60):
+        damping.learn(torch.randn(500, 3, generator=random), torch.randn(500, 3, generator=random))
+    assert share_of(damping) < 0.1
+
+
+def test_frames_that_say_nothing_change_nothing() -> None:
+    damping = Damping()
+    damping.learn(torch.zeros(4, 3), torch.ones(4, 3))
+    damping.learn(torch.full((4, 3), torch.nan), torch.ones(4, 3))
+    damping.learn(torch.zeros(0, 3), torch.zeros(0, 3))
+    assert share_of(damping) == pytest.approx(AT_FIRST)
