@@ -11,7 +11,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.coverage import uncovered_pixels
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
-from gsplat_core.training.unseen import Archive, LastSeen
+from gsplat_core.training.unseen import Archive, LastSeen, pixels_of
 
 SEE_EVERY = 8
 """Frames between two looks at which Gaussians are seen; while rows are short, every frame is looked at."""
@@ -19,6 +19,8 @@ ROOM_SHARE = 0.1
 """Share of the rows that is kept free for new tissue, where there is anything unseen that can leave."""
 UNSEEN_S = 0.5
 """Seconds after which a Gaussian that nobody saw may leave."""
+MARGIN_SHARE = 0.1
+"""Gaussians this close to the picture, in widths of it, stay: their extent may reach into it."""
 ARCHIVED_SCENES = 4
 """The archive's capacity, in multiples of the scene's."""
 REACH_PX = 5
@@ -47,7 +49,7 @@ class OutOfView:
         kept_free = round(ROOM_SHARE * self._capacity)
         if self._looks % SEE_EVERY == 0 or self._capacity - step.gaussians.count < kept_free // 2:
             self.last_seen.see(step.at(observation.time_s), observation)
-            self._make_room(step, observation.time_s, kept_free, UNSEEN_S)
+            self._make_room(step, observation, kept_free, UNSEEN_S)
         self._looks += 1
         if len(self.archive) and observation.camera != self._looked_from:
             self._looked_from = observation.camera
@@ -55,14 +57,20 @@ class OutOfView:
             if in_view:
                 self._bring_back(step, observation, in_view)
 
-    def _make_room(self, step: TrainingStep, time_s: float, wanted: int, unseen_s: float) -> None:
-        """Let Gaussians leave until `wanted` rows are free, as far as there are any that were not seen for `unseen_s`."""
+    def _make_room(self, step: TrainingStep, observation: Observation, wanted: int, unseen_s: float) -> None:
+        """Let Gaussians leave until `wanted` rows are free, as far as there are any outside of the picture that were not seen for `unseen_s`.
+
+        What a tool hides stays: it can be uncovered at any moment.
+        """
         short = wanted - (self._capacity - step.gaussians.count)
         if short <= 0:
             return
-        leaving = self.last_seen.longest_unseen(short, time_s - unseen_s)
+        now = step.at(observation.time_s)
+        margin_px = MARGIN_SHARE * observation.camera.width_px
+        outside = ~pixels_of(now.means, observation.camera, margin_px)[1]
+        leaving = self.last_seen.longest_unseen(short, observation.time_s - unseen_s, outside)
         if bool(leaving.any()):
-            self.archive.put(step.at(time_s).select(leaving))
+            self.archive.put(now.select(leaving))
             self.last_seen.close_gaps(step.remove(leaving))
 
     def _bring_back(self, step: TrainingStep, observation: Observation, in_view: int) -> None:
@@ -77,7 +85,7 @@ class OutOfView:
         if back is None:
             return
         self.last_seen.see(now, observation)
-        self._make_room(step, observation.time_s, back.count, unseen_s=0.0)
+        self._make_room(step, observation, back.count, unseen_s=0.0)
         room = self._capacity - step.gaussians.count
         if back.count > room:
             self.archive.put(back.select(slice(room, None)))

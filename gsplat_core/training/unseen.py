@@ -11,8 +11,8 @@ from gsplat_core.scene.rows import RowMoves
 from gsplat_core.training.observations import Observation
 
 
-def pixels_of(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Where the camera sees points [N, 3]: pixel coordinates [N, 2], and bool [N] whether that is in the picture."""
+def pixels_of(means: Tensor, camera: Camera, margin_px: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Where the camera sees points [N, 3]: pixel coordinates [N, 2], and bool [N] whether that is in the picture or this close to it."""
     viewmat, intrinsics = camera.matrices(means.device, means.dtype)
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     plane, z = points[:, :2], points[:, 2:]
@@ -23,7 +23,7 @@ def pixels_of(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
         plane = plane / torch.where(z > 0, z, torch.inf)
     pixels = plane * intrinsics.diagonal()[:2] + intrinsics[:2, 2]
     size = pixels.new_tensor([camera.width_px, camera.height_px])
-    return pixels, ((pixels >= 0) & (pixels < size)).all(1) & (z[:, 0] > 0)
+    return pixels, ((pixels >= -margin_px) & (pixels < size + margin_px)).all(1) & (z[:, 0] > 0)
 
 
 def value_at(plane: Tensor, pixels: Tensor) -> Tensor:
@@ -68,9 +68,10 @@ class LastSeen:
         moves.apply(self._times, 0.0)
         self._count = moves.count
 
-    def longest_unseen(self, count: int, before_s: float) -> Tensor:
-        """Marks, bool [N], at most `count` of the Gaussians that were not seen since `before_s`, those unseen for the longest first."""
-        times = self.times()
+    def longest_unseen(self, count: int, before_s: float, among: Tensor) -> Tensor:
+        """Marks, bool [N], at most `count` of the Gaussians in `among`, bool [N], that were not seen since `before_s`; those unseen for the
+        longest first."""
+        times = self.times().masked_fill(~among, torch.inf)
         marks = torch.zeros(self._count, dtype=torch.bool, device=times.device)
         oldest = torch.argsort(times, stable=True)[:count]
         marks[oldest] = times[oldest] < before_s

@@ -90,6 +90,15 @@ def test_tissue_is_remembered_before_anything_is_learned_again():
     assert score(made, frame_at(80, 0, time_s=made.snapshot().time_window_s[1])) > 24
 
 
+def test_what_a_tool_hides_never_makes_room():
+    made = reconstructor(310)  # fewer free rows than are kept free
+    mask = np.ones((HEIGHT, WIDTH), np.uint8)
+    mask[:, 24:] = 0
+    watch(made, [frame_at(0, 0)])
+    watch(made, [frame_at(k, 0, mask=mask) for k in range(1, 60)], steps=1)
+    assert made.kept()["archived"] == 0
+
+
 def moved(count, **at):
     means = torch.zeros(count, 3)
     means[:, 2] = DEPTH_MM
@@ -110,9 +119,12 @@ def test_only_what_lies_on_tissue_in_the_picture_is_seen():
     seen.see(scene, first)
     seen.see(scene, later)
     assert seen.times().tolist() == [5.0, 1.0, 1.0, 1.0]
-    assert seen.longest_unseen(3, before_s=3.0).tolist() == [False, True, True, True]
-    assert seen.longest_unseen(2, before_s=3.0).sum() == 2
-    assert not seen.longest_unseen(3, before_s=0.5).any()
+    anyone = torch.ones(4, dtype=torch.bool)
+    assert seen.longest_unseen(3, 3.0, anyone).tolist() == [False, True, True, True]
+    assert seen.longest_unseen(2, 3.0, anyone).sum() == 2
+    assert not seen.longest_unseen(3, 0.5, anyone).any()
+    anyone[2] = False
+    assert seen.longest_unseen(4, 3.0, anyone).tolist() == [False, True, False, True]
     seen.close_gaps(RowMoves.without(torch.tensor([True, False, False, False])))
     seen.join(4, 9.0)
     assert sorted(seen.times().tolist()) == [1.0, 1.0, 1.0, 9.0]
