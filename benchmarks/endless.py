@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from gsplat_core.io.recordings import open_recording
+from gsplat_core.memory import return_freed_memory
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
@@ -43,7 +44,8 @@ def looped(frames: list[Frame], fps: float, count: int, new_scenes: bool) -> Ite
 
 
 def memory_mib(device: str) -> dict[str, float]:
-    """What the process and the device hold now."""
+    """What the process and the device hold now, without what was freed already."""
+    return_freed_memory()
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     held = {"process_mib": round(pages * resource.getpagesize() / 2**20, 1)}
     if device == "cuda":

@@ -39,6 +39,8 @@ class TrainingCounts:
     """Frames that were not trained on, by reason."""
     scenes: dict[str, int] = field(default_factory=dict)
     """How often the scene began anew, by reason."""
+    places_found: int = 0
+    """New scenes that were a place which the stream had left before."""
 
 
 class LiveReconstructOp(Operator):
@@ -155,7 +157,7 @@ class LiveReconstructOp(Operator):
     def _begin_scene(self, frame: Frame, reason: str) -> None:
         assert self._reconstructor is not None
         self.counts.scenes[reason] = self.counts.scenes.get(reason, 0) + 1
-        self._reconstructor.begin_scene(frame)
+        self.counts.places_found += self._reconstructor.begin_scene(frame)
         self._tell(ScheduleEvent("begin_scene", seq=frame.seq))
         self.newest = None
 

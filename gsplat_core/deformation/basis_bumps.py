@@ -53,6 +53,7 @@ class BumpTensors(DeformationField):
         spacing = spacing_s or ((end - start) or 1.0) / (bumps - 3)
         self._columns = Columns(start - spacing, spacing, bumps, bumps)
         self._history_s: float | None = None
+        self._fading_s = math.inf
         self._spare_rows = 0
         """Inert rows at the end, which `append` turns into Gaussians without moving a tensor."""
         self.centers = torch.nn.Parameter(torch.arange(bumps, dtype=torch.float32).repeat(count, 1))
@@ -88,18 +89,18 @@ class BumpTensors(DeformationField):
         """What the field adds at `time_s`: [N, 13] position, rotation, log-scale, colour. Differentiable."""
         raise NotImplementedError
 
-    def keep_last(self, history_s: float) -> None:
+    def keep_last(self, history_s: float, fading_s: float = math.inf) -> None:
         """From now on keep only the last `history_s` seconds before the newest frame deformable.
 
         All memory is taken here: new bumps take the places of the oldest ones, and no tensor moves while the stream goes on. Times
-        before the window show its first state. Columns are then never dropped by the start of a window.
+        before the window show its first state. What new bumps hold fades with the time constant `fading_s` where training goes on.
         """
         if not (math.isfinite(history_s) and history_s > 0):
             raise InvalidInput(f"history_s must be a positive number of seconds, got {history_s}")
         places = max(ring_places(history_s, self.spacing_s), self._columns.places)
         self._add_places(places - self._columns.places)
         self._columns = replace(self._columns, is_ring=True)
-        self._history_s = history_s
+        self._history_s, self._fading_s = history_s, fading_s
 
     def restart(self, time_s: float, count: int) -> bool:
         """See `DeformationField.restart`; there have to be rows for so many Gaussians."""
@@ -128,7 +129,7 @@ class BumpTensors(DeformationField):
             raise InvalidInput(f"the window {self._time_window_s} can only move forward, got {(start, end)}")
         added, dropped = columns_to_change((start, end), self._columns)
         if added:
-            passed = self._append_columns(added, None if hold_at_s is None else self.deltas(hold_at_s).detach())
+            passed = self._append_columns(added, None if hold_at_s is None else self._held(hold_at_s))
             if passed:
                 start = max(start, self._columns.origin_s + BUMP_REACH * self.spacing_s)
         if dropped and not self._columns.is_ring:
@@ -216,11 +217,20 @@ class BumpTensors(DeformationField):
             memo[id(parameter)] = torch.nn.Parameter(kept, requires_grad=False)
         copied = copy.deepcopy(self, memo)
         copied._columns = replace(self._columns, places=self.bumps, oldest=0, is_ring=False)
-        copied._history_s, copied._spare_rows = None, 0
+        copied._history_s, copied._fading_s, copied._spare_rows = None, math.inf, 0
         return copied.requires_grad_(False)
 
     def _training_state(self) -> Sequence[object]:
         return (self._moments,)
+
+    def _held(self, time_s: float) -> Tensor:
+        """The deformation [N, 13] that new bumps continue. What training does not need of it must not add up without an end."""
+        deltas = self.deltas(time_s).detach()
+        if self._fading_s == math.inf or self._moments is None:
+            return deltas
+        # The newest column reaches back to the time when it was laid out: one spacing ago.
+        trained = self._moments.steps[: self.count, self._columns.newest_place] > 0
+        return torch.where(trained[:, None], deltas * math.exp(-self.spacing_s / self._fading_s), deltas)
 
     def _append_columns(self, added: int, held: Tensor | None) -> int:
         """Lay out columns at the head; returns how many at the tail they were written over."""
@@ -242,9 +252,8 @@ class BumpTensors(DeformationField):
         used = self.count
         for tensor, inert in self._tensors_and_fill():
             tensor[:used, places] = inert
-        self.centers.data[:used, places] = torch.arange(
-            numbers.start, numbers.stop, dtype=self.centers.dtype, device=self.centers.device
-        )
+        centers = self.centers.data[:used, places]
+        centers.copy_(torch.arange(numbers.start, numbers.stop, dtype=centers.dtype, device=centers.device))
         if held is not None:
             self.weights.data[:used, places] = held[:, None] / BUMPS_PER_SPACING
 
@@ -282,9 +291,8 @@ class BumpTensors(DeformationField):
     def _set_parameters(self, centers: Tensor, log_widths: Tensor, weights: Tensor) -> None:
         """New parameters of other sizes; an optimiser that holds the old ones must be given the new ones."""
         requires_grad = self.weights.requires_grad
-        self.centers = torch.nn.Parameter(centers.contiguous(), requires_grad)
-        self.log_widths = torch.nn.Parameter(log_widths.contiguous(), requires_grad)
-        self.weights = torch.nn.Parameter(weights.contiguous(), requires_grad)
+        for name, values in (("centers", centers), ("log_widths", log_widths), ("weights", weights)):
+            setattr(self, name, torch.nn.Parameter(values.contiguous(), requires_grad))
 
     def _change_moments(self, change: Callable[[Tensor], Tensor]) -> None:
         if self._moments is not None:

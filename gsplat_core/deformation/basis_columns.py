@@ -57,6 +57,11 @@ class Columns:
         oldest = (self.oldest + passed) % self.places
         return replace(self, origin_s=origin_s, count=self.count + added - passed, oldest=oldest), passed
 
+    @property
+    def newest_place(self) -> int:
+        """The place of the newest column."""
+        return (self.oldest + self.count - 1) % self.places
+
     def newest_places(self, count: int) -> Iterator[tuple[slice, range]]:
         """The places of the newest `count` columns in one or two pieces, each with the numbers of its columns."""
         number = self.count - count

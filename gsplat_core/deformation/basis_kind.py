@@ -17,6 +17,10 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import BASIS_CHANNELS
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
+FADING_S = 4.0
+"""Time constant with which the deformation of Gaussians that are in view fades beside what training asks for, where a stream has no end.
+Without it deformations that cancel each other add up: Gaussians become needles, and quality falls as the stream goes on."""
+
 
 @dataclass(frozen=True)
 class BasisLearningRates(FieldRates):
@@ -101,7 +105,7 @@ def new_basis_field(wanted: NewField) -> BasisField:
     bumps = max(4, round(span_s / spacing_s) + 3)
     field = BasisField(wanted.gaussians.count, (wanted.start_s, wanted.start_s + span_s), bumps=bumps)
     if wanted.end_s is None and wanted.history_s is not None:
-        field.keep_last(wanted.history_s)
+        field.keep_last(wanted.history_s, FADING_S)
     return field
 
 

@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
+from gsplat_core.training.out_of_view import OutOfView
+from gsplat_core.training.places import Place, Places
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
@@ -75,11 +78,17 @@ class LiveReconstructor(Reconstructor):
         self._kept: TrainingStep | None = None
         """That of the scene before, whose memory the next scene takes over."""
         self._rehearsing = StepsInFlight(self.device, most=REHEARSED_IN_FLIGHT)
+        self._places = Places()
+        self._taken_up: tuple[int, Place] | None = None
+        """The number of a frame and the place that it shows, from which its scene starts."""
+        self._out_of_view = OutOfView(config.max_gaussians, self.device) if config.preallocate else None
 
     def kept(self) -> dict[str, int]:
         """How much of the stream is held, by what holds it; none of it grows without end."""
         columns = 0 if self._step is None else getattr(self._step.field, "bumps", 0)
-        return {"window_frames": len(self._window), "columns": columns}
+        archived = 0 if self._out_of_view is None else len(self._out_of_view.archive)
+        kept = {"window_frames": len(self._window), "columns": columns, "places": len(self._places)}
+        return {**kept, "archived": archived}
 
     def rehearse(self, steps: int) -> None:
         """So many steps on frames of the window. On a GPU they are queued, and at most `REHEARSED_IN_FLIGHT` of them are not finished when
@@ -100,9 +109,13 @@ class LiveReconstructor(Reconstructor):
 
     def grow(self, frame: Frame) -> None:
         """What `observe` leaves for the time after `frame`, the newest one that was trained on, was shown: Gaussians are added where it
-        shows tissue that the model does not cover, and the motion prior sees it."""
-        super()._grow(frame, self._window.newest)
-        self._follow(frame, self._window.newest)
+        shows tissue that the model does not cover, those out of view make room and come back, and the motion prior sees the frame."""
+        assert self._step is not None
+        observation = self._window.newest
+        if self._out_of_view is not None:
+            self._out_of_view.follow(self._step, observation)
+        super()._grow(frame, observation)
+        self._follow(frame, observation)
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
         pass
@@ -111,20 +124,38 @@ class LiveReconstructor(Reconstructor):
         """As if no frame had been observed, but for what is known about the device: the memory that was taken, how long a step takes."""
         self._settle()
         self._kept = self._step or self._kept
-        self._step = None
+        self._step = self._taken_up = None
+        self._places = Places()
         self._version = 0
         self._window = ObservationWindow(self.config.window_frames, self.config.newest_share, self._seed)
 
-    def begin_scene(self, frame: Frame) -> None:
-        """Forget the scene: `frame`, which is observed next, starts another one. The frame may be of another size; versions go on counting."""
-        version = self._version
+    def begin_scene(self, frame: Frame) -> bool:
+        """Leave the scene: `frame`, which is observed next, starts another one, or one that was left before; says whether it is such.
+
+        Places that were left are kept as they were last, in host memory; their number is bounded. The frame may be of another size. Versions
+        go on counting.
+        """
+        version, places = self._version, self._places
+        if self._step is not None:
+            places.leave(self._step.at(self._last_time_s), self._window.newest.camera, self._last_time_s)
         self.forget()
-        self._version = version
+        self._version, self._places = version, places
         if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
             self.camera = self.camera.resized(frame.width_px, frame.height_px)
+        place = places.take(frame)
+        self._taken_up = None if place is None else (frame.seq, place)
+        return place is not None
+
+    def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
+        if self._taken_up is None or self._taken_up[0] != frame.seq:
+            return super()._first_gaussians(frame, observation)
+        self._first_time_s, self.camera = observation.time_s, observation.camera
+        return self._taken_up[1].gaussians.to(self.device)
 
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
         kept, self._kept = self._kept, None
+        if self._out_of_view is not None:
+            self._out_of_view.restart()
         camera = observation.camera
         same_size = self._kept_size == (camera.width_px, camera.height_px)
         self._kept_size = camera.width_px, camera.height_px

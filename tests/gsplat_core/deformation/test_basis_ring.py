@@ -42,7 +42,8 @@ def watch(field: BasisField, time_s: float, newest_s: float, steps: int = 2, rat
     """What the reconstructor does with a frame."""
     field.cover(time_s, newest_s)
     for _ in range(steps):
-        field.adam_step(time_s, field.deltas(time_s).detach() - wave(field.count, time_s), rates)
+        target = wave(field.count, time_s).to(field.weights.device)
+        field.adam_step(time_s, field.deltas(time_s).detach() - target, rates)
 
 
 def addresses(field: BasisField) -> list[tuple[int, tuple[int, ...]]]:
@@ -258,7 +259,7 @@ def test_snapshots_of_a_ring_stay_at_their_addresses(make_gaussians, device):
     slots = SnapshotSlots(device, most=1, rows=40)
     newest, layouts = 0.0, set()
     for frame in range(120):
-        watch_on(field, frame * FRAME_S, newest)
+        watch(field, frame * FRAME_S, newest)
         newest = frame * FRAME_S
         snapshot = slots.publish(
             gaussians, field, version=1, camera=Camera.from_focal(30.0, 32, 24), time_window_s=field.time_window_s
@@ -271,13 +272,26 @@ def test_snapshots_of_a_ring_stay_at_their_addresses(make_gaussians, device):
     assert len(layouts) == 1
 
 
-def watch_on(field: BasisField, time_s: float, newest_s: float) -> None:
-    field.cover(time_s, newest_s)
-    target = wave(field.count, time_s).to(field.weights.device)
-    field.adam_step(time_s, field.deltas(time_s).detach() - target, RATES)
-
-
 @pytest.mark.parametrize("history_s", [0.0, -1.0, float("nan"), float("inf")])
 def test_an_impossible_history_is_refused(history_s):
     with pytest.raises(InvalidInput, match="history_s"):
         online(1).keep_last(history_s)
+
+
+def test_what_is_held_fades_where_training_goes_on_and_stays_where_nobody_looks():
+    field, newest = online(2), 0.0
+    field.keep_last(HISTORY_S, fading_s=1.0)
+    pull = torch.zeros(2, 13)
+    for frame in range(60):
+        field.cover(frame * FRAME_S, newest)
+        newest = frame * FRAME_S
+        field.adam_step(newest, field.deltas(newest).detach() - 0.2, RATES)
+    before = field.deltas(newest).detach()
+    for frame in range(60, 160):
+        field.cover(frame * FRAME_S, newest)
+        newest = frame * FRAME_S
+        pull[0, 12] = 1e-15 if frame % 2 else -1e-15  # seen, and as it should be
+        field.adam_step(newest, pull, BasisRates(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    seen, hidden = field.deltas(newest).detach()
+    assert float((seen / before[0])[:3].max()) < 0.4
+    torch.testing.assert_close(hidden[:3], before[1, :3], rtol=0.1, atol=1e-3)

@@ -1,0 +1,93 @@
+"""Room in a scene of fixed size: what was not seen for long makes place for new tissue, and comes back when the camera does."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.training.coverage import uncovered_pixels
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.unseen import Archive, LastSeen, pixels_of
+
+SEE_EVERY = 8
+"""Frames between two looks at which Gaussians are seen; while rows are short, every frame is looked at."""
+ROOM_SHARE = 0.1
+"""Share of the rows that is kept free for new tissue, where there is anything unseen that can leave."""
+UNSEEN_S = 0.5
+"""Seconds after which a Gaussian that nobody saw may leave."""
+MARGIN_SHARE = 0.1
+"""Gaussians this close to the picture, in widths of it, stay: their extent may reach into it."""
+ARCHIVED_SCENES = 4
+"""The archive's capacity, in multiples of the scene's."""
+REACH_PX = 5
+"""Archived Gaussians come back this close to where something is uncovered: their centre may lie where tissue is still shown."""
+
+
+class OutOfView:
+    """Keeps the books of one scene: who was seen when, and who is archived."""
+
+    def __init__(self, capacity: int, device: torch.device) -> None:
+        self._capacity = capacity
+        self.last_seen = LastSeen(capacity, device)
+        self.archive = Archive(ARCHIVED_SCENES * capacity)
+        self._looks = 0
+        self._looked_from: Camera | None = None
+        """Where the archive was last searched from."""
+
+    def restart(self) -> None:
+        """Another scene begins."""
+        self.last_seen.restart()
+        self.archive = Archive(ARCHIVED_SCENES * self._capacity)
+        self._looks = 0
+
+    def follow(self, step: TrainingStep, observation: Observation) -> None:
+        """Look at the newest observation, make room where it is short, and bring back what comes into view. Before the scene grows."""
+        kept_free = round(ROOM_SHARE * self._capacity)
+        if self._looks % SEE_EVERY == 0 or self._capacity - step.gaussians.count < kept_free // 2:
+            self.last_seen.see(step.at(observation.time_s), observation)
+            self._make_room(step, observation, kept_free, UNSEEN_S)
+        self._looks += 1
+        if len(self.archive) and observation.camera != self._looked_from:
+            self._looked_from = observation.camera
+            in_view = int(torch.count_nonzero(self.archive.in_view(observation.camera)))
+            if in_view:
+                self._bring_back(step, observation, in_view)
+
+    def _make_room(self, step: TrainingStep, observation: Observation, wanted: int, unseen_s: float) -> None:
+        """Let Gaussians leave until `wanted` rows are free, as far as there are any outside of the picture that were not seen for `unseen_s`.
+
+        What a tool hides stays: it can be uncovered at any moment.
+        """
+        short = wanted - (self._capacity - step.gaussians.count)
+        if short <= 0:
+            return
+        now = step.at(observation.time_s)
+        margin_px = MARGIN_SHARE * observation.camera.width_px
+        outside = ~pixels_of(now.means, observation.camera, margin_px)[1]
+        leaving = self.last_seen.longest_unseen(short, observation.time_s - unseen_s, outside)
+        if bool(leaving.any()):
+            self.archive.put(now.select(leaving))
+            self.last_seen.close_gaps(step.remove(leaving))
+
+    def _bring_back(self, step: TrainingStep, observation: Observation, in_view: int) -> None:
+        now = step.at(observation.time_s)
+        with torch.no_grad():
+            alpha = render(now, observation.camera, depth=False).alpha
+        uncovered = uncovered_pixels(alpha, torch.ones_like(observation.mask)).cpu().numpy().astype(np.uint8)
+        if not uncovered.any():
+            return
+        near = torch.from_numpy(cv2.dilate(uncovered, np.ones((2 * REACH_PX + 1,) * 2, np.uint8)) > 0)
+        back = self.archive.take_uncovered(observation.camera, near, self._capacity)
+        if back is None:
+            return
+        self.last_seen.see(now, observation)
+        self._make_room(step, observation, back.count, unseen_s=0.0)
+        room = self._capacity - step.gaussians.count
+        if back.count > room:
+            self.archive.put(back.select(slice(room, None)))
+        step.append(back.select(slice(0, room)).to(alpha.device))
+        self.last_seen.join(step.gaussians.count, observation.time_s)

@@ -1,0 +1,160 @@
+"""A scope that wanders with known poses: what it left makes room, and is there again when it is back."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.rows import RowMoves
+from gsplat_core.training.budget import Budget
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.unseen import Archive, LastSeen, pixels_of
+
+WIDTH, HEIGHT = 48, 40
+FOCAL = 50.0
+DEPTH_MM = 60.0
+CAMERA = Camera.from_focal(FOCAL, WIDTH, HEIGHT)
+WALL = cv2.resize(
+    np.random.default_rng(3).uniform(40, 215, (8, 60, 3)).astype(np.float32),
+    (480, HEIGHT),
+    interpolation=cv2.INTER_CUBIC,
+)
+
+
+def frame_at(seq, column, time_s=None, **fields):
+    """The wall seen from where its `column` is at the left edge of the picture."""
+    image = np.clip(np.rint(WALL[:, column : column + WIDTH]), 0, 255).astype(np.uint8)
+    pose = np.eye(4)
+    pose[0, 3] = -column * DEPTH_MM / FOCAL
+    time_s = seq / 30 if time_s is None else time_s
+    return Frame(seq, round(time_s * 1e9), image, pose=pose, **fields)
+
+
+def reconstructor(rows, device="cpu"):
+    config = ReconstructorConfig(
+        gaussians=300, max_gaussians=rows, window_frames=20, bump_spacing_s=0.1, history_s=1.0, preallocate=True,
+        default_depth_mm=DEPTH_MM,
+    )  # fmt: skip
+    return LiveReconstructor(config, CAMERA, device=device)
+
+
+def watch(made, frames, steps=6):
+    for frame in frames:
+        made.observe(frame, budget=Budget.of_steps(steps))
+        made.grow(frame)
+        made.rehearse(2)
+
+
+def score(made, frame):
+    image = made.snapshot().render(frame.time_s, CAMERA.with_pose(frame.pose)).image
+    return psnr_tissue_db((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy(), frame.image)
+
+
+def there_and_on(first, columns):
+    return [frame_at(first + k, column) for k, column in enumerate(columns)]
+
+
+@pytest.mark.parametrize("rows", [6000, 700])
+def test_a_scope_that_is_back_after_a_minute_finds_what_it_left(device, rows):
+    """With room for all of it, and with room for two pictures only, so that most of it is archived meanwhile."""
+    made = reconstructor(rows, device)
+    watch(made, there_and_on(0, [0] * 30), steps=8)
+    watch(made, there_and_on(30, range(0, 380, 4)))
+    at = frame_at(125, 376)
+    watch(made, [at.with_fields(seq=125 + k, pts_ns=at.pts_ns + k * 3 * 10**9) for k in range(20)], steps=2)
+    assert (made.kept()["archived"] > 200) == (rows == 700)
+    assert made.gaussians <= rows
+    back = [frame_at(200 + k, 0, time_s=70 + k / 30) for k in range(3)]
+    shown = []
+    for frame in back:
+        watch(made, [frame], steps=20)
+        shown.append(score(made, frame))
+    assert max(shown) > 33
+    fresh = reconstructor(rows, device)
+    watch(fresh, back, steps=20)
+    assert made.gaussians <= rows and shown[-1] > score(fresh, back[-1])
+
+
+def test_tissue_is_remembered_before_anything_is_learned_again():
+    made = reconstructor(6000)
+    watch(made, there_and_on(0, [0] * 30), steps=8)
+    watch(made, there_and_on(30, range(0, 200, 8)))
+    assert score(made, frame_at(80, 0, time_s=made.snapshot().time_window_s[1])) > 24
+
+
+def test_what_a_tool_hides_never_makes_room():
+    made = reconstructor(310)  # fewer free rows than are kept free
+    mask = np.ones((HEIGHT, WIDTH), np.uint8)
+    mask[:, 24:] = 0
+    watch(made, [frame_at(0, 0)])
+    watch(made, [frame_at(k, 0, mask=mask) for k in range(1, 60)], steps=1)
+    assert made.kept()["archived"] == 0
+
+
+def moved(count, **at):
+    means = torch.zeros(count, 3)
+    means[:, 2] = DEPTH_MM
+    for row, x in at.items():
+        means[int(row[1:]), 0] = x
+    one = torch.ones(count, 4)
+    return Gaussians(means, one, one[:, :3], one[:, 0], torch.zeros(count, 1, 3))
+
+
+def test_only_what_lies_on_tissue_in_the_picture_is_seen():
+    seen = LastSeen(6, torch.device("cpu"))
+    mask = np.ones((HEIGHT, WIDTH), np.uint8)
+    mask[:, 30:] = 0
+    first = Observation.of(frame_at(0, 0, time_s=1.0), CAMERA)
+    later = Observation.of(frame_at(1, 0, time_s=5.0, mask=mask), CAMERA)
+    scene = moved(4, r1=20.0, r2=100.0)  # in the middle, under the tool, out of view
+    scene.means[3, 2] = -DEPTH_MM  # behind the camera
+    seen.see(scene, first)
+    seen.see(scene, later)
+    assert seen.times().tolist() == [5.0, 1.0, 1.0, 1.0]
+    anyone = torch.ones(4, dtype=torch.bool)
+    assert seen.longest_unseen(3, 3.0, anyone).tolist() == [False, True, True, True]
+    assert seen.longest_unseen(2, 3.0, anyone).sum() == 2
+    assert not seen.longest_unseen(3, 0.5, anyone).any()
+    anyone[2] = False
+    assert seen.longest_unseen(4, 3.0, anyone).tolist() == [False, True, False, True]
+    seen.close_gaps(RowMoves.without(torch.tensor([True, False, False, False])))
+    seen.join(4, 9.0)
+    assert sorted(seen.times().tolist()) == [1.0, 1.0, 1.0, 9.0]
+
+
+@pytest.mark.parametrize("model", ["pinhole", "fisheye", "ortho"])
+def test_pixels_are_those_of_the_renderer(model):
+    from gsplat_core.ops.projection.projection import fully_fused_projection
+
+    camera = Camera(CAMERA.K if model != "ortho" else np.diag([0.8, 0.8, 1.0]) + np.array([[0, 0, 24.0], [0, 0, 20], [0, 0, 0]]),
+                    WIDTH, HEIGHT, model=model)  # fmt: skip
+    means = torch.randn(50, 3) * 10 + torch.tensor([0.0, 0.0, 60.0])
+    viewmat, K = (matrix[None] for matrix in camera.matrices(means.device))
+    quats, scales = torch.tensor([[1.0, 0, 0, 0]]).repeat(50, 1), torch.ones(50, 3)
+    expected = fully_fused_projection(means, None, quats, scales, viewmat, K, WIDTH, HEIGHT, camera_model=model)
+    visible = (expected[0][0] > 0).all(-1)
+    pixels, _ = pixels_of(means, camera)
+    torch.testing.assert_close(pixels[visible], expected[1][0][visible], rtol=1e-3, atol=1e-2)
+
+
+def test_the_archive_is_bounded_and_counts_what_it_drops():
+    archive = Archive(5)
+    archive.put(moved(4, r0=1.0, r1=2.0, r2=3.0, r3=4.0))
+    archive.put(moved(3, r0=5.0, r1=6.0, r2=7.0))
+    assert len(archive) == 5 and archive.forgotten == 2
+    assert bool(archive.in_view(CAMERA).all())
+    covered = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    assert archive.take_uncovered(CAMERA, covered, 9) is None
+    assert archive.take_uncovered(CAMERA, ~covered, 0) is None
+    newest = archive.take_uncovered(CAMERA, ~covered, 2)
+    assert newest.means[:, 0].tolist() == [6.0, 7.0] and len(archive) == 3
+    assert archive.take_uncovered(CAMERA, ~covered, 9).means[:, 0].tolist() == [3.0, 4.0, 5.0]
+    assert len(archive) == 0 and archive.take_uncovered(CAMERA, ~covered, 9) is None

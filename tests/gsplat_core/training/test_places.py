@@ -1,0 +1,182 @@
+"""Places that were left are found again: those that the stream shows, and no others."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.budget import Budget
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.places import MOST_PLACES, Places, likeness_of
+
+WIDTH, HEIGHT = 64, 48
+CAMERA = Camera.from_focal(60.0, WIDTH, HEIGHT)
+
+
+def tissue(seed, width=WIDTH, height=HEIGHT, shift_px=0.0):
+    """A smooth random texture; the same seed is the same tissue."""
+    random = np.random.default_rng(seed)
+    coarse = random.uniform(40, 215, (9, 12, 3)).astype(np.float32)
+    large = cv2.resize(coarse, (2 * WIDTH, 2 * HEIGHT), interpolation=cv2.INTER_CUBIC)
+    moved = cv2.warpAffine(large, np.float32([[1, 0, -shift_px], [0, 1, 0]]), (2 * WIDTH, 2 * HEIGHT))
+    cut = moved[HEIGHT // 2 : HEIGHT // 2 + HEIGHT, WIDTH // 2 : WIDTH // 2 + WIDTH]
+    return np.clip(np.rint(cv2.resize(cut, (width, height))), 0, 255).astype(np.uint8)
+
+
+def frame_of(seed, seq=0, **fields):
+    return Frame(seq, seq * 33_333_333, tissue(seed), **fields)
+
+
+def left(*seeds):
+    places = Places()
+    for seed in seeds:
+        gaussians = gaussians_from_frame(frame_of(seed), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
+        places.leave(gaussians, CAMERA, float(seed))
+    return places
+
+
+def test_a_frame_finds_its_own_place_and_takes_it():
+    places = left(1, 2, 3)
+    assert places.take(frame_of(2)).left_s == 2.0
+    assert len(places) == 2 and places.take(frame_of(2)) is None
+    assert places.take(frame_of(9)) is None and len(places) == 2
+
+
+@pytest.mark.parametrize("gain,offset", [(0.5, 0), (1.3, 0), (0.6, 40)])
+def test_exposure_and_white_balance_play_no_part(gain, offset):
+    image = tissue(2) * np.array([gain, 0.9 * gain, 1.1 * gain]) + offset
+    frame = Frame(0, 0, np.clip(image, 0, 255).astype(np.uint8))
+    assert left(1, 2, 3).take(frame).left_s == 2.0
+
+
+def test_only_tissue_is_compared():
+    mask = np.ones((HEIGHT, WIDTH), np.uint8)
+    mask[:, :30] = 0
+    image = tissue(2)
+    image[:, :30] = 255 * (np.indices((HEIGHT, 30)).sum(0) // 8 % 2)[..., None]
+    assert left(2).take(Frame(0, 0, image)) is None
+    assert left(2).take(Frame(0, 0, image, mask=mask)).left_s == 2.0
+    assert left(2).take(Frame(0, 0, image, loss_mask=mask)).left_s == 2.0
+    assert left(2).take(Frame(0, 0, tissue(2), mask=np.zeros_like(mask))) is None
+
+
+def test_a_picture_of_another_size_shows_the_same_place():
+    assert left(1, 2).take(Frame(0, 0, tissue(2, 96, 72))).left_s == 2.0
+
+
+def test_a_pose_that_looks_elsewhere_does_not_show_the_place():
+    away = np.eye(4)
+    away[0, 3] = -30.0
+    assert left(2).take(frame_of(2, pose=np.eye(4))) is not None
+    assert left(2).take(frame_of(2, pose=away)) is None
+
+
+@pytest.mark.parametrize("image", [np.zeros((HEIGHT, WIDTH, 3)), np.full((HEIGHT, WIDTH, 3), 255), tissue(2)[:, ::-1]])
+def test_black_white_and_mirrored_pictures_show_no_place(image):
+    assert left(1, 2, 3).take(Frame(0, 0, np.ascontiguousarray(image, np.uint8))) is None
+
+
+def test_the_number_of_places_is_bounded():
+    places = left(*range(MOST_PLACES + 3))
+    assert len(places) == MOST_PLACES
+    assert places.take(frame_of(0)) is None and places.take(frame_of(5)) is not None
+
+
+def test_likeness_of_too_little_is_none():
+    picture = np.asarray(tissue(1), np.float32)
+    known = np.zeros((HEIGHT, WIDTH), bool)
+    assert likeness_of(picture, picture, known) == 0.0
+    known[:] = True
+    assert likeness_of(picture, picture, known) == pytest.approx(1.0)
+
+
+def reconstructor(device="cpu"):
+    config = ReconstructorConfig(
+        gaussians=500, max_gaussians=1000, window_frames=20, bump_spacing_s=0.1, history_s=1.0, preallocate=True
+    )
+    return LiveReconstructor(config, CAMERA, device=device)
+
+
+def watch(made, frames, steps):
+    for frame in frames:
+        if frame.new_scene is not None:
+            made.begin_scene(frame)
+        made.observe(frame, budget=Budget.of_steps(steps))
+
+
+def score(made, frame):
+    image = made.snapshot().render(frame.time_s).image
+    return psnr_tissue_db((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy(), frame.image, frame.mask)
+
+
+def swinging(seed, first, count, new_scene=None):
+    for seq in range(first, first + count):
+        image = tissue(seed, shift_px=1.5 * np.sin(seq / 5))
+        yield Frame(seq, seq * 33_333_333, image, new_scene=new_scene if seq == first else None)
+
+
+def test_a_scope_that_comes_back_after_a_minute_goes_on_where_it_left(device):
+    made = reconstructor(device)
+    watch(made, swinging(1, 0, 60), steps=8)
+    memory = [tensor.data_ptr() for tensor in made._step.field.training_tensors()]
+    watch(made, swinging(2, 60, 20, new_scene="cut"), steps=4)
+    back = list(swinging(1, 60 + 1800, 3))
+    # A tool covers half of the picture when it is back: what lies there was seen before.
+    mask = np.ones((HEIGHT, WIDTH), np.uint8)
+    mask[:, WIDTH // 2 :] = 0
+    assert made.begin_scene(back[0].with_fields(mask=mask))
+    watch(made, (frame.with_fields(mask=mask) for frame in back), steps=8)
+    assert score(made, back[-1].with_fields(mask=mask)) > 33
+    # The hidden half swung on, but it is that tissue: without memory it is painted over from the other half.
+    hidden = back[-1].with_fields(mask=1 - mask)
+    fresh = reconstructor(device)
+    watch(fresh, (frame.with_fields(mask=mask) for frame in back), steps=8)
+    assert score(made, hidden) > score(fresh, hidden) + 5
+    assert made._step.field.time_window_s[0] == pytest.approx(back[0].time_s)
+    assert [tensor.data_ptr() for tensor in made._step.field.training_tensors()] == memory
+
+
+def test_a_place_never_seen_starts_anew(device):
+    made = reconstructor(device)
+    watch(made, swinging(1, 0, 5), steps=4)
+    other = next(iter(swinging(2, 5, 1)))
+    assert not made.begin_scene(other)
+    made.observe(other, budget=Budget.of_steps(30))
+    assert score(made, other) > 30
+    assert made.kept()["places"] == 1
+    assert made.snapshot().version > 0
+
+
+def test_another_size_begins_in_memory_of_its_own():
+    made = reconstructor()
+    watch(made, swinging(1, 0, 20), steps=6)
+    large = Frame(20, 20 * 33_333_333, tissue(1, 96, 72, shift_px=1.5 * np.sin(4)), new_scene="resized")
+    assert made.begin_scene(large)
+    made.observe(large, budget=Budget.of_steps(20))
+    assert (made.camera.width_px, made.camera.height_px) == (96, 72)
+    assert score(made, large) > 30
+
+
+def test_a_warm_up_leaves_no_place_behind():
+    made = reconstructor()
+    watch(made, swinging(1, 0, 3), steps=2)
+    made.begin_scene(next(iter(swinging(2, 3, 1))))
+    made.forget()
+    assert made.kept()["places"] == 0
+
+
+@pytest.mark.cuda
+def test_a_cut_captures_nothing_again(gpu):
+    made = reconstructor(gpu)
+    watch(made, swinging(1, 0, 10), steps=6)
+    graph = made._step._captured._captured
+    watch(made, swinging(2, 10, 10, new_scene="cut"), steps=6)
+    watch(made, swinging(1, 20, 10, new_scene="cut"), steps=6)
+    assert made._step._captured._captured is graph
