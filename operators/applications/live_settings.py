@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
@@ -20,13 +20,17 @@ from operators.frame_clock import ClockSettings
 from operators.out_of_body import Policy
 from operators.tool_mask import check_tool_mask
 
-LIVE_WINDOW_FRAMES = 150
-LIVE_BUMP_SPACING_S = 0.1
-LIVE_HISTORY_S = 6.0
-"""How much of the past stays deformable: what the window holds at 30 frames a second, and the last 5 s rendered again."""
+LIVE_WINDOW_FRAMES = {"cpu": 60, "cuda": 150}
+LIVE_BUMP_SPACING_S = {"cpu": 0.2, "cuda": 0.1}
+LIVE_HISTORY_S = {"cpu": 3.0, "cuda": 6.0}
+"""How much of the past stays deformable: what the window holds at 30 frames a second, and a little more. On a CPU each second of it makes
+every step longer."""
 LIVE_MOTION_DETAIL: Detail = "half"
 LIVE_GAUSSIANS = {"cpu": 30_000, "cuda": 45_000}
-LIVE_MOST_GAUSSIANS = 90_000
+LIVE_MOST_GAUSSIANS = 100_000
+"""At the start of a scene, for large pictures; twice as many may be there in all."""
+LIVE_PIXELS_PER_GAUSSIAN = 13
+"""On a GPU, for pictures that are larger than the usual ones."""
 LIVE_TRAINING = {"cpu": LiveTraining(first_rate=1.0, last_rate=1.0), "cuda": LiveTraining()}
 LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
 """Beside L1: follows motion better. On a CPU a step takes half as long again with it, and steps are what is short there."""
@@ -90,20 +94,23 @@ class LiveSettings:
 
     def reconstructor_config(self, pixels: int) -> ReconstructorConfig:
         """The reconstructor's settings for frames of so many pixels. Raises InvalidSetting."""
-        config = ReconstructorConfig(
+        device = self.device
+        wanted = LIVE_GAUSSIANS[device]
+        if device == "cuda":
+            wanted = max(wanted, min(LIVE_MOST_GAUSSIANS, pixels // LIVE_PIXELS_PER_GAUSSIAN))
+        wanted = min(wanted, max(64, pixels // PIXELS_PER_GAUSSIAN))
+        return ReconstructorConfig(
             field=self.field,
-            gaussians=LIVE_GAUSSIANS[self.device],
-            max_gaussians=LIVE_MOST_GAUSSIANS,
-            window_frames=LIVE_WINDOW_FRAMES,
-            bump_spacing_s=LIVE_BUMP_SPACING_S,
-            history_s=LIVE_HISTORY_S,
+            gaussians=wanted,
+            max_gaussians=2 * wanted,
+            window_frames=LIVE_WINDOW_FRAMES[device],
+            bump_spacing_s=LIVE_BUMP_SPACING_S[device],
+            history_s=LIVE_HISTORY_S[device],
             preallocate=True,
             motion_prior="flow",
             motion_detail=LIVE_MOTION_DETAIL,
-            ssim_weight=LIVE_SSIM_WEIGHT[self.device],
+            ssim_weight=LIVE_SSIM_WEIGHT[device],
         )
-        most = max(64, pixels // PIXELS_PER_GAUSSIAN)
-        return replace(config, gaussians=min(config.gaussians, most), max_gaussians=min(config.max_gaussians, 2 * most))
 
     def stated(self) -> RunSettings:
         """What the report says about them."""
