@@ -73,6 +73,7 @@ class FrameClock:
         self.training_ns = 0.0
         """Usual time from taking a frame to its published model."""
         self._last_arrival_ns: int | None = None
+        self._last_taken_ns: int | None = None
         self._shown = threading.Event()
 
     def budget(self, frame: Frame, *, first: bool = False) -> Budget:
@@ -80,6 +81,7 @@ class FrameClock:
         settings = self.settings
         arrived_ns = self.now_ns() if frame.arrived_ns is None else frame.arrived_ns
         self._learn_interval(arrived_ns)
+        self._last_taken_ns = self.now_ns()
         until_ns = arrived_ns + (settings.first_ms * 1e6 if first else self.show_after_ns) - self.display_ns
         if settings.budget_ms is None and not first:
             until_ns = max(until_ns, self.now_ns() + settings.least_share * self.interval_ns)
@@ -100,10 +102,10 @@ class FrameClock:
 
     def may_rehearse(self, made: int, ahead_ns: float) -> bool:
         """Whether there is room for more rehearsal: `made` steps were made since the last frame, and those that would be under way take
-        `ahead_ns`. It ends just before the next frame is due, so that the frame finds the device free."""
-        if made >= self.settings.rehearse_at_most or self._last_arrival_ns is None:
+        `ahead_ns`. It ends just before the next frame is due here, so that the frame finds the device free."""
+        if made >= self.settings.rehearse_at_most or self._last_taken_ns is None:
             return False
-        return self.now_ns() + ahead_ns < self._last_arrival_ns + self.interval_ns - REHEARSAL_MARGIN_NS
+        return self.now_ns() + ahead_ns < self._last_taken_ns + self.interval_ns - REHEARSAL_MARGIN_NS
 
     def too_late(self, frame: Frame, waiting: int) -> bool:
         """Whether a frame is passed over for one of the `waiting` newer ones. After a delay frames are caught up with one by one, as long

@@ -83,7 +83,7 @@ class SideBySideOp(Operator):
             wait(others)
         gated, *found = [other.result() for other in others]
         if gated.withheld is None:
-            for each in (gated, *found):
+            for each in found:
                 decided = with_findings(decided, each)
         else:
             decided = gated.with_fields(seq=decided.seq, pts_ns=decided.pts_ns)

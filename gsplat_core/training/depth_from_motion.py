@@ -17,7 +17,7 @@ from torch import Tensor
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.layout import POSITION
 from gsplat_core.training.step import TrainingStep
-from gsplat_core.training.surface_motion import SurfaceMotion
+from gsplat_core.training.surface_motion import SurfaceMotion, beside
 
 FLOW_ERROR_PX = 1.0
 """Standard deviation of the motion that the camera's does not explain: the tissue's own, and errors of flow and pose."""
@@ -98,11 +98,11 @@ def parallax_terms(pixels: Tensor, target: Tensor, before: Camera, after: Camera
     In units of the focal length. c is 0 where the camera only turned.
     """
     between = after.world_to_camera @ np.linalg.inv(before.world_to_camera)
-    rotation = torch.as_tensor(between[:3, :3].astype(np.float32), device=pixels.device)
+    rotation = beside(pixels, between[:3, :3])
     tx, ty, tz = (float(value) for value in between[:3, 3])
     first, second = _normalised(pixels, before), _normalised(target, after)
     ray = torch.cat([first, torch.ones_like(first[:, :1])], dim=1) @ rotation.T
-    c = second * tz - second.new_tensor([tx, ty])
+    c = second * tz - beside(second, [tx, ty])
     return c, ray[:, :2] - second * ray[:, 2:]
 
 
@@ -120,5 +120,5 @@ def translation_between(before: Camera, after: Camera) -> NDArray[np.float64]:
 
 
 def _normalised(pixels: Tensor, camera: Camera) -> Tensor:
-    focal = pixels.new_tensor([camera.K[0, 0], camera.K[1, 1]])
-    return (pixels - pixels.new_tensor([camera.K[0, 2], camera.K[1, 2]])) / focal
+    focal = beside(pixels, [camera.K[0, 0], camera.K[1, 1]])
+    return (pixels - beside(pixels, [camera.K[0, 2], camera.K[1, 2]])) / focal

@@ -30,11 +30,11 @@ LONGER_STEP_DECAY = 0.1
 class LiveTraining:
     """How the steps beside a live stream are taken. Raises InvalidSetting for a value out of its range."""
 
-    first_rate: float = 1.0
+    first_rate: float = 2.0
     """Factor of all learning rates in a frame's first step: large steps follow a large motion."""
-    last_rate: float = 1.0
+    last_rate: float = 0.5
     """The factor that they end with: small steps settle."""
-    rate_steps: int = 40
+    rate_steps: int = 30
     """Steps from the first factor to the last, in equal ratios; a frame that gets more goes on with the last one."""
     recent_share: float = 0.3
     """Share of the rehearsal steps that go to the newest frame; the others are spread evenly over the window."""

@@ -173,15 +173,16 @@ def new_motion_prior(config: ReconstructorConfig, field: DeformationField) -> Mo
 
 
 @contextmanager
-def continued(step: TrainingStep, prior: MotionPrior | None) -> Iterator[None]:
-    """For the time of a copy for publishing the scene goes on after the newest frame as the prior says; training knows nothing of it."""
+def continued(step: TrainingStep, prior: MotionPrior | None, learned_s: float) -> Iterator[None]:
+    """For the time of a copy for publishing the scene goes on as the prior says after `learned_s`, the time of the newest frame that was
+    trained on; training knows nothing of it. The scene holds still there where the prior has not seen that frame yet."""
     if prior is None:
         yield
         return
     # Also without a velocity: slots whose fields have a continuation from the start need no other memory later.
-    velocity = prior.velocity(step)
+    velocity = prior.velocity(step) if prior.newest_s == learned_s else None
     still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
-    step.field.continue_with(still if velocity is None else velocity, prior.newest_s, HORIZON_S)
+    step.field.continue_with(still if velocity is None else velocity, learned_s, HORIZON_S)
     try:
         yield
     finally:

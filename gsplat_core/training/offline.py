@@ -27,14 +27,14 @@ class FitSettings:
 
     final_rate: float = 0.02
     """What is left of every learning rate at the end, as a share; on the way there they follow half a cosine."""
-    smoothing: float = 0.9
+    smoothing: float = 1.5
     """How far, in a pass over all frames, what the field learned for each time is moved to the mean of its neighbours in time, times the
     factor of the learning rates: a frame between two others is then shown between them, not with the noise of both. 0: not at all."""
-    densify_rounds: int = 10
+    densify_rounds: int = 6
     """How often Gaussians that nobody sees are dropped and those with the largest error are split; 0: never."""
     densify_until: float = 0.7
     """Share of the steps after which the last of these rounds is; the rounds are spread evenly."""
-    densify_frames: int = 16
+    densify_frames: int = 12
     """Frames, chosen at random for each round, in which the error is looked for."""
 
     def __post_init__(self) -> None:

@@ -71,8 +71,7 @@ class Reconstructor:
         self._version = 0
         self._slots = SnapshotSlots(self.device, rows=self._fixed_rows)
         self._usual_first_loss = math.inf
-        self._first_time_s = 0.0
-        self._last_time_s = 0.0
+        self._first_time_s = self._last_time_s = self._learned_s = 0.0
 
     _follows_at_once = True
     """Whether the motion prior sees a frame before the model is trained on it."""
@@ -129,6 +128,7 @@ class Reconstructor:
         self._window.forget_before(self._step.field.time_window_s[0])
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
+        self._learned_s = observation.time_s
         if self._follows_at_once:
             self._follow(frame, observation)
         self._window.add(observation)
@@ -233,7 +233,7 @@ class Reconstructor:
             raise InvalidInput("there is no model yet: observe a frame first")
         self._settle()
         self._version += 1
-        with continued(self._step, self._prior):
+        with continued(self._step, self._prior, self._learned_s):
             gaussians, field = self._step.copy()
         return Model(gaussians=gaussians, field=field, **self._facts())
 
@@ -245,7 +245,7 @@ class Reconstructor:
         if self._step is None or self.device.type != "cuda" or not SnapshotSlots.can_hold(self._step.field):
             return self.snapshot()
         self._version += 1
-        with continued(self._step, self._prior):
+        with continued(self._step, self._prior, self._learned_s):
             return self._slots.publish(self._step.gaussians, self._step.field, **self._facts())
 
     def _facts(self) -> dict[str, Any]:

@@ -94,7 +94,7 @@ class TrainingStep:
         sees the same picture. Adam's moments follow, the rates with `take_distance`."""
         with torch.no_grad():
             scene, each = self.gaussians, factor[:, None]
-            centre = torch.as_tensor(camera.position, dtype=scene.means.dtype).to(scene.device)
+            centre = torch.as_tensor(camera.position, dtype=scene.means.dtype).to(scene.device, non_blocking=True)
             scene.means.copy_(centre + each * (scene.means - centre))
             scene.log_scales.add_(each.log())
             self.field.scale_positions(factor)

@@ -5,9 +5,12 @@ A surface point's depth is taken not to change between two frames: pictures of o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.scene.cameras import Camera
@@ -47,7 +50,7 @@ class SurfaceMotion:
 
     def at(self, pixels: Tensor) -> Tensor:
         """The flow at pixels [N, 2], bilinear; beyond the picture's edge that of the edge."""
-        size = pixels.new_tensor([self.after.width_px, self.after.height_px])
+        size = beside(pixels, [self.after.width_px, self.after.height_px])
         grid = (2 * pixels / size - 1).clamp(-2, 2)
         sampled = torch.nn.functional.grid_sample(
             self.flow.permute(2, 0, 1)[None], grid[None, None], padding_mode="border", align_corners=False
@@ -66,7 +69,7 @@ class Seen:
         local = points @ self._rotation.T + view[:3, 3]
         self.depth = local[:, 2:].clamp(min=NEAREST)
         self.pixels = local[:, :2] / self.depth * self._focal + intrinsics[:2, 2]
-        size = points.new_tensor([camera.width_px, camera.height_px])
+        size = beside(points, [camera.width_px, camera.height_px])
         in_picture = ((self.pixels >= 0) & (self.pixels <= size)).all(dim=1, keepdim=True)
         self.inside = in_picture & (local[:, 2:] > NEAREST)
 
@@ -74,3 +77,8 @@ class Seen:
         """Motion [N, 2] in pixels as motion in the world at the points' depth; none for points that are not `inside` [N, 1]."""
         moved = torch.where(inside, moved_px * self.depth / self._focal, torch.zeros_like(moved_px))
         return moved @ self._rotation[:2]
+
+
+def beside(tensor: Tensor, values: Sequence[float] | NDArray[np.floating]) -> Tensor:
+    """A few numbers on the device of `tensor` and of its type; the host does not wait for the copy (see `Camera.matrices`)."""
+    return torch.tensor(np.asarray(values), dtype=tensor.dtype).to(tensor.device, non_blocking=True)

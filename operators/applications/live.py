@@ -24,6 +24,7 @@ from operators.applications.recording import RunRecording
 from operators.applications.replay import REPORT_RESERVE_BYTES
 from operators.applications.result import RunOutcome
 from operators.applications.session import Session
+from operators.applications.trial_run import trial_run
 from operators.deform import DeformOp
 from operators.display import DisplayOp
 from operators.frame_clock import FrameClock
@@ -130,15 +131,16 @@ def live(
 
     def run(inside: LiveSettings, notes: list[str]) -> RunOutcome:
         source = prepare(inside, notes)
-        graph = LiveApplication(
-            source,
-            inside,
-            warm_up(inside, source),
-            stop_requested=stop_requested,
-            on_scored=on_scored,
-            on_shown=on_shown,
-        )
         with low_latency():
+            trial_run(inside, source, lambda made_up, tried: LiveApplication(made_up, tried, warm_up(tried, source)))
+            graph = LiveApplication(
+                source,
+                inside,
+                warm_up(inside, source),
+                stop_requested=stop_requested,
+                on_scored=on_scored,
+                on_shown=on_shown,
+            )
             return Session(
                 graph,
                 inside.stated(),
@@ -160,9 +162,7 @@ def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
     check_renderer(settings.renderer, settings.device)
     source = open_source(
         settings.source,
-        SourceOptions(
-            settings.scale, settings.max_frames, realtime=True, loop=settings.loop, fps=settings.fps, process=True
-        ),
+        SourceOptions(settings.scale, settings.max_frames, realtime=True, loop=settings.loop, fps=settings.fps),
     )
     check_picture(source.description.camera, settings.scale)
     notes.extend(source.description.notes)

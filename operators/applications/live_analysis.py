@@ -33,11 +33,13 @@ def analysis_operator(
     return SideBySideOp(
         fragment,
         name="analysis",
-        gate=[
-            OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body),
-            StageOp(fragment, name="highlights", stages=new_stages(PICTURE_STAGES, without=others)),
-        ],
+        gate=[OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body)],
         first=[StageOp(fragment, name="picture", stages=new_stages(PICTURE_STAGES, without=[BESIDE]))],
-        beside=[[new_tool_mask(fragment, tool_mask)]],
+        beside=[
+            [
+                new_tool_mask(fragment, tool_mask),
+                StageOp(fragment, name="highlights", stages=new_stages(PICTURE_STAGES, without=others)),
+            ]
+        ],
         then=[*behind_gate, StageOp(fragment, name="tissue", stages=new_stages(TISSUE_STAGES)), *behind],
     )

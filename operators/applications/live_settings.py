@@ -25,6 +25,9 @@ LIVE_BUMP_SPACING_S = 0.1
 LIVE_HISTORY_S = 6.0
 """How much of the past stays deformable: what the window holds at 30 frames a second, and the last 5 s rendered again."""
 LIVE_MOTION_DETAIL: Detail = "half"
+LIVE_GAUSSIANS = {"cpu": 30_000, "cuda": 45_000}
+LIVE_MOST_GAUSSIANS = 90_000
+LIVE_TRAINING = {"cpu": LiveTraining(first_rate=1.0, last_rate=1.0), "cuda": LiveTraining()}
 LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
 """Beside L1: follows motion better. On a CPU a step takes half as long again with it, and steps are what is short there."""
 
@@ -58,7 +61,8 @@ class LiveSettings:
     """What happens to pictures from outside of the body: nothing of them goes on, or (`off`) they are not looked for."""
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
     display: DisplaySettings = dataclasses.field(default_factory=DisplaySettings)
-    training: LiveTraining = dataclasses.field(default_factory=LiveTraining)
+    training: LiveTraining | None = None
+    """None: as suits the number of steps that the device can make in a frame's time."""
 
     def __post_init__(self) -> None:
         check_seed(self.seed)
@@ -74,6 +78,11 @@ class LiveSettings:
         check_tool_mask(self.tool_mask)
 
     @property
+    def chosen_training(self) -> LiveTraining:
+        """How the steps are taken."""
+        return self.training or LIVE_TRAINING[self.device]
+
+    @property
     def inputs(self) -> tuple[Path, ...]:
         """What the run reads from the disk."""
         path = Path(self.source)
@@ -83,6 +92,8 @@ class LiveSettings:
         """The reconstructor's settings for frames of so many pixels. Raises InvalidSetting."""
         config = ReconstructorConfig(
             field=self.field,
+            gaussians=LIVE_GAUSSIANS[self.device],
+            max_gaussians=LIVE_MOST_GAUSSIANS,
             window_frames=LIVE_WINDOW_FRAMES,
             bump_spacing_s=LIVE_BUMP_SPACING_S,
             history_s=LIVE_HISTORY_S,

@@ -16,15 +16,16 @@ from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.live import LiveReconstructor
 from operators.applications.device import seeded
 from operators.applications.live_settings import LiveSettings
-from operators.applications.warm_reconstructor import noise, warm_reconstructor
-from operators.display import labelled
-from operators.messages import DeformedScene, PictureState
+from operators.applications.warm_reconstructor import warm_reconstructor
+from operators.messages import DeformedScene
 from operators.rasterize import Rasterizer
 from operators.sources.source import FrameSource
 
+GARBAGE_THRESHOLDS = (20_000, 20, 1000)
+"""Garbage is looked for seldom, and mostly among what is new: no frame makes cycles of objects, and a whole search takes tens of ms."""
 SWITCH_INTERVAL_S = 0.0002
 """How long a thread may keep Python's interpreter while another one waits for it: a frame must not wait for 5 ms, the default."""
-OPENCV_THREADS = 2
+OPENCV_THREADS = 1
 """More of them take longer to start than small pictures take to look at."""
 
 
@@ -34,7 +35,7 @@ def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveR
     return LiveReconstructor(
         settings.reconstructor_config(camera.width_px * camera.height_px),
         camera,
-        live=settings.training,
+        live=settings.chosen_training,
         seed=settings.seed,
         device=settings.device,
     )
@@ -61,7 +62,6 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> WarmParts:
     with seeded(settings.seed, settings.device):
         reconstructor = new_live_reconstructor(settings, source)
         warm_reconstructor(reconstructor, draw)
-    labelled(noise(camera), PictureState.LIVE, 0)
     return WarmParts(reconstructor, rasterizer)
 
 
@@ -74,9 +74,12 @@ def low_latency() -> Iterator[None]:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()
+    thresholds = gc.get_threshold()
+    gc.set_threshold(*GARBAGE_THRESHOLDS)
     try:
         yield
     finally:
+        gc.set_threshold(*thresholds)
         gc.unfreeze()
         cv2.setNumThreads(threads)
         sys.setswitchinterval(interval_s)

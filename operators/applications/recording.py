@@ -108,7 +108,7 @@ class RunRecording:
                     seed=settings.seed,
                     renderer=settings.renderer,
                     config=_json(reconstructor.config),
-                    training=_json(settings.training),
+                    training=_json(settings.chosen_training),
                     camera=camera_record(reconstructor.camera),
                 )
             )

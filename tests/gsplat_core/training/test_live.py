@@ -144,3 +144,15 @@ def test_rates_go_from_the_first_to_the_last():
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(InvalidSetting):
         LiveTraining(**wrong)
+
+
+def test_a_motion_prior_that_has_not_seen_the_newest_frame_does_not_hold_its_picture_back():
+    """The prior sees a frame after it was shown: until then the published model is at rest after that frame, and not after the one before."""
+    config = ReconstructorConfig(gaussians=120, max_gaussians=240, motion_prior="flow")
+    made = LiveReconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT))
+    for k in range(4):
+        frame = frame_at(6 * k)
+        made.observe(frame, budget=Budget.of_steps(20))
+        shown = made.publish().at(frame.time_s)
+        assert torch.equal(shown.means, made._step.at(frame.time_s).means)
+        made.grow(frame)

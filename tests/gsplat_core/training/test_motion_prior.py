@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.rendering.registry import new_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
@@ -193,3 +194,20 @@ def test_the_prior_of_a_configuration() -> None:
     field.observe(next(stream([0.0])), steps=1)
     assert field._step is not None
     assert isinstance(new_motion_prior(ReconstructorConfig(motion_prior="flow"), field._step.field), FlowPrior)
+
+
+def test_every_published_state_shows_its_own_continuation(device: str) -> None:
+    """Slots and captured frames read it where it lies, frame after frame, and show what a model of the same state computes."""
+    config = ReconstructorConfig(
+        gaussians=700, max_gaussians=900, motion_prior="flow", start_from_motion=True, history_s=1.0, preallocate=True
+    )
+    reconstructor, renderer = Reconstructor(config, CAMERA, device=device), new_renderer("alpha", CAMERA, device)
+    for frame in stream([0.0, 1.0, 2.2, 3.0, 3.1]):
+        reconstructor.observe(frame, steps=4)
+        published = reconstructor.publish()
+        renderer.prepare(published)
+        later_s = frame.time_s + INTERVAL_S
+        shown = renderer.render(CAMERA, later_s).result().image.cpu()
+        expected = published.as_model().to("cpu").render(later_s, depth=False).image
+        assert psnr_tissue_db(shown.numpy(), expected.numpy()) > 45
+    assert not torch.equal(published.at(frame.time_s).means, published.at(later_s).means)
