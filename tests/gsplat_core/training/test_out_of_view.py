@@ -87,8 +87,8 @@ def test_a_scope_that_is_back_after_a_minute_finds_what_it_left(device, rows):
 def test_tissue_is_remembered_before_anything_is_learned_again():
     made = reconstructor(6000)
     watch(made, there_and_on(0, [0] * 30), steps=8)
-    watch(made, there_and_on(30, range(0, 200, 8)))
-    assert score(made, frame_at(80, 0, time_s=made.snapshot().time_window_s[1])) > 24
+    watch(made, there_and_on(30, range(0, 200, 4)))
+    assert score(made, frame_at(100, 0, time_s=made.snapshot().time_window_s[1])) > 24
 
 
 def test_what_a_tool_hides_never_makes_room():
