@@ -17,7 +17,7 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import BASIS_CHANNELS
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
-FADING_S = 4.0
+FADING_S = 1.0
 """Time constant with which the deformation of Gaussians that are in view fades beside what training asks for, where a stream has no end.
 Without it deformations that cancel each other add up: Gaussians become needles, and quality falls as the stream goes on."""
 
