@@ -34,7 +34,7 @@ class ClockSettings:
     """A frame is to be shown so long after it has come; None: `auto_share` of the time between frames, at most `auto_most_ms`."""
     auto_share: float = 0.6
     auto_most_ms: float = 18.3
-    least_share: float = 0.33
+    least_share: float = 0.34
     """Training gets so much of the time between frames, though a frame that had to wait is shown later for it."""
     at_least_steps: int = 5
     """Steps that every frame gets, though it is shown late: fewer would change nothing that can be seen."""
@@ -74,7 +74,6 @@ class FrameClock:
         """Usual time from taking a frame to its published model."""
         self._last_arrival: tuple[int, int] | None = None
         """When the newest frame came, and its number."""
-        self._last_taken_ns: int | None = None
         self._shown = threading.Event()
 
     def budget(self, frame: Frame, *, first: bool = False) -> Budget:
@@ -82,7 +81,6 @@ class FrameClock:
         settings = self.settings
         arrived_ns = self.now_ns() if frame.arrived_ns is None else frame.arrived_ns
         self._learn_interval(arrived_ns, frame.seq)
-        self._last_taken_ns = self.now_ns()
         until_ns = arrived_ns + (settings.first_ms * 1e6 if first else self.show_after_ns) - self.display_ns
         if settings.budget_ms is None and not first:
             until_ns = max(until_ns, self.now_ns() + settings.least_share * self.interval_ns)
@@ -104,9 +102,9 @@ class FrameClock:
     def may_rehearse(self, made: int, ahead_ns: float) -> bool:
         """Whether there is room for more rehearsal: `made` steps were made since the last frame, and those that would be under way take
         `ahead_ns`. It ends just before the next frame is due here, so that the frame finds the device free."""
-        if made >= self.settings.rehearse_at_most or self._last_taken_ns is None:
+        if made >= self.settings.rehearse_at_most or self._last_arrival is None:
             return False
-        return self.now_ns() + ahead_ns < self._last_taken_ns + self.interval_ns - REHEARSAL_MARGIN_NS
+        return self.now_ns() + ahead_ns < self._last_arrival[0] + self.interval_ns - REHEARSAL_MARGIN_NS
 
     def too_late(self, frame: Frame, waiting: int) -> bool:
         """Whether a frame is passed over for one of the `waiting` newer ones. After a delay frames are caught up with one by one, as long

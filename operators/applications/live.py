@@ -162,7 +162,9 @@ def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
     check_renderer(settings.renderer, settings.device)
     source = open_source(
         settings.source,
-        SourceOptions(settings.scale, settings.max_frames, realtime=True, loop=settings.loop, fps=settings.fps),
+        SourceOptions(
+            settings.scale, settings.max_frames, realtime=True, loop=settings.loop, fps=settings.fps, process=True
+        ),
     )
     check_picture(source.description.camera, settings.scale)
     notes.extend(source.description.notes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from operators.endoscope.ordinary import OrdinaryStream, PictureStagesOp, TissueStagesOp
 from operators.endoscope.stage import StageOp
 from operators.endoscope.stages import PICTURE_STAGES, TISSUE_STAGES, new_stages
 from operators.graph import Operator
@@ -30,16 +31,31 @@ def analysis_operator(
     gate. behind: those that see it at the end.
     """
     others = [name for name in PICTURE_STAGES if name != BESIDE]
+    stream = OrdinaryStream()
     return SideBySideOp(
         fragment,
         name="analysis",
         gate=[OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body)],
-        first=[StageOp(fragment, name="picture", stages=new_stages(PICTURE_STAGES, without=[BESIDE]))],
+        first=[
+            PictureStagesOp(
+                fragment, name="picture", stages=new_stages(PICTURE_STAGES, without=[BESIDE]), stream=stream
+            )
+        ],
         beside=[
             [
                 new_tool_mask(fragment, tool_mask),
                 StageOp(fragment, name="highlights", stages=new_stages(PICTURE_STAGES, without=others)),
             ]
         ],
-        then=[*behind_gate, StageOp(fragment, name="tissue", stages=new_stages(TISSUE_STAGES)), *behind],
+        then=[
+            *behind_gate,
+            TissueStagesOp(
+                fragment,
+                name="tissue",
+                always=new_stages(TISSUE_STAGES, without=["exposure"]),
+                stages=new_stages(TISSUE_STAGES, without=[name for name in TISSUE_STAGES if name != "exposure"]),
+                stream=stream,
+            ),
+            *behind,
+        ],
     )

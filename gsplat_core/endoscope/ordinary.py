@@ -1,0 +1,129 @@
+"""Whether a picture is an ordinary next one, by a few numbers that cost next to nothing: then the closer looks can wait for a few frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidSetting
+
+BANDS = 4
+"""Horizontal bands of a picture that are looked at apart: what is torn has changed in some of them only."""
+SAMPLES_PER_SIDE = 64
+USUAL_DECAY = 0.1
+LEAST_CHANGE = 0.2
+"""Mean change of a band, in levels of 255, below which a picture may be the same again."""
+
+
+@dataclass(frozen=True)
+class OrdinarySettings:
+    """How far an ordinary picture may be from what is usual. Raises InvalidSetting for a value out of its range."""
+
+    look_every: int = 6
+    """Every so many frames the closer look is taken whatever the picture is."""
+    most_change: float = 2.0
+    """Change of a band from the picture before, as a multiple of its usual change."""
+    least_change: float = 0.4
+    brightness_levels: float = 2.0
+    """Shift of a channel's mean since the last closer look, in levels of 255."""
+    sharpness_share: float = 0.08
+    """Change of the mean difference of neighbouring pixels since the last closer look."""
+    interval_share: float = 1.7
+    """A longer time since the last frame, as a multiple of the usual one, is not ordinary."""
+
+    def __post_init__(self) -> None:
+        if self.look_every < 1:
+            raise InvalidSetting(f"look_every is {self.look_every}; it must be at least 1")
+        if not 0 < self.least_change < 1 < self.most_change <= 100:
+            raise InvalidSetting(
+                f"least_change is {self.least_change} and most_change {self.most_change}; they must be below and above 1"
+            )
+        for name in ("brightness_levels", "sharpness_share", "interval_share"):
+            if not 0 < getattr(self, name) <= 255:
+                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be positive")
+
+
+class OrdinaryPictures:
+    """Follows a stream, one call a frame. Keeps a small picture and a few numbers."""
+
+    def __init__(self, settings: OrdinarySettings | None = None) -> None:
+        self.settings = settings or OrdinarySettings()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the stream."""
+        self._before: NDArray[np.uint8] | None = None
+        self._shape: tuple[int, ...] = ()
+        self._usual = np.zeros(BANDS)
+        self._looked: tuple[NDArray[np.float64], float] | None = None
+        """Mean colour and sharpness at the last closer look."""
+        self._since_look = 0
+        self._last_ns: int | None = None
+        self._interval_ns = 0.0
+
+    def is_ordinary(self, image: NDArray[np.uint8], pts_ns: int) -> bool:
+        """Whether the next picture, RGB uint8 [H, W, 3] at `pts_ns`, is as the ones before it lead to expect. False: look closer."""
+        small, colour, sharpness = _sampled(image)
+        before, self._before = self._before, small
+        in_time = self._in_time(pts_ns)
+        if before is None or self._shape != image.shape:
+            self._shape = image.shape
+            return self._look(colour, sharpness)
+        change = _change_of_bands(small, before)
+        usual, settings = self._usual, self.settings
+        expected = bool(
+            (change >= np.maximum(LEAST_CHANGE, settings.least_change * usual)).all()
+            and (change <= settings.most_change * usual).all()
+        )
+        self._usual = np.where(usual > 0, usual + USUAL_DECAY * (np.minimum(change, 3 * usual) - usual), change)
+        self._since_look += 1
+        if not (expected and in_time and self._like_the_looked(colour, sharpness)):
+            return self._look(colour, sharpness)
+        return self._since_look < settings.look_every or self._look(colour, sharpness)
+
+    def _look(self, colour: NDArray[np.float64], sharpness: float) -> bool:
+        self._looked, self._since_look = (colour, sharpness), 0
+        return False
+
+    def _like_the_looked(self, colour: NDArray[np.float64], sharpness: float) -> bool:
+        if self._looked is None:
+            return False
+        colour_then, sharpness_then = self._looked
+        shifted = float(np.abs(colour - colour_then).max())
+        return (
+            shifted <= self.settings.brightness_levels
+            and abs(sharpness - sharpness_then) <= self.settings.sharpness_share * sharpness_then
+        )
+
+    def _in_time(self, pts_ns: int) -> bool:
+        last, self._last_ns = self._last_ns, pts_ns
+        if last is None:
+            return False
+        interval, usual = pts_ns - last, self._interval_ns
+        if interval <= 0:
+            return False
+        self._interval_ns = interval if usual == 0 else usual + USUAL_DECAY * (min(interval, 3 * usual) - usual)
+        return usual > 0 and interval <= self.settings.interval_share * usual
+
+
+def _sampled(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:
+    """Some of the pixels, their mean colour, and the mean difference of neighbours in some of the rows."""
+    height, width = image.shape[:2]
+    small = np.ascontiguousarray(image[:: max(1, height // SAMPLES_PER_SIDE), :: max(1, width // SAMPLES_PER_SIDE)])
+    rows = np.ascontiguousarray(image[:: max(1, height // 24)])
+    colour = np.array(cv2.mean(small)[:3])
+    if width < 2:
+        return small, colour, 0.0
+    sharpness = float(np.mean(cv2.mean(cv2.absdiff(rows[:, 1:], rows[:, :-1]))[:3]))
+    return small, colour, sharpness
+
+
+def _change_of_bands(small: NDArray[np.uint8], before: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Mean absolute change of each horizontal band."""
+    edges = np.linspace(0, len(small), BANDS + 1).astype(int)
+    difference = cv2.absdiff(small, before)
+    return np.array([np.mean(cv2.mean(difference[a:b])[:3]) if b > a else 1.0 for a, b in pairwise(edges)])
