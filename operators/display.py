@@ -36,7 +36,7 @@ COLOURS = {
 class DisplaySettings:
     """From which age on a picture is no longer live. Raises InvalidSetting for a value out of its range."""
 
-    stale_after_ms: float = 100.0
+    stale_after_ms: float = 150.0
     stale_after_intervals: float = 3.0
     """The larger of the two counts: a slow camera's pictures are older without anything being wrong."""
     frozen_after_ms: float = 1000.0

@@ -36,8 +36,8 @@ class ClockSettings:
     auto_most_ms: float = 18.3
     least_share: float = 0.34
     """Training gets so much of the time between frames, though a frame that had to wait is shown later for it."""
-    at_least_steps: int = 5
-    """Steps that every frame gets, though it is shown late: fewer would change nothing that can be seen."""
+    at_least_steps: int | None = None
+    """Steps that every frame gets, though it is shown late; None: as suits the device."""
     at_most_steps: int = 80
     """Steps before a frame is shown, though there is time left."""
     first_ms: float = 40.0
@@ -53,7 +53,7 @@ class ClockSettings:
         for name in ("auto_share", "least_share"):
             if not 0 < getattr(self, name) <= 1:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be in (0, 1]")
-        if not 0 < self.at_least_steps <= self.at_most_steps:
+        if self.at_least_steps is not None and not 0 < self.at_least_steps <= self.at_most_steps:
             raise InvalidSetting(
                 f"at_least_steps is {self.at_least_steps} and at_most_steps {self.at_most_steps}; they must be in order"
             )
@@ -86,7 +86,7 @@ class FrameClock:
             until_ns = max(until_ns, self.now_ns() + settings.least_share * self.interval_ns)
         return Budget.until(
             until_ns * 1e-9,
-            at_least=settings.first_at_least_steps if first else settings.at_least_steps,
+            at_least=settings.first_at_least_steps if first else settings.at_least_steps or 1,
             at_most=settings.first_at_most_steps if first else settings.at_most_steps,
             clock=lambda: self.now_ns() * 1e-9,
         )

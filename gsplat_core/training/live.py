@@ -74,6 +74,8 @@ class LiveReconstructor(Reconstructor):
     ) -> None:
         super().__init__(config, camera, seed=seed, recording_digest=recording_digest, device=device)
         self._live = live or LiveTraining()
+        # Where training starts from the motion, it has to be known before.
+        self._follows_at_once = config.start_from_motion
         self._kept_size: tuple[int, int] | None = None
         self._kept: TrainingStep | None = None
         """That of the scene before, whose memory the next scene takes over."""
@@ -105,8 +107,6 @@ class LiveReconstructor(Reconstructor):
         """How long so many rehearsal steps usually take, together with those that are still under way; 0 before anything was timed."""
         return (steps + REHEARSED_IN_FLIGHT) * (self._step_s or 0.0) * 1e9
 
-    _follows_at_once = False
-
     def grow(self, frame: Frame) -> None:
         """What `observe` leaves for the time after `frame`, the newest one that was trained on, was shown: Gaussians are added where it
         shows tissue that the model does not cover, those out of view make room and come back, and the motion prior sees the frame."""
@@ -115,7 +115,8 @@ class LiveReconstructor(Reconstructor):
         if self._out_of_view is not None:
             self._out_of_view.follow(self._step, observation)
         super()._grow(frame, observation)
-        self._follow(frame, observation)
+        if not self._follows_at_once:
+            self._follow(frame, observation)
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
         pass

@@ -58,7 +58,7 @@ class LiveApplication(Application):
         super().__init__(name="live", track=True)
         self.scheduler(MultiThreadScheduler(self))
         self.frame_source, self.settings, self._warm = source, settings, warm
-        self.clock = FrameClock(settings.clock, source.description.fps)
+        self.clock = FrameClock(settings.chosen_clock, source.description.fps)
         self._stop_requested = stop_requested
         self._on_scored, self._on_shown = on_scored, on_shown
 

@@ -26,12 +26,16 @@ LIVE_HISTORY_S = {"cpu": 3.0, "cuda": 6.0}
 """How much of the past stays deformable: what the window holds at 30 frames a second, and a little more. On a CPU each second of it makes
 every step longer."""
 LIVE_MOTION_DETAIL: Detail = "half"
-LIVE_GAUSSIANS = {"cpu": 30_000, "cuda": 45_000}
+LIVE_GAUSSIANS = {"cpu": 12_000, "cuda": 45_000}
 LIVE_MOST_GAUSSIANS = 100_000
 """At the start of a scene, for large pictures; twice as many may be there in all."""
 LIVE_PIXELS_PER_GAUSSIAN = 13
 """On a GPU, for pictures that are larger than the usual ones."""
-LIVE_TRAINING = {"cpu": LiveTraining(first_rate=1.0, last_rate=1.0), "cuda": LiveTraining()}
+LIVE_TRAINING = {"cpu": LiveTraining(first_rate=2.0, last_rate=1.5, rate_steps=2), "cuda": LiveTraining()}
+LIVE_LEAST_STEPS = {"cpu": 2, "cuda": 5}
+"""Steps that a frame gets though it is shown late."""
+LIVE_STARTS_FROM_MOTION = {"cpu": True, "cuda": False}
+"""With few steps a frame, optical flow tells where the tissue is sooner than training does; on a GPU the flow itself takes longer."""
 LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
 """Beside L1: follows motion better. On a CPU a step takes half as long again with it, and steps are what is short there."""
 
@@ -82,6 +86,13 @@ class LiveSettings:
         check_tool_mask(self.tool_mask)
 
     @property
+    def chosen_clock(self) -> ClockSettings:
+        """When frames are shown."""
+        return dataclasses.replace(
+            self.clock, at_least_steps=self.clock.at_least_steps or LIVE_LEAST_STEPS[self.device]
+        )
+
+    @property
     def chosen_training(self) -> LiveTraining:
         """How the steps are taken."""
         return self.training or LIVE_TRAINING[self.device]
@@ -109,6 +120,7 @@ class LiveSettings:
             preallocate=True,
             motion_prior="flow",
             motion_detail=LIVE_MOTION_DETAIL,
+            start_from_motion=LIVE_STARTS_FROM_MOTION[device],
             ssim_weight=LIVE_SSIM_WEIGHT[device],
         )
 

@@ -17,7 +17,7 @@ def test_training_ends_early_enough_to_show_the_picture_in_time(clock, frame, fa
     clock.display_ns = 3e6
     budget = clock.budget(frame(0, arrived_ns=fake_time.ns))
     assert budget.deadline_s == pytest.approx((fake_time.ns + clock.show_after_ns - 3e6) * 1e-9)
-    assert (budget.at_least, budget.at_most) == (clock.settings.at_least_steps, clock.settings.at_most_steps)
+    assert (budget.at_least, budget.at_most) == (1, clock.settings.at_most_steps)
 
 
 def test_a_late_frame_still_gets_its_least_share(clock, frame, fake_time):
@@ -104,7 +104,13 @@ def test_waiting_for_a_picture_ends_when_it_is_shown_or_does_not_come(clock):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"budget_ms": 0.0}, {"budget_ms": float("nan")}, {"auto_share": 0.0}, {"at_least_steps": 0}, {"at_most_steps": 1}],
+    [
+        {"budget_ms": 0.0},
+        {"budget_ms": float("nan")},
+        {"auto_share": 0.0},
+        {"at_least_steps": 0},
+        {"at_least_steps": 5, "at_most_steps": 1},
+    ],
 )
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(InvalidSetting):

@@ -1,0 +1,91 @@
+"""Ordinary pictures are told from others by a few numbers, and nothing that a closer look would find passes as ordinary."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.endoscope.ordinary import OrdinaryPictures, OrdinarySettings
+from gsplat_core.errors import InvalidSetting
+
+FRAME_NS = 33_000_000
+
+
+@pytest.fixture
+def stream(rng):
+    """Pictures of something uneven that moves a little and evenly."""
+    patches = cv2.resize(
+        rng.uniform(40, 200, (12, 16, 3)).astype(np.float32), (320, 256), interpolation=cv2.INTER_CUBIC
+    )
+    noisy = [np.roll(patches, 2 * k, axis=1) + rng.normal(0, 2, patches.shape) for k in range(60)]
+    return [np.clip(picture, 0, 255).astype(np.uint8) for picture in noisy]
+
+
+def judged(pictures, **settings):
+    follower = OrdinaryPictures(OrdinarySettings(**settings))
+    return [follower.is_ordinary(picture, k * FRAME_NS) for k, picture in enumerate(pictures)]
+
+
+def test_most_pictures_of_an_even_stream_are_ordinary_and_every_few_are_looked_at(stream):
+    ordinary = judged(stream, look_every=6)[10:]
+    assert sum(ordinary) > 0.7 * len(ordinary)
+    longest = max(len(run) for run in "".join("o" if each else "-" for each in ordinary).split("-"))
+    assert longest < 6
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        lambda now, before, rng: np.zeros_like(now),
+        lambda now, before, rng: before.copy(),
+        lambda now, before, rng: np.concatenate([now[:128], before[128:]]),
+        lambda now, before, rng: cv2.GaussianBlur(now, (0, 0), 3),
+        lambda now, before, rng: rng.integers(0, 256, now.shape, np.uint8),
+        lambda now, before, rng: np.clip(now * 1.2, 0, 255).astype(np.uint8),
+        lambda now, before, rng: now[::-1].copy(),
+        lambda now, before, rng: now[:200, :200].copy(),
+    ],
+    ids=["black", "duplicate", "torn", "blurred", "noise", "brighter", "another picture", "another size"],
+)
+def test_no_faulty_picture_is_ordinary(stream, rng, fault):
+    for at in range(20, 50, 3):
+        pictures = list(stream)
+        pictures[at] = fault(stream[at], stream[at - 1], rng)
+        assert not judged(pictures)[at]
+
+
+def test_a_slow_change_is_looked_at_before_it_is_large(stream):
+    dimmed = [np.clip(picture * (1 - 0.004 * k), 0, 255).astype(np.uint8) for k, picture in enumerate(stream)]
+    ordinary = judged(dimmed, look_every=1000)
+    assert ordinary.count(False) > 5
+
+
+def test_a_gap_or_a_step_back_in_time_is_not_ordinary(stream):
+    for jump_ns in (10 * FRAME_NS, -5 * FRAME_NS):
+        follower = OrdinaryPictures()
+        times = [k * FRAME_NS + (jump_ns if k >= 30 else 0) for k in range(40)]
+        ordinary = [follower.is_ordinary(stream[k], at) for k, at in enumerate(times)]
+        assert not ordinary[30]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 50), (50, 1), (3, 2), (700, 9)])
+def test_pictures_of_any_size_and_content_are_taken(rng, size):
+    follower = OrdinaryPictures()
+    for k in range(5):
+        follower.is_ordinary(rng.integers(0, 256, (*size, 3), np.uint8), k * FRAME_NS)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"look_every": 0},
+        {"least_change": 1.5},
+        {"most_change": 0.5},
+        {"brightness_levels": 0.0},
+        {"sharpness_share": float("nan")},
+    ],
+)
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(InvalidSetting):
+        OrdinarySettings(**wrong)
