@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gsplat_core.memory import return_freed_memory
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.training.metrics import FrameQuality, QualityTracker, ScoredMean, psnr_tissue_db
 from operators.frame_log import MAX_SERIES, Entry, FrameLog, Value, frames_per_entry, read_frames, series
@@ -22,6 +24,8 @@ from operators.outcome import OutcomeBuilder
 LOOK_NS = 500_000_000
 WAITING = 8
 """Frames and pictures that may wait to be scored; beyond them the oldest go unscored and are counted."""
+TRIM_EVERY_S = 30.0
+"""How often memory that is free is given back to the system."""
 SIMILARITY_EVERY = 8
 """SSIM takes several times as long as PSNR: it is measured on every so many frames."""
 SETTLING_S = 1.0
@@ -101,6 +105,7 @@ class OnScreenMetricsOp(Operator):
         self._previous: Frame | None = None
         self._first_s: float | None = None
         self._last_seq: int | None = None
+        self._trimmed_s = time.monotonic()
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         shown: ShownPicture | None
@@ -115,6 +120,11 @@ class OnScreenMetricsOp(Operator):
             op_output.emit(scored, "scored")
         while len(self._shown) > 4 * WAITING:
             self._show(self._shown.popleft())
+        now_s = time.monotonic()
+        if now_s - self._trimmed_s > TRIM_EVERY_S:
+            # Pictures come and go by the thousand: without this the process seems to grow for hours.
+            self._trimmed_s = now_s
+            return_freed_memory()
 
     def _score_waiting(self, waiting: int) -> list[ScoredFrame]:
         """Score frames until so many are left besides the oldest, and return the scores."""

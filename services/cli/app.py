@@ -14,6 +14,7 @@ from services.cli.options import (
     EvaluateOptions,
     EvaluationOutOption,
     JsonOption,
+    LiveOptions,
     LiveOutOption,
     ModelArgument,
     OutOption,
@@ -126,19 +127,11 @@ def replay(
 @takes_run_options
 def live(
     source: SourceArgument,
-    options: RunOptions,
+    options: LiveOptions,
     out: LiveOutOption = None,
     budget_ms: Annotated[
         str, typer.Option(help="Show a frame so many milliseconds after it came: auto, or a number.")
     ] = "auto",
-    seconds: Annotated[
-        float | None, typer.Option(help="End after so many seconds.", show_default="when the source ends")
-    ] = None,
-    tool_mask: Annotated[
-        str, typer.Option(help="Tools in frames without a mask: builtin, none, or another way to find them.")
-    ] = "builtin",
-    loop: Annotated[bool, typer.Option("--loop", help="Play a recording again and again.")] = False,
-    fps: Annotated[float | None, typer.Option(help="Play a recording at this rate.", show_default="its own")] = None,
     record: Annotated[
         bool,
         typer.Option(
@@ -150,8 +143,7 @@ def live(
     """Reconstruct a stream live: show each frame's reconstruction within its time, and say how old it is."""
     from services.cli.live import live_command, live_settings
 
-    wanted = {"seconds": seconds, "loop": loop, "fps": fps, "tool_mask": tool_mask, **options.settings()}
-    with live_settings(source, out, budget_ms, record, **wanted) as settings:
+    with live_settings(source, out, budget_ms, record, **options.settings()) as settings:
         return live_command(settings, keep=out is not None, as_json=json)
 
 

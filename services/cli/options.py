@@ -111,6 +111,23 @@ class EvaluateOptions:
     place: PlaceOption = None
 
 
+@dataclass(frozen=True)
+class LiveOptions(RunOptions):
+    """What `live` takes besides; the names are those of `LiveSettings`."""
+
+    seconds: Annotated[
+        float | None, typer.Option(help="End after so many seconds.", show_default="when the source ends")
+    ] = None
+    tool_mask: Annotated[
+        str, typer.Option(help="Tools in frames without a mask: builtin, none, or another way to find them.")
+    ] = "builtin"
+    out_of_body: Annotated[
+        str, typer.Option(help="Pictures from outside of the body: withhold, or off to let them pass.")
+    ] = "withhold"
+    loop: Annotated[bool, typer.Option("--loop", help="Play a recording again and again.")] = False
+    fps: Annotated[float | None, typer.Option(help="Play a recording at this rate.", show_default="its own")] = None
+
+
 def takes_run_options(command: Callable[..., int]) -> Callable[..., int]:
     """A command whose parameter `options`, a dataclass, is filled from an option for each of its fields."""
     kind: Any = get_type_hints(command, include_extras=True)["options"]
