@@ -41,6 +41,8 @@ class SourceResult:
     """Seconds of the run that the source spent in each state but `live`."""
     state_sentence: str = ""
     """What the source said of its state last."""
+    out_of_time: bool = False
+    """Whether it was ended because the time asked for was over."""
 
 
 class SourceOp(Operator):
@@ -67,6 +69,7 @@ class SourceOp(Operator):
         self.source = source
         self.seconds = seconds
         self._until_s = math.inf
+        self._out_of_time = False
         self.stop_requested = stop_requested
         self.emitted = 0
         self.reached_end = False
@@ -83,6 +86,7 @@ class SourceOp(Operator):
         self.emitted, self.reached_end, self._last_seq = 0, False, None
         self.damaged = DamagedFrames()
         self._states = _TimeInStates()
+        self._out_of_time = False
         self.source.open()
         self._until_s = math.inf if self.seconds is None else time.monotonic() + self.seconds
 
@@ -120,6 +124,7 @@ class SourceOp(Operator):
                 counts,
                 self._states.seconds(),
                 self._states.sentence,
+                self._out_of_time,
             )
         )
         if counts:
@@ -132,6 +137,7 @@ class SourceOp(Operator):
         """The next frame; None when there is none yet, or none any more."""
         for _ in range(round(PATIENCE_S / LOOK_S)):
             if self.stop_requested() or time.monotonic() > self._until_s:
+                self._out_of_time = time.monotonic() > self._until_s
                 self.stop_execution()
                 return None
             frame = self.source.read(LOOK_S)

@@ -131,6 +131,8 @@ class Session:
             return str(self.failure), interrupted
         if interrupted:
             return "interrupted", True
+        if source is not None and source.out_of_time:
+            return "end of the time asked for", False
         finite = source is None or source.description.frame_count is not None
         return "end of recording" if finite else "end of stream", False
 

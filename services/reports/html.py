@@ -51,7 +51,7 @@ def render_html(report: RunReport, keyframes: Sequence[KeyframePictures], worst_
     ended = (
         f'<p class="notice ended" role="alert">This run did not reach the end of the recording: {escape(run.stop_reason)}. '
         "All figures cover the frames that were displayed.</p>"
-        if run.stop_reason not in ("end of recording", "end of stream")
+        if run.stop_reason not in ("end of recording", "end of stream", "end of the time asked for")
         else ""
     )
     title = f"{recording.name} - IntraSplat {run.command}"
