@@ -76,13 +76,16 @@ class FrameClock:
         """When the newest frame came, and its number."""
         self._shown = threading.Event()
 
-    def budget(self, frame: Frame, *, first: bool = False) -> Budget:
-        """The training that a frame may take before it is shown; the `first` one of a scene takes longer."""
+    def budget(self, frame: Frame, *, first: bool = False, behind: bool = False) -> Budget:
+        """The training that a frame may take before it is shown; the `first` one of a scene takes longer.
+
+        A frame that others wait `behind` gets no more than its time holds: after a delay that is how it is caught up with.
+        """
         settings = self.settings
         arrived_ns = self.now_ns() if frame.arrived_ns is None else frame.arrived_ns
         self._learn_interval(arrived_ns, frame.seq)
         until_ns = arrived_ns + (settings.first_ms * 1e6 if first else self.show_after_ns) - self.display_ns
-        if settings.budget_ms is None and not first:
+        if settings.budget_ms is None and not first and not behind:
             until_ns = max(until_ns, self.now_ns() + settings.least_share * self.interval_ns)
         return Budget.until(
             until_ns * 1e-9,

@@ -112,14 +112,14 @@ class LiveReconstructOp(Operator):
         while (waiting := op_input.queued("frame")) and self.clock.too_late(frame, waiting):
             self.counts.passed_over += 1
             frame = op_input.receive("frame").carrying_scene_of(frame)
-        reconstruction = self._observe(frame)
+        reconstruction = self._observe(frame, behind=bool(op_input.queued("frame")))
         if reconstruction is not None:
             op_output.emit(reconstruction, "reconstruction")
             if not op_input.queued("frame"):
                 self.clock.wait_until_shown()
             self._rehearse(frame, lambda: bool(op_input.queued("frame")))
 
-    def _observe(self, frame: Frame) -> Reconstruction | None:
+    def _observe(self, frame: Frame, behind: bool) -> Reconstruction | None:
         assert self._reconstructor is not None
         taken_ns = self.clock.now_ns()
         reason = self._why_not(frame)
@@ -133,7 +133,9 @@ class LiveReconstructOp(Operator):
             if self.newest is not None:
                 self._begin_scene(frame, frame.new_scene or "resized")
         first = self.newest is None
-        report = self._reconstructor.observe(frame, budget=self.clock.budget(frame, first=first), train=reason is None)
+        report = self._reconstructor.observe(
+            frame, budget=self.clock.budget(frame, first=first, behind=behind), train=reason is None
+        )
         if reason is None:
             self._learned = frame
             self.counts.frames += 1

@@ -27,6 +27,12 @@ def test_a_late_frame_still_gets_its_least_share(clock, frame, fake_time):
     assert left_s == pytest.approx(clock.settings.least_share * clock.interval_ns * 1e-9)
 
 
+def test_a_late_frame_that_others_wait_behind_gets_no_extra_time(clock, frame, fake_time):
+    arrived_ns = fake_time.ns
+    fake_time.pass_ms(200)
+    assert clock.budget(frame(0, arrived_ns=arrived_ns), behind=True).deadline_s < fake_time.ns * 1e-9
+
+
 def test_a_fixed_budget_that_is_over_is_over(frame, fake_time):
     clock = FrameClock(ClockSettings(budget_ms=12.0), 30.0, fake_time)
     arrived_ns = fake_time.ns
