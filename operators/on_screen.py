@@ -106,6 +106,7 @@ class OnScreenMetricsOp(Operator):
         self._first_s: float | None = None
         self._last_seq: int | None = None
         self._trimmed_s = time.monotonic()
+        self._log_works = True
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         shown: ShownPicture | None
@@ -167,8 +168,11 @@ class OnScreenMetricsOp(Operator):
             quality = FrameQuality(frame.seq, math.nan, math.nan, math.nan)
         self._count(frame, on_screen, quality, before_db)
         scored = ScoredFrame(on_screen.rendered, quality, before_db)
-        if self.log is not None:
+        if self.log is not None and self._log_works:
+            # What ended the run, a full disk say, is said once: `stop` writes no more into a log that has failed.
+            self._log_works = False
             self.log.write(_entry(scored, frame, on_screen, until_ns))
+            self._log_works = True
         return scored
 
     def _count(self, frame: Frame, on_screen: ShownPicture, quality: FrameQuality, before_db: float) -> None:

@@ -1,0 +1,249 @@
+"""Faults of a real scope in the middle of a live stream: it goes on, says so, recovers by itself, and learns nothing from garbage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsplat_core.io.bundle import load_bundle
+from gsplat_core.scene.frames import FrameStatus
+from operators.applications import live as live_module
+from operators.applications.live import live
+from operators.applications.live_settings import LiveSettings
+from operators.display import COLOURS, DisplaySettings, LiveDisplayResult
+from operators.endoscope.cuts import CutCounts
+from operators.endoscope.sequence import MaskAndDepthCounts, SequenceCounts
+from operators.ingest import SourceResult
+from operators.live_reconstruct import TrainingCounts
+from operators.messages import PictureState
+from operators.out_of_body import OutOfBodyFrames
+from operators.sources.order import FrameOrder
+from tests.operators.applications.scripted import (
+    BLACK,
+    HEIGHT,
+    INTERVAL_NS,
+    SECOND_NS,
+    WIDTH,
+    Script,
+    ScriptedSource,
+    Watched,
+    scope_picture,
+    torn,
+)
+
+SLOW = DisplaySettings(stale_after_ms=700.0, stale_after_intervals=1.0, frozen_after_ms=1400.0)
+"""A busy machine shows pictures late, and that is not what is tested here."""
+
+
+@pytest.fixture
+def watched(tmp_path, monkeypatch) -> Callable[..., Watched]:
+    """Run a script live to its end."""
+
+    def run(script: Script, *, source: dict[str, Any] | None = None, **settings: Any) -> Watched:
+        watch = Watched(script)
+        # The graph's trial run before the stream tells the same listener.
+        played = ScriptedSource(script, watch.events.clear, **(source or {}))
+        monkeypatch.setattr(live_module, "open_source", lambda address, options: played)
+        monkeypatch.setattr(live_module.RunRecording, "listener", property(lambda self: watch.events.append))
+        wanted = LiveSettings("scripted", tmp_path / "out", **{"out_of_body": "off", "display": SLOW, **settings})
+        watch.outcome = live(wanted, on_shown=watch.shown.append)
+        assert watch.outcome.stop_reason == "end of stream"
+        return watch
+
+    return run
+
+
+def everything_came(watch: Watched) -> None:
+    assert watch.part(SourceResult).frames == len(watch.script.frames)
+    assert watch.part(SourceResult).reached_end
+
+
+def test_pictures_that_are_none(watched):
+    """Black, duplicated, frozen, torn and damaged."""
+    script = Script()
+    script.good(20)
+    script.fault(*[{"image": BLACK}] * 5)
+    after = [script.good(15)]
+    script.fault({"image": script.newest.image})
+    after.append(script.good(15))
+    frozen = script.fault(*[{"image": script.newest.image}] * 25)
+    after.append(script.good(15))
+    script.fault({"image": torn(scope_picture(len(script.frames)), script.newest.image)})
+    after.append(script.good(15))
+    script.fault(*[{"status": FrameStatus.DAMAGED, "damage": "lost packets"}] * 3)
+    after.append(script.good(15))
+    watch = watched(script)
+    everything_came(watch)
+    found = watch.part(SequenceCounts).found
+    assert (found["black"], found["torn"], found["duplicate"] + found["frozen"]) == (5, 1, 26)
+    assert found["frozen"] >= 15 and watch.part(SourceResult).damaged == 3
+    withheld = watch.part(TrainingCounts).withheld
+    assert {"black", "frozen"} <= set(withheld) <= {*found, "damaged"}
+    assert all(count <= found[reason] for reason, count in withheld.items() if reason != "damaged")
+    # A second of the same picture: what is shown is as old as the last one that was new.
+    assert watch.part(LiveDisplayResult).states["stale"] >= 1
+    assert any(each.state is PictureState.STALE and each.rendered.frame.seq in frozen for each in watch.shown)
+    for frames in after:
+        watch.recovers_in(frames)
+    watch.learned_nothing_bad()
+
+
+def test_late_frames_and_a_clock_that_is_set(watched):
+    """Forwards by an hour, backwards by two: the model's time goes on as it did."""
+    script = Script()
+    script.good(20)
+    script.fault(*[{"pts_ns": script.pts_ns - late * INTERVAL_NS} for late in (6, 9)])
+    after = [script.good(15)]
+    script.pts_ns += 3600 * SECOND_NS
+    after.append(script.good(15))
+    script.pts_ns -= 7200 * SECOND_NS
+    after.append(script.good(25))
+    watch = watched(script)
+    everything_came(watch)
+    found = watch.part(SequenceCounts).found
+    # Before it is clear that the clock was set back, three frames look late.
+    assert (found["out of order"], found["clock jump"]) == (5, 2)
+    for frames in after:
+        watch.recovers_in(frames)
+    watch.learned_nothing_bad()
+    model = load_bundle(watch.outcome.outputs["model"])
+    times = [picture.rendered.frame.time_s for picture in watch.shown]
+    assert times == sorted(times) and times[-1] - times[0] < 60
+    assert 0 <= model.time_window_s[0] <= model.time_window_s[1] < 60
+
+
+def test_frames_that_a_sender_mixes_up(watched):
+    """Numbers that come twice, late, or begin anew are put right or dropped where the frames come in."""
+    script = Script()
+    script.good(20)
+    twice = script.newest
+    script.fault({"seq": twice.seq, "pts_ns": twice.pts_ns, "image": twice.image})
+    after = [script.good(15)]
+    late = script.frames[-4].frame
+    script.fault({"seq": late.seq, "pts_ns": late.pts_ns})
+    after.append(script.good(15))
+    watch = watched(script, source={"order": FrameOrder()})
+    counts = watch.part(SourceResult).counts
+    assert counts["duplicates"] == counts["out_of_order"] == 1
+    assert watch.part(SourceResult).frames == len(script.frames) - 2
+    for frames in after:
+        watch.recovers_in(frames)
+    watch.learned_nothing_bad()
+
+
+def test_a_stream_that_changes_its_size_and_back(watched):
+    """Each size begins a new scene, also where its first pictures are black."""
+    script = Script()
+    script.good(20)
+    sizes = (80, 64), (WIDTH, HEIGHT), (48, 72)
+    after = []
+    for width, height in sizes:
+        script.fault(*[{"image": np.zeros((height, width, 3), np.uint8)}] * 2)
+        first = len(script.frames)
+        for k in range(first, first + 20):
+            script.good(1, image=scope_picture(k, width, height))
+        after.append(range(first, first + 20))
+    watch = watched(script)
+    everything_came(watch)
+    assert watch.part(CutCounts).found["resized"] == 3
+    assert watch.part(TrainingCounts).scenes == {"resized": 3}
+    for frames in after:
+        watch.recovers_in(frames)
+    watch.learned_nothing_bad()
+    camera = load_bundle(watch.outcome.outputs["model"]).camera
+    assert (camera.width_px, camera.height_px) == sizes[-1]
+
+
+def test_masks_and_depth_that_cannot_be(watched):
+    """A mask without tissue, one that loses the tool, depth of NaN, infinity and nonsense."""
+    tool = np.ones((HEIGHT, WIDTH), np.uint8)
+    tool[:, : WIDTH // 4] = 0
+    plane = np.full((HEIGHT, WIDTH), 60.0, np.float32)
+    holes = plane.copy()
+    holes[::9, ::7], holes[4::9, 3::7] = np.nan, np.inf
+    script = Script(mask=lambda seq: tool, depth=lambda seq: plane)
+    script.good(20)
+    script.fault(*[{"mask": np.zeros_like(tool)}] * 4)
+    after = [script.good(12)]
+    script.fault(*[{"mask": np.ones_like(tool)}] * 4)
+    after.append(script.good(12))
+    for depth in (np.full_like(plane, np.nan), holes, np.full_like(plane, np.inf), -plane, plane * 1000):
+        after.append(script.good(12, depth=depth))
+    after.append(script.good(12))
+    watch = watched(script)
+    everything_came(watch)
+    found = watch.part(MaskAndDepthCounts).found
+    assert (found["no tissue"], found["tool mask lost"]) == (4, 4)
+    assert found["depth not usable"] == 48 and found["depth repaired"] == 12
+    assert set(watch.part(TrainingCounts).withheld) <= {"no tissue", "tool mask lost"}
+    for frames in after:
+        watch.recovers_in(frames)
+    watch.learned_nothing_bad()
+
+
+def test_a_source_that_is_gone_for_a_while(watched):
+    script = Script()
+    script.good(20)
+    after = script.good(25, pause_s=2.0)
+    watch = watched(script)
+    everything_came(watch)
+    source, states = watch.part(SourceResult), watch.part(LiveDisplayResult).states
+    assert source.state_s["stalled"] > 0 and source.counts["stalls"] == 1
+    assert states["live"] >= 2 and states["source lost"] >= 1
+    gone = [picture for picture in watch.shown if picture.state is PictureState.SOURCE_LOST and not picture.new]
+    assert any(picture.rendered.frame.seq < after[0] for picture in gone)
+    red = tuple(COLOURS[PictureState.SOURCE_LOST])
+    assert all(tuple(picture.image[-1, -1]) == red for picture in gone), "drawn into the picture"
+    watch.recovers_in(after)
+    watch.learned_nothing_bad()
+
+
+def test_behind_the_gate_that_keeps_the_outside_of_the_body_away(watched):
+    """Nothing is learned or shown of a picture from outside, and the stream is believed again after ten from inside."""
+    room = np.full((HEIGHT, WIDTH, 3), (90, 140, 200), np.uint8) + np.arange(WIDTH, dtype=np.uint8)[:, None] // 2
+    script = Script()
+    script.good(25)
+    outside = script.fault(*[{"image": np.roll(room, k, axis=1)} for k in range(6)])
+    script.fault(*[{}] * 9)
+    after = script.good(25)
+    watch = watched(script, out_of_body="withhold")
+    everything_came(watch)
+    gate = watch.part(OutOfBodyFrames)
+    assert sum(gate.withheld.values()) >= 15 and gate.passed >= 20
+    assert watch.part(TrainingCounts).withheld["out of body"] >= 1
+    watch.recovers_in(after)
+    watch.learned_nothing_bad()
+    for picture in watch.shown:
+        if picture.rendered.frame.seq in outside:
+            assert not picture.rendered.trained and not picture.rendered.frame.image.any()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_faults_one_upon_the_other(watched, seed):
+    """Any mixture, from the first frame on."""
+    rng = np.random.default_rng(seed)
+    script = Script(mask=lambda seq: None, depth=lambda seq: None)
+    small = np.zeros((32, 40, 3), np.uint8)
+    noise = rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    choices = [
+        lambda: script.fault({"image": BLACK}),
+        lambda: script.fault({"image": small}),
+        lambda: script.fault({"image": np.full_like(BLACK, 255)}),
+        lambda: script.fault({"image": noise}),
+        lambda: script.fault({"mask": np.zeros((HEIGHT, WIDTH), np.uint8)}),
+        lambda: script.fault({"status": FrameStatus.DAMAGED, "mask": np.ones((HEIGHT, WIDTH), np.uint8)}),
+        lambda: script.good(1, depth=np.full((HEIGHT, WIDTH), np.nan, np.float32)),
+        lambda: script.good(1, image=scope_picture(len(script.frames), 56, 40)),
+        lambda: setattr(script, "pts_ns", script.pts_ns + int(rng.integers(-9, 9)) * SECOND_NS),
+    ]
+    for _ in range(60):
+        choices[rng.integers(len(choices))]()
+        script.good(int(rng.integers(0, 3)))
+    after = script.good(40)
+    watch = watched(script)
+    everything_came(watch)
+    watch.recovers_in(after)
+    watch.learned_nothing_bad()

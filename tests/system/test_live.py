@@ -1,0 +1,153 @@
+"""`live` as a whole program: however it ends, what was reached is there, and one sentence says why."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.recordings import synthesize
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.live import LiveReconstructor
+from operators.applications import live as live_module
+from operators.applications.live_settings import LiveSettings
+from operators.errors import RunFailed, SourceLost
+from operators.frame_log import read_frames
+from operators.sources.realtime import RealtimeSource, play
+from operators.storage import STAGING_PREFIX
+from services.cli.exit_codes import user_sentence
+from services.reports.schema import RunReport
+
+
+@pytest.fixture(scope="module")
+def scope(tmp_path_factory):
+    return synthesize(
+        tmp_path_factory.mktemp("recordings") / "scope", frames=8, width_px=64, height_px=48, stereo=False
+    )
+
+
+def showing(start, source, out):
+    """A run whose pictures are on the screen."""
+    process = start("live", source, "--loop", "--out", out)
+    for line in process.stderr:
+        if line.startswith("live"):
+            time.sleep(0.5)
+            return process
+    pytest.fail("the process ended before its first picture")
+
+
+def reached(out, frames=5):
+    """The report of a run that has left everything, whole."""
+    report = RunReport.read(out / "report.json")
+    assert report.run.command == "live" and report.frames.displayed >= frames
+    assert load_bundle(out / "model").sha256() == report.model.sha256
+    assert len(list(read_frames(out / "frames.jsonl"))) >= frames
+    assert "</html>" in (out / "report.html").read_text(encoding="utf-8")
+    assert not [path for path in out.iterdir() if path.name.startswith(STAGING_PREFIX)], "nothing half-written stays"
+    return report
+
+
+def one_sentence(err):
+    """The only line that says what went wrong."""
+    assert "Traceback" not in err
+    said = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert len(said) == 1, err
+    return said[0]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_how_a_stream_is_ended(scope, tmp_path, start, number):
+    process = showing(start, scope, tmp_path / "out")
+    process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0 and "Traceback" not in err
+    assert "ended: interrupted" in out and "error" not in err
+    report = reached(tmp_path / "out")
+    assert report.run.interrupted and report.run.stop_reason == "interrupted"
+
+
+def test_seconds_end_a_stream(scope, tmp_path, intrasplat):
+    done = intrasplat("live", scope, "--loop", "--seconds", "1.5", "--out", tmp_path / "out", "--json")
+    assert done.code == 0, done.err
+    report = reached(tmp_path / "out")
+    assert report.run.stop_reason == "end of stream" and not report.run.interrupted
+    assert json.loads(done.out)["run"]["stop_reason"] == "end of stream", "one JSON document and nothing else"
+
+
+class Dying(RealtimeSource):
+    """A recording whose thirtieth frame does not come."""
+
+    def frames(self) -> Iterator[Frame]:
+        """See `RealtimeSource`."""
+        for frame in super().frames():
+            if frame.seq == 30:
+                raise SourceLost("the scope was pulled out; plug it in again")
+            yield frame
+
+
+def test_a_source_that_dies(scope, tmp_path, intrasplat, monkeypatch):
+    def dying(address, options):
+        source = play(address, options)
+        return Dying(source.recording, replace(options, process=False))
+
+    monkeypatch.setattr(live_module, "open_source", dying)
+    done = intrasplat("live", scope, "--loop", "--out", tmp_path / "out")
+    assert done.code == 2
+    assert "the scope was pulled out; plug it in again" in one_sentence(done.err)
+    assert "the scope was pulled out" in reached(tmp_path / "out").run.stop_reason
+
+
+def test_a_device_without_memory(scope, tmp_path, monkeypatch):
+    observe = LiveReconstructor.observe
+
+    def observing(self, frame, **more):
+        if frame.seq == 25:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+        return observe(self, frame, **more)
+
+    monkeypatch.setattr(LiveReconstructor, "observe", observing)
+    written = []
+    settings = LiveSettings(str(scope), tmp_path / "out", loop=True)
+    with pytest.raises(RunFailed) as failed:
+        live_module.live(settings, report=lambda outcome, folder: written.append(outcome))
+    assert "operator 'reconstruct' failed" in written[0].stop_reason
+    sentence = user_sentence(failed.value)
+    assert sentence is not None and "there is not enough memory (CUDA out of memory." in sentence
+    assert load_bundle(tmp_path / "out" / "model").gaussians.count > 0
+    assert len(list(read_frames(tmp_path / "out" / "frames.jsonl"))) >= 5
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 12 MiB: a tmpfs where this process may mount one."""
+    if os.geteuid() != 0:
+        pytest.skip("only root may mount a small tmpfs")
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", str(folder)], capture_output=True, check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip(f"this container may not mount a tmpfs: {mounted.stderr.decode().strip()}")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_disk_that_fills_up(scope, small_disk, start):
+    """Somebody else takes the room: the model and the report find what was kept free for them."""
+    process = showing(start, scope, small_disk / "out")
+    with open(small_disk / "ballast", "ab") as ballast:
+        os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(small_disk).free - (6 << 20))
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "is full" in one_sentence(err) and "free some space" in one_sentence(err)
+    assert "is full" in reached(small_disk / "out").run.stop_reason
