@@ -17,6 +17,7 @@ from operators.sources.child_process import ChildLost, ChildProcess, Opening
 from operators.sources.live import STALLED_AFTER_S, LiveSource
 from operators.sources.options import SourceOptions
 from operators.sources.order import FrameOrder
+from operators.sources.registry import split_address
 from operators.sources.shared_memory import BadHeader
 from operators.sources.source import SourceDescription, SourceState
 from operators.sources.wire import description_from, finite_counts, frame_from
@@ -27,6 +28,8 @@ OPEN_TIMEOUT_S = 30.0
 """How long the process may take to start and to open its source."""
 HUNG_AFTER_S = 5.0
 """A process that says nothing for so long does not work any more."""
+ON_DISK = frozenset({"recording", "realtime"})
+"""Sources that do not come back once they are gone."""
 MOST_FAILURES = 10
 """So many processes in a row that gave no frame are given up."""
 LOOK_S = 0.05
@@ -55,6 +58,7 @@ class ProcessSource(LiveSource):
         # The process knows best whether its source stalls, and counts it; whether the process itself does is asked in `state`.
         super().__init__(waiting=options.waiting, stalled_after_s=math.inf, order=FrameOrder(trusted=True))
         self._opening = Opening(opener, address, options)
+        self._scheme = split_address(address)[0]
         self._hung_after_s, self._stuck_after_s, self._open_timeout_s = hung_after_s, stuck_after_s, open_timeout_s
         self._child_state: tuple[SourceState, str] | None = None
         self._child_counts: dict[str, int] = {}
@@ -124,8 +128,9 @@ class ProcessSource(LiveSource):
                     self._child_counts, self._child_state = {}, None
                     name = self.description.name
                     delay_s = backoff.failed()
-                    # What is not there may come back; what ends its process again and again will not.
-                    crashes = 0 if isinstance(error, SourceUnavailable) else crashes + 1
+                    # A camera that is not there may come back; files that are gone, and what ends its process again and again, will not.
+                    comes_back = isinstance(error, SourceUnavailable) and self._scheme not in ON_DISK
+                    crashes = 0 if comes_back else crashes + 1
                     if crashes >= MOST_FAILURES:
                         raise SourceLost(
                             f"{name} is given up after {crashes} attempts: {error}. Check the source and start again."

@@ -79,7 +79,7 @@ def test_seconds_end_a_stream(scope, tmp_path, intrasplat):
     done = intrasplat("live", scope, "--loop", "--seconds", "1.5", "--out", tmp_path / "out", "--json")
     assert done.code == 0, done.err
     report = reached(tmp_path / "out")
-    assert report.run.stop_reason == "end of stream" and not report.run.interrupted
+    assert report.run.stop_reason == "end of the time asked for" and not report.run.interrupted
     assert json.loads(done.out)["run"]["stop_reason"] == "end of stream", "one JSON document and nothing else"
 
 
