@@ -42,7 +42,7 @@ class RunOutcome:
     wall_s: float
     """From the start of the run to the end of its graph; saving and baselines are not in it."""
     stop_reason: str
-    """`end of recording`, `end of stream`, `interrupted`, or what failed."""
+    """`end of recording`, `end of stream`, `end of the time asked for`, `interrupted`, or what failed."""
     interrupted: bool
     dropped: int
     """Messages that edges of the graph dropped."""
