@@ -134,7 +134,7 @@ def folder(tmp_path_factory):
 
 def test_a_path_is_played_in_real_time_with_what_lies_beside_the_images(folder):
     assert isinstance(open_source(folder), RecordingSource), "only where it is asked for"
-    source = open_source(folder, SourceOptions(realtime=True, loop=True, speed=1000, scale=0.5, waiting=64))
+    source = open_source(folder, SourceOptions(realtime=True, loop=True, speed=math.inf, scale=0.5))
     assert isinstance(source, RealtimeSource) and source.description.width_px == 32
     expected = list(open_recording(folder, scale=0.5))
     source.open()
