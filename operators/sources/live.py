@@ -5,22 +5,21 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import Counter, deque
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.sources.order import FrameOrder
-from operators.sources.source import SourceDescription, SourceState
+from operators.sources.source import SourceState
+from operators.sources.threaded import ThreadedSource
 
 log = logging.getLogger(__name__)
-CLOSE_TIMEOUT_S = 1.0
-"""How long `close` waits for a reader that is within a call of its library."""
 STALLED_AFTER_S = 1.0
 
 
-class LiveSource:
+class LiveSource(ThreadedSource):
     """A `FrameSource` that follows the clock: a subclass gives `description` and `frames()`.
 
     `frames()` runs in a daemon thread and yields each frame at the moment at which it is there. At most `waiting` frames wait for `read`; when another
@@ -28,7 +27,7 @@ class LiveSource:
     is gone and is being made again, and counts with `count` what it dropped or repaired.
     """
 
-    description: SourceDescription
+    close_timeout_s = 1.0
 
     def __init__(
         self,
@@ -42,22 +41,12 @@ class LiveSource:
         `frames()` wait for room in place of dropping. order: repairs numbers and times of a sender that is not ours."""
         if waiting < 1:
             raise InvalidInput(f"waiting is {waiting}; at least one frame must be able to wait")
-        self._waiting, self._stalled_after_s, self._drops, self._order = waiting, stalled_after_s, drops, order
-        self._changed = threading.Condition()
-        self._thread: threading.Thread | None = None
-        self._stop = threading.Event()
+        super().__init__(ahead=waiting, stalled_after_s=stalled_after_s)
+        self._drops, self._order = drops, order
         self._own = threading.local()
-        self._ready: deque[Frame] = deque()
         self._counts: Counter[str] = Counter()
-        self._done = True
-        self._error: BaseException | None = None
-        self._last_s = 0.0
         self._lost: str | None = None
         self._ending: str | None = None
-
-    def frames(self) -> Iterator[Frame]:
-        """The frames, each when it is there; called in the reader's thread, once for each `open`."""
-        raise NotImplementedError(f"{type(self).__name__} has no frames method")
 
     # What `frames()` uses, in the reader's thread.
 
@@ -98,14 +87,8 @@ class LiveSource:
     def state(self) -> SourceState:
         """See `FrameSource`."""
         with self._changed:
-            if self._ready:
-                return SourceState.LIVE
-            if self._done:
-                return SourceState.ENDED
-            if self._lost is not None:
-                return SourceState.RECONNECTING
-            late = time.monotonic() - self._last_s > self._stalled_after_s
-            return SourceState.STALLED if late else SourceState.LIVE
+            lost = self._lost is not None and not self._ready and not self._done
+            return SourceState.RECONNECTING if lost else super().state
 
     @property
     def state_sentence(self) -> str:
@@ -131,72 +114,26 @@ class LiveSource:
         """See `FrameSource`. After `close` it begins again, with frame 0."""
         if self._thread is not None:
             return
-        # A reader that did not end in time keeps the event that it was given, and so never writes into a later run's frames.
-        self._stop = threading.Event()
-        self._ready.clear()
         self._counts.clear()
         if self._order is not None:
             self._order.begin()
-        self._done, self._error, self._last_s, self._lost, self._ending = False, None, time.monotonic(), None, None
-        name = f"read {self.description.name}"
-        self._thread = threading.Thread(target=self._run, args=(self._stop,), name=name, daemon=True)
-        self._thread.start()
-
-    def read(self, timeout_s: float) -> Frame | None:
-        """See `FrameSource`."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._ready or self._done, timeout_s)
-            if self._ready:
-                frame = self._ready.popleft()
-                self._changed.notify_all()
-                return frame
-            error, self._error = self._error, None
-        if error is not None:
-            raise error
-        return None
+        self._lost = self._ending = None
+        super().open()
 
     def close(self) -> None:
         """See `FrameSource`."""
-        thread, self._thread = self._thread, None
-        if thread is None:
-            return
-        with self._changed:
-            self._stop.set()
-            self._changed.notify_all()
-        self.interrupt()
-        thread.join(CLOSE_TIMEOUT_S)
-        if thread.is_alive():
-            log.warning("%s does not end; it is left behind", thread.name)
-        with self._changed:
-            self._ready.clear()
-            self._done, self._error, self._ending = True, None, None
+        super().close()
+        self._ending = None
 
-    def interrupt(self) -> None:
-        """Make `frames()` return soon, from another thread, where waiting for it in `wait` is not all that it does."""
+    def _ended(self, error: BaseException | None) -> None:
+        self._ending = f"{self.description.name} has given its last frame" if error is None else str(error)
+        self._lost = None
 
     def _run(self, stop: threading.Event) -> None:
-        """The life of the reader's thread."""
         self._own.stop = stop
-        error: BaseException | None = None
-        end = f"{self.description.name} has given its last frame"
-        try:
-            frames = self.frames()
-            try:
-                for frame in frames:
-                    if not self._take(frame, stop):
-                        break
-            finally:
-                close = getattr(frames, "close", None)
-                if close is not None:
-                    close()
-        except BaseException as raised:  # noqa: BLE001 - carried to the thread that reads
-            error, end = raised, str(raised)
-        with self._changed:
-            if not stop.is_set():
-                self._done, self._error, self._ending, self._lost = True, error, end, None
-                self._changed.notify_all()
+        super()._run(stop)
 
-    def _take(self, frame: Frame, stop: threading.Event) -> bool:
+    def _put(self, frame: Frame, stop: threading.Event) -> bool:
         """Put a frame where `read` finds it; False when the source is being closed."""
         arrived_ns = time.monotonic_ns() if frame.arrived_ns is None else frame.arrived_ns
         status = FrameStatus.LIVE if frame.status is FrameStatus.REPLAY else frame.status
@@ -210,14 +147,14 @@ class LiveSource:
             frame = replace(frame, arrived_ns=arrived_ns, status=status)
         with self._changed:
             if not self._drops:
-                self._changed.wait_for(lambda: stop.is_set() or len(self._ready) < self._waiting)
+                self._changed.wait_for(lambda: stop.is_set() or len(self._ready) < self._ahead)
             if stop.is_set():
                 return False
             now_s = time.monotonic()
             if self._lost is None and now_s - self._last_s > self._stalled_after_s:
                 self._counts["stalls"] += 1
             self._last_s, self._lost = now_s, None
-            if len(self._ready) >= self._waiting:
+            if len(self._ready) >= self._ahead:
                 self._ready.popleft()
                 self._counts["too_late"] += 1
             self._ready.append(frame)

@@ -14,8 +14,6 @@ from gsplat_core.scene.frames import Frame
 from operators.sources.source import SourceDescription, SourceState
 
 log = logging.getLogger(__name__)
-CLOSE_TIMEOUT_S = 10.0
-"""How long `close` waits for a reader that is within a call of its library."""
 
 
 class ThreadedSource:
@@ -26,6 +24,8 @@ class ThreadedSource:
     """
 
     description: SourceDescription
+    close_timeout_s = 10.0
+    """How long `close` waits for a reader that is within a call of its library."""
 
     def __init__(self, *, ahead: int = 2, stalled_after_s: float = math.inf) -> None:
         """ahead: frames that are kept ready. stalled_after_s: when no frame came for so long, the state is `STALLED`."""
@@ -89,12 +89,19 @@ class ThreadedSource:
         with self._changed:
             self._stop.set()
             self._changed.notify_all()
-        thread.join(CLOSE_TIMEOUT_S)
+        self.interrupt()
+        thread.join(self.close_timeout_s)
         if thread.is_alive():
             log.warning("%s does not end; it is left behind", thread.name)
         with self._changed:
             self._ready.clear()
             self._done, self._error = True, None
+
+    def interrupt(self) -> None:
+        """Make `frames()` return soon, from another thread, where that needs more than closing it."""
+
+    def _ended(self, error: BaseException | None) -> None:
+        """The iterator has ended, with what it raised; called once for each reading, under the lock."""
 
     def _run(self, stop: threading.Event) -> None:
         """The life of the reader's thread."""
@@ -115,6 +122,7 @@ class ThreadedSource:
         with self._changed:
             if not stop.is_set():
                 self._done, self._error = True, error
+                self._ended(error)
                 self._changed.notify_all()
 
     def _put(self, frame: Frame, stop: threading.Event) -> bool:

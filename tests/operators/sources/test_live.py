@@ -121,7 +121,7 @@ def test_an_error_comes_after_the_frames_before_it_and_once(camera, frame):
 
 
 def test_a_reader_that_is_left_behind_changes_nothing_in_a_later_reading(camera, frame, monkeypatch):
-    monkeypatch.setattr("operators.sources.live.CLOSE_TIMEOUT_S", 0.01)
+    monkeypatch.setattr("operators.sources.live.LiveSource.close_timeout_s", 0.01)
     hold = threading.Event()
     source = opened(Scripted([frame(0), hold, "gone", frame(99)], camera))
     left = source._thread

@@ -7,7 +7,6 @@ import threading
 import pytest
 
 from gsplat_core.errors import InvalidInput
-from operators.sources import threaded
 from operators.sources.source import FrameSource, SourceDescription, SourceState
 from operators.sources.threaded import ThreadedSource
 
@@ -125,7 +124,7 @@ def test_the_iterator_is_closed_in_the_thread_that_runs_it(camera, frame):
 def test_a_reader_that_does_not_end_is_left_behind_and_never_gives_frames_to_a_later_reading(
     camera, frame, monkeypatch, caplog
 ):
-    monkeypatch.setattr(threaded, "CLOSE_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(ThreadedSource, "close_timeout_s", 0.01)
     stuck = threading.Event()
     source = Listed([frame(0), stuck, frame(1)], camera)
     source.open()
