@@ -45,7 +45,7 @@ def showing(start, source, out):
     pytest.fail("the process ended before its first picture")
 
 
-def reached(out, frames=1):
+def reached(out, frames=5):
     """The report of a run that has left everything, whole."""
     report = RunReport.read(out / "report.json")
     assert report.run.command == "live" and report.frames.displayed >= frames
@@ -86,12 +86,12 @@ def test_seconds_end_a_stream(scope, tmp_path, intrasplat):
 
 
 class Dying(RealtimeSource):
-    """A recording whose thirtieth frame does not come."""
+    """A recording whose 150th frame does not come: by then even a busy machine has shown several."""
 
     def frames(self) -> Iterator[Frame]:
         """See `RealtimeSource`."""
         for frame in super().frames():
-            if frame.seq == 30:
+            if frame.seq == 150:
                 raise SourceLost("the scope was pulled out; plug it in again")
             yield frame
 
@@ -112,7 +112,7 @@ def test_a_device_without_memory(scope, tmp_path, monkeypatch):
     observe = LiveReconstructor.observe
 
     def observing(self, frame, **more):
-        if frame.seq >= 25:
+        if frame.seq >= 150:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
         return observe(self, frame, **more)
 
@@ -125,7 +125,7 @@ def test_a_device_without_memory(scope, tmp_path, monkeypatch):
     sentence = user_sentence(failed.value)
     assert sentence is not None and "there is not enough memory (CUDA out of memory." in sentence
     assert load_bundle(tmp_path / "out" / "model").gaussians.count > 0
-    assert len(list(read_frames(tmp_path / "out" / "frames.jsonl"))) >= 1
+    assert len(list(read_frames(tmp_path / "out" / "frames.jsonl"))) >= 5
 
 
 @pytest.fixture
