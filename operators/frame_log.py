@@ -48,6 +48,11 @@ class FrameLog:
         with storage_errors(self.path.parent):
             self._file.write(line)
 
+    def series(self, frames: int) -> tuple[tuple[Entry, ...], int]:
+        """The report's series of a run of so many frames, and how many of them one entry sums up."""
+        per_entry = frames_per_entry(frames, MAX_SERIES)
+        return (tuple(series(read_frames(self.path), per_entry)) if frames else ()), per_entry
+
     def close(self) -> None:
         """Finish the file. Closing twice is allowed."""
         if self._file is not None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.training.metrics import FrameQuality, QualityTracker, psnr_tissue_db
-from operators.frame_log import MAX_SERIES, Entry, FrameLog, frames_per_entry, read_frames, series
+from operators.frame_log import Entry, FrameLog
 from operators.graph import Operator, OperatorSpec
 from operators.messages import RenderedFrame
 from operators.outcome import OutcomeBuilder
@@ -131,10 +131,8 @@ class MetricsOp(Operator):
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
-        entries: tuple[Entry, ...] = ()
-        per_entry = frames_per_entry(self.frames, MAX_SERIES)
+        entries, per_entry = self.log.series(self.frames) if self.log is not None else ((), 1)
         if self.log is not None and self.frames:
-            entries = tuple(series(read_frames(self.log.path), per_entry))
             outcome.output("frames", self.log.path)
         outcome.add(QualityResult(self.live, self.held_out, entries, per_entry, self.frames_sha256, self.frames))
 

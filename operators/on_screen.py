@@ -15,7 +15,7 @@ import numpy as np
 from gsplat_core.memory import return_freed_memory
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.training.metrics import FrameQuality, QualityTracker, ScoredMean, psnr_tissue_db
-from operators.frame_log import MAX_SERIES, Entry, FrameLog, Value, frames_per_entry, read_frames, series
+from operators.frame_log import FrameLog, Value
 from operators.graph import ConditionType, MessageOrTimeoutCondition, Operator, OperatorSpec
 from operators.messages import ShownPicture
 from operators.metrics import QualityResult, ScoredFrame
@@ -190,10 +190,8 @@ class OnScreenMetricsOp(Operator):
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
-        entries: tuple[Entry, ...] = ()
-        per_entry = frames_per_entry(self.frames, MAX_SERIES)
+        entries, per_entry = self.log.series(self.frames) if self.log is not None else ((), 1)
         if self.log is not None and self.frames:
-            entries = tuple(series(read_frames(self.log.path), per_entry))
             outcome.output("frames", self.log.path)
         sha256 = self._digest.hexdigest()
         outcome.add(QualityResult(self.quality, QualityTracker(), entries, per_entry, sha256, self.frames))

@@ -96,7 +96,7 @@ class SideBySideOp(Operator):
                 operator.contribute(outcome)
 
 
-TAKEN_OVER = ("mask", "rehearsal_mask", "flow", "flow_since")
+TAKEN_OVER = ("mask", "rehearsal_mask")
 """Fields that a frame takes over from another chain where it has none of its own."""
 
 

@@ -41,16 +41,13 @@ class ImageMotion:
         self._before: NDArray[np.uint8] | None = None
         self._mask_before: NDArray[np.uint8] | None = None
 
-    def follow(
-        self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None, raw: NDArray[np.float32] | None = None
-    ) -> Flow | None:
+    def follow(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> Flow | None:
         """Take the next picture [H, W, 3]; returns how the one before moves to it. None for the first one and after a change of size.
 
         `mask` [H, W] is 1 where tissue can be followed; None: everywhere. What is not tissue in both pictures moves as the tissue around it.
-        `raw`: the `raw_flow` between the same two pictures, where another `ImageMotion` of this detail has found it already.
         """
         shape, mask_before = image.shape[:2], self._mask_before
-        flow = self.raw_flow(image, raw)
+        flow = self._pixel_flow(image)
         self._mask_before = mask
         if flow is None:
             return None
@@ -60,9 +57,7 @@ class ImageMotion:
                 tissue &= (each != 0).astype(np.uint8)
         return smoothed(flow, tissue)
 
-    def raw_flow(
-        self, image: NDArray[np.uint8], known: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32] | None:
+    def _pixel_flow(self, image: NDArray[np.uint8]) -> NDArray[np.float32] | None:
         """As `follow`, without the tissue: [h, w, 2] in pixels of the full picture, h and w its own size or half of it where that is searched."""
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
         height, width = grey.shape
@@ -71,8 +66,6 @@ class ImageMotion:
         before, self._before = self._before, grey
         if before is None or before.shape != grey.shape or min(grey.shape) < SMALLEST_PX:
             return None
-        if known is not None and known.shape[:2] == grey.shape:
-            return known
         flow = np.asarray(self._method.calc(before, grey, None), np.float32)
         return flow if grey.shape[1] == width else flow * (width / grey.shape[1])
 

@@ -70,12 +70,10 @@ class FlowPrior:
     def __init__(self, config: ReconstructorConfig) -> None:
         self._starts_there, self._finds_depth = config.start_from_motion, config.depth_from_motion
         self._image_motion = ImageMotion(config.motion_detail)
-        self._newest_seq: int | None = None
         self.forget()
 
     def forget(self) -> None:
         """See `MotionPrior.forget`."""
-        self._newest_seq = None
         self._image_motion.forget()
         self._depth = DepthFromMotion()
         self._damping = Damping()
@@ -91,9 +89,7 @@ class FlowPrior:
         before, before_s = self._camera, self.newest_s
         self._camera, self.newest_s = camera, time_s
         last, last_interval_s, self._motion = self._usable_motion(), self._interval_s, None
-        known = frame.flow if frame.flow_since == self._newest_seq else None
-        self._newest_seq = frame.seq
-        flow = self._image_motion.follow(frame.image, _followed(frame), known)
+        flow = self._image_motion.follow(frame.image, _followed(frame))
         if flow is None or before is None or camera.model != "pinhole":
             return
         self._interval_s = time_s - before_s

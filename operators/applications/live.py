@@ -19,7 +19,7 @@ from operators.applications.finishing import saves_model
 from operators.applications.limits import check_picture
 from operators.applications.live_analysis import analysis_operator
 from operators.applications.live_settings import LiveSettings
-from operators.applications.live_start import WarmParts, low_latency, warm_up
+from operators.applications.live_start import LiveParts, low_latency, new_parts, warm_up
 from operators.applications.recording import RunRecording
 from operators.applications.replay import REPORT_RESERVE_BYTES
 from operators.applications.result import RunOutcome
@@ -49,7 +49,7 @@ class LiveApplication(Application):
         self,
         source: FrameSource,
         settings: LiveSettings,
-        warm: WarmParts,
+        parts: LiveParts,
         *,
         stop_requested: Callable[[], bool] = lambda: False,
         on_scored: Callable[[LiveApplication, ScoredFrame], None] | None = None,
@@ -57,7 +57,7 @@ class LiveApplication(Application):
     ) -> None:
         super().__init__(name="live", track=True)
         self.scheduler(MultiThreadScheduler(self))
-        self.frame_source, self.settings, self._warm = source, settings, warm
+        self.frame_source, self.settings, self._parts = source, settings, parts
         self.clock = FrameClock(settings.chosen_clock, source.description.fps)
         self._stop_requested = stop_requested
         self._on_scored, self._on_shown = on_scored, on_shown
@@ -77,12 +77,12 @@ class LiveApplication(Application):
         self.reconstruct = LiveReconstructOp(
             self,
             name="reconstruct",
-            make_reconstructor=recording.made_by(lambda: self._warm.reconstructor),
+            make_reconstructor=recording.made_by(lambda: self._parts.reconstructor),
             clock=self.clock,
             listener=recording.listener,
         )
         deform = DeformOp(self, name="deform")
-        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer, rasterizer=self._warm.rasterizer)
+        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer, rasterizer=self._parts.rasterizer)
         self.display = DisplayOp(
             self,
             name="display",
@@ -132,7 +132,7 @@ def live(
     def run(inside: LiveSettings, notes: list[str]) -> RunOutcome:
         source = prepare(inside, notes)
         with low_latency():
-            trial_run(inside, source, lambda made_up, tried: LiveApplication(made_up, tried, warm_up(tried, source)))
+            trial_run(inside, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
             graph = LiveApplication(
                 source,
                 inside,

@@ -42,27 +42,31 @@ def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> LiveR
 
 
 @dataclass(frozen=True)
-class WarmParts:
-    """What a live run works with, used once already."""
+class LiveParts:
+    """What a live run works with."""
 
     reconstructor: LiveReconstructor
     rasterizer: Rasterizer
 
 
-def warm_up(settings: LiveSettings, source: FrameSource) -> WarmParts:
-    """Do everything once that takes long the first time: kernels are loaded, graphs captured, memory is taken, threads are started. The
-    stream's first frame then has to wait for none of it."""
+def new_parts(settings: LiveSettings, source: FrameSource) -> LiveParts:
+    """The parts for the frames of a source; their first use takes long."""
+    return LiveParts(new_live_reconstructor(settings, source), Rasterizer(settings.renderer))
+
+
+def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
+    """New parts that have done everything once that takes long the first time: graphs are captured, memory is taken, the length of a step is
+    known. The stream's first frame then has to wait for none of it."""
     camera = source.description.camera
-    rasterizer = Rasterizer(settings.renderer)
+    parts = new_parts(settings, source)
 
     def draw(frame: Frame, model: Model | Snapshot) -> object:
         scene = DeformedScene(frame, model, camera, trained=True)
-        return scene, rasterizer.draw(scene)
+        return scene, parts.rasterizer.draw(scene)
 
     with seeded(settings.seed, settings.device):
-        reconstructor = new_live_reconstructor(settings, source)
-        warm_reconstructor(reconstructor, draw)
-    return WarmParts(reconstructor, rasterizer)
+        warm_reconstructor(parts.reconstructor, draw)
+    return parts
 
 
 @contextmanager

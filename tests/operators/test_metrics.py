@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from gsplat_core.scene.frames import FrameStatus
-from operators import metrics
 from operators.frame_log import FrameLog
 from operators.metrics import MetricsOp, QualityResult
 from operators.outcome import OutcomeBuilder
@@ -82,7 +81,7 @@ def test_without_a_frame_there_is_a_result_and_no_file_to_show(tmp_path, compute
 
 
 def test_a_long_run_has_a_series_of_bounded_length(rendered, compute, tmp_path, monkeypatch):
-    monkeypatch.setattr(metrics, "MAX_SERIES", 4)
+    monkeypatch.setattr("operators.frame_log.MAX_SERIES", 4)
     operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
     score(operator, compute, [rendered(k, offset=2) for k in range(10)])
     quality, _ = result(operator)

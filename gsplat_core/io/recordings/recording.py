@@ -111,8 +111,6 @@ class FileRecording:
                 for name in ("depth", "mask", "loss_mask", "rehearsal_mask")
                 if (plane := getattr(frame, name)) is not None
             },
-            flow=None,
-            flow_since=None,
         )
 
 
