@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from gsplat_core.scene.frames import Frame, FrameStatus
@@ -19,6 +19,8 @@ from operators.schedule import ScheduleEvent, ScheduleListener
 
 REHEARSED_AT_ONCE = 3
 """Rehearsal steps between two looks for a new frame, on a GPU; on the CPU, where a step takes long, it is one."""
+GROWN_AT_LATEST = 10
+"""After so many frames without time to spare, tissue that the scene does not cover is looked for all the same."""
 WAITING = 5
 """Frames that may wait to be trained on, where a delay can be caught up with; beyond them the oldest is dropped."""
 
@@ -79,6 +81,10 @@ class LiveReconstructOp(Operator):
         self._reconstructor: LiveReconstructor | None = None
         self._learned: Frame | None = None
         """The newest frame that the model has seen."""
+        self._scene = 0
+        """Number of the scene that the model shows."""
+        self._since_grown = 0
+        """Frames that were trained on since the scene was last looked at for tissue that it does not cover."""
         super().__init__(fragment, *args, **kwargs)
 
     @property
@@ -101,6 +107,7 @@ class LiveReconstructOp(Operator):
 
     def start(self) -> None:
         self.counts, self.newest, self._learned = TrainingCounts(), None, None
+        self._scene = self._since_grown = 0
         self._reconstructor = self.make_reconstructor()
 
     def stop(self) -> None:
@@ -111,7 +118,7 @@ class LiveReconstructOp(Operator):
         frame: Frame = op_input.receive("frame")
         while (waiting := op_input.queued("frame")) and self.clock.too_late(frame, waiting):
             self.counts.passed_over += 1
-            frame = op_input.receive("frame").carrying_scene_of(frame)
+            frame = op_input.receive("frame")
         reconstruction = self._observe(frame, behind=bool(op_input.queued("frame")))
         if reconstruction is not None:
             op_output.emit(reconstruction, "reconstruction")
@@ -127,11 +134,16 @@ class LiveReconstructOp(Operator):
             self.counts.withheld[reason] = self.counts.withheld.get(reason, 0) + 1
         camera = self._reconstructor.camera
         resized = (frame.width_px, frame.height_px) != (camera.width_px, camera.height_px)
-        if self.newest is None or resized or frame.new_scene is not None:
+        # The frame that began a scene may have been passed over, or withheld: its number tells.
+        other_scene = frame.new_scene is not None or frame.scene != self._scene
+        if self.newest is None or resized or other_scene:
             if reason is not None:
                 return None  # nothing can be shown of it, and no scene begins with it
             if self.newest is not None:
-                self._begin_scene(frame, frame.new_scene or "resized")
+                self._begin_scene(
+                    frame, "resized" if resized else frame.new_scene or "begun by a frame that was not used"
+                )
+            self._scene = frame.scene
         first = self.newest is None
         report = self._reconstructor.observe(
             frame, budget=self.clock.budget(frame, first=first, behind=behind), train=reason is None
@@ -140,6 +152,7 @@ class LiveReconstructOp(Operator):
             self._learned = frame
             self.counts.frames += 1
             self.counts.steps += report.steps
+            self._since_grown += 1
         self._tell(ScheduleEvent("observe", seq=frame.seq, steps=report.steps, train=reason is None))
         self.newest = self._reconstructor.publish()
         published_ns = self.clock.now_ns()
@@ -168,10 +181,16 @@ class LiveReconstructOp(Operator):
         assert self._reconstructor is not None
         at_once = REHEARSED_AT_ONCE if self._reconstructor.device.type == "cuda" else 1
         made = 0
-        while not frame_waits() and self.clock.may_rehearse(made, self._reconstructor.rehearsal_ns(at_once)):
-            if made == 0 and frame is self._learned:
-                self._reconstructor.grow(frame)
-                self._tell(ScheduleEvent("grow", seq=frame.seq))
+
+        def has_time() -> bool:
+            assert self._reconstructor is not None
+            return not frame_waits() and self.clock.may_rehearse(made, self._reconstructor.rehearsal_ns(at_once))
+
+        if frame is self._learned and (self._since_grown >= GROWN_AT_LATEST or has_time()):
+            self._reconstructor.grow(frame)
+            self._tell(ScheduleEvent("grow", seq=frame.seq))
+            self._since_grown = 0
+        while has_time():
             self._reconstructor.rehearse(at_once)
             made += at_once
         self.counts.rehearsed += made
@@ -189,7 +208,8 @@ class LiveReconstructOp(Operator):
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
-        outcome.add(self.counts)
+        counts = self.counts
+        outcome.add(replace(counts, withheld=dict(counts.withheld), scenes=dict(counts.scenes)))
         model = self.model
         if model is not None:
             outcome.add(ModelResult(model))

@@ -50,16 +50,14 @@ class Frame:
     """[H, W]; 0 = left out of the loss though it may be tissue: outside of the field of view, a recorder's strip. None: nothing is left out."""
     rehearsal_mask: NDArray[np.uint8] | None = None
     """[H, W]; 0 = left out of the loss of what lasts, and still shown: highlights, which move with the light and not with the tissue."""
-    flow: NDArray[np.float32] | None = None
-    """Optical flow from an earlier picture to this one, [h, w, 2] (see `gsplat_core.training.image_motion.ImageMotion.raw_flow`)."""
-    flow_since: int | None = None
-    """`seq` of that earlier frame."""
     exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """How bright red, green and blue of this picture are beside the scene's own colours, which are those of the stream's first frames."""
     withheld: str | None = None
     """Why the frame is kept from training, in a word or two ("blur", "out of body"); None: it may be trained on."""
     new_scene: str | None = None
     """Why the scene is another one from this frame on ("cut", "resized"); None: it goes on."""
+    scene: int = 0
+    """Number of the frame's scene in its stream, where that is counted: whoever misses the frame that began it sees it by this."""
 
     def __post_init__(self) -> None:
         image = self.image
@@ -95,12 +93,6 @@ class Frame:
     def width_px(self) -> int:
         """Width of the image."""
         return int(self.image.shape[1])
-
-    def carrying_scene_of(self, earlier: Frame) -> Frame:
-        """This frame in place of an `earlier` one that is passed over: a scene that began with that one begins with this one."""
-        if earlier.new_scene is None or self.new_scene is not None:
-            return self
-        return replace(self, new_scene=earlier.new_scene)
 
     def with_fields(self, **fields: Any) -> Frame:
         """A copy with more fields known."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from operators.endoscope.cuts import SceneNumberStage
 from operators.endoscope.ordinary import OrdinaryStream, PictureStagesOp, TissueStagesOp
 from operators.endoscope.stage import StageOp
 from operators.endoscope.stages import PICTURE_STAGES, TISSUE_STAGES, new_stages
@@ -52,7 +53,7 @@ def analysis_operator(
             TissueStagesOp(
                 fragment,
                 name="tissue",
-                always=new_stages(TISSUE_STAGES, without=["exposure"]),
+                always=[*new_stages(TISSUE_STAGES, without=["exposure"]), SceneNumberStage()],
                 stages=new_stages(TISSUE_STAGES, without=[name for name in TISSUE_STAGES if name != "exposure"]),
                 stream=stream,
             ),

@@ -16,6 +16,25 @@ class CutCounts(StageCounts):
     """New scenes by reason (cut, returned, resized, frame rate), and frames that were withheld until the next one told."""
 
 
+@dataclass(frozen=True)
+class SceneCounts(StageCounts):
+    """Frames whose scene was counted; `CutCounts` has why scenes began."""
+
+
+class SceneNumberStage(Stage):
+    """Sets `Frame.scene`: how many scenes have begun before. It comes after everything that sets `Frame.new_scene`, and sees every frame."""
+
+    counts_type = SceneCounts
+
+    def reset(self) -> None:
+        self._scene = 0
+
+    def annotate(self, frame: Frame) -> Frame:
+        if frame.new_scene is not None:
+            self._scene += 1
+        return frame if self._scene == 0 else frame.with_fields(scene=self._scene)
+
+
 class CutStage(Stage):
     """Sets `Frame.new_scene`, which a withheld or damaged frame never has; they say nothing about the scene.
 

@@ -1,0 +1,124 @@
+"""Live training: what is shown, what begins another scene though its first frame was missed, and what is done though time is short."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from operators.frame_clock import ClockSettings, FrameClock
+from operators.live_reconstruct import GROWN_AT_LATEST, LiveReconstructOp
+
+
+class FakeReconstructor:
+    """Writes down what it is asked to do."""
+
+    def __init__(self, make_model, camera):
+        self.calls, self.version, self.make_model = [], 0, make_model
+        self.camera, self.device = camera, torch.device("cpu")
+
+    def observe(self, frame, *, budget, train):
+        self.calls.append(("observe", frame.seq, train))
+        return SimpleNamespace(steps=3 if train else 0, arriving_loss=None)
+
+    def publish(self):
+        self.version += 1
+        return self.make_model(self.version)
+
+    def begin_scene(self, frame):
+        self.calls.append(("begin_scene", frame.seq))
+        return False
+
+    def grow(self, frame):
+        self.calls.append(("grow", frame.seq))
+
+    def rehearse(self, steps):
+        self.calls.append(("rehearse", steps))
+
+    def rehearsal_ns(self, steps):
+        return 1e6 * steps
+
+    def seqs(self, kind):
+        return [call[1] for call in self.calls if call[0] == kind]
+
+
+@pytest.fixture
+def live(model, camera, fake_time):
+    """The operator, its fake reconstructor, and the calls that its listener was told."""
+    fake, told = FakeReconstructor(model, camera), []
+    clock = FrameClock(ClockSettings(), 30.0, fake_time)
+    clock.wait_until_shown = lambda: None
+    operator = LiveReconstructOp(None, make_reconstructor=lambda: fake, clock=clock, listener=told.append)
+    operator.start()
+    return SimpleNamespace(operator=operator, fake=fake, told=told, time=fake_time)
+
+
+def arrived(frame, live, seq, **fields):
+    return frame(seq, arrived_ns=live.time.ns, **fields)
+
+
+@pytest.fixture
+def one_by_one(live, frame, compute_queued):
+    """Hand frames over, each when it comes, with time for rehearsal in between."""
+
+    def hand(*given):
+        shown = []
+        for seq, fields in given:
+            live.time.pass_ms(33)
+            rehearse = live.fake.rehearse
+
+            def rehearsed(steps, rehearse=rehearse):
+                rehearse(steps)
+                live.time.pass_ms(4)
+
+            live.fake.rehearse = rehearsed
+            shown += compute_queued(live.operator, frame=[arrived(frame, live, seq, **fields)])
+            live.fake.rehearse = rehearse
+        return shown
+
+    return hand
+
+
+def test_a_withheld_frame_is_shown_with_what_was_learned_before(live, one_by_one):
+    shown = one_by_one((0, {}), (1, {"withheld": "blur"}))
+    assert [(each.trained, each.content.seq) for each in shown] == [(True, 0), (False, 0)]
+    assert live.operator.counts.withheld == {"blur": 1}
+
+
+def test_no_scene_begins_with_a_withheld_frame(live, one_by_one):
+    assert one_by_one((0, {"withheld": "black"})) == []
+    assert live.fake.calls == []
+
+
+@pytest.mark.parametrize("missed", [[], [(1, {"new_scene": "cut", "scene": 1, "withheld": "no tissue"})]])
+def test_a_scene_begins_though_its_first_frame_was_lost_or_withheld(live, one_by_one, missed):
+    one_by_one((0, {}), *missed, (2, {"scene": 1}), (3, {"scene": 1}))
+    assert live.fake.seqs("begin_scene") == [2]
+
+
+def test_a_scene_that_goes_on_begins_once(live, one_by_one):
+    one_by_one((0, {}), (1, {"new_scene": "cut", "scene": 1}), (2, {"scene": 1}))
+    assert live.fake.seqs("begin_scene") == [1]
+
+
+def test_the_scene_grows_in_time_that_is_left(live, one_by_one):
+    one_by_one((0, {}), (1, {}))
+    assert live.fake.seqs("grow") == [0, 1]
+
+
+def test_the_scene_grows_now_and_then_though_no_time_is_ever_left(live, frame, compute_queued):
+    for seq in range(3 * GROWN_AT_LATEST):
+        live.time.pass_ms(33)
+        compute_queued(live.operator, frame=[frame(seq, arrived_ns=live.time.ns - 100_000_000)])
+    assert live.fake.seqs("grow") == [GROWN_AT_LATEST * k - 1 for k in (1, 2, 3)]
+    assert not live.fake.seqs("rehearse")
+
+
+def test_the_listener_is_told_every_call_in_order(live, one_by_one):
+    one_by_one((0, {}), (1, {"new_scene": "cut", "scene": 1}))
+    kinds = [event.kind for event in live.told]
+    made = [call[0] for call in live.fake.calls]
+    assert [kind for kind in kinds if kind != "rehearse"] == [kind for kind in made if kind != "rehearse"]
+    steps = sum(event.steps for event in live.told if event.kind == "rehearse")
+    assert steps == sum(live.fake.seqs("rehearse")) == live.operator.counts.rehearsed > 0
