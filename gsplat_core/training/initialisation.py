@@ -67,16 +67,16 @@ def gaussians_at_pixels(
     points = points @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
     sigma = SIGMA_IN_SPACINGS * spacing_px * pixel_mm
     count = len(pixels)
-    sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
+    sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (colour - 0.5) / SH_C0
+    quat = facing(np.asarray(camera_to_world[:3, :3], np.float64)).astype(np.float32)
+    # Arrays become tensors without a copy: a stream's first picture waits for this.
     return Gaussians(
-        means=torch.tensor(points, dtype=torch.float32),
-        quats=torch.tensor(facing(np.asarray(camera_to_world[:3, :3], np.float64)), dtype=torch.float32).repeat(
-            count, 1
-        ),
-        log_scales=torch.tensor(np.log(sigma[:, None] * np.array([1, 1, THICKNESS])), dtype=torch.float32),
-        logit_opacities=torch.full((count,), math.log(0.9 / 0.1)),
-        sh=torch.tensor(sh, dtype=torch.float32),
+        means=torch.from_numpy(points.astype(np.float32)),
+        quats=torch.from_numpy(np.tile(quat, (count, 1))),
+        log_scales=torch.from_numpy(np.log(sigma[:, None] * np.array([1, 1, THICKNESS])).astype(np.float32)),
+        logit_opacities=torch.from_numpy(np.full(count, math.log(0.9 / 0.1), np.float32)),
+        sh=torch.from_numpy(sh),
     )
 
 
