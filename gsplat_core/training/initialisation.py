@@ -18,6 +18,10 @@ SIGMA_IN_SPACINGS = 0.7
 THICKNESS = 0.3
 """Depth of a fresh Gaussian relative to its width: tissue is a surface."""
 
+FIRST_OPACITY = 0.9
+TOOL_MARGIN_PX = 2
+"""So much around a tool is painted over with it: masks end a little early."""
+
 MAX_ANGLE_RAD = math.radians(85)
 """Widest angle from the axis at which a fisheye pixel is placed; what lies farther out is placed there."""
 
@@ -31,19 +35,25 @@ def gaussians_from_frame(
     has Gaussians to learn with. Depth comes from the frame where it is known, else from the plane z = `default_depth_mm`.
     """
     height, width = frame.image.shape[:2]
+    pixels, spacing_px = jittered_grid(width, height, count, seed)
+    return gaussians_at_pixels(
+        pixels, spacing_px, tissue_colours(frame), tissue_depth(frame, default_depth_mm), camera, sh_degree=sh_degree
+    )
+
+
+def jittered_grid(width: int, height: int, count: int, seed: int) -> tuple[NDArray[np.float64], float]:
+    """About `count` pixels [M, 2] (x, y) that cover a picture evenly, and how far they are apart."""
     spacing = math.sqrt(height * width / count)
     columns, rows = max(1, round(width / spacing)), max(1, round(height / spacing))
     jitter = np.random.default_rng(seed).uniform(-0.15, 0.15, (2, rows, columns))
     u = (np.arange(columns)[None, :] + 0.5 + jitter[0]) * (width / columns)
     v = (np.arange(rows)[:, None] + 0.5 + jitter[1]) * (height / rows)
-    return gaussians_at_pixels(
-        np.stack([u.ravel(), v.ravel()], -1),
-        spacing,
-        tissue_colours(frame),
-        tissue_depth(frame, default_depth_mm),
-        camera,
-        sh_degree=sh_degree,
-    )
+    return np.stack([u.ravel(), v.ravel()], -1), spacing
+
+
+def blur_sigma_px(spacing_px: float) -> float:
+    """How much a picture is blurred before Gaussians so far apart take their colours from it."""
+    return max(0.3, 0.3 * spacing_px)
 
 
 def gaussians_at_pixels(
@@ -59,7 +69,7 @@ def gaussians_at_pixels(
     height, width = depth_mm.shape
     column = np.clip(pixels[:, 0].astype(np.int64), 0, width - 1)
     row = np.clip(pixels[:, 1].astype(np.int64), 0, height - 1)
-    smooth = cv2.GaussianBlur(image, (0, 0), max(0.3, 0.3 * spacing_px))
+    smooth = cv2.GaussianBlur(image, (0, 0), blur_sigma_px(spacing_px))
     colour = smooth[row, column].astype(np.float64) / 255
     z = depth_mm[row, column].astype(np.float64)
     camera_to_world = np.linalg.inv(camera.world_to_camera)
@@ -75,7 +85,7 @@ def gaussians_at_pixels(
         means=torch.from_numpy(points.astype(np.float32)),
         quats=torch.from_numpy(np.tile(quat, (count, 1))),
         log_scales=torch.from_numpy(np.log(sigma[:, None] * np.array([1, 1, THICKNESS])).astype(np.float32)),
-        logit_opacities=torch.from_numpy(np.full(count, math.log(0.9 / 0.1), np.float32)),
+        logit_opacities=torch.from_numpy(np.full(count, math.log(FIRST_OPACITY / (1 - FIRST_OPACITY)), np.float32)),
         sh=torch.from_numpy(sh),
     )
 
@@ -126,7 +136,7 @@ def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
     if frame.mask is None or frame.mask.all() or not frame.mask.any():
         return frame.image
     bare_tool = (frame.mask == 0).astype(np.uint8)
-    tool = cv2.dilate(bare_tool, np.ones((5, 5), np.uint8))
+    tool = cv2.dilate(bare_tool, np.ones((2 * TOOL_MARGIN_PX + 1,) * 2, np.uint8))
     if tool.all():  # no tissue would be left
         tool = bare_tool
     return inpaint_quarter_size(frame.image, np.asarray(tool, np.uint8))

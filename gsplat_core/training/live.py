@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
@@ -15,6 +16,7 @@ from gsplat_core.training.observe_report import ObserveReport
 from gsplat_core.training.out_of_view import OutOfView
 from gsplat_core.training.places import Place, Places
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.start_on_device import StartOnDevice
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
@@ -76,6 +78,9 @@ class LiveReconstructor(Reconstructor):
         self._live = live or LiveTraining()
         # Where training starts from the motion, it has to be known before.
         self._follows_at_once = config.start_from_motion
+        self._to_follow: deque[tuple[Frame, Observation]] = deque(maxlen=2)
+        """The newest frames that were trained on, where the motion prior does not see each of them."""
+        self._start_here: StartOnDevice | None = None
         self._kept_size: tuple[int, int] | None = None
         self._kept: TrainingStep | None = None
         """That of the scene before, whose memory the next scene takes over."""
@@ -109,23 +114,43 @@ class LiveReconstructor(Reconstructor):
 
     def grow(self, frame: Frame) -> None:
         """What `observe` leaves for the time after `frame`, the newest one that was trained on, was shown: Gaussians are added where it
-        shows tissue that the model does not cover, those out of view make room and come back, and the motion prior sees the frame."""
+        shows tissue that the model does not cover, those out of view make room and come back."""
         assert self._step is not None
         observation = self._window.newest
         if self._out_of_view is not None:
             self._out_of_view.follow(self._step, observation)
         super()._grow(frame, observation)
-        if not self._follows_at_once:
-            self._follow(frame, observation)
+
+    def observe(
+        self, frame: Frame, *, budget: Budget | None = None, steps: int | None = None, train: bool = True
+    ) -> ObserveReport:
+        """See `Reconstructor.observe`."""
+        if not train and not self._follows_at_once:
+            self._follow_last()
+        return super().observe(frame, budget=budget, steps=steps, train=train)
+
+    def _follow_last(self) -> None:
+        """Let the motion prior see the newest frames, of which nothing is to be trained on now: what is shown goes on as they moved.
+
+        Seeing every frame takes longer than some steps on it, and a picture that was just trained on needs no prior.
+        """
+        if len(self._to_follow) == 2 and self._prior is not None:
+            self._prior.forget()
+            for frame, observation in self._to_follow:
+                self._follow(frame, observation)
+        self._to_follow.clear()
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
-        pass
+        # `grow` adds Gaussians, later.
+        if not self._follows_at_once:
+            self._to_follow.append((frame, observation))
 
     def forget(self) -> None:
         """As if no frame had been observed, but for what is known about the device: the memory that was taken, how long a step takes."""
         self._settle()
         self._kept = self._step or self._kept
         self._step = self._taken_up = None
+        self._to_follow.clear()
         self._places = Places()
         self._version = 0
         self._window = ObservationWindow(self.config.window_frames, self.config.newest_share, self._seed)
@@ -148,10 +173,17 @@ class LiveReconstructor(Reconstructor):
         return place is not None
 
     def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
-        if self._taken_up is None or self._taken_up[0] != frame.seq:
-            return super()._first_gaussians(frame, observation)
         self._first_time_s, self.camera = observation.time_s, observation.camera
-        return self._taken_up[1].gaussians.to(self.device)
+        if self._taken_up is not None and self._taken_up[0] == frame.seq:
+            return self._taken_up[1].gaussians.to(self.device)
+        if self.device.type != "cuda":
+            return super()._first_gaussians(frame, observation)
+        if self._start_here is None or not self._start_here.fits(observation.camera):
+            self._start_here = StartOnDevice(observation.camera, self.config.gaussians, self.device, self._seed)
+        config = self.config
+        return self._start_here(
+            frame, observation, sh_degree=config.sh_degree, default_depth_mm=config.default_depth_mm
+        )
 
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
         kept, self._kept = self._kept, None

@@ -1,0 +1,131 @@
+"""The Gaussians that a scene starts with, made on the device: the same as `initialisation` makes on the host, within a millisecond on a GPU."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, conv2d, interpolate, max_pool2d, pad
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import SH_C0, Gaussians
+from gsplat_core.training.initialisation import (
+    FIRST_OPACITY,
+    SIGMA_IN_SPACINGS,
+    THICKNESS,
+    TOOL_MARGIN_PX,
+    blur_sigma_px,
+    facing,
+    jittered_grid,
+    tissue_depth,
+    unprojected,
+)
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.surface_motion import beside
+from gsplat_core.transfers import tensor_of
+
+COARSE = 4
+"""What lies under a tool is filled in at this part of the size, as it is on the host."""
+
+
+class StartOnDevice:
+    """The jittered grid of one size and camera, laid out before the first frame comes."""
+
+    def __init__(self, camera: Camera, count: int, device: torch.device, seed: int = 0) -> None:
+        """As `gaussians_from_frame`; only the camera's pose may be another one later."""
+        self.camera, self._device = camera, device
+        pixels, self._spacing_px = jittered_grid(camera.width_px, camera.height_px, count, seed)
+        columns = np.clip(pixels[:, 0].astype(np.int64), 0, camera.width_px - 1)
+        rows = np.clip(pixels[:, 1].astype(np.int64), 0, camera.height_px - 1)
+        self._cells = torch.from_numpy(rows * camera.width_px + columns).to(device)
+        # Every camera model places a pixel on a straight line, so that two depths give all of them.
+        at_zero, at_one = (unprojected(pixels, np.full(len(pixels), z), camera) for z in (0.0, 1.0))
+        self._points = self._float32(at_zero[0]), self._float32(at_one[0] - at_zero[0])
+        self._pixel_mm = self._float32(at_zero[1]), self._float32(at_one[1] - at_zero[1])
+
+    def fits(self, camera: Camera) -> bool:
+        """Whether it is laid out for that camera; the pose does not matter."""
+        mine = self.camera
+        same_size = (mine.width_px, mine.height_px, mine.model) == (camera.width_px, camera.height_px, camera.model)
+        return same_size and bool((mine.K == camera.K).all())
+
+    def __call__(self, frame: Frame, observation: Observation, *, sh_degree: int, default_depth_mm: float) -> Gaussians:
+        """The Gaussians of `frame`, which is `observation` on the device. Nothing waits for the device."""
+        image, camera = observation.image, observation.camera
+        z = image.new_full((len(self._cells),), default_depth_mm, dtype=torch.float32)
+        if frame.depth is not None:
+            z = tensor_of(tissue_depth(frame, default_depth_mm), self._device).flatten()[self._cells]
+        colours = _blurred(_without_tools(frame, image), blur_sigma_px(self._spacing_px))
+        colour = colours.flatten(1)[:, self._cells].T
+        camera_to_world = np.linalg.inv(camera.world_to_camera)
+        pose = beside(z, camera_to_world[:3].ravel()).view(3, 4)
+        local = self._points[0] + self._points[1] * z[:, None]
+        sigma = SIGMA_IN_SPACINGS * self._spacing_px * (self._pixel_mm[0] + self._pixel_mm[1] * z)
+        count = len(z)
+        sh = z.new_zeros(count, (sh_degree + 1) ** 2, 3)
+        sh[:, 0] = (colour - 0.5) / SH_C0
+        flattened = beside(z, np.log([1, 1, THICKNESS]))
+        return Gaussians(
+            means=local @ pose[:, :3].T + pose[:, 3],
+            quats=beside(z, facing(np.asarray(camera_to_world[:3, :3], np.float64))).repeat(count, 1),
+            log_scales=sigma.log()[:, None] + flattened,
+            logit_opacities=torch.full_like(z, math.log(FIRST_OPACITY / (1 - FIRST_OPACITY))),
+            sh=sh,
+        )
+
+    def _float32(self, values: np.ndarray) -> Tensor:
+        return torch.from_numpy(values.astype(np.float32)).to(self._device)
+
+
+def _without_tools(frame: Frame, image: Tensor) -> Tensor:
+    """The picture as float [3, H, W] in 0..1, tools painted over by the tissue around them."""
+    picture = image.permute(2, 0, 1).float() / 255
+    if frame.mask is None or frame.mask.all() or not frame.mask.any():
+        return picture
+    tissue = tensor_of(frame.mask, image.device)
+    bare = (tissue == 0).float()[None, None]
+    margin = 2 * TOOL_MARGIN_PX + 1
+    tool = max_pool2d(bare, margin, stride=1, padding=TOOL_MARGIN_PX)
+    tool = torch.where(tool.min() > 0, bare, tool)[0]  # with the margin no tissue would be left
+    return torch.where(tool > 0, filled(picture, 1 - tool), picture)
+
+
+def filled(picture: Tensor, known: Tensor) -> Tensor:
+    """`picture` [C, H, W] with the pixels whose `known` [1, H, W] is 0 taken from the known ones around them, smoothly and at a coarse size.
+
+    A pyramid of means over what is known ("push and pull": Gortler et al., "The Lumigraph", 1996): each level fills the holes of the finer one.
+    """
+    height, width = known.shape[1:]
+    levels = [_shrunk((picture * known)[None], known[None], COARSE)]
+    while max(levels[-1][1].shape[2:]) > 1:
+        levels.append(_shrunk(*levels[-1], 2))
+    total, weight = levels.pop()
+    whole = total / weight.clamp(min=1e-6)
+    for total, weight in reversed(levels):
+        coarser = interpolate(whole, size=weight.shape[2:], mode="bilinear", align_corners=False)
+        sure = (COARSE * weight).clamp(max=1)
+        whole = sure * total / weight.clamp(min=1e-6) + (1 - sure) * coarser
+    return interpolate(whole, size=(height, width), mode="bilinear", align_corners=False)[0]
+
+
+def _shrunk(total: Tensor, weight: Tensor, factor: int) -> tuple[Tensor, Tensor]:
+    """Sums over what is known, and how much that is, as means over cells of `factor` squared."""
+    height, width = weight.shape[2:]
+    beyond = (0, -width % factor, 0, -height % factor)
+    return avg_pool2d(pad(total, beyond), factor), avg_pool2d(pad(weight, beyond), factor)
+
+
+def _blurred(picture: Tensor, sigma_px: float) -> Tensor:
+    """`picture` [C, H, W] under a Gaussian of that width, the picture reflected beyond its edge."""
+    reach = max(1, math.ceil(3 * sigma_px))
+    if min(picture.shape[1:]) <= reach:
+        return picture
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
+    kernel = beside(picture, taps / taps.sum())
+    channels = picture.shape[0]
+    wide = pad(picture[None], (reach, reach, reach, reach), mode="reflect")
+    across = conv2d(wide, kernel.view(1, 1, 1, -1).repeat(channels, 1, 1, 1), groups=channels)
+    return conv2d(across, kernel.view(1, 1, -1, 1).repeat(channels, 1, 1, 1), groups=channels)[0]
