@@ -114,6 +114,10 @@ class DisplayOp(Operator):
     def start(self) -> None:
         self._reset()
 
+    def prepare_thread(self) -> None:
+        """OpenCV reads its font once in every thread, which takes longer than a frame."""
+        cv2.getTextSize("LIVE", cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)
+
     def _reset(self) -> None:
         self.pictures = 0
         self.state: PictureState | None = None

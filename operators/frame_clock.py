@@ -40,7 +40,7 @@ class ClockSettings:
     """Steps that every frame gets, though it is shown late; None: as suits the device."""
     at_most_steps: int = 80
     """Steps before a frame is shown, though there is time left."""
-    first_ms: float = 40.0
+    first_ms: float = 20.0
     """A scene's first frame may take so long, at least `first_at_least_steps`."""
     first_at_least_steps: int = 10
     first_at_most_steps: int = 60

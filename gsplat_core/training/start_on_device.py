@@ -1,4 +1,7 @@
-"""The Gaussians that a scene starts with, made on the device: the same as `initialisation` makes on the host, within a millisecond on a GPU."""
+"""The Gaussians that a scene starts with, made on the device: the same as `initialisation` makes on the host, in a few milliseconds on a GPU.
+
+Neither cuBLAS nor cuDNN is used: each takes tens of milliseconds for its first work in a thread, and a stream's first picture waits for this.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, conv2d, interpolate, max_pool2d, pad
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
@@ -69,7 +72,7 @@ class StartOnDevice:
         sh[:, 0] = (colour - 0.5) / SH_C0
         flattened = beside(z, np.log([1, 1, THICKNESS]))
         return Gaussians(
-            means=local @ pose[:, :3].T + pose[:, 3],
+            means=(local[:, None, :] * pose[:, :3]).sum(dim=2) + pose[:, 3],
             quats=beside(z, facing(np.asarray(camera_to_world[:3, :3], np.float64))).repeat(count, 1),
             log_scales=sigma.log()[:, None] + flattened,
             logit_opacities=torch.full_like(z, math.log(FIRST_OPACITY / (1 - FIRST_OPACITY))),
@@ -121,11 +124,11 @@ def _shrunk(total: Tensor, weight: Tensor, factor: int) -> tuple[Tensor, Tensor]
 def _blurred(picture: Tensor, sigma_px: float) -> Tensor:
     """`picture` [C, H, W] under a Gaussian of that width, the picture reflected beyond its edge."""
     reach = max(1, math.ceil(3 * sigma_px))
-    if min(picture.shape[1:]) <= reach:
+    height, width = picture.shape[1:]
+    if min(height, width) <= reach:
         return picture
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
-    kernel = beside(picture, taps / taps.sum())
-    channels = picture.shape[0]
-    wide = pad(picture[None], (reach, reach, reach, reach), mode="reflect")
-    across = conv2d(wide, kernel.view(1, 1, 1, -1).repeat(channels, 1, 1, 1), groups=channels)
-    return conv2d(across, kernel.view(1, 1, -1, 1).repeat(channels, 1, 1, 1), groups=channels)[0]
+    weights = (taps / taps.sum()).tolist()
+    wide = pad(picture[None], (reach, reach, reach, reach), mode="reflect")[0]
+    across = sum((weight * wide[:, :, k : k + width] for k, weight in enumerate(weights)), start=torch.zeros(()))
+    return sum((weight * across[:, k : k + height] for k, weight in enumerate(weights)), start=torch.zeros(()))

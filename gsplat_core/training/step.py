@@ -27,8 +27,13 @@ SETTLE_EVERY = 32
 
 def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
     """World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres."""
-    centre = camera.viewmat.to(gaussians.device)
-    distance = (gaussians.means @ centre[2, :3] + centre[2, 3]).abs().median() if gaussians.count else torch.ones(())
+    if not gaussians.count:
+        return 1 / float(camera.K[0, 0])
+    x, y, z, offset = camera.world_to_camera[2].tolist()
+    # Not a matrix product: cuBLAS takes tens of milliseconds for its first one in a thread, and a stream's first picture waits for this.
+    distance = (
+        (x * gaussians.means[:, 0] + y * gaussians.means[:, 1] + z * gaussians.means[:, 2] + offset).abs().median()
+    )
     return float(distance) / float(camera.K[0, 0])
 
 

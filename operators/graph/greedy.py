@@ -41,6 +41,8 @@ class GreedyScheduler:
         wait_event = SchedulingStatus.WAIT_EVENT
         timestamp = self.clock.timestamp
         live = [task for task in graph.tasks if not task.finished]
+        for task in live:
+            task.prepare_thread()
         while live:
             progressed = event_awaited = False
             due_ns: int | None = None

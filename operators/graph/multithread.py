@@ -65,10 +65,11 @@ class MultiThreadScheduler:
             assert isinstance(edge, LockedEdge)
             edge.wake_producer = partial(self._rouse, producer)
             edge.wake_consumer = partial(self._rouse, consumer)
+        tasks = [task for task in graph.tasks if not task.finished]
+        prepared = threading.Barrier(max(1, len(tasks)))
         threads = [
-            threading.Thread(target=self._work, args=(graph, task), name=task.name, daemon=True)
-            for task in graph.tasks
-            if not task.finished
+            threading.Thread(target=self._work, args=(graph, task, prepared), name=task.name, daemon=True)
+            for task in tasks
         ]
         try:
             for thread in threads:
@@ -76,15 +77,20 @@ class MultiThreadScheduler:
             interruptible_wait(self._over)
         finally:
             graph.stop()
+            prepared.abort()
             self._join(threads)
         if self._interrupt is not None:
             raise self._interrupt
 
-    def _work(self, graph: Graph, task: OperatorTask) -> None:
+    def _work(self, graph: Graph, task: OperatorTask, prepared: threading.Barrier) -> None:
         """The life of one operator's thread."""
         try:
+            task.prepare_thread()
+            prepared.wait()
             while (now_ns := self._await_ready(graph, task)) is not None:
                 task.tick(now_ns)
+        except threading.BrokenBarrierError:
+            pass  # the run was interrupted before all threads were there
         except BaseException as error:  # noqa: BLE001 - carried to the thread that called run()
             self._interrupt = self._interrupt or error
             graph.stop()

@@ -59,6 +59,10 @@ class Operator:
     def start(self) -> None:
         """Acquire what compute needs; called again after `stop` by a restart."""
 
+    def prepare_thread(self) -> None:
+        """Called after `start` by the thread that is going to compute, before any operator computes: for what a library does once in every
+        thread and takes long over. The Holoscan SDK, whose threads are its own, does not call it."""
+
     def compute(self, op_input: InputContext, op_output: OutputContext, context: ExecutionContext) -> None:
         """Do one step: receive, work, emit."""
         raise NotImplementedError(f"operator {self.name!r} ({type(self).__name__}) has no compute method")

@@ -191,6 +191,13 @@ class OperatorTask:
         except Exception as error:  # noqa: BLE001 - the boundary of the operator's fault policy
             self._answer(error, "start")
 
+    def prepare_thread(self) -> None:
+        """Let the operator prepare the calling thread; what it raises fails the graph."""
+        try:
+            self.operator.prepare_thread()
+        except Exception as error:  # noqa: BLE001 - told to the thread that called run()
+            self.graph.fail(OperatorFailed(self.name, "prepare_thread", error))
+
     def stop(self) -> None:
         """Stop the operator if it is started; what it raises fails the graph."""
         if not self.started:
