@@ -23,8 +23,8 @@ LEAST_CHANGE = 0.2
 class OrdinarySettings:
     """How far an ordinary picture may be from what is usual. Raises InvalidSetting for a value out of its range."""
 
-    look_every: int = 6
-    """Every so many frames the closer look is taken whatever the picture is."""
+    look_every_s: float = 0.2
+    """The closer look is taken so often whatever the pictures are: every sixth of 30 a second."""
     most_change: float = 2.0
     """Change of a band from the picture before, as a multiple of its usual change."""
     least_change: float = 0.4
@@ -36,8 +36,8 @@ class OrdinarySettings:
     """A longer time since the last frame, as a multiple of the usual one, is not ordinary."""
 
     def __post_init__(self) -> None:
-        if self.look_every < 1:
-            raise InvalidSetting(f"look_every is {self.look_every}; it must be at least 1")
+        if not 0 <= self.look_every_s <= 60:
+            raise InvalidSetting(f"look_every_s is {self.look_every_s:g}; it must be between 0 and 60 seconds")
         if not 0 < self.least_change < 1 < self.most_change <= 100:
             raise InvalidSetting(
                 f"least_change is {self.least_change} and most_change {self.most_change}; they must be below and above 1"
@@ -61,7 +61,7 @@ class OrdinaryPictures:
         self._usual = np.zeros(BANDS)
         self._looked: tuple[NDArray[np.float64], float] | None = None
         """Mean colour and sharpness at the last closer look."""
-        self._since_look = 0
+        self._looked_ns = 0
         self._last_ns: int | None = None
         self._interval_ns = 0.0
 
@@ -72,7 +72,7 @@ class OrdinaryPictures:
         in_time = self._in_time(pts_ns)
         if before is None or self._shape != image.shape:
             self._shape = image.shape
-            return self._look(colour, sharpness)
+            return self._look(colour, sharpness, pts_ns)
         change = _change_of_bands(small, before)
         usual, settings = self._usual, self.settings
         expected = bool(
@@ -80,13 +80,14 @@ class OrdinaryPictures:
             and (change <= settings.most_change * usual).all()
         )
         self._usual = np.where(usual > 0, usual + USUAL_DECAY * (np.minimum(change, 3 * usual) - usual), change)
-        self._since_look += 1
         if not (expected and in_time and self._like_the_looked(colour, sharpness)):
-            return self._look(colour, sharpness)
-        return self._since_look < settings.look_every or self._look(colour, sharpness)
+            return self._look(colour, sharpness, pts_ns)
+        # By the stream's time; the frame that comes nearest to when it is due.
+        due_ns = self._looked_ns + 1e9 * settings.look_every_s - 0.5 * self._interval_ns
+        return pts_ns < due_ns or self._look(colour, sharpness, pts_ns)
 
-    def _look(self, colour: NDArray[np.float64], sharpness: float) -> bool:
-        self._looked, self._since_look = (colour, sharpness), 0
+    def _look(self, colour: NDArray[np.float64], sharpness: float, pts_ns: int) -> bool:
+        self._looked, self._looked_ns = (colour, sharpness), pts_ns
         return False
 
     def _like_the_looked(self, colour: NDArray[np.float64], sharpness: float) -> bool:
