@@ -59,10 +59,12 @@ class RealtimeSource(LiveSource):
     def frames(self) -> Iterator[Frame]:
         """Each frame at its time."""
         speed = self.options.speed
-        start_ns = time.monotonic_ns()
+        start_ns: int | None = None
         with closing(read_ahead(self._numbered(), f"decode {self.description.name}", DECODED_AHEAD)) as decoded:
             for frame in decoded:
                 if math.isfinite(speed):
+                    # The clock starts with the first picture: opening a file is no delay of the second one.
+                    start_ns = time.monotonic_ns() if start_ns is None else start_ns
                     due_ns = start_ns + round(frame.pts_ns / speed)
                     late_ns = time.monotonic_ns() - due_ns
                     if late_ns < 0 and self.wait(-late_ns * 1e-9):
