@@ -8,6 +8,7 @@ import time
 import pytest
 
 from gsplat_core.io.recordings import open_recording, synthesize
+from services.reports.evaluation_schema import EvaluationReport
 from services.reports.schema import RunReport
 
 
@@ -74,3 +75,18 @@ def test_without_a_folder_that_stays_nothing_is_recorded(scope, intrasplat):
     done = intrasplat("live", scope, "--record", "--seconds", "1")
     assert done.code == 2
     assert "--out" in done.err and "Traceback" not in done.err
+
+
+def test_a_session_is_evaluated_at_its_own_size_and_times(scope, tmp_path, intrasplat):
+    """It was recorded at the run's scale, in the run's time: neither is applied to it again, however often the source was looped."""
+    out = tmp_path / "out"
+    arguments = ("--loop", "--seconds", "2", "--scale", "0.5", "--fps", "60", "--record", "--json")
+    assert intrasplat("live", scope, *arguments, "--out", out).code == 0
+    (session,) = (out / "recordings").iterdir()
+    done = intrasplat("evaluate", out, session, "--protocol", "live", "--protocol", "retention", "--json")
+    assert done.code == 0, done.err
+    report = EvaluationReport.model_validate_json(done.out)
+    assert (report.recording.width_px, report.recording.height_px, report.evaluated.scale) == (32, 24, 1.0)
+    assert not any("as --scale says" in note or "looped" in note or "played" in note for note in report.notes)
+    scored = [frame for frame in open_recording(session) if frame.withheld is None]
+    assert report.retention is not None and report.retention.last.frames == len(scored) > 10
