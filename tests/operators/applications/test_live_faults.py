@@ -179,6 +179,9 @@ def test_masks_and_depth_that_cannot_be(watched):
     assert (found["no tissue"], found["tool mask lost"]) == (4, 4)
     assert found["depth not usable"] == 48 and found["depth repaired"] == 12
     assert set(watch.part(TrainingCounts).withheld) <= {"no tissue", "tool mask lost"}
+    for picture in watch.shown:
+        if picture.state is PictureState.LIVE and picture.remembered is not None:
+            assert not picture.remembered[tool > 0].any(), "only what the tool hides is marked in a live picture"
     for frames in after:
         watch.recovers_in(frames)
     watch.learned_nothing_bad()
@@ -197,6 +200,7 @@ def test_a_source_that_is_gone_for_a_while(watched):
     assert any(picture.rendered.frame.seq < after[0] for picture in gone)
     red = tuple(COLOURS[PictureState.SOURCE_LOST])
     assert all(tuple(picture.image[-1, -1]) == red for picture in gone), "drawn into the picture"
+    assert all(picture.remembered is not None for picture in gone), "nobody sees any of it"
     watch.recovers_in(after)
     watch.learned_nothing_bad()
 
