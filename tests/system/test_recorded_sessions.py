@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 
@@ -50,13 +51,22 @@ def test_a_killed_session_is_replayed_and_stays_when_the_next_one_is_recorded(sc
     notes = replayed(intrasplat, killed, tmp_path / "replay").notes
     assert any("byte for byte" in note for note in notes), notes
 
-    done = intrasplat("live", scope, "--loop", "--seconds", "2", "--out", out, "--record", "--json")
+    options = ("--out", out, "--record", "--record-keep", "1h", "--json")
+    done = intrasplat("live", scope, "--loop", "--seconds", "2", *options)
     assert done.code == 0, done.err
     recordings = sorted((out / "recordings").iterdir())
     assert killed in recordings and len(recordings) == 2
     assert open_recording(killed).frame_count == frames
     assert any("frames were recorded in" in note for note in RunReport.read(out / "report.json").notes)
     assert (out / "model").is_dir()
+
+    for log in killed.rglob("log.jsonl"):
+        os.utime(log, (time.time() - 7200, time.time() - 7200))
+    done = intrasplat("live", scope, "--loop", "--seconds", "1", *options)
+    assert done.code == 0 and not killed.exists() and len(list((out / "recordings").iterdir())) == 2
+    assert any(
+        "earlier recordings" in note and note.endswith(": 1") for note in RunReport.read(out / "report.json").notes
+    )
 
 
 def test_an_interrupted_session_is_complete(scope, tmp_path, start, intrasplat):
