@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.scene.frames import FrameStatus
 from operators.frame_clock import FrameClock
 from operators.graph import ConditionType, MessageOrTimeoutCondition, Operator, OperatorSpec
 from operators.graph.tracking import DurationSummary, Histogram
 from operators.messages import PictureState, RenderedFrame, ShownPicture
 from operators.outcome import OutcomeBuilder
+from operators.remembered import RememberedTissue
 from operators.sources.source import SourceState
 
 LOOK_NS = 50_000_000
@@ -34,7 +36,7 @@ COLOURS = {
 
 @dataclass(frozen=True)
 class DisplaySettings:
-    """From which age on a picture is no longer live. Raises InvalidSetting for a value out of its range."""
+    """From which age on a picture is no longer live, and what is drawn into it. Raises InvalidSetting for a value out of its range."""
 
     stale_after_ms: float = 150.0
     stale_after_intervals: float = 3.0
@@ -42,6 +44,8 @@ class DisplaySettings:
     frozen_after_ms: float = 1000.0
     label: bool = True
     """Draw state and age into every picture. A picture that is not live is always labelled."""
+    mark_remembered: bool = True
+    """Draw tissue that nobody sees at this moment without colour (`RememberedTissue`)."""
 
     def __post_init__(self) -> None:
         if not 0 < self.stale_after_ms < self.frozen_after_ms <= 60_000:
@@ -88,7 +92,7 @@ class DisplayOp(Operator):
     Params:
         clock: the run's; it learns how long showing takes.
         source_state: what the source is doing, from any thread.
-        settings: from which age on a picture is not live.
+        settings: from which age on a picture is not live, and what is drawn into it.
     """
 
     def __init__(
@@ -103,6 +107,7 @@ class DisplayOp(Operator):
         self.clock = clock
         self.source_state = source_state
         self.settings = settings or DisplaySettings()
+        self._tissue = RememberedTissue()
         self._reset()
         super().__init__(fragment, MessageOrTimeoutCondition(fragment, LOOK_NS), *args, **kwargs)
 
@@ -149,13 +154,27 @@ class DisplayOp(Operator):
         if changed:
             self.states[state.value] = self.states.get(state.value, 0) + 1
         self.state, self._sent_ns = state, now_ns
-        image = self._current.image
-        if self.settings.label or state is not PictureState.LIVE:
-            image = labelled(image, state, age_ns)
+        image, remembered = self._drawn(self._current, state, age_ns)
         shown_ns = self.clock.now_ns()
         if arrived is not None:
             self._count(arrived, shown_ns)
-        op_output.emit(ShownPicture(self._current, image, state, age_ns, shown_ns, arrived is not None), "shown")
+        new = arrived is not None
+        op_output.emit(ShownPicture(self._current, image, state, age_ns, shown_ns, new, remembered), "shown")
+
+    def _drawn(
+        self, rendered: RenderedFrame, state: PictureState, age_ns: float
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+        """The picture with what is drawn into it, a copy where that is anything, and where it shows remembered tissue."""
+        image, whole = rendered.image, _nobody_sees(rendered, state)
+        remembered = self._tissue.layer(rendered, whole) if self.settings.mark_remembered else None
+        label = self.settings.label or state is not PictureState.LIVE
+        if label or remembered is not None:
+            image = image.copy()
+        if remembered is not None:
+            self._tissue.mark(image, remembered, None if whole else (rendered.content or rendered.frame).mask)
+        if label:
+            draw_label(image, state, age_ns)
+        return image, remembered
 
     def _count(self, rendered: RenderedFrame, shown_ns: int) -> None:
         age_ns = max(0, shown_ns - _content_ns(rendered, shown_ns))
@@ -177,13 +196,19 @@ def _content_ns(rendered: RenderedFrame, now_ns: int) -> int:
     return now_ns if content.arrived_ns is None else content.arrived_ns
 
 
-def labelled(image: NDArray[np.uint8], state: PictureState, age_ns: float) -> NDArray[np.uint8]:
-    """A copy of the picture with its state and age in the upper left corner; one that is not live has a frame of the state's colour."""
-    height, width = image.shape[:2]
+def _nobody_sees(rendered: RenderedFrame, state: PictureState) -> bool:
+    """Whether all that a picture shows is remembered: no frame has come for long, or those that came showed nothing of it. A picture that
+    is merely late is not: a slow machine shows what was seen a moment ago."""
+    unused = rendered.frame.withheld is not None or rendered.frame.status is FrameStatus.DAMAGED
+    return state in (PictureState.FROZEN, PictureState.SOURCE_LOST) or (state is PictureState.STALE and unused)
+
+
+def draw_label(picture: NDArray[np.uint8], state: PictureState, age_ns: float) -> None:
+    """Draw state and age into the upper left corner, in place; a picture that is not live gets a frame of the state's colour."""
+    height, width = picture.shape[:2]
     colour = COLOURS[state]
     scale = max(0.35, height / 1000)
     text = f"{state.value.upper()} {_age_text(age_ns)}"
-    picture = image.copy()
     thickness = max(1, round(scale * 2))
     (text_width, text_height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
     pad = max(2, text_height // 2)
@@ -195,7 +220,6 @@ def labelled(image: NDArray[np.uint8], state: PictureState, age_ns: float) -> ND
     if state is not PictureState.LIVE:
         edge = max(2, height // 80)
         cv2.rectangle(picture, (0, 0), (width - 1, height - 1), colour, edge)
-    return picture
 
 
 def _age_text(age_ns: float) -> str:

@@ -137,7 +137,7 @@ class ShownPicture:
 
     rendered: RenderedFrame
     image: NDArray[np.uint8]
-    """RGB uint8 [H, W, 3]: the rendered picture with its state and age drawn into it."""
+    """RGB uint8 [H, W, 3]: the rendered picture with its state and age drawn into it, and remembered tissue marked."""
     state: PictureState
     age_ns: int
     """Time since the arrival of the newest frame that the picture shows, when it came on the screen."""
@@ -145,3 +145,5 @@ class ShownPicture:
     """When it came on the screen, by `time.monotonic_ns`."""
     new: bool
     """False when the picture was there before, and only its state or its age has changed."""
+    remembered: NDArray[np.uint8] | None = None
+    """uint8 [H, W], 255 where the picture shows tissue that nobody saw when its content came; None: nowhere, or it was not looked for."""

@@ -50,9 +50,7 @@ def evaluate(
     """
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device)
-    scale = settings.scale if settings.scale is not None or run is None else run.scale
-    fps = None if run is None else run.fps
-    source, scale, playback, notes = fitting_source(settings.recording, model, scale, settings.max_frames, fps)
+    source, scale, playback, notes = fitting_source(settings.recording, model, settings.scale, settings.max_frames, run)
     check_picture(source.description.camera, scale)
     work = _Work(model, run, settings, source, playback, scale, folder, progress, stop_requested)
     work.notes += [*source.description.notes, *notes]
@@ -149,8 +147,7 @@ class _Work:
             places = tuple(find_places(self._frames("places"))) if poses else ()
         end_s = self.model.time_window_s[1]
         if math.isinf(self.playback.round_s):
-            description = self.source.description
-            end_s = min(end_s, ((description.frame_count or 1) - 1) / description.fps * self.playback.stretch)
+            end_s = min(end_s, self.playback.last_s)
         from_s = min([end_s - self.settings.last_s, *(place.first[0] for place in places)])
         with self._log("retention") as record:
             return evaluate_retention(

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.sessions import SessionReader, is_session
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
@@ -41,6 +43,8 @@ class EvaluatedRun:
 class Playback:
     """How a stream's times follow from those of the recording that it played, as `RealtimeSource` does it."""
 
+    last_s: float
+    """When the last frame of the recording was there, the first time."""
     stretch: float = 1.0
     """Of all times: a recording of 30 frames/s that is played at 60 is over in half of its time."""
     round_s: float = math.inf
@@ -61,7 +65,7 @@ class SeenFrames:
     source: FrameSource
     from_s: float
     until_s: float
-    playback: Playback = Playback()
+    playback: Playback
     stop_requested: Callable[[], bool] = lambda: False
     progress: Callable[[int], None] = lambda done: None
 
@@ -91,13 +95,12 @@ def frame_tolerance_s(fps: float) -> float:
 
 
 def fitting_source(
-    address: Path | str, model: Model, scale: float | None, max_frames: int | None, fps: float | None = None
+    address: Path | str, model: Model, scale: float | None, max_frames: int | None, run: EvaluatedRun | None = None
 ) -> tuple[FrameSource, float, Playback, list[str]]:
     """The recording at the model's size; returns it, its scale, how it was played, and in sentences what a reader of the figures must know.
 
-    fps: the rate at which a live run played it.
-
-    scale: of the frames; None takes the one that the model was made at.
+    scale: of the frames; None takes the one that leads to the model's size: a session that was recorded at it needs none.
+    run: how the model was made.
 
     Raises InvalidSetting where the model cannot have been made from such a recording: another camera, another shape of the picture, or
     times that have nothing in common; and as `open_source`.
@@ -106,10 +109,11 @@ def fitting_source(
     source = open_source(address, SourceOptions(scale or 1.0, max_frames))
     made = model.camera
     if scale is None:
-        scale = made.width_px / source.description.width_px
+        scale = _scale_of_model(made, source.description.camera, None if run is None else run.scale)
         if scale != 1:
             source = open_source(address, SourceOptions(scale, max_frames))
-            notes.append(f"evaluated at the model's size of {made.width_px}x{made.height_px} px, scale {scale:.4g}")
+            if run is None or scale != run.scale:
+                notes.append(f"evaluated at the model's size of {made.width_px}x{made.height_px} px, scale {scale:.4g}")
     description = source.description
     _check_camera(made, description.camera, description.name)
     if (made.width_px, made.height_px) != (description.width_px, description.height_px):
@@ -126,8 +130,21 @@ def fitting_source(
             "the model was made from other files than these: the figures say how well it shows a recording that it was not made from,"
             " unless only files beside the pictures have changed"
         )
-    playback, more = _playback(model, description, fps, max_frames is not None)
+    if is_session(Path(address)):
+        playback, more = _session_playback(model, Path(address), description)
+    else:
+        playback, more = _playback(model, description, None if run is None else run.fps, max_frames is not None)
     return source, scale, playback, [*notes, *more]
+
+
+def _scale_of_model(made: Camera, seen: Camera, run_scale: float | None) -> float:
+    """The scale at which pictures of the camera `seen` have the size of the model's; that of the run where it leads there."""
+    for scale in (1.0, run_scale):
+        if scale is not None:
+            scaled = seen.scaled(scale)
+            if (scaled.width_px, scaled.height_px) == (made.width_px, made.height_px):
+                return scale
+    return made.width_px / seen.width_px
 
 
 def _check_camera(made: Camera, seen: Camera, name: str) -> None:
@@ -162,25 +179,40 @@ def _playback(
     stretch = 1.0 if fps is None else description.fps / fps
     start_s, end_s = model.time_window_s
     round_s = description.frame_count / description.fps * stretch
+    last_s = (description.frame_count - 1) / description.fps * stretch
     tolerance_s = frame_tolerance_s(description.fps / stretch)
     notes = [f"the run played the recording at {fps:g} frames/s; times are the run's"] if fps and stretch != 1 else []
     if fps is not None and not shortened and end_s - tolerance_s > round_s:
         notes.append(
             f"the run looped the recording: retention is of the last of {end_s / round_s:.1f} rounds, the baselines are of one"
         )
-        return Playback(stretch, round_s), notes
-    if start_s > round_s + tolerance_s:
-        raise InvalidSetting(
-            f"the model has seen {start_s:.2f} to {end_s:.2f} s, and the frames of {description.name} end at {round_s:.2f} s; they have no time"
-            " in common"
-        )
-    if end_s - tolerance_s > round_s:
-        notes.append(
-            f"the model has seen {start_s:.2f} to {end_s:.2f} s, and the frames that are evaluated end at {round_s:.2f} s"
-        )
+        return Playback(last_s, stretch, round_s), notes
+    notes += _common_time(model, description.name, round_s, tolerance_s)
     seen = math.floor((end_s + tolerance_s) * description.fps / stretch) + 1
     if seen < description.frame_count:
         notes.append(
             f"the model has seen {start_s:.2f} to {end_s:.2f} s: the first {seen} of the {description.frame_count} frames are evaluated"
         )
-    return Playback(stretch), notes
+    return Playback(last_s, stretch), notes
+
+
+def _session_playback(model: Model, folder: Path, description: SourceDescription) -> tuple[Playback, list[str]]:
+    """A recorded session has the times of the run that it was, whatever that played, and lacks the frames that the run never got."""
+    lines = islice(SessionReader(folder).frame_lines(), description.frame_count)
+    last_s = max((line.pts_ns * 1e-9 for line in lines), default=0.0)
+    return Playback(last_s), _common_time(model, description.name, last_s, frame_tolerance_s(description.fps))
+
+
+def _common_time(model: Model, name: str, recorded_s: float, tolerance_s: float) -> list[str]:
+    """What to say where the model has seen more than a recording that ends at `recorded_s`. Raises InvalidSetting when they have no time in
+    common."""
+    start_s, end_s = model.time_window_s
+    if start_s > recorded_s + tolerance_s:
+        raise InvalidSetting(
+            f"the model has seen {start_s:.2f} to {end_s:.2f} s, and the frames of {name} end at {recorded_s:.2f} s; they have no time in common"
+        )
+    if end_s - tolerance_s > recorded_s:
+        return [
+            f"the model has seen {start_s:.2f} to {end_s:.2f} s, and the frames that are evaluated end at {recorded_s:.2f} s"
+        ]
+    return []

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.messages import RenderedFrame
+from operators.remembered import marked
 
 MINIMUM_PANE_WIDTH_PX = 320
 """A smaller recording is enlarged by a whole factor, so that its caption fits."""
@@ -32,7 +33,8 @@ def fitted(picture: NDArray[np.uint8], height_px: int, width_px: int) -> NDArray
 
 
 def side_by_side(rendered: RenderedFrame) -> NDArray[np.uint8]:
-    """Raw | reconstruction, RGB uint8, with frame number, time and model version in a caption above, never on the tissue."""
+    """Raw | reconstruction, RGB uint8, with frame number, time and model version in a caption above, never on the tissue; tissue that the
+    frame does not show, behind a tool say, is marked as remembered."""
     frame = rendered.frame
     zoom = -(-MINIMUM_PANE_WIDTH_PX // frame.width_px) if frame.width_px < MINIMUM_PANE_WIDTH_PX else 1
     middle = zoom * frame.width_px
@@ -41,7 +43,7 @@ def side_by_side(rendered: RenderedFrame) -> NDArray[np.uint8]:
     cv2.rectangle(canvas, (0, 0), (2 * middle, CAPTION_HEIGHT_PX - 1), _BACKGROUND, cv2.FILLED)
     for pane, image in (
         (canvas[CAPTION_HEIGHT_PX:, :middle], frame.image),
-        (canvas[CAPTION_HEIGHT_PX:, middle:], rendered.image),
+        (canvas[CAPTION_HEIGHT_PX:, middle:], marked(rendered)),
     ):
         pane[...] = image if zoom == 1 else image.repeat(zoom, axis=0).repeat(zoom, axis=1)
     _caption(canvas, 8, f"{frame.status.value}  frame {frame.seq}  {frame.time_s:.2f} s")

@@ -24,6 +24,8 @@ class Recorded:
     """What it takes on the disk."""
     deleted_segments: int = 0
     """Older segments that were removed to keep within the bounds."""
+    deleted_sessions: int = 0
+    """Earlier sessions that were removed for the same reason."""
     ended: str | None = None
     """Why it ended before the session did; None: it did not."""
 
@@ -40,5 +42,9 @@ def stated(recorded: Recorded) -> list[str]:
     if recorded.deleted_segments:
         said.append(
             f"{recorded.deleted_segments} older segments of the recording were removed to keep it within its bounds"
+        )
+    if recorded.deleted_sessions:
+        said.append(
+            f"earlier recordings beside {recorded.folder} were removed to keep within the bounds: {recorded.deleted_sessions}"
         )
     return said

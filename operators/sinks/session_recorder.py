@@ -95,7 +95,9 @@ class SessionRecorder:
         self._closing = False
         self._ended: str | None = None
         self._failure: BaseException | None = None
-        self._bytes = self._deleted = 0
+        self._bytes = 0
+        self._deleted = 0, 0
+        """Segments and earlier sessions."""
         self._thread: threading.Thread | None = None
 
     def open(self) -> None:
@@ -150,7 +152,7 @@ class SessionRecorder:
         """What the recording has become so far; from any thread."""
         with self._changed:
             return Recorded(
-                self.folder, self._written["frame"], self._written["shown"], dict(self._lost), self._bytes, self._deleted,
+                self.folder, self._written["frame"], self._written["shown"], dict(self._lost), self._bytes, *self._deleted,
                 self._ended,
             )  # fmt: skip
 
@@ -246,7 +248,8 @@ class SessionRecorder:
             if self._waiting:
                 self._waiting.popleft()
                 self._waiting_bytes -= part.bytes
-            self._bytes, self._deleted = writer.bytes, writer.deleted_segments
+            self._bytes = writer.bytes
+            self._deleted = writer.deleted_segments, writer.deleted_sessions
             what = part.what or "line"
             if wrong is None:
                 self._written[what] += 1

@@ -19,6 +19,7 @@ from services.cli.options import (
     ModelArgument,
     OutOption,
     RecordingArgument,
+    RecordKeepOption,
     RendererOption,
     RenderOutOption,
     RunOptions,
@@ -138,12 +139,13 @@ def live(
             "--record", help="Record what comes in, what is trained and what is shown: into recordings/ in --out."
         ),
     ] = False,
+    record_keep: RecordKeepOption = None,
     json: JsonOption = False,
 ) -> int:
     """Reconstruct a stream live: show each frame's reconstruction within its time, and say how old it is."""
     from services.cli.live import live_command, live_settings
 
-    with live_settings(source, out, budget_ms, record, **options.settings()) as settings:
+    with live_settings(source, out, budget_ms, record, record_keep or (), **options.settings()) as settings:
         return live_command(settings, keep=out is not None, as_json=json)
 
 

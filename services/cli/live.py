@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -14,6 +16,7 @@ from typing import Any
 import typer
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.sessions import WriterOptions
 from operators.applications.live import LiveApplication, live
 from operators.applications.live_settings import LiveSettings
 from operators.applications.recording import new_recording_folder
@@ -26,6 +29,12 @@ from services.cli.streams import printable
 from services.reports.build import write_reports
 from services.reports.schema import LiveFacts, RunReport
 
+_KEPT = re.compile(r"(\d+(?:\.\d+)?) *([A-Za-z]+)")
+_UNITS = {
+    "mib": ("bytes", 2.0**20), "gib": ("bytes", 2.0**30), "tib": ("bytes", 2.0**40),
+    "min": ("seconds", 60.0), "h": ("seconds", 3600.0), "d": ("seconds", 86400.0),
+}  # fmt: skip
+_LEAST = {"bytes": 64.0 * 2**20, "seconds": 60.0}
 STATUS_PERIOD_S = 1.0
 PLAIN_PERIOD_S = 5.0
 
@@ -69,7 +78,12 @@ class LiveStatus:
 
 @contextmanager
 def live_settings(
-    source: str, out: Path | None, budget_ms: str, record: bool = False, **settings: Any
+    source: str,
+    out: Path | None,
+    budget_ms: str,
+    record: bool = False,
+    record_keep: Sequence[str] = (),
+    **settings: Any,
 ) -> Iterator[LiveSettings]:
     """The settings of a run; without `out` its results are written into a folder that goes with the context, and nothing can be recorded.
 
@@ -84,12 +98,40 @@ def live_settings(
             raise InvalidSetting(f"budget-ms is {budget_ms!r}; give auto, or a number of milliseconds") from None
     if record and out is None:
         raise InvalidSetting("--record needs a folder that stays; give --out, in which recordings/ is made")
+    if record_keep and not record:
+        raise InvalidSetting(f"--record-keep {record_keep[0]} bounds what --record writes; give --record, too")
+    kept = recording_kept(record_keep)
     if out is not None:
         recording = new_recording_folder(out) if record else None
-        yield LiveSettings(source=source, out=out, clock=clock, record=recording, **settings)
+        yield LiveSettings(source=source, out=out, clock=clock, record=recording, recording=kept, **settings)
         return
     with TemporaryDirectory(prefix="intrasplat-live-") as folder:
         yield LiveSettings(source=source, out=Path(folder) / "out", clock=clock, **settings)
+
+
+def recording_kept(texts: Sequence[str]) -> WriterOptions:
+    """How sessions are recorded of which so much, or what is so young, is kept: `20GiB`, `90min`, or one of each. Raises InvalidSetting."""
+    bounds: dict[str, float] = {}
+    for text in texts:
+        match = _KEPT.fullmatch(text.strip())
+        kind, factor = _UNITS.get(match[2].lower() if match else "", ("", 0.0))
+        if match is None or not kind or kind in bounds:
+            raise InvalidSetting(
+                f"record-keep is {text!r}; give a size in MiB, GiB or TiB, or a time in min, h or d, each once, such as 20GiB or 48h"
+            )
+        bounds[kind] = float(match[1]) * factor
+        if not _LEAST[kind] <= bounds[kind] < 1e15:
+            raise InvalidSetting(f"record-keep is {text!r}; it must be at least 64MiB, or 1min")
+    options, size, age_s = WriterOptions(), bounds.get("bytes"), bounds.get("seconds")
+    return replace(
+        options,
+        keep_bytes=None if size is None else int(size),
+        keep_s=age_s,
+        # What goes at once is a whole segment.
+        segment_bytes=options.segment_bytes if size is None else min(options.segment_bytes, int(size / 8)),
+        segment_s=options.segment_s if age_s is None else min(options.segment_s, age_s / 8),
+        with_earlier=bool(bounds),
+    )
 
 
 def live_command(settings: LiveSettings, *, keep: bool, as_json: bool) -> int:

@@ -59,6 +59,15 @@ PlaceOption = Annotated[
         show_default="found by the poses",
     ),
 ]
+RecordKeepOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--record-keep",
+        metavar="<size|time>",
+        help="Keep so much (20GiB), or what is not older (48h), of all recordings in --out, and remove the oldest; once for each.",
+        show_default="everything",
+    ),
+]
 RenderOutOption = Annotated[Path, _path_option("--out", "A video (name.mp4) or a folder of images.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
 RendererOption = Annotated[str, typer.Option(help="How Gaussians become a picture: alpha.")]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.metrics import ScoredFrame
+from operators.remembered import marked
 from operators.sinks.pictures import depth_map, depth_range, error_map
 
 WIDTH_PX = 420
@@ -37,7 +38,7 @@ def keyframe_pictures(scored: ScoredFrame) -> KeyframePictures:
     return KeyframePictures(
         scored,
         raw=data_uri(rendered.frame.image),
-        reconstruction=data_uri(rendered.image),
+        reconstruction=data_uri(marked(rendered)),
         error=data_uri(error_map(rendered)),
         depth=data_uri(depth_map(rendered)),
         depth_range=depth_range(rendered),

@@ -103,7 +103,9 @@ def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | Non
             cells.append(f'<img src="{uri}" alt="frame {seq}, {name}" loading="lazy">')
     return (
         "<section><h2>Frames</h2>"
-        '<p class="lead">Error <span class="scale inferno"></span> from 0 to 32 grey levels or more; '
+        '<p class="lead">Where the reconstruction is grey and dark with a light outline, it shows tissue that the frame does not, behind a tool or outside '
+        "of the field of view: remembered as it was seen last, not as it is now. "
+        'Error <span class="scale inferno"></span> from 0 to 32 grey levels or more; '
         'depth <span class="scale viridis"></span> from near to far; grey marks tools, which are not scored, and unknown depth.</p>'
         f'<div class="frames">{"".join(cells)}</div></section>'
     )

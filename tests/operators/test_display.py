@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from operators.display import DisplayOp, DisplaySettings, LiveDisplayResult, labelled
+from operators.display import DisplayOp, DisplaySettings, LiveDisplayResult, draw_label
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.messages import PictureState
 from operators.outcome import OutcomeBuilder
@@ -102,19 +102,62 @@ def test_a_picture_that_is_not_live_is_labelled_even_where_labels_are_off(fake_t
     assert (lost.image != picture.image).any()
 
 
-def test_the_label_is_drawn_into_a_copy(rng):
-    image = rng.integers(0, 256, (64, 96, 3), np.uint8)
-    before = image.copy()
-    for state in PictureState:
-        drawn = labelled(image, state, 12e6)
-        assert drawn.shape == image.shape
-        assert (drawn != image).any()
-    assert np.array_equal(image, before)
+@pytest.mark.parametrize("state", PictureState)
+def test_the_label_is_drawn_into_a_copy(screen, rendered, frame, fake_time, compute_queued, state):
+    picture = arrived(rendered, frame, fake_time)
+    before = picture.image.copy()
+    fake_time.pass_ms({PictureState.STALE: 500, PictureState.FROZEN: 5000}.get(state, 0))
+    screen.source = SourceState.STALLED if state is PictureState.SOURCE_LOST else SourceState.LIVE
+    (shown,) = compute_queued(screen.operator, rendered=[picture])
+    assert shown.state is state and (shown.image != before).any()
+    assert np.array_equal(picture.image, before)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (7, 5)])
 def test_tiny_pictures_can_be_labelled(size):
-    assert labelled(np.zeros((*size, 3), np.uint8), PictureState.FROZEN, 3e9).shape == (*size, 3)
+    picture = np.zeros((*size, 3), np.uint8)
+    draw_label(picture, PictureState.FROZEN, 3e9)
+    assert picture.any()
+
+
+def with_tool(frame, **fields):
+    """A frame with a tool over its upper half."""
+    mask = np.ones(frame(0).image.shape[:2], np.uint8)
+    mask[:8] = 0
+    return frame(**{"mask": mask, **fields})
+
+
+def test_tissue_behind_a_tool_is_marked_and_tissue_that_is_seen_stays_as_it_is(
+    fake_time, rendered, frame, compute_queued
+):
+    picture = rendered(0, frame=with_tool(frame, arrived_ns=fake_time.ns))
+    (shown,) = compute_queued(Screen(fake_time, label=False).operator, rendered=[picture])
+    tissue = picture.frame.mask > 0
+    assert np.array_equal(shown.remembered == 0, tissue)
+    assert np.array_equal(shown.image[tissue], picture.image[tissue])
+    assert (np.ptp(shown.image[~tissue], axis=-1) == 0).all()
+    (plain,) = compute_queued(Screen(fake_time, label=False, mark_remembered=False).operator, rendered=[picture])
+    assert plain.image is picture.image and plain.remembered is None
+
+
+def test_nobody_sees_a_picture_without_new_frames_or_whose_frames_show_nothing(
+    screen, rendered, frame, fake_time, compute_queued
+):
+    content = frame(0, arrived_ns=fake_time.ns)
+    seen = rendered(0, frame=content, content=content)
+    black = rendered(1, frame=frame(1, withheld="black"), content=content)
+    assert compute_queued(screen.operator, rendered=[black])[0].remembered is None, "what it shows was seen just now"
+    fake_time.pass_ms(300)
+    (held,) = compute_queued(screen.operator, rendered=[black])
+    (late,) = compute_queued(screen.operator, rendered=[seen])
+    assert held.state is late.state is PictureState.STALE
+    assert held.remembered.all() and late.remembered is None, "a slow machine is late and not blind"
+    fake_time.pass_ms(900)
+    (frozen,) = compute_queued(screen.operator)
+    assert frozen.state is PictureState.FROZEN and frozen.remembered.all()
+    screen.source = SourceState.RECONNECTING
+    (lost,) = compute_queued(screen.operator)
+    assert lost.state is PictureState.SOURCE_LOST and lost.remembered.all()
 
 
 def test_the_outcome_counts_states_and_ages(screen, rendered, frame, fake_time, compute_queued):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 
 import pytest
 
 from gsplat_core.io.recordings import open_recording, synthesize
+from services.reports.evaluation_schema import EvaluationReport
 from services.reports.schema import RunReport
 
 
@@ -49,13 +51,22 @@ def test_a_killed_session_is_replayed_and_stays_when_the_next_one_is_recorded(sc
     notes = replayed(intrasplat, killed, tmp_path / "replay").notes
     assert any("byte for byte" in note for note in notes), notes
 
-    done = intrasplat("live", scope, "--loop", "--seconds", "2", "--out", out, "--record", "--json")
+    options = ("--out", out, "--record", "--record-keep", "1h", "--json")
+    done = intrasplat("live", scope, "--loop", "--seconds", "2", *options)
     assert done.code == 0, done.err
     recordings = sorted((out / "recordings").iterdir())
     assert killed in recordings and len(recordings) == 2
     assert open_recording(killed).frame_count == frames
     assert any("frames were recorded in" in note for note in RunReport.read(out / "report.json").notes)
     assert (out / "model").is_dir()
+
+    for log in killed.rglob("log.jsonl"):
+        os.utime(log, (time.time() - 7200, time.time() - 7200))
+    done = intrasplat("live", scope, "--loop", "--seconds", "1", *options)
+    assert done.code == 0 and not killed.exists() and len(list((out / "recordings").iterdir())) == 2
+    assert any(
+        "earlier recordings" in note and note.endswith(": 1") for note in RunReport.read(out / "report.json").notes
+    )
 
 
 def test_an_interrupted_session_is_complete(scope, tmp_path, start, intrasplat):
@@ -74,3 +85,18 @@ def test_without_a_folder_that_stays_nothing_is_recorded(scope, intrasplat):
     done = intrasplat("live", scope, "--record", "--seconds", "1")
     assert done.code == 2
     assert "--out" in done.err and "Traceback" not in done.err
+
+
+def test_a_session_is_evaluated_at_its_own_size_and_times(scope, tmp_path, intrasplat):
+    """It was recorded at the run's scale, in the run's time: neither is applied to it again, however often the source was looped."""
+    out = tmp_path / "out"
+    arguments = ("--loop", "--seconds", "2", "--scale", "0.5", "--fps", "60", "--record", "--json")
+    assert intrasplat("live", scope, *arguments, "--out", out).code == 0
+    (session,) = (out / "recordings").iterdir()
+    done = intrasplat("evaluate", out, session, "--protocol", "live", "--protocol", "retention", "--json")
+    assert done.code == 0, done.err
+    report = EvaluationReport.model_validate_json(done.out)
+    assert (report.recording.width_px, report.recording.height_px, report.evaluated.scale) == (32, 24, 1.0)
+    assert not any("as --scale says" in note or "looped" in note or "played" in note for note in report.notes)
+    scored = [frame for frame in open_recording(session) if frame.withheld is None]
+    assert report.retention is not None and report.retention.last.frames == len(scored) > 10

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -28,13 +26,13 @@ from gsplat_core.io.sessions.records import (
     ShownLine,
     TrackName,
 )
+from gsplat_core.io.sessions.retention import KeptPart, Retention, earlier_sessions, finish_removals
 from gsplat_core.io.sessions.segment_writer import SegmentWriter, Stage
 from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SessionInfo, write_session_file
 from gsplat_core.scene.frames import Frame
 
 _PLANES: tuple[TrackName, ...] = ("image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth")
 _DTYPES = {"depth": np.float32}
-_DELETING = ".deleted-"
 
 
 @dataclass(frozen=True)
@@ -50,6 +48,8 @@ class WriterOptions:
     """Remove the oldest segments when all of them take more; None: keep them."""
     keep_s: float | None = None
     """Remove segments that ended longer ago; None: keep them."""
+    with_earlier: bool = False
+    """Both bounds are those of all sessions in the folder in which this one lies: earlier ones go before its segments."""
     sync_s: float = 1.0
     """Force what was written to the disk so often: a power failure loses no more than that."""
     clock: Callable[[], int] = time.monotonic_ns
@@ -95,21 +95,21 @@ class SessionWriter:
         """folder: made where it is not there. Raises FileExistsError where a session is in it."""
         self.folder, self.info = folder, info
         self.options = options or WriterOptions()
-        self.deleted_segments = 0
+        self.deleted_segments = self.deleted_sessions = 0
         folder.mkdir(parents=True, exist_ok=True)
         (folder / SEGMENTS_FOLDER).mkdir(exist_ok=True)
         write_session_file(folder, info)
         self._shown_coding: Coding = "vp9" if self.options.shown == "vp9" else "colour"
-        self._ended: deque[tuple[Path, int, int, int]] = deque()
-        """Segments that are complete: folder, number, bytes, when they ended."""
-        self._ended_bytes = 0
+        self._kept = Retention(self.options.keep_bytes, self.options.keep_s, self.options.segment_bytes)
         self._synced_ns = self.options.clock()
         self._segment = self._begin(0, "begin")
+        if self.options.with_earlier:
+            self._count_earlier()
 
     @property
     def bytes(self) -> int:
         """What the recording takes on the disk now."""
-        return self._ended_bytes + self._segment.bytes
+        return self._kept.segment_bytes + self._segment.bytes
 
     def frame(self, frame: Frame) -> None:
         """A frame that came in."""
@@ -202,25 +202,32 @@ class SessionWriter:
     def _next(self, why: str, now_ns: int) -> None:
         ended = self._segment
         ended.close(why)
-        self._ended.append((ended.folder, ended.number, ended.bytes, now_ns))
-        self._ended_bytes += ended.bytes
+        self._kept.add(KeptPart(ended.folder, ended.bytes, now_ns, ended.number))
         self._segment = self._begin(ended.number + 1, why)
-        while self._ended and self._too_old(now_ns):
-            folder, number, size, _ = self._ended.popleft()
-            # Renamed first: a reader finds a segment whole or not at all.
-            away = folder.with_name(_DELETING + folder.name)
-            folder.rename(away)
-            shutil.rmtree(away)
-            self._ended_bytes -= size
-            self.deleted_segments += 1
-            self._segment.line(DeletedLine(segment=number, bytes=size))
+        self._give_up(now_ns)
 
-    def _too_old(self, now_ns: int) -> bool:
-        options = self.options
-        if options.keep_s is not None and now_ns - self._ended[0][3] > options.keep_s * 1e9:
-            return True
-        # A segment that is being written may reach its full size before it can be removed itself.
-        return options.keep_bytes is not None and self._ended_bytes + options.segment_bytes > options.keep_bytes
+    def _count_earlier(self) -> None:
+        recordings, now_ns = self.folder.parent, self.options.clock()
+        for path, failure in finish_removals(recordings):
+            self._say_of_earlier(path, f"could not be removed: {failure}")
+        for part in earlier_sessions(recordings, self.folder, now_ns):
+            self._kept.add(part)
+        self._give_up(now_ns)
+
+    def _give_up(self, now_ns: int) -> None:
+        """Remove what is too much or too old, and say so in the log."""
+        for part, failure in self._kept.give_up(now_ns):
+            if part.segment is not None:
+                self.deleted_segments += 1
+                self._segment.line(DeletedLine(segment=part.segment, bytes=part.bytes))
+            elif failure is None:
+                self.deleted_sessions += 1
+                self._say_of_earlier(part.folder, f"was removed: {part.bytes} bytes")
+            else:
+                self._say_of_earlier(part.folder, f"could not be removed: {failure}")
+
+    def _say_of_earlier(self, session: Path, what: str) -> None:
+        self._segment.line(NoteLine(text=f"the earlier session {session.name} {what}"[:MAX_TEXT]))
 
 
 def _said(frame: Frame) -> dict[str, Any]:

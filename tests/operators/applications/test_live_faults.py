@@ -158,7 +158,7 @@ def test_a_stream_that_changes_its_size_and_back(watched):
 
 
 def test_masks_and_depth_that_cannot_be(watched):
-    """A mask without tissue, one that loses the tool, depth of NaN, infinity and nonsense."""
+    """A mask that is all tool, for a moment and for a second; one that is all tissue at once; depth of NaN, infinity and nonsense."""
     tool = np.ones((HEIGHT, WIDTH), np.uint8)
     tool[:, : WIDTH // 4] = 0
     plane = np.full((HEIGHT, WIDTH), 60.0, np.float32)
@@ -173,30 +173,42 @@ def test_masks_and_depth_that_cannot_be(watched):
     for depth in (np.full_like(plane, np.nan), holes, np.full_like(plane, np.inf), -plane, plane * 1000):
         after.append(script.good(12, depth=depth))
     after.append(script.good(12))
+    hidden = script.fault(*[{"mask": np.zeros_like(tool)}] * 28)
+    after.append(script.good(12))
     watch = watched(script)
     everything_came(watch)
     found = watch.part(MaskAndDepthCounts).found
-    assert (found["no tissue"], found["tool mask lost"]) == (4, 4)
+    assert (found["no tissue"], found["tool mask lost"]) == (4 + 28, 4)
     assert found["depth not usable"] == 48 and found["depth repaired"] == 12
     assert set(watch.part(TrainingCounts).withheld) <= {"no tissue", "tool mask lost"}
+    stale = [each for each in watch.shown if each.state is PictureState.STALE and each.rendered.frame.seq in hidden]
+    assert stale and all(picture.remembered is not None for picture in stale), "after 0.7 s nothing of it is live"
+    for picture in watch.shown:
+        if picture.state is PictureState.LIVE and picture.remembered is not None:
+            assert not picture.remembered[tool > 0].any(), "only what the tool hides is marked in a live picture"
     for frames in after:
         watch.recovers_in(frames)
     watch.learned_nothing_bad()
 
 
-def test_a_source_that_is_gone_for_a_while(watched):
+def test_a_source_that_is_gone_for_five_seconds(watched):
     script = Script()
     script.good(20)
-    after = script.good(25, pause_s=2.0)
+    after = script.good(25, pause_s=5.0)
     watch = watched(script)
     everything_came(watch)
     source, states = watch.part(SourceResult), watch.part(LiveDisplayResult).states
-    assert source.state_s["stalled"] > 0 and source.counts["stalls"] == 1
+    assert source.state_s["stalled"] > 4 and source.counts["stalls"] == 1
     assert states["live"] >= 2 and states["source lost"] >= 1
-    gone = [picture for picture in watch.shown if picture.state is PictureState.SOURCE_LOST and not picture.new]
-    assert any(picture.rendered.frame.seq < after[0] for picture in gone)
+    gone = [
+        picture
+        for picture in watch.shown
+        if picture.state is PictureState.SOURCE_LOST and not picture.new and picture.rendered.frame.seq < after[0]
+    ]
+    assert max(picture.age_ns for picture in gone) > 4.5e9, "its age is shown as long as nothing comes"
     red = tuple(COLOURS[PictureState.SOURCE_LOST])
     assert all(tuple(picture.image[-1, -1]) == red for picture in gone), "drawn into the picture"
+    assert all(picture.remembered is not None for picture in gone), "nobody sees any of it"
     watch.recovers_in(after)
     watch.learned_nothing_bad()
 
