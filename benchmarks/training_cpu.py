@@ -85,7 +85,7 @@ def parts(
     gaussians, _ = step.copy()
     weights = LossWeights(config.ssim_weight, config.depth_weight, config.squared_error)
     deformed = step.at(1.0)
-    _, gradients = loss_and_gradients(deformed, observation, weights)
+    gradients = loss_and_gradients(deformed, observation, weights).gradients
     deltas = torch.cat([gradients["means"], gradients["quats"], gradients["log_scales"], gradients["sh"][:, 0]], 1)
     adam = FusedAdam(gaussians.tensors(), dict.fromkeys(gaussians.tensors(), 0.0))
     still = BasisRates(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

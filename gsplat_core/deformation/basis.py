@@ -44,6 +44,7 @@ class BasisField(BumpTensors):
     kind = "basis"
     slot_type = BasisSlot
     continues = True
+    can_be_moved = True
 
     @classmethod
     def for_gaussians(cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any) -> BasisField:

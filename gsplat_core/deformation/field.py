@@ -41,6 +41,8 @@ class DeformationField(torch.nn.Module):
 
     continues: ClassVar[bool] = False
     """Whether `continuation` is looked at."""
+    can_be_moved: ClassVar[bool] = False
+    """Whether `move_at` is there."""
 
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__()

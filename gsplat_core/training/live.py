@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
+import torch
+
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
+from gsplat_core.training.colour_correction import MOST_RELAXATION
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
@@ -23,6 +26,9 @@ from gsplat_core.transfers import HostCopy
 REHEARSED_IN_FLIGHT = 2
 """Rehearsal steps that may be queued on a GPU and not finished: the next frame's first step waits for them."""
 
+
+REHEARSED_CORRECTION = 0.5
+"""Share of `colour_relaxation` in a rehearsal step: what is corrected at one time shows at the times around it, which had their turn."""
 
 LONGER_STEP_DECAY = 0.1
 """How fast the usual time of a step follows longer ones."""
@@ -40,6 +46,9 @@ class LiveTraining:
     """Steps from the first factor to the last, in equal ratios; a frame that gets more goes on with the last one."""
     recent_share: float = 0.3
     """Share of the rehearsal steps that go to the newest frame; the others are spread evenly over the window."""
+    colour_relaxation: float = 0.0
+    """Above 0 colours are not trained with a rate but corrected by what the picture is off by, by so many times the mean over the pixels that
+    show them (`colour_correction`), where the field can be moved at one time. On a CPU, with the squared error."""
 
     def __post_init__(self) -> None:
         for name in ("first_rate", "last_rate"):
@@ -49,6 +58,10 @@ class LiveTraining:
             raise InvalidSetting(f"rate_steps is {self.rate_steps}; it must be at least 1")
         if not 0 <= self.recent_share <= 1:
             raise InvalidSetting(f"recent_share is {self.recent_share}; it must be between 0 and 1")
+        if not 0 <= self.colour_relaxation < MOST_RELAXATION:
+            raise InvalidSetting(
+                f"colour_relaxation is {self.colour_relaxation}; it must be at least 0 and below {MOST_RELAXATION:g}"
+            )
 
     def rate_at(self, step: int) -> float:
         """The factor of a frame's step, counted from 0."""
@@ -76,6 +89,7 @@ class LiveReconstructor(Reconstructor):
     ) -> None:
         super().__init__(config, camera, seed=seed, recording_digest=recording_digest, device=device)
         self._live = live or LiveTraining()
+        _check_colours(self._live, config, self.device)
         # Where training starts from the motion, it has to be known before.
         self._follows_at_once = config.start_from_motion
         self._to_follow: deque[tuple[Frame, Observation]] = deque(maxlen=2)
@@ -104,7 +118,7 @@ class LiveReconstructor(Reconstructor):
             raise InvalidInput("there is nothing to rehearse yet: observe a frame first")
         for _ in range(steps):
             observation = self._window.draw(self._live.recent_share)
-            self._step(observation, self._live.last_rate)
+            self._step(observation, self._live.last_rate, REHEARSED_CORRECTION * self._live.colour_relaxation)
             self._unsettled = observation
             self._rehearsing.queued()
 
@@ -216,7 +230,8 @@ class LiveReconstructor(Reconstructor):
         spending = Spending(budget, self._step_s)
         loss = None
         while spending.allows_step():
-            loss = self._step(observation, 1.0 if first else self._live.rate_at(spending.made))
+            rate = 1.0 if first else self._live.rate_at(spending.made)
+            loss = self._step(observation, rate, self._live.colour_relaxation)
             spending.step_made(self._in_flight.queued() if budget.is_timed else 0)
         if loss is None:
             return ObserveReport(observation.seq, 0, None, self.gaussians, spending.ending)
@@ -225,3 +240,17 @@ class LiveReconstructor(Reconstructor):
         if budget.is_timed:
             self._learn_step_time(spending)
         return ObserveReport(observation.seq, spending.made, HostCopy(loss), self.gaussians, spending.ending)
+
+
+def _check_colours(live: LiveTraining, config: ReconstructorConfig, device: torch.device) -> None:
+    if live.colour_relaxation == 0:
+        return
+    if device.type != "cpu":
+        raise InvalidSetting(
+            f"colour_relaxation is {live.colour_relaxation} on {device}: colours are corrected on a CPU only; set 0 to train them"
+        )
+    if not config.squared_error or config.ssim_weight > 0:
+        raise InvalidSetting(
+            f"colour_relaxation is {live.colour_relaxation} with squared_error {config.squared_error} and ssim_weight"
+            f" {config.ssim_weight}: colours are corrected by the squared error alone; set squared_error and ssim_weight 0"
+        )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.image_loss.image_loss import image_loss
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.image_loss.image_loss import STEEP_AS_L1, image_loss
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.tiles import bin_splats
@@ -15,6 +17,7 @@ from gsplat_core.rendering.chain import Geometry, RenderedSplats, StepOperations
 from gsplat_core.rendering.settings import EPS2D, RenderSettings
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
+from gsplat_core.training.colour_correction import colour_correction
 from gsplat_core.training.observations import Observation
 
 
@@ -27,16 +30,35 @@ class LossWeights:
     squared: bool = False
     """The squared error in place of L1, see `image_loss`."""
 
+    @property
+    def show_residuals(self) -> bool:
+        """Whether the gradient at the picture's colours is the residual times a constant."""
+        return self.squared and self.ssim == 0
+
+
+class Compared(NamedTuple):
+    """A rendered frame beside an observation."""
+
+    loss: Tensor
+    """[], on the device: whoever wants the number waits for it."""
+    gradients: dict[str, Tensor]
+    """Of the loss, for each of the Gaussians' five raw tensors."""
+    colour_change: Tensor | None = None
+    """[N, 3] to add to the colours of degree 0, `sh[:, 0]`, whose gradient is 0 then; None: they are left to the gradient."""
+
 
 @torch.no_grad()
 def loss_and_gradients(
-    gaussians: Gaussians, observation: Observation, weights: LossWeights
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Loss [] against `observation`, and its gradient for each of the Gaussians' five raw tensors, by name.
+    gaussians: Gaussians, observation: Observation, weights: LossWeights, colour_relaxation: float = 0.0
+) -> Compared:
+    """Loss against `observation`, and its gradient for the Gaussians.
 
-    The loss stays on the device: whoever wants the number waits for it. The same as `render`, `image_loss` and `backward()`,
-    without an autograd graph: this is the inner loop of training.
+    The same as `render`, `image_loss` and `backward()`, without an autograd graph: this is the inner loop of training. With a
+    `colour_relaxation` above 0 the same passes say how colours change, see `colour_correction`. Raises InvalidInput when the loss is another
+    one than the squared error then.
     """
+    if colour_relaxation > 0 and not weights.show_residuals:
+        raise InvalidInput(f"colours are corrected by the residual, which the squared error alone shows, got {weights}")
     camera = observation.camera
     viewmat, intrinsics = (matrix[None] for matrix in camera.matrices(gaussians.device))
     scales, opacities = gaussians.scales, gaussians.opacities
@@ -50,7 +72,8 @@ def loss_and_gradients(
     splats = render_splats(_STEPS, geometry, lambda dense: (unclamped.clamp(min=0)[None], dense), None, settings)
 
     loss, v_picture, v_alphas = _loss_of_picture(splats, observation, weights, use_depth)
-    v_means2d, v_conics, v_channels, v_opacities = _composite_backward(splats, v_picture, v_alphas, settings)
+    tissue = (observation.mask != 0).float() if colour_relaxation > 0 else None
+    v_means2d, v_conics, v_channels, v_opacities = _composite_backward(splats, v_picture, v_alphas, settings, tissue)
     v_depths = v_channels[:, 3].contiguous()[None, None] if use_depth else None
     v_means, _, v_quats, v_scales, _ = torch.ops.gsplat_core.project_gaussians_backward(
         gaussians.means[None], None, gaussians.quats[None], scales[None], viewmat[None], intrinsics[None],
@@ -64,13 +87,19 @@ def loss_and_gradients(
             gaussians.sh_degree, directions[None], gaussians.sh, None, v_colours.contiguous()[None], True
         )
         v_means = v_means + v_directions[0]
-    return loss, {
+    colour_change = None
+    if tissue is not None:
+        residuals = v_channels[:, :3] * (-3 * STEEP_AS_L1 * tissue.sum())
+        colour_change = colour_correction(unclamped, residuals, v_channels[:, -1], colour_relaxation) / SH_C0
+        v_sh[:, 0] = 0
+    gradients = {
         "means": v_means,
         "quats": v_quats[0],
         "log_scales": v_scales[0] * scales,
         "logit_opacities": v_opacities * opacities * (1 - opacities),
         "sh": v_sh,
     }
+    return Compared(loss, gradients, colour_change)
 
 
 def _loss_of_picture(
@@ -104,10 +133,18 @@ def _composite(
 
 
 def _composite_backward(
-    splats: RenderedSplats, v_picture: Tensor, v_alphas: Tensor, settings: RenderSettings
+    splats: RenderedSplats, v_picture: Tensor, v_alphas: Tensor, settings: RenderSettings, weighed: Tensor | None
 ) -> tuple[Tensor, ...]:
-    """Gradients of the splats' means2d [N, 2], conics [N, 3], channels [N, D] and opacities [N]."""
-    blended = (splats.rows.means2d[0], splats.rows.conics[0], splats.channels[0], splats.opacities[0])
+    """Gradients of the splats' means2d [N, 2], conics [N, 3], channels [N, D] and opacities [N].
+
+    With `weighed` [H, W] the channels have one more, the last: the sum over pixels of blending weight times that.
+    """
+    channels = splats.channels[0]
+    if weighed is not None:
+        # A channel in which every splat is 0: no other gradient sees it.
+        channels = torch.nn.functional.pad(channels, (0, 1))
+        v_picture = torch.cat([v_picture, weighed[None, ..., None]], -1)
+    blended = (splats.rows.means2d[0], splats.rows.conics[0], channels, splats.opacities[0])
     lists = (splats.isect_offsets, splats.flatten_ids)
     size = (settings.width, settings.height, settings.tile_size)
     (last,) = splats.rest

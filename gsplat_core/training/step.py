@@ -10,9 +10,10 @@ from torch import Tensor
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.deformation.kind import FieldTraining
 from gsplat_core.deformation.registry import kind_of
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.layout import COLOUR
 from gsplat_core.scene.rows import GaussianRows, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.field_training import AutogradTraining
@@ -81,18 +82,28 @@ class TrainingStep:
             AutogradTraining(field, self._field_rates) if kind.training is None else kind.training(field)
         )
 
-    def __call__(self, observation: Observation, rate_scale: float = 1.0) -> Tensor:
+    def __call__(self, observation: Observation, rate_scale: float = 1.0, colour_relaxation: float = 0.0) -> Tensor:
         """Train on one observation; returns its loss before the update, [] on the Gaussians' device.
 
-        On a GPU this only queues the step: ask for the loss's value, or `settle`, to wait for it.
+        With a `colour_relaxation` above 0 colours are not trained but corrected (`colour_correction`) at the observation's time, if the field
+        can be moved at one time. A captured step only queues: ask for the loss's value, or `settle`, to wait for it. Raises InvalidInput for a
+        captured step that is to correct colours.
         """
         if self._captured is not None:
+            if colour_relaxation > 0:
+                raise InvalidInput(
+                    f"colour_relaxation is {colour_relaxation}: a step in a CUDA graph trains colours; set it to 0"
+                )
             return self._captured_step(self._captured, observation, rate_scale)
         deformed = self._training.deform(self.gaussians, observation.time_s)
-        loss, gradients = loss_and_gradients(deformed, observation, self._weights)
-        own = self._training.update(gradients, self._field_rates.scaled(self._mm_per_px, rate_scale))
+        relaxation = colour_relaxation if self.field.can_be_moved else 0.0
+        compared = loss_and_gradients(deformed, observation, self._weights, relaxation)
+        own = self._training.update(compared.gradients, self._field_rates.scaled(self._mm_per_px, rate_scale))
         self._adam.step(self.gaussians.tensors(), own, self._gaussian_rates(rate_scale))
-        return loss
+        if compared.colour_change is not None:
+            before_colour = (COLOUR.start, 0)
+            self.field.move_at(observation.time_s, torch.nn.functional.pad(compared.colour_change, before_colour))
+        return compared.loss
 
     def scale_about(self, camera: Camera, factor: Tensor) -> None:
         """Move every Gaussian to `factor` [N] times its distance from the camera's centre, at all times, and scale it with that: the camera

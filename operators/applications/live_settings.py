@@ -31,7 +31,12 @@ LIVE_MOST_GAUSSIANS = 100_000
 """At the start of a scene, for large pictures; twice as many may be there in all."""
 LIVE_PIXELS_PER_GAUSSIAN = 13
 """On a GPU, for pictures that are larger than the usual ones."""
-LIVE_TRAINING = {"cpu": LiveTraining(first_rate=2.0, last_rate=1.5, rate_steps=2), "cuda": LiveTraining()}
+LIVE_TRAINING = {
+    "cpu": LiveTraining(first_rate=2.0, last_rate=1.5, rate_steps=2, colour_relaxation=1.5),
+    "cuda": LiveTraining(),
+}
+LIVE_SQUARED_ERROR = {"cpu": True, "cuda": False}
+"""What colours are corrected by where there are few steps; with many L1 follows motion better."""
 LIVE_LEAST_STEPS = {"cpu": 2, "cuda": 5}
 """Steps that a frame gets though it is shown late."""
 LIVE_STARTS_FROM_MOTION = {"cpu": True, "cuda": False}
@@ -122,6 +127,7 @@ class LiveSettings:
             motion_detail=LIVE_MOTION_DETAIL,
             start_from_motion=LIVE_STARTS_FROM_MOTION[device],
             ssim_weight=LIVE_SSIM_WEIGHT[device],
+            squared_error=LIVE_SQUARED_ERROR[device],
         )
 
     def stated(self) -> RunSettings:

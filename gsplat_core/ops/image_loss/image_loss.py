@@ -10,6 +10,9 @@ from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.image_loss.result import ImageLoss
 from gsplat_core.ops.ssim.ssim import MAX_CHANNELS
 
+STEEP_AS_L1 = 0.01
+"""kSteepAsL1 of `image_loss.h`: the difference at which the squared error is as steep as L1."""
+
 
 def image_loss(
     image: Tensor,

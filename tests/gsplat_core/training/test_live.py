@@ -15,6 +15,7 @@ from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
 
 WIDTH, HEIGHT = 48, 40
+CAMERA = Camera.from_focal(40.0, WIDTH, HEIGHT)
 
 
 def frame_at(k, width=WIDTH, height=HEIGHT):
@@ -139,11 +140,41 @@ def test_rates_go_from_the_first_to_the_last():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"first_rate": 0.0}, {"last_rate": float("nan")}, {"rate_steps": 0}, {"recent_share": 1.5}]
+    "wrong",
+    [{"first_rate": 0.0}, {"last_rate": float("nan")}, {"rate_steps": 0}, {"recent_share": 1.5}]
+    + [{"colour_relaxation": wrong} for wrong in (-0.1, 2.0, float("nan"))],
 )
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(InvalidSetting):
         LiveTraining(**wrong)
+
+
+@pytest.mark.parametrize("loss", [{}, {"squared_error": True, "ssim_weight": 0.1}])
+def test_colours_are_corrected_by_the_squared_error_only(loss):
+    with pytest.raises(InvalidSetting, match="set squared_error and ssim_weight 0"):
+        LiveReconstructor(ReconstructorConfig(**loss), CAMERA, live=LiveTraining(colour_relaxation=1.0))
+
+
+def test_colours_are_corrected_on_a_cpu_only():
+    live, config = LiveTraining(colour_relaxation=1.0), ReconstructorConfig(squared_error=True)
+    with pytest.raises(InvalidSetting, match="on a CPU only"):
+        LiveReconstructor(config, CAMERA, live=live, device="cuda")
+
+
+def test_one_step_a_frame_follows_a_light_that_changes_if_it_corrects_colours():
+    """Trained colours move by their rate, whatever the picture asks for."""
+
+    def shown_db(relaxation):
+        config = ReconstructorConfig(gaussians=400, max_gaussians=400, squared_error=True)
+        made = LiveReconstructor(config, CAMERA, live=LiveTraining(colour_relaxation=relaxation))
+        made.observe(frame_at(0), budget=Budget.of_steps(30))
+        for k in range(1, 6):
+            frame = frame_at(k)
+            frame = Frame(k, k * 33_000_000, (frame.image * (1 - 0.1 * k)).astype(np.uint8))
+            made.observe(frame, budget=Budget.of_steps(1))
+        return psnr_tissue_db(made.snapshot().render(frame.time_s).image, frame.image)
+
+    assert shown_db(1.5) > shown_db(0.0) + 3
 
 
 def test_a_picture_that_was_just_trained_on_is_shown_as_it_was_trained():

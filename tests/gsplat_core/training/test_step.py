@@ -43,7 +43,7 @@ def make_step(make_frame, camera):
 def test_steps_lower_the_loss_and_report_the_one_before_the_update(make_step, make_frame, camera, field):
     step = make_step(field)
     seen = Observation.of(make_frame(4, shift_px=1), camera)
-    expected, _ = loss_and_gradients(step.at(seen.time_s), seen, LossWeights())
+    expected = loss_and_gradients(step.at(seen.time_s), seen, LossWeights()).loss
     losses = [step(seen) for _ in range(25)]
     assert losses[0] == expected
     assert losses[-1] < 0.6 * losses[0]
@@ -151,3 +151,43 @@ def test_a_frame_that_is_all_tool_teaches_nothing(make_step, make_frame, camera,
     assert step(Observation.of(make_frame(mask=np.zeros((40, 48), np.uint8)), camera)) == 0
     for name, tensor in before.tensors().items():
         assert torch.equal(tensor, step.gaussians.tensors()[name])
+
+
+def test_corrected_colours_change_at_the_time_of_the_frame(make_step, make_frame, camera):
+    step = make_step(rates=still("basis"), squared_error=True)
+    canonical, far = step.gaussians.clone(), step.at(1.0)
+    dark = make_frame(4)
+    dark = dataclasses.replace(dark, image=dark.image // 2)
+    seen = Observation.of(dark, camera)
+    losses = [float(step(seen, colour_relaxation=1.0)) for _ in range(4)]
+    assert losses == sorted(losses, reverse=True)
+    assert losses[1] < 0.2 * losses[0]
+    for name, tensor in canonical.tensors().items():
+        assert torch.equal(tensor, step.gaussians.tensors()[name])
+    at_once, later = step.at(seen.time_s), step.at(1.0)
+    assert torch.equal(at_once.means, canonical.means)
+    assert (later.sh - far.sh).abs().max() < 0.05 * (at_once.sh - canonical.sh).abs().max()
+
+
+def test_a_field_that_cannot_be_moved_at_one_time_trains_its_colours(make_step, make_frame, camera):
+    trained, corrected = make_step("hexplane", squared_error=True), make_step("hexplane", squared_error=True)
+    seen = Observation.of(make_frame(4, shift_px=2), camera)
+    for _ in range(2):
+        assert trained(seen) == corrected(seen, colour_relaxation=1.0)
+
+
+def test_correcting_a_frame_that_is_all_tool_changes_nothing(make_step, make_frame, camera):
+    step = make_step(squared_error=True)
+    before = step.at(0.2)
+    step(Observation.of(make_frame(6, mask=np.zeros((40, 48), np.uint8)), camera), colour_relaxation=1.5)
+    assert torch.equal(step.at(0.2).sh, before.sh)
+
+
+def test_correcting_leaves_a_gaussian_alone_that_is_not_finite(make_step, make_frame, camera):
+    step = make_step(squared_error=True)
+    step.gaussians.means[7] = float("nan")
+    step.gaussians.sh[9] = float("inf")
+    seen = Observation.of(make_frame(4, shift_px=1), camera)
+    losses = [step(seen, colour_relaxation=1.5) for _ in range(10)]
+    assert losses[-1] < 0.7 * losses[0]
+    assert all(bool(parameter.isfinite().all()) for parameter in step.field.parameters())
