@@ -27,8 +27,9 @@ def warm_reconstructor(
     Replay of a recorded session does the same: a GPU's tile lists, which noise has made longer, decide which steps are taken again.
     """
     image = noise(reconstructor.camera)
-    tissue = np.ones(image.shape[:2], np.uint8)
-    tissue[len(tissue) // 2 :, : tissue.shape[1] // 2] = 0  # a scene starts in another way where tools hide some of it
+    height, width = image.shape[:2]
+    tissue = np.ones((height, width), np.uint8)
+    tissue[height // 2 :, : width // 2] = 0  # a scene starts in another way where tools hide some of it
     drawn: list[object] = []
     for frames in (WARM_FRAMES, 1):  # the second scene takes over the memory of the first one, as the stream's does
         for seq in range(frames):
