@@ -1,6 +1,6 @@
 """Causal next-frame prediction: show frame i + 1 with the model that learned frames 0 to i, score it, then learn from it.
 
-    python benchmarks/causal.py RECORDING... [--steps 40] [--device cuda] [--frames N] [--scale S] [--prior flow] [--live]
+    python benchmarks/causal.py RECORDING... [--steps 40] [--device cuda] [--frames N] [--scale S] [--prior flow|learned] [--live]
 
 One JSON line a recording: mean tissue PSNR in dB of the prediction, of the newest state held still, of a copy of the previous frame and of that
 frame moved on by half of the last optical flow (DIS, medium preset), all over the same frames, the first two left out; of the model on the

@@ -22,14 +22,14 @@ from gsplat_core.scene.layout import COLOUR, LOG_SCALE, POSITION, RAW_COLUMNS
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.damping import Damping
 from gsplat_core.training.depth_from_motion import DepthFromMotion
-from gsplat_core.training.image_motion import ImageMotion, typical_px
+from gsplat_core.training.image_motion import Flow, ImageMotion, typical_px
 from gsplat_core.training.motion_priors import MOTION_PRIORS
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import SurfaceMotion
 from gsplat_core.transfers import tensor_of
 
 HORIZON_S = 0.15
-"""How long after the newest frame its motion goes on; then the model holds still."""
+"""How long after the newest frame its motion goes on at most; then the model holds still."""
 LONGEST_GAP_S = 0.15
 """Frames further apart do not show a velocity."""
 UNCERTAINTY = 0.05
@@ -56,6 +56,10 @@ class MotionPrior(Protocol):
     @property
     def newest_s(self) -> float:
         """Time of the newest frame that was observed."""
+
+    @property
+    def horizon_s(self) -> float:
+        """How long after the newest frame its velocity goes on; then the model holds still."""
 
     def forget(self) -> None:
         """A new scene begins."""
@@ -84,17 +88,24 @@ class FlowPrior:
         self._is_sudden = False
         self.newest_s = 0.0
 
+    @property
+    def horizon_s(self) -> float:
+        """See `MotionPrior.horizon_s`."""
+        return HORIZON_S
+
     def observe(self, frame: Frame, time_s: float, camera: Camera, step: TrainingStep) -> None:
         """See `MotionPrior.observe`."""
         before, before_s = self._camera, self.newest_s
         self._camera, self.newest_s = camera, time_s
         last, last_interval_s, self._motion = self._usable_motion(), self._interval_s, None
-        flow = self._image_motion.follow(frame.image, _followed(frame))
+        flow = self._image_motion.follow(frame.image, followed(frame))
         if flow is None or before is None or camera.model != "pinhole":
+            self._take(frame, None, step.gaussians.device)
             return
         self._interval_s = time_s - before_s
         self._judge(typical_px(flow))
         self._motion = SurfaceMotion(tensor_of(flow, step.gaussians.device), before, camera)
+        self._take(frame, flow, step.gaussians.device)
         if self._finds_depth and frame.pose is not None and frame.depth is None:
             self._depth.apply(step, self._motion, before_s)
         if last is not None and self._usable_motion() is not None:
@@ -114,6 +125,9 @@ class FlowPrior:
             velocity[:, POSITION] = self._damping.damped(moved)
             velocity[:, LOG_SCALE] = widened(step.gaussians.log_scales + deltas[:, LOG_SCALE], moved)
         return velocity / self._interval_s
+
+    def _take(self, frame: Frame, flow: Flow | None, device: torch.device) -> None:
+        """What else is to be learned from a frame, and from how the picture before moved to it; None where that is not known."""
 
     def _usable_motion(self) -> SurfaceMotion | None:
         """The newest motion where it says how the next frame will be."""
@@ -151,7 +165,7 @@ def widened(log_scales: Tensor, moved: Tensor) -> Tensor:
     return (0.5 * torch.log1p(variance * torch.exp(-2 * log_scales))).clamp(max=MOST_WIDENED)
 
 
-def _followed(frame: Frame) -> NDArray[np.uint8] | None:
+def followed(frame: Frame) -> NDArray[np.uint8] | None:
     """Where the frame shows tissue that can be followed; None: everywhere."""
     if frame.mask is None or frame.loss_mask is None:
         return frame.mask if frame.loss_mask is None else frame.loss_mask
@@ -178,7 +192,7 @@ def continued(step: TrainingStep, prior: MotionPrior | None, learned_s: float) -
     # Also without a velocity: slots whose fields have a continuation from the start need no other memory later.
     velocity = prior.velocity(step) if prior.newest_s == learned_s else None
     still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
-    step.field.continue_with(still if velocity is None else velocity, learned_s, HORIZON_S)
+    step.field.continue_with(still if velocity is None else velocity, learned_s, prior.horizon_s)
     try:
         yield
     finally:

@@ -9,6 +9,10 @@ from gsplat_core.registry import Registry
 
 MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
     "motion prior",
-    {"bumps": "gsplat_core.training.motion_prior:no_prior", "flow": "gsplat_core.training.motion_prior:FlowPrior"},
+    {
+        "bumps": "gsplat_core.training.motion_prior:no_prior",
+        "flow": "gsplat_core.training.motion_prior:FlowPrior",
+        "learned": "gsplat_core.training.learned_prior:LearnedPrior",
+    },
 )
 """Made from a `ReconstructorConfig`. `bumps` is none: the field's bumps simply go on."""

@@ -115,7 +115,7 @@ class EvaluateOptions:
         int | None, typer.Option(help="Optimiser steps per frame of causal.", show_default="the run's")
     ] = None
     motion_prior: Annotated[
-        str | None, typer.Option(help="What causal assumes about motion: bumps or flow.", show_default="bumps")
+        str | None, typer.Option(help="What causal assumes about motion: bumps, flow or learned.", show_default="bumps")
     ] = None
     place: PlaceOption = None
 

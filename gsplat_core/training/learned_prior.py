@@ -1,0 +1,112 @@
+"""A motion prior that learns from the stream how its pictures go on: the beat of the heart, and what of a picture does not stay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.layout import COLOUR, POSITION, RAW_COLUMNS
+from gsplat_core.training.colour_fit import colour_change
+from gsplat_core.training.damping import AT_FIRST
+from gsplat_core.training.expected_picture import ExpectedPicture, moved
+from gsplat_core.training.image_motion import Flow
+from gsplat_core.training.local_shares import LocalShares, SharesSettings
+from gsplat_core.training.motion_prior import HORIZON_S, FlowPrior, followed
+from gsplat_core.training.similar_moments import SimilarMoments
+from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.surface_motion import SurfaceMotion
+from gsplat_core.transfers import tensor_of
+
+REFERENCE_S = 1 / 30
+"""Motions are kept in pixels per so long."""
+SHARES = SharesSettings(at_first=(AT_FIRST, 0.0), decay=0.97, around_cells=3.0, pull=4.0, ridge=0.2)
+"""Of the last motion, and of what followed similar moments; in squares of pixels."""
+
+
+COLOUR_STEPS = 8
+"""Steps in which the colours of the moved Gaussians are fitted to the expected picture."""
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """The next frame as an interval will bring it, on the device."""
+
+    motion: SurfaceMotion
+    picture: Tensor
+    """[H, W, 3], 0 to 1."""
+    tissue: Tensor
+    """[H, W], 1 where the picture shows tissue."""
+
+
+class LearnedPrior(FlowPrior):
+    """The next motion is a mixture of the last one and of those that followed earlier moments like now; colours return to their mean.
+
+    The shares are learned in the pictures, on the host, from what came of earlier expectations, and put onto the Gaussians on the device. That
+    holds for a camera that stands still: where it is known to move, the motion goes on as for `FlowPrior`.
+    """
+
+    def forget(self) -> None:
+        """See `MotionPrior.forget`."""
+        super().forget()
+        self._moments = SimilarMoments()
+        self._shares = LocalShares(SHARES)
+        self._picture = ExpectedPicture()
+        self._guesses: list[Flow] = []
+        """At the next motion."""
+        self._expected: Expectation | None = None
+
+    @property
+    def horizon_s(self) -> float:
+        """See `MotionPrior.horizon_s`. What was learned is said about the next frame only."""
+        return HORIZON_S if self._expected is None else min(HORIZON_S, self._interval_s)
+
+    def velocity(self, step: TrainingStep) -> Tensor | None:
+        """See `MotionPrior.velocity`."""
+        expected = self._expected
+        if expected is None or self._usable_motion() is None:
+            return super().velocity(step)
+        with torch.no_grad():
+            now = step.at(self.newest_s)
+            moving = expected.motion.ahead(now.means)
+            there = replace(now, means=now.means + moving)
+            velocity = moving.new_zeros(moving.shape[0], RAW_COLUMNS)
+            velocity[:, POSITION] = moving
+            velocity[:, COLOUR] = colour_change(
+                there, expected.motion.after, expected.picture, expected.tissue, COLOUR_STEPS
+            )
+        return velocity / self._interval_s
+
+    def _take(self, frame: Frame, flow: Flow | None, device: torch.device) -> None:
+        motion, guesses = self._usable_motion(), self._guesses
+        self._expected, self._guesses = None, []
+        if flow is None or motion is None or motion.before != motion.after:
+            self._picture.take(frame.image, followed(frame), None)
+            return
+        self._picture.take(frame.image, followed(frame), flow)
+        ahead = self._next_motion(flow, guesses)
+        picture = self._picture.after(ahead)
+        if picture is not None:
+            tissue = (
+                np.ones(picture.shape[:2], np.float32) if frame.mask is None else (frame.mask != 0).astype(np.float32)
+            )
+            there = SurfaceMotion(tensor_of(ahead, device), motion.after, motion.after)
+            self._expected = Expectation(there, tensor_of(picture / 255, device), tensor_of(tissue, device))
+
+    def _next_motion(self, flow: Flow, guesses: list[Flow]) -> Flow:
+        """Learn from the newest motion, and from what was expected of it; guess at the next one. In pixels an interval."""
+        per_reference = np.float32(REFERENCE_S / self._interval_s)
+        motion = flow * per_reference
+        if guesses:
+            self._shares.learn(guesses, motion, np.ones(motion.shape[:2], np.float32))
+        self._moments.take(motion)
+        similar = self._moments.next_motion()
+        self._guesses = [moved(motion, flow), np.zeros_like(motion) if similar is None else similar]
+        shares = self._shares.local(motion.shape)
+        ahead = np.zeros_like(motion)
+        for index, guess in enumerate(self._guesses):
+            ahead += shares[..., index, None] * guess
+        return np.asarray(ahead / per_reference, np.float32)

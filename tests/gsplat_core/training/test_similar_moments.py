@@ -1,0 +1,67 @@
+"""What followed earlier moments like now."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gsplat_core.training.similar_moments import REMEMBERED, SOONEST, SimilarMoments
+
+
+def motion(phase: float, shape: tuple[int, int] = (12, 16)) -> NDArray[np.float32]:
+    """A wave that runs over the picture."""
+    columns = np.arange(shape[1], dtype=np.float32) / shape[1]
+    wave = np.sin(2 * np.pi * (phase - columns)) + 0.4 * np.sin(4 * np.pi * phase)
+    return np.broadcast_to(np.stack([wave, -wave], axis=1), (*shape, 2)).astype(np.float32)
+
+
+def test_there_is_nothing_to_compare_with_at_first() -> None:
+    moments = SimilarMoments()
+    assert moments.next_motion() is None
+    for frame in range(SOONEST + 1):
+        moments.take(motion(frame / 9))
+        assert moments.next_motion() is None
+    moments.take(motion(0.0))
+    assert moments.next_motion() is not None
+
+
+@pytest.mark.parametrize("period", [11, 17.5])
+@pytest.mark.parametrize("frames", [60, REMEMBERED + 90])
+def test_a_periodic_motion_is_forecast(period: float, frames: int) -> None:
+    """Far better than by the last motion, within the ring and after it was written over."""
+    moments = SimilarMoments()
+    for frame in range(frames):
+        moments.take(motion(frame / period))
+    came, forecast = motion(frames / period), moments.next_motion()
+    assert forecast is not None
+    of_last = np.square(motion((frames - 1) / period) - came).mean()
+    assert np.square(forecast - came).mean() < 0.15 * of_last
+
+
+def test_how_unlike_two_moments_are_is_summed_over_what_came_before() -> None:
+    """Two moments whose last motion is the same are told apart by the motions before it."""
+    up, down, same = (np.full((8, 8, 2), value, np.float32) for value in (1.0, -1.0, 0.25))
+    rest = [np.zeros((8, 8, 2), np.float32)] * 8
+    moments = SimilarMoments()
+    for each in [*rest, up, same, up, *rest, down, same, down, *rest, down, same]:
+        moments.take(each)
+    forecast = moments.next_motion()
+    assert forecast is not None
+    assert forecast.mean() < -0.4
+
+
+def test_a_still_scene_stays_still() -> None:
+    moments = SimilarMoments()
+    for _ in range(20):
+        moments.take(np.zeros((12, 16, 2), np.float32))
+    forecast = moments.next_motion()
+    assert forecast is not None and not forecast.any()
+
+
+def test_another_size_begins_anew() -> None:
+    moments = SimilarMoments()
+    for frame in range(20):
+        moments.take(motion(frame / 9))
+    moments.take(motion(0.0, (5, 7)))
+    assert moments.next_motion() is None
