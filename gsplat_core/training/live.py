@@ -44,7 +44,7 @@ class LiveTraining:
     """The factor that they end with: small steps settle."""
     rate_steps: int = 30
     """Steps from the first factor to the last, in equal ratios; a frame that gets more goes on with the last one."""
-    recent_share: float = 0.3
+    recent_share: float = 0.6
     """Share of the rehearsal steps that go to the newest frame; the others are spread evenly over the window."""
     colour_relaxation: float = 0.0
     """Above 0 colours are not trained with a rate but corrected by what the picture is off by, by so many times the mean over the pixels that
