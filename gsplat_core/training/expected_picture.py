@@ -1,11 +1,12 @@
 """The picture that is expected next: the newest one moved on, with colours that return to their mean, and blurred as far as nobody can know.
 
 Highlights flicker, noise does not stay, and motion is not known exactly: the best guess of a colour lies between those of the newest, of earlier and
-of blurred pictures. How far, is learned place by place from what came of earlier guesses (`LocalShares`).
+of blurred pictures, and of what several motions would bring. How far, is learned place by place from what came of earlier guesses (`LocalShares`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,13 +15,14 @@ from numpy.typing import NDArray
 
 from gsplat_core.training.image_motion import CELL_PX, Flow
 from gsplat_core.training.local_shares import Field, LocalShares, SharesSettings, blurred
+from gsplat_core.training.similar_moments import Weighted, weighted_mean
 
 FOLLOWS = 0.2
 """How fast the mean of earlier pictures follows the newest one."""
 BLUR_PX = 1.5
 """Standard deviation of the blurred guess, in pixels."""
-SHARES = SharesSettings(at_first=(0.0, 0.0, 0.0), decay=0.95, around_cells=3.0, pull=200.0, ridge=1.0)
-"""Of the newest picture where it is, the mean, and the blurred picture. In squares of grey levels, 0..255."""
+SHARES = SharesSettings(at_first=(0.0, 0.0, 0.0, 0.0), decay=0.95, around_cells=3.0, pull=200.0, ridge=1.0)
+"""Of the newest picture where it is, the mean, the blurred picture, and the mean of what other motions would bring. In squares of grey levels, 0..255."""
 INVERSE_STEPS = 2
 """Iterations to find where a cell came from, in a flow that says where cells go."""
 
@@ -57,17 +59,21 @@ class ExpectedPicture:
             if self._guesses is not None:
                 weight = np.ones(picture.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
                 self._shares.learn(self._guesses.others, picture - self._guesses.moved, weight)
+                self._guesses = None
             assert self._mean is not None
             before = moved(self._mean, motion)
             self._mean = before + FOLLOWS * (picture - before)
         self._newest = picture
 
-    def after(self, motion: Flow) -> Field | None:
-        """The expected picture [H, W, 3], in grey levels, after the newest one has moved so. None before there is a picture."""
+    def after(self, motion: Flow, others: Sequence[Weighted] = ()) -> Field | None:
+        """The expected picture [H, W, 3], in grey levels, after the newest one has moved so, where it may have moved by one of the `others`
+        too. None before there is a picture."""
         if self._newest is None or self._mean is None:
             return None
         newest, mean = moved(self._newest, motion), moved(self._mean, motion)
-        guesses = [self._newest, mean, blurred(newest, BLUR_PX)]
+        of_others = [(weight, moved(self._newest, other)) for weight, other in others]
+        spread = weighted_mean(of_others) if of_others else newest
+        guesses = [self._newest, mean, blurred(newest, BLUR_PX), spread]
         self._guesses = _Guesses(newest, [guess - newest for guess in guesses])
         shares = self._shares.local(newest.shape)
         expected = newest.copy()

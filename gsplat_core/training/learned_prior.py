@@ -16,7 +16,7 @@ from gsplat_core.training.expected_picture import ExpectedPicture, moved
 from gsplat_core.training.image_motion import Flow
 from gsplat_core.training.local_shares import LocalShares, SharesSettings
 from gsplat_core.training.motion_prior import HORIZON_S, FlowPrior, followed
-from gsplat_core.training.similar_moments import SimilarMoments
+from gsplat_core.training.similar_moments import SimilarMoments, Weighted, weighted_mean
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import SurfaceMotion
 from gsplat_core.transfers import tensor_of
@@ -27,7 +27,7 @@ SHARES = SharesSettings(at_first=(AT_FIRST, 0.0), decay=0.97, around_cells=3.0, 
 """Of the last motion, and of what followed similar moments; in squares of pixels."""
 
 
-COLOUR_STEPS = 8
+COLOUR_STEPS = 16
 """Steps in which the colours of the moved Gaussians are fitted to the expected picture."""
 
 
@@ -87,8 +87,8 @@ class LearnedPrior(FlowPrior):
             self._picture.take(frame.image, followed(frame), None)
             return
         self._picture.take(frame.image, followed(frame), flow)
-        ahead = self._next_motion(flow, guesses)
-        picture = self._picture.after(ahead)
+        ahead, others = self._next_motion(flow, guesses)
+        picture = self._picture.after(ahead, others)
         if picture is not None:
             tissue = (
                 np.ones(picture.shape[:2], np.float32) if frame.mask is None else (frame.mask != 0).astype(np.float32)
@@ -96,17 +96,20 @@ class LearnedPrior(FlowPrior):
             there = SurfaceMotion(tensor_of(ahead, device), motion.after, motion.after)
             self._expected = Expectation(there, tensor_of(picture / 255, device), tensor_of(tissue, device))
 
-    def _next_motion(self, flow: Flow, guesses: list[Flow]) -> Flow:
-        """Learn from the newest motion, and from what was expected of it; guess at the next one. In pixels an interval."""
-        per_reference = np.float32(REFERENCE_S / self._interval_s)
-        motion = flow * per_reference
+    def _next_motion(self, flow: Flow, guesses: list[Flow]) -> tuple[Flow, list[Weighted]]:
+        """Learn from the newest motion, and from what was expected of it; guess at the next one: what is expected, and what followed similar
+        moments. In pixels an interval."""
+        scale = np.float32(self._interval_s / REFERENCE_S)
+        motion = np.asarray(flow / scale, np.float32)
         if guesses:
             self._shares.learn(guesses, motion, np.ones(motion.shape[:2], np.float32))
         self._moments.take(motion)
-        similar = self._moments.next_motion()
-        self._guesses = [moved(motion, flow), np.zeros_like(motion) if similar is None else similar]
+        similar = [(weight, np.asarray(each * scale, np.float32)) for weight, each in self._moments.next_motions()]
+        of_similar = weighted_mean(similar) if similar else np.zeros_like(flow)
+        # Guesses are learned from in the unit in which motions are kept.
+        self._guesses = [np.asarray(each / scale, np.float32) for each in (moved(flow, flow), of_similar)]
         shares = self._shares.local(motion.shape)
         ahead = np.zeros_like(motion)
         for index, guess in enumerate(self._guesses):
             ahead += shares[..., index, None] * guess
-        return np.asarray(ahead / per_reference, np.float32)
+        return np.asarray(ahead * scale, np.float32), similar

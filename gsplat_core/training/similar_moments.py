@@ -6,11 +6,14 @@ of them at once, or one that changes, need no model of their own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TypeAlias
+
 import cv2
 import numpy as np
 
 from gsplat_core.training.image_motion import Flow
-from gsplat_core.training.local_shares import cells_for
+from gsplat_core.training.local_shares import Field, cells_for
 
 REMEMBERED = 256
 """Frames whose motion is remembered: some seconds, several heartbeats."""
@@ -20,6 +23,9 @@ EARLIER_COUNTS = 0.64
 """Weight, in the comparison of two moments, of how unlike the moments before them were."""
 FOLLOWED = 6
 """The moments that are most like now, whose next motion is averaged."""
+
+Weighted: TypeAlias = tuple[float, Flow]
+"""A motion and its weight."""
 
 
 class SimilarMoments:
@@ -53,16 +59,25 @@ class SimilarMoments:
         self._unlike[row] = np.inf
         self._unlike[self._taken :] = np.inf
 
-    def next_motion(self) -> Flow | None:
-        """The mean motion after the moments that were most like now; None before there are any."""
+    def next_motions(self) -> list[Weighted]:
+        """The motions after the moments that were most like now, and how much each of them counts; none before there are any."""
         newest = self._taken - 1
         kept = np.arange(max(0, self._taken - REMEMBERED + 1), newest - SOONEST)
         unlike = self._unlike[kept % REMEMBERED]
         best = np.argsort(unlike, kind="stable")[:FOLLOWED]
         if len(best) == 0:
-            return None
+            return []
         weights = np.exp(-unlike[best] / max(unlike[best[0]], 1e-12))
         weights /= weights.sum()
         after = (kept[best] + 1) % REMEMBERED
-        motions = self._motions[after].astype(np.float32)
-        return np.asarray(np.tensordot(weights.astype(np.float32), motions, axes=1), np.float32)
+        return [
+            (float(weight), self._motions[row].astype(np.float32)) for weight, row in zip(weights, after, strict=True)
+        ]
+
+
+def weighted_mean(parts: Sequence[Weighted]) -> Field:
+    """Of fields with their weights, which sum to 1."""
+    mean = np.zeros_like(parts[0][1])
+    for weight, field in parts:
+        mean += np.float32(weight) * field
+    return mean

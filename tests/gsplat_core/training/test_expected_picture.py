@@ -80,6 +80,21 @@ def test_without_a_motion_it_begins_anew_and_keeps_what_it_learned() -> None:
     np.testing.assert_allclose(expected.after(STILL), as_bytes(texture(1)), atol=0.01)
 
 
+def test_where_one_of_two_motions_comes_their_mean_is_learned_to_be_expected() -> None:
+    """Nobody knows which: the mean of both pictures is nearer to what comes than either of them."""
+    expected, chance, errors = ExpectedPicture(), np.random.default_rng(0), []
+    ahead, back = STILL + np.float32([3, 0]), STILL - np.float32([3, 0])
+    for _ in range(40):
+        expected.take(as_bytes(texture()), None, STILL)
+        picture = expected.after(ahead, [(0.5, ahead), (0.5, back)])
+        came = moved(texture(), ahead if chance.random() < 0.5 else back)
+        errors.append((error(picture, came), error(moved(texture(), ahead), came)))
+        expected.take(as_bytes(came), None, STILL)
+        expected.take(as_bytes(texture()), None, STILL)
+    of_mean, of_one = np.mean(errors[20:], axis=0)
+    assert of_mean < 0.7 * of_one
+
+
 def test_masked_pixels_are_not_learned_from() -> None:
     """The right side is noise, of which nothing stays; that is learned for the whole picture where it is not masked."""
     changed = []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsplat_core.training.similar_moments import REMEMBERED, SOONEST, SimilarMoments
+from gsplat_core.training.similar_moments import FOLLOWED, REMEMBERED, SOONEST, SimilarMoments, weighted_mean
 
 
 def motion(phase: float, shape: tuple[int, int] = (12, 16)) -> NDArray[np.float32]:
@@ -18,12 +18,12 @@ def motion(phase: float, shape: tuple[int, int] = (12, 16)) -> NDArray[np.float3
 
 def test_there_is_nothing_to_compare_with_at_first() -> None:
     moments = SimilarMoments()
-    assert moments.next_motion() is None
+    assert moments.next_motions() == []
     for frame in range(SOONEST + 1):
         moments.take(motion(frame / 9))
-        assert moments.next_motion() is None
+        assert moments.next_motions() == []
     moments.take(motion(0.0))
-    assert moments.next_motion() is not None
+    assert len(moments.next_motions()) == 1
 
 
 @pytest.mark.parametrize("period", [11, 17.5])
@@ -33,8 +33,9 @@ def test_a_periodic_motion_is_forecast(period: float, frames: int) -> None:
     moments = SimilarMoments()
     for frame in range(frames):
         moments.take(motion(frame / period))
-    came, forecast = motion(frames / period), moments.next_motion()
-    assert forecast is not None
+    followed = moments.next_motions()
+    assert len(followed) == FOLLOWED and sum(weight for weight, _ in followed) == pytest.approx(1)
+    came, forecast = motion(frames / period), weighted_mean(followed)
     of_last = np.square(motion((frames - 1) / period) - came).mean()
     assert np.square(forecast - came).mean() < 0.15 * of_last
 
@@ -46,17 +47,14 @@ def test_how_unlike_two_moments_are_is_summed_over_what_came_before() -> None:
     moments = SimilarMoments()
     for each in [*rest, up, same, up, *rest, down, same, down, *rest, down, same]:
         moments.take(each)
-    forecast = moments.next_motion()
-    assert forecast is not None
-    assert forecast.mean() < -0.4
+    assert weighted_mean(moments.next_motions()).mean() < -0.4
 
 
 def test_a_still_scene_stays_still() -> None:
     moments = SimilarMoments()
     for _ in range(20):
         moments.take(np.zeros((12, 16, 2), np.float32))
-    forecast = moments.next_motion()
-    assert forecast is not None and not forecast.any()
+    assert not weighted_mean(moments.next_motions()).any()
 
 
 def test_another_size_begins_anew() -> None:
@@ -64,4 +62,4 @@ def test_another_size_begins_anew() -> None:
     for frame in range(20):
         moments.take(motion(frame / 9))
     moments.take(motion(0.0, (5, 7)))
-    assert moments.next_motion() is None
+    assert moments.next_motions() == []
