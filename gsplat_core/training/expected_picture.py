@@ -57,7 +57,7 @@ class ExpectedPicture:
             self._mean = picture
         else:
             if self._guesses is not None:
-                weight = np.ones(picture.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
+                weight = np.ones(picture.shape[:2], np.float32) if mask is None else (mask != 0).astype(np.float32)
                 self._shares.learn(self._guesses.others, picture - self._guesses.moved, weight)
                 self._guesses = None
             assert self._mean is not None
