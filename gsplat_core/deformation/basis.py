@@ -19,7 +19,6 @@ from torch import Tensor
 
 from gsplat_core.deformation.basis_adam import BasisRates
 from gsplat_core.deformation.basis_bumps import BumpTensors
-from gsplat_core.deformation.basis_shift import shifted_bumps_
 from gsplat_core.deformation.continuation import Continuation
 from gsplat_core.deformation.field import ops_for
 from gsplat_core.deformation.field_slots import BasisSlot
@@ -158,11 +157,10 @@ class BasisField(BumpTensors):
         continuation.set_clock(self.tau, self.spacing_s)
         self.continuation = continuation
 
-    def move_at(self, time_s: float, change: Tensor) -> bool:
-        """See `DeformationField.move_at`: each bump's weight changes in proportion to its height then, the smallest change that does it."""
-        with torch.no_grad():
-            centers, log_widths, weights = (p.data for p in self._parameters_of(self.count))
-            shifted_bumps_(centers, log_widths, weights, self.tau(time_s), change)
+    def move_to(self, time_s: float, deltas: Tensor) -> bool:
+        """See `DeformationField.move_to`: each bump's weight changes in proportion to its height then, the smallest change that does it."""
+        centers, log_widths, weights = (p.data for p in self._parameters_of(self.count))
+        self._ops.basis_field_move_to_(centers, log_widths, weights, self.tau(time_s), deltas)
         return True
 
     def training_tensors(self) -> tuple[Tensor, ...]:

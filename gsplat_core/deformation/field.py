@@ -155,9 +155,9 @@ class DeformationField(torch.nn.Module):
         if time_s > end:
             self.extend((start, start + 2 * (time_s - start)))
 
-    def move_at(self, time_s: float, change: Tensor) -> bool:
-        """Change what the field adds at `time_s` by `change` [N, C], the first columns of a raw row, and at other times as little as it
-        can. False, with nothing changed, for a field that cannot do that: here."""
+    def move_to(self, time_s: float, deltas: Tensor) -> bool:
+        """Let the field add `deltas` (as `deltas(time_s)` gives them) at `time_s`, and change other times as little as it can. False, with
+        nothing changed, for a field that cannot do that: here."""
         return False
 
     def scale_positions(self, factor: Tensor) -> None:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from gsplat_core.ops.basis_field.plain_torch import basis_field, basis_field_backward, basis_field_backward_adam_
+from gsplat_core.ops.basis_field.plain_torch import (
+    basis_field,
+    basis_field_backward,
+    basis_field_backward_adam_,
+    basis_field_move_to_,
+)
 from gsplat_core.ops.hexplane.plain_torch import (
     hexplane_decode,
     hexplane_deltas,
@@ -15,6 +20,7 @@ __all__ = [
     "basis_field",
     "basis_field_backward",
     "basis_field_backward_adam_",
+    "basis_field_move_to_",
     "hexplane_decode",
     "hexplane_deltas",
     "hexplane_features",

@@ -18,7 +18,7 @@ from torch import Tensor
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.layout import COLOUR, LOG_SCALE, POSITION, RAW_COLUMNS
+from gsplat_core.scene.layout import LOG_SCALE, POSITION, RAW_COLUMNS
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.damping import Damping
 from gsplat_core.training.depth_from_motion import DepthFromMotion
@@ -108,10 +108,19 @@ class FlowPrior:
         self._take(frame, flow, step.gaussians.device)
         if self._finds_depth and frame.pose is not None and frame.depth is None:
             self._depth.apply(step, self._motion, before_s)
-        if last is not None and self._usable_motion() is not None:
-            self._learn_damping(step, last, last_interval_s, before_s)
-        if self._starts_there:
-            self._start_there(step, before_s, time_s)
+        learns = last is not None and self._usable_motion() is not None
+        if not (learns or self._starts_there):
+            return
+        with torch.no_grad():
+            held = step.field.deltas(before_s)
+            points = step.gaussians.means + held[:, POSITION]
+            ahead = self._motion.ahead(points)
+            if last is not None and learns:
+                self._damping.learn(last.arrived(points) / last_interval_s, ahead / self._interval_s)
+            if self._starts_there:
+                # The scene at `time_s` is its state at `before_s`, moved on by the flow, in place of what the bumps go on with.
+                held[:, POSITION] += ahead
+                step.field.move_to(time_s, held)
 
     def velocity(self, step: TrainingStep) -> Tensor | None:
         """See `MotionPrior.velocity`."""
@@ -133,26 +142,11 @@ class FlowPrior:
         """The newest motion where it says how the next frame will be."""
         return self._motion if 0 < self._interval_s <= LONGEST_GAP_S and not self._is_sudden else None
 
-    def _learn_damping(self, step: TrainingStep, last: SurfaceMotion, last_interval_s: float, before_s: float) -> None:
-        assert self._motion is not None
-        with torch.no_grad():
-            points = step.gaussians.means + step.field.deltas(before_s)[:, POSITION]
-            self._damping.learn(last.arrived(points) / last_interval_s, self._motion.ahead(points) / self._interval_s)
-
     def _judge(self, moved_px: float) -> None:
         """Whether the motion is a jump; learn the usual one."""
         usual = moved_px if self._usual_px is None else self._usual_px
         self._is_sudden = moved_px > max(SUDDEN * usual, SUDDEN_PX)
         self._usual_px = usual + USUAL_DECAY * (min(moved_px, SUDDEN * usual) - usual)
-
-    def _start_there(self, step: TrainingStep, before_s: float, time_s: float) -> None:
-        """Move the scene at `time_s` to its state at `before_s` and on by the flow, in place of what the bumps go on with."""
-        assert self._motion is not None
-        with torch.no_grad():
-            held = step.field.deltas(before_s)
-            change = held - step.field.deltas(time_s)
-            change[:, POSITION] += self._motion.ahead(step.gaussians.means + held[:, POSITION])
-            step.field.move_at(time_s, change[:, : COLOUR.stop])
 
 
 def widened(log_scales: Tensor, moved: Tensor) -> Tensor:

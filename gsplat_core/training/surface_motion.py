@@ -1,6 +1,7 @@
 """From flow in the picture to motion of the Gaussians that the picture shows.
 
 A surface point's depth is taken not to change between two frames: pictures of one camera do not show motion along the line of sight.
+Float32 points on the CPU take one compiled op; the same in plain torch is for all others, and what that op is tested against.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gsplat_core.ops.surface_motion.surface_motion import surface_motion
 from gsplat_core.scene.cameras import Camera
 
 NEAREST = 1e-6
@@ -35,12 +37,16 @@ class SurfaceMotion:
 
     def ahead(self, points: Tensor) -> Tensor:
         """World-space motion [N, 3] of `points` [N, 3] from where they are in the first frame to the second one; 0 outside the picture."""
+        if self._is_compiled_for(points):
+            return surface_motion(points, self.flow, self.before, self.after, arrived=False)
         seen = Seen(self.before, points)
         later = Seen(self.after, points)
         return later.to_world(seen.pixels + self.at(seen.pixels) - later.pixels, seen.inside)
 
     def arrived(self, points: Tensor) -> Tensor:
         """World-space motion [N, 3] by which points came to be where they are in the second frame, `points` [N, 3]."""
+        if self._is_compiled_for(points):
+            return surface_motion(points, self.flow, self.before, self.after, arrived=True)
         seen = Seen(self.after, points)
         earlier = Seen(self.before, points)
         came_from = seen.pixels
@@ -56,6 +62,10 @@ class SurfaceMotion:
             self.flow.permute(2, 0, 1)[None], grid[None, None], padding_mode="border", align_corners=False
         )
         return sampled[0, :, 0].T
+
+    def _is_compiled_for(self, points: Tensor) -> bool:
+        """Whether the compiled op takes such points and this flow; it is not differentiable."""
+        return all(t.is_cpu and t.dtype == torch.float32 and not t.requires_grad for t in (points, self.flow))
 
 
 class Seen:

@@ -13,6 +13,8 @@ constexpr int64_t kBasisChannels = kRawBasisChannels;
 constexpr int64_t kBasisPadded =
     kRawColumns;                     // columns of deltas and gradients as whole raw rows; the field has no part in the last
 constexpr float kBasisReach = 4.0f;  // widths; a bump further away is left out (BUMP_REACH in Python)
+constexpr float kBasisLeastHeight =
+    1e-2f;  // sum of squared heights below which bumps cannot move a Gaussian (LEAST_HEIGHT in Python)
 
 // Learning rates in their order: position, rotation, log-scale, colour; centres, widths.
 constexpr int kBasisRates = 6, kBasisCenterRate = 4, kBasisWidthRate = 5;
@@ -49,6 +51,8 @@ struct Kernels {
   void (*backward)(const BasisBumps& field, const float* gradient, float* centers, float* log_widths, float* weights,
                    int64_t begin, int64_t end);
   void (*adam)(const BasisAdam& field, const float* gradient, int64_t begin, int64_t end);
+  // Changes `weights`, those of the field, so that its deltas become `target` [N, row].
+  void (*move_to)(const BasisBumps& field, float* weights, const float* target, int64_t begin, int64_t end);
 };
 
 // CUDA: the same with numbers in device memory, as every pointer here.

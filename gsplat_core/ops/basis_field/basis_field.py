@@ -17,6 +17,7 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_float32
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.basis_field import plain_torch
 from gsplat_core.ops.scalars.scalars import store_scalars_
 from gsplat_core.scene.layout import BASIS_CHANNELS as CHANNELS
 from gsplat_core.scene.layout import RAW_COLUMNS
@@ -82,6 +83,24 @@ def basis_field_backward_adam_(
     )  # fmt: skip
 
 
+def basis_field_move_to_(
+    centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, target: Tensor
+) -> None:
+    """Change `weights` in place, as little as that can be done, so that the deltas at `tau` are `target` [N, 13].
+
+    Arguments as `gsplat_core.reference.basis_field_move_to_`; `weights` must be contiguous. Compiled for the CPU; on CUDA plain torch.
+    """
+    _check(centers, log_widths, weights)
+    if target.shape != (centers.shape[0], CHANNELS):
+        raise InvalidInput(f"target must be [{centers.shape[0]}, {CHANNELS}], got {list(target.shape)}")
+    require_float32("basis_field", centers=centers, target=target)
+    if centers.device.type == "cpu":
+        tau = _scalars("tau", tau, centers, 1)
+        torch.ops.gsplat_core.basis_field_move_to_(centers, log_widths, weights, tau, target)
+    else:
+        plain_torch.basis_field_move_to_(centers, log_widths, weights, tau, target)
+
+
 def _scalars(name: str, values: float | Sequence[float] | Tensor, like: Tensor, count: int) -> Tensor:
     """`count` float32 on the device of `like`. Numbers travel in a launch's arguments, so that the host does not wait."""
     if not isinstance(values, Tensor):
@@ -133,6 +152,11 @@ def _(
 
 @torch.library.register_fake("gsplat_core::basis_field_backward_adam_")
 def _(*arguments: Any) -> None:
+    return None
+
+
+@torch.library.register_fake("gsplat_core::basis_field_move_to_")
+def _(centers: Tensor, log_widths: Tensor, weights: Tensor, tau: Tensor, target: Tensor) -> None:
     return None
 
 

@@ -43,6 +43,12 @@ GSPLAT_INLINE bool is_zero(const Row& r) {
   return set == 0;
 }
 
+GSPLAT_INLINE bool is_finite(const Row& r) {
+  vfloat nan_if_not = r.v[0] * 0.0f;
+  for (int i = 1; i < kRowVectors; ++i) nan_if_not += r.v[i] * 0.0f;
+  return sum(nan_if_not) == 0.0f;
+}
+
 // Whether every square is finite: an infinite second moment would stop its parameter for good.
 GSPLAT_INLINE bool is_usable(const Row& r) {
   vfloat nan_if_unusable = r.v[0] * r.v[0] * 0.0f;
@@ -132,6 +138,43 @@ void backward(const BasisBumps& field, const float* gradient, float* centers, fl
   }
 }
 
+// Two passes over a Gaussian's bumps: what they add up to, then the change. The second finds their rows in the cache.
+void move_to(const BasisBumps& field, float* weights, const float* target, int64_t begin, int64_t end) {
+  for (int64_t n = begin; n < end; ++n) {
+    const int64_t first = n * field.bumps;
+    Row change = load_row(target + n * field.row);
+    float squares = 0;
+    for (int64_t from = 0; from < field.bumps; from += kLanes) {
+      const int64_t at = first + from;
+      const Bumps b = bumps_at(field.centers + at, field.log_widths + at, lanes_left(from, field.bumps), field.tau);
+      if (b.mask == 0) continue;
+      float heights[kLanes];
+      store(heights, b.height);
+      squares += sum(b.height * b.height);
+      prefetch_rows<true>(weights, at, field.bumps, b.mask);
+      for (uint32_t left = b.mask; left != 0; left &= left - 1) {
+        const int lane = __builtin_ctz(left);
+        const Row w = load_row(weights + (at + lane) * kBasisChannels);
+        for (int i = 0; i < kRowVectors; ++i) change.v[i] -= heights[lane] * w.v[i];
+      }
+    }
+    if (!(squares > kBasisLeastHeight) || !is_finite(change)) continue;
+    for (int64_t from = 0; from < field.bumps; from += kLanes) {
+      const int64_t at = first + from;
+      const Bumps b = bumps_at(field.centers + at, field.log_widths + at, lanes_left(from, field.bumps), field.tau);
+      float shares[kLanes];
+      store(shares, b.height / squares);
+      for (uint32_t left = b.mask; left != 0; left &= left - 1) {
+        const int lane = __builtin_ctz(left);
+        float* const row = weights + (at + lane) * kBasisChannels;
+        Row w = load_row(row);
+        for (int i = 0; i < kRowVectors; ++i) w.v[i] += shares[lane] * change.v[i];
+        store_row(row, w);
+      }
+    }
+  }
+}
+
 // One Adam update of a vector: parameter, moments, gradient, rate / (1 - beta1^k), 1 / sqrt(1 - beta2^k).
 GSPLAT_INLINE void adam_update(vfloat& p, vfloat& m, vfloat& v, vfloat g, vfloat rate, vfloat inverse_root_bias2,
                                const BasisAdam& a) {
@@ -193,6 +236,6 @@ void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t 
 
 }  // namespace
 
-extern const Kernels kernels = {forward, backward, adam};
+extern const Kernels kernels = {forward, backward, adam, move_to};
 
 }  // namespace GSPLAT_ISA::basis_field

@@ -153,6 +153,19 @@ void update(const Call&, Adam a, const Field& f, const Tensor& gradient, const f
                               [&](int64_t begin, int64_t end) { kernels().adam(a, data(gradient), begin, end); });
 }
 
+void basis_field_move_to_(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, Tensor target) {
+  const Call call(centers);
+  const Field f(call, centers, log_widths, weights, tau);
+  call.in_place(weights, "weights");
+  const Tensor wanted = call.floats(target, "target");
+  check(wanted.dim() == 2 && wanted.size(0) == f.count && wanted.size(1) == kBasisChannels, "the target must be [N, ",
+        kBasisChannels, "] with N = ", f.count);
+  const BasisBumps field = bumps_of(f, kBasisChannels);
+  torch::stable::parallel_for(0, f.count, kGrain, [&](int64_t begin, int64_t end) {
+    kernels().move_to(field, mutable_data(weights), data(wanted), begin, end);
+  });
+}
+
 #endif
 
 Tensor basis_field(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, bool padded) {
@@ -199,6 +212,9 @@ STABLE_TORCH_LIBRARY_IMPL(gsplat_core, GSPLAT_DEVICE, m) {
   m.impl("basis_field", GSPLAT_BOX(&basis_field));
   m.impl("basis_field_backward", GSPLAT_BOX(&basis_field_backward));
   m.impl("basis_field_backward_adam_", GSPLAT_BOX(&basis_field_backward_adam_));
+#if !defined(GSPLAT_CUDA)
+  m.impl("basis_field_move_to_", GSPLAT_BOX(&basis_field_move_to_));
+#endif
 }
 
 }  // namespace gsplat::basis_field

@@ -15,6 +15,9 @@ from gsplat_core.scene.layout import BASIS_GROUPS, RAW_COLUMNS, width_of
 BUMP_REACH = 4.0
 """A bump further than this many widths from the time contributes nothing: exp(-16) is 1e-7 of its height."""
 
+LEAST_HEIGHT = 1e-2
+"""Sum of the squared heights of the bumps at a time below which they are left alone: weights would become huge."""
+
 
 def basis_field(
     centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, padded: bool = False
@@ -92,3 +95,22 @@ def basis_field_backward_adam_(
             v.copy_(torch.where(chosen, v + (1 - beta2) * (g * g - v), v))
             step = rate * (m / bias1.reshape(shape)) / ((v / bias2.reshape(shape)).sqrt() + epsilon)
             parameter.copy_(torch.where(chosen, parameter - step, parameter))
+
+
+def basis_field_move_to_(
+    centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, target: Tensor
+) -> None:
+    """Let the deltas at `tau` be `target` [N, C], in place, with the least change of the weights.
+
+    With heights h_b = exp(-u_b^2) (see `basis_field`), the weights that add up to a change and have the smallest norm are
+    h_b / sum(h^2) times it. Other times change by exp(-d^2 / 2) of it, d bump spacings away, as training on that frame alone
+    would make them. A row that would not be finite is left alone.
+    """
+    with torch.no_grad():
+        change = target - basis_field(centers, log_widths, weights, tau)
+        u = (tau - centers) * torch.exp(-log_widths)
+        heights = torch.where(u.abs() > BUMP_REACH, torch.zeros_like(u), torch.exp(-u * u))
+        squared = (heights * heights).sum(dim=1, keepdim=True)
+        usable = (squared > LEAST_HEIGHT) & change.isfinite().all(dim=1, keepdim=True)
+        share = torch.where(usable, heights / squared.clamp(min=LEAST_HEIGHT), torch.zeros_like(heights))
+        weights += share[..., None] * torch.where(usable, change, torch.zeros_like(change))[:, None]

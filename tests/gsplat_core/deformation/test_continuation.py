@@ -114,7 +114,7 @@ def test_moving_a_field_at_a_time_changes_it_there_by_just_that() -> None:
     before, far = field.deltas(0.5).detach(), field.deltas(0.0).detach()
     change = torch.randn(5, 13, generator=torch.Generator().manual_seed(2))
     change[3] = math.nan
-    assert field.move_at(0.5, change)
+    assert field.move_to(0.5, before + change)
     expected = before + change
     expected[3] = before[3]
     torch.testing.assert_close(field.deltas(0.5).detach(), expected)
