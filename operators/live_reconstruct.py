@@ -76,7 +76,9 @@ class LiveReconstructOp(Operator):
         self.clock = clock
         self.listener = listener
         self.newest: Model | Snapshot | None = None
-        """What was published last."""
+        """What was published last, for showing it."""
+        self.model: Model | None = None
+        """The newest model with its past; there once the run is over."""
         self.counts = TrainingCounts()
         self._reconstructor: LiveReconstructor | None = None
         self._learned: Frame | None = None
@@ -88,9 +90,10 @@ class LiveReconstructOp(Operator):
         super().__init__(fragment, *args, **kwargs)
 
     @property
-    def model(self) -> Model | None:
-        """What was published last, as a model in memory of its own; on a GPU it is copied when it is asked for."""
-        return None if self.newest is None else self.newest.as_model()
+    def parameter_count(self) -> int:
+        """Numbers in the tensors of the whole model that is kept when the run ends."""
+        kept = self._reconstructor or self.model
+        return 0 if kept is None else kept.parameter_count
 
     @property
     def newest_gaussians(self) -> int:
@@ -106,11 +109,13 @@ class LiveReconstructOp(Operator):
         spec.output("reconstruction", type=Reconstruction)
 
     def start(self) -> None:
-        self.counts, self.newest, self._learned = TrainingCounts(), None, None
+        self.counts, self.newest, self.model, self._learned = TrainingCounts(), None, None, None
         self._scene = self._since_grown = 0
         self._reconstructor = self.make_reconstructor()
 
     def stop(self) -> None:
+        if self.newest is not None and self._reconstructor is not None:
+            self.model = self._reconstructor.whole_model(self.newest)
         self.newest = self.model
         self._reconstructor = self._learned = None
 
@@ -210,6 +215,5 @@ class LiveReconstructOp(Operator):
         """See `Contributor`."""
         counts = self.counts
         outcome.add(replace(counts, withheld=dict(counts.withheld), scenes=dict(counts.scenes)))
-        model = self.model
-        if model is not None:
-            outcome.add(ModelResult(model))
+        if self.model is not None:
+            outcome.add(ModelResult(self.model))

@@ -45,6 +45,8 @@ class ScheduledReconstructOp(ReconstructOp):
         self._due = next(self._lines, None)
 
     def stop(self) -> None:
+        if self.newest is not None and self._live is not None:
+            self.newest = self._live.whole_model(self.newest)
         super().stop()
         self._live = self._observed = None
         self._lines = iter(())

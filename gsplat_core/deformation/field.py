@@ -71,6 +71,11 @@ class DeformationField(torch.nn.Module):
         return None
 
     @property
+    def parameter_count(self) -> int:
+        """Numbers in all tensors that a `detached_copy` has."""
+        return sum(tensor.numel() for tensor in self.state_dict().values())
+
+    @property
     def time_window_s(self) -> tuple[float, float]:
         """First and last time covered, in seconds."""
         return self._time_window_s

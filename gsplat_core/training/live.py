@@ -11,9 +11,12 @@ from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.colour_correction import MOST_RELAXATION
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.motion_prior import newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
 from gsplat_core.training.out_of_view import OutOfView
@@ -110,6 +113,32 @@ class LiveReconstructor(Reconstructor):
         archived = 0 if self._out_of_view is None else len(self._out_of_view.archive)
         kept = {"window_frames": len(self._window), "columns": columns, "places": len(self._places)}
         return {**kept, "archived": archived}
+
+    def publish(self) -> Model | Snapshot:
+        """The model as it is now, for showing the time of the newest frame that was trained on and what follows, with the next version number.
+
+        On a CPU, where a motion prior says how it goes on, that is all that is copied; `whole_model` has the past as well. A GPU's snapshots
+        are whole.
+        """
+        step, prior = self._step, self._prior
+        if step is None or prior is None or self.device.type != "cpu":
+            return super().publish()
+        self._version += 1
+        gaussians, field = newest_state(step, prior, self._learned_s)
+        facts = {**self._facts(), "time_window_s": (self._learned_s, self._last_time_s)}
+        return Model(gaussians=gaussians, field=field, **facts)
+
+    def whole_model(self, shown: Model | Snapshot) -> Model:
+        """The model with its past, in memory of its own; `shown` is what was published last."""
+        return shown.as_model() if isinstance(shown, Snapshot) else self.snapshot()
+
+    @property
+    def parameter_count(self) -> int:
+        """Numbers in all tensors of the whole model; 0 before there is one."""
+        step = self._step
+        if step is None:
+            return 0
+        return sum(tensor.numel() for tensor in step.gaussians.tensors().values()) + step.field.parameter_count
 
     def rehearse(self, steps: int) -> None:
         """So many steps on frames of the window. On a GPU they are queued, and at most `REHEARSED_IN_FLIGHT` of them are not finished when

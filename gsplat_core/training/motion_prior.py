@@ -15,9 +15,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gsplat_core.deformation.continuation import Continuation
 from gsplat_core.deformation.field import DeformationField
+from gsplat_core.deformation.newest_state import NewestState, displaced
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import LOG_SCALE, POSITION, RAW_COLUMNS
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.damping import Damping
@@ -50,8 +53,9 @@ class MotionPrior(Protocol):
         """Take the next frame before the model is trained on it; the field covers `time_s` already. The scene may be moved to where the
         frame shows it."""
 
-    def velocity(self, step: TrainingStep) -> Tensor | None:
-        """What the raw parameters change by per second after the newest frame, [N, 16]; None for nothing."""
+    def velocity(self, step: TrainingStep, deltas: Tensor | None = None) -> Tensor | None:
+        """What the raw parameters change by per second after the newest frame, [N, 16]; None for nothing. `deltas` are what the field adds
+        at that frame's time, where they are known already."""
 
     @property
     def newest_s(self) -> float:
@@ -122,13 +126,13 @@ class FlowPrior:
                 held[:, POSITION] += ahead
                 step.field.move_to(time_s, held)
 
-    def velocity(self, step: TrainingStep) -> Tensor | None:
+    def velocity(self, step: TrainingStep, deltas: Tensor | None = None) -> Tensor | None:
         """See `MotionPrior.velocity`."""
         motion = self._usable_motion()
         if motion is None:
             return None
         with torch.no_grad():
-            deltas = step.field.deltas(self.newest_s)
+            deltas = step.field.deltas(self.newest_s) if deltas is None else deltas
             moved = motion.arrived(step.gaussians.means + deltas[:, POSITION])
             velocity = moved.new_zeros(moved.shape[0], RAW_COLUMNS)
             velocity[:, POSITION] = self._damping.damped(moved)
@@ -191,3 +195,15 @@ def continued(step: TrainingStep, prior: MotionPrior | None, learned_s: float) -
         yield
     finally:
         step.field.continuation = None
+
+
+def newest_state(step: TrainingStep, prior: MotionPrior, learned_s: float) -> tuple[Gaussians, NewestState]:
+    """The scene at `learned_s`, the time of the newest frame that was trained on, and how the prior lets it go on: what `continued` copies
+    shows from then on, without the past, in memory of its own."""
+    with torch.no_grad():
+        deltas = step.field.deltas(learned_s)
+        velocity = prior.velocity(step, deltas) if prior.newest_s == learned_s else None
+        still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
+        continuation = Continuation(step.gaussians.count, step.gaussians.device)
+        continuation.write(still if velocity is None else velocity, learned_s, HORIZON_S)
+        return displaced(step.gaussians, deltas), NewestState(learned_s, continuation)

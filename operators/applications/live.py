@@ -112,8 +112,7 @@ class LiveApplication(Application):
 
     def room_to_finish(self) -> int:
         """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
-        model = self.reconstruct.newest
-        return REPORT_RESERVE_BYTES + (0 if model is None else 4 * model.parameter_count)
+        return REPORT_RESERVE_BYTES + 4 * self.reconstruct.parameter_count
 
 
 def live(

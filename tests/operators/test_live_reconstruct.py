@@ -9,6 +9,8 @@ import torch
 
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.live_reconstruct import GROWN_AT_LATEST, LiveReconstructOp
+from operators.outcome import OutcomeBuilder
+from operators.reconstruct import ModelResult
 
 
 class FakeReconstructor:
@@ -25,6 +27,9 @@ class FakeReconstructor:
     def publish(self):
         self.version += 1
         return self.make_model(self.version)
+
+    def whole_model(self, shown):
+        return self.make_model(shown.version + 100)
 
     def begin_scene(self, frame):
         self.calls.append(("begin_scene", frame.seq))
@@ -122,3 +127,19 @@ def test_the_listener_is_told_every_call_in_order(live, one_by_one):
     assert [kind for kind in kinds if kind != "rehearse"] == [kind for kind in made if kind != "rehearse"]
     steps = sum(event.steps for event in live.told if event.kind == "rehearse")
     assert steps == sum(live.fake.seqs("rehearse")) == live.operator.counts.rehearsed > 0
+
+
+def test_the_whole_model_is_kept_when_the_run_is_over(live, one_by_one):
+    one_by_one((0, {}), (1, {}))
+    assert live.operator.model is None
+    live.operator.stop()
+    assert live.operator.model is live.operator.newest and live.operator.model.version == 102
+    outcome = OutcomeBuilder()
+    live.operator.contribute(outcome)
+    assert outcome.find(ModelResult).model is live.operator.model
+    assert live.operator.parameter_count == live.operator.model.parameter_count > 0
+
+
+def test_a_run_without_a_frame_has_no_model(live):
+    live.operator.stop()
+    assert live.operator.model is None and live.operator.parameter_count == 0

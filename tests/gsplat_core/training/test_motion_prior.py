@@ -10,12 +10,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.rendering.registry import new_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.motion_prior import HORIZON_S, FlowPrior, new_motion_prior, widened
 from gsplat_core.training.reconstructor import Reconstructor
@@ -211,3 +212,37 @@ def test_every_published_state_shows_its_own_continuation(device: str) -> None:
         expected = published.as_model().to("cpu").render(later_s, depth=False).image
         assert psnr_tissue_db(shown.numpy(), expected.numpy()) > 45
     assert not torch.equal(published.at(frame.time_s).means, published.at(later_s).means)
+
+
+@pytest.mark.parametrize("start_from_motion", [False, True])
+def test_what_is_published_live_shows_what_the_whole_model_does(start_from_motion: bool) -> None:
+    config = ReconstructorConfig(
+        gaussians=700, max_gaussians=900, motion_prior="flow", start_from_motion=start_from_motion, history_s=1.0
+    )
+    reconstructor = LiveReconstructor(config, CAMERA)
+    for seq, frame in enumerate(stream([0.0, 1.0, 2.2, 3.0, 3.1])):
+        trained = seq != 3
+        reconstructor.observe(frame, steps=4, train=trained)
+        shown, whole = reconstructor.publish(), reconstructor.snapshot()
+        assert isinstance(shown, Model) and shown.version == whole.version - 1
+        assert shown.parameter_count < whole.parameter_count == reconstructor.parameter_count
+        for later_s in (0.0, 0.5 * INTERVAL_S, INTERVAL_S, HORIZON_S, 5.0):
+            seen, wanted = (each.at(frame.time_s + later_s).tensors() for each in (shown, whole))
+            for name in wanted:
+                torch.testing.assert_close(seen[name], wanted[name], rtol=1e-5, atol=1e-5)
+        before = shown.sha256()
+        if trained:
+            reconstructor.grow(frame)
+            reconstructor.rehearse(1)
+        assert shown.sha256() == before
+        assert reconstructor.whole_model(shown).field is not None
+
+
+def test_what_is_published_live_is_whole_where_nothing_says_how_it_goes_on() -> None:
+    reconstructor = LiveReconstructor(ReconstructorConfig(gaussians=700, max_gaussians=900), CAMERA)
+    assert reconstructor.parameter_count == 0
+    with pytest.raises(InvalidInput, match="no model yet"):
+        reconstructor.publish()
+    for frame in stream([0.0, 1.0]):
+        reconstructor.observe(frame, steps=2)
+    assert reconstructor.publish().parameter_count == reconstructor.snapshot().parameter_count
