@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -21,9 +22,7 @@ REHEARSAL_MARGIN_NS = 300_000
 SHOWN_WITHIN_S = 0.005
 """Rehearsal waits so long for a picture to be shown."""
 CATCH_UP_SHARE = 0.8
-"""Frames that take a larger share of the time between them cannot be caught up with."""
-CATCH_UP_INTERVALS = 4.0
-"""A frame that has waited longer is passed over."""
+"""Frames that take a larger share of the time between them, with the fewest steps, cannot be caught up with."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,11 @@ class ClockSettings:
     least_share: float = 0.34
     """Training gets so much of the time between frames, though a frame that had to wait is shown later for it."""
     at_least_steps: int | None = None
-    """Steps that every frame gets, though it is shown late; None: as suits the device."""
+    """Steps that a frame gets, though it is shown late; None: as suits the device."""
+    fewest_steps: int | None = None
+    """The same of a frame that others wait behind: so that all of them can be shown; None: as suits the device."""
+    catch_up_intervals: float = 4.0
+    """A frame that has waited for longer than so many times the time between frames is passed over for newer ones."""
     at_most_steps: int = 80
     """Steps before a frame is shown, though there is time left."""
     first_ms: float = 20.0
@@ -57,6 +60,12 @@ class ClockSettings:
             raise InvalidSetting(
                 f"at_least_steps is {self.at_least_steps} and at_most_steps {self.at_most_steps}; they must be in order"
             )
+        if self.fewest_steps is not None and not 0 < self.fewest_steps <= (self.at_least_steps or self.at_most_steps):
+            raise InvalidSetting(
+                f"fewest_steps is {self.fewest_steps} and at_least_steps {self.at_least_steps}; they must be in order"
+            )
+        if not 0 < self.catch_up_intervals < math.inf:
+            raise InvalidSetting(f"catch_up_intervals is {self.catch_up_intervals}; it must be positive")
 
 
 class FrameClock:
@@ -71,7 +80,7 @@ class FrameClock:
         self.display_ns = 2e6
         """Usual time from a published model to its shown picture."""
         self.training_ns = 0.0
-        """Usual time from taking a frame to its published model."""
+        """Usual time from taking a frame to its published model, had it had the fewest steps."""
         self._last_arrival: tuple[int, int] | None = None
         """When the newest frame came, and its number."""
         self._shown = threading.Event()
@@ -89,10 +98,15 @@ class FrameClock:
             until_ns = max(until_ns, self.now_ns() + settings.least_share * self.interval_ns)
         return Budget.until(
             until_ns * 1e-9,
-            at_least=settings.first_at_least_steps if first else settings.at_least_steps or 1,
+            at_least=settings.first_at_least_steps if first else self.least_steps(behind),
             at_most=settings.first_at_most_steps if first else settings.at_most_steps,
             clock=lambda: self.now_ns() * 1e-9,
         )
+
+    def least_steps(self, behind: bool) -> int:
+        """Steps that a frame gets at least, with others waiting `behind` it or not."""
+        at_least = self.settings.at_least_steps or 1
+        return self.settings.fewest_steps or at_least if behind else at_least
 
     @property
     def show_after_ns(self) -> float:
@@ -111,16 +125,19 @@ class FrameClock:
 
     def too_late(self, frame: Frame, waiting: int) -> bool:
         """Whether a frame is passed over for one of the `waiting` newer ones. After a delay frames are caught up with one by one, as long
-        as they usually take less time than there is between them, and none is shown very late."""
+        as that takes less time than there is between them, and none is shown very late. One is trained on while the last is being shown."""
         if not waiting or frame.arrived_ns is None:
             return False
-        keeps_up = self.training_ns + self.display_ns < CATCH_UP_SHARE * self.interval_ns
-        return not keeps_up or self.now_ns() - frame.arrived_ns > CATCH_UP_INTERVALS * self.interval_ns
+        keeps_up = max(self.training_ns, self.display_ns) < CATCH_UP_SHARE * self.interval_ns
+        waited_ns = self.now_ns() - frame.arrived_ns
+        return not keeps_up or waited_ns > self.settings.catch_up_intervals * self.interval_ns
 
-    def published(self, taken_ns: int, published_ns: int) -> None:
-        """The model of a frame that was taken then is published now."""
+    def published(self, taken_ns: int, published_ns: int, steps: int = 0, step_ns: float = 0.0) -> None:
+        """The model of a frame that was taken then, and got so many steps of that length, is published now."""
         self._shown.clear()
-        self.training_ns += DISPLAY_DECAY * (published_ns - taken_ns - self.training_ns)
+        spared_ns = max(0, steps - self.least_steps(behind=True)) * step_ns
+        needed_ns = max(0.0, published_ns - taken_ns - spared_ns)
+        self.training_ns += DISPLAY_DECAY * (needed_ns - self.training_ns)
 
     def shown(self, published_ns: int, shown_ns: int) -> None:
         """A picture of the model that was published then is shown now."""

@@ -162,7 +162,7 @@ class LiveReconstructOp(Operator):
         self.newest = self._reconstructor.publish()
         published_ns = self.clock.now_ns()
         if not first:
-            self.clock.published(taken_ns, published_ns)
+            self.clock.published(taken_ns, published_ns, report.steps, self._reconstructor.step_ns)
         return Reconstruction(
             frame,
             self.newest,

@@ -153,7 +153,12 @@ class LiveReconstructor(Reconstructor):
 
     def rehearsal_ns(self, steps: int) -> float:
         """How long so many rehearsal steps usually take, together with those that are still under way; 0 before anything was timed."""
-        return (steps + REHEARSED_IN_FLIGHT) * (self._step_s or 0.0) * 1e9
+        return (steps + REHEARSED_IN_FLIGHT) * self.step_ns
+
+    @property
+    def step_ns(self) -> float:
+        """How long a step usually takes; 0 before anything was timed."""
+        return (self._step_s or 0.0) * 1e9
 
     def grow(self, frame: Frame) -> None:
         """What `observe` leaves for the time after `frame`, the newest one that was trained on, was shown: Gaussians are added where it

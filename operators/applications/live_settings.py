@@ -39,6 +39,8 @@ LIVE_SQUARED_ERROR = {"cpu": True, "cuda": False}
 """What colours are corrected by where there are few steps; with many L1 follows motion better."""
 LIVE_LEAST_STEPS = {"cpu": 2, "cuda": 5}
 """Steps that a frame gets though it is shown late."""
+LIVE_FEWEST_STEPS = {"cpu": 1, "cuda": 5}
+"""The same of a frame that others wait behind."""
 LIVE_STARTS_FROM_MOTION = {"cpu": True, "cuda": False}
 """With few steps a frame, optical flow tells where the tissue is sooner than training does; on a GPU the flow itself takes longer."""
 LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
@@ -93,9 +95,9 @@ class LiveSettings:
     @property
     def chosen_clock(self) -> ClockSettings:
         """When frames are shown."""
-        return dataclasses.replace(
-            self.clock, at_least_steps=self.clock.at_least_steps or LIVE_LEAST_STEPS[self.device]
-        )
+        at_least = self.clock.at_least_steps or LIVE_LEAST_STEPS[self.device]
+        fewest = self.clock.fewest_steps or min(at_least, LIVE_FEWEST_STEPS[self.device])
+        return dataclasses.replace(self.clock, at_least_steps=at_least, fewest_steps=fewest)
 
     @property
     def chosen_training(self) -> LiveTraining:

@@ -94,6 +94,41 @@ def test_the_newest_frame_wins_where_training_does_not_keep_up(clock, frame, fak
     assert clock.too_late(frame(0, arrived_ns=fake_time.ns), waiting=1)
 
 
+def test_showing_a_picture_while_the_next_one_is_trained_on_does_not_count_twice(clock, frame, fake_time):
+    clock.training_ns, clock.display_ns = 20e6, 20e6
+    assert not clock.too_late(frame(0, arrived_ns=fake_time.ns), waiting=1)
+    clock.display_ns = 60e6
+    assert clock.too_late(frame(0, arrived_ns=fake_time.ns), waiting=1)
+
+
+def test_a_frame_that_others_wait_behind_gets_the_fewest_steps(frame, fake_time):
+    clock = FrameClock(ClockSettings(at_least_steps=4, fewest_steps=1), 30.0, fake_time)
+    given = [clock.budget(frame(0, arrived_ns=fake_time.ns), behind=behind).at_least for behind in (False, True)]
+    assert given == [4, 1]
+    same = FrameClock(ClockSettings(at_least_steps=4), 30.0, fake_time)
+    assert same.budget(frame(0, arrived_ns=fake_time.ns), behind=True).at_least == 4
+
+
+def test_whether_frames_can_be_caught_up_with_depends_on_what_the_fewest_steps_take(frame, fake_time):
+    clock = FrameClock(ClockSettings(at_least_steps=4, fewest_steps=1), 30.0, fake_time)
+    for _ in range(100):
+        clock.published(0, 40_000_000, steps=4, step_ns=10e6)
+    assert clock.training_ns == pytest.approx(10e6)
+    assert not clock.too_late(frame(0, arrived_ns=fake_time.ns), waiting=1)
+    for _ in range(100):
+        clock.published(0, 40_000_000, steps=1, step_ns=10e6)
+    assert clock.too_late(frame(0, arrived_ns=fake_time.ns), waiting=1)
+
+
+def test_a_frame_waits_no_longer_than_the_settings_say(frame, fake_time):
+    clock = FrameClock(ClockSettings(catch_up_intervals=2.0), 30.0, fake_time)
+    arrived_ns = fake_time.ns
+    fake_time.pass_ms(60)
+    assert not clock.too_late(frame(0, arrived_ns=arrived_ns), waiting=1)
+    fake_time.pass_ms(10)
+    assert clock.too_late(frame(0, arrived_ns=arrived_ns), waiting=1)
+
+
 def test_the_only_frame_is_never_passed_over(clock, frame, fake_time):
     clock.training_ns = 60e6
     arrived_ns = fake_time.ns
@@ -116,6 +151,10 @@ def test_waiting_for_a_picture_ends_when_it_is_shown_or_does_not_come(clock):
         {"auto_share": 0.0},
         {"at_least_steps": 0},
         {"at_least_steps": 5, "at_most_steps": 1},
+        {"at_least_steps": 2, "fewest_steps": 3},
+        {"fewest_steps": 0},
+        {"catch_up_intervals": 0.0},
+        {"catch_up_intervals": float("nan")},
     ],
 )
 def test_settings_out_of_range_are_refused(wrong):
