@@ -23,6 +23,8 @@ SHOWN_WITHIN_S = 0.005
 """Rehearsal waits so long for a picture to be shown."""
 CATCH_UP_SHARE = 0.8
 """Frames that take a larger share of the time between them, with the fewest steps, cannot be caught up with."""
+CATCH_UP_INTERVALS = 4.0
+"""Used where `ClockSettings.catch_up_intervals` says nothing."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,14 @@ class ClockSettings:
     """Steps that a frame gets, though it is shown late; None: as suits the device."""
     fewest_steps: int | None = None
     """The same of a frame that others wait behind: so that all of them can be shown; None: as suits the device."""
-    catch_up_intervals: float = 4.0
-    """A frame that has waited for longer than so many times the time between frames is passed over for newer ones."""
+    catch_up_intervals: float | None = None
+    """A frame that has waited for longer than so many times the time between frames is passed over for newer ones; None: as suits the device."""
     at_most_steps: int = 80
     """Steps before a frame is shown, though there is time left."""
     first_ms: float = 20.0
     """A scene's first frame may take so long, at least `first_at_least_steps`."""
-    first_at_least_steps: int = 10
+    first_at_least_steps: int | None = None
+    """None: as suits the device."""
     first_at_most_steps: int = 60
     rehearse_at_most: int = 120
     """Steps on the window between two frames, though no frame comes."""
@@ -60,11 +63,16 @@ class ClockSettings:
             raise InvalidSetting(
                 f"at_least_steps is {self.at_least_steps} and at_most_steps {self.at_most_steps}; they must be in order"
             )
+        if self.first_at_least_steps is not None and not 0 < self.first_at_least_steps <= self.first_at_most_steps:
+            raise InvalidSetting(
+                f"first_at_least_steps is {self.first_at_least_steps} and first_at_most_steps {self.first_at_most_steps};"
+                " they must be in order"
+            )
         if self.fewest_steps is not None and not 0 < self.fewest_steps <= (self.at_least_steps or self.at_most_steps):
             raise InvalidSetting(
                 f"fewest_steps is {self.fewest_steps} and at_least_steps {self.at_least_steps}; they must be in order"
             )
-        if not 0 < self.catch_up_intervals < math.inf:
+        if self.catch_up_intervals is not None and not 0 < self.catch_up_intervals < math.inf:
             raise InvalidSetting(f"catch_up_intervals is {self.catch_up_intervals}; it must be positive")
 
 
@@ -98,7 +106,7 @@ class FrameClock:
             until_ns = max(until_ns, self.now_ns() + settings.least_share * self.interval_ns)
         return Budget.until(
             until_ns * 1e-9,
-            at_least=settings.first_at_least_steps if first else self.least_steps(behind),
+            at_least=settings.first_at_least_steps or 1 if first else self.least_steps(behind),
             at_most=settings.first_at_most_steps if first else settings.at_most_steps,
             clock=lambda: self.now_ns() * 1e-9,
         )
@@ -130,7 +138,7 @@ class FrameClock:
             return False
         keeps_up = max(self.training_ns, self.display_ns) < CATCH_UP_SHARE * self.interval_ns
         waited_ns = self.now_ns() - frame.arrived_ns
-        return not keeps_up or waited_ns > self.settings.catch_up_intervals * self.interval_ns
+        return not keeps_up or waited_ns > (self.settings.catch_up_intervals or CATCH_UP_INTERVALS) * self.interval_ns
 
     def published(self, taken_ns: int, published_ns: int, steps: int = 0, step_ns: float = 0.0) -> None:
         """The model of a frame that was taken then, and got so many steps of that length, is published now."""

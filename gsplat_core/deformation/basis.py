@@ -117,6 +117,11 @@ class BasisField(BumpTensors):
         towards_neighbours_(self.weights.data[: self.count, : self.bumps], amount)
 
     @property
+    def parameter_count(self) -> int:
+        """See `DeformationField.parameter_count`: of the Gaussians and bumps in use."""
+        return self.count * self.bumps * (2 + BASIS_CHANNELS)
+
+    @property
     def has_frame_deltas(self) -> bool:
         """Always."""
         return True

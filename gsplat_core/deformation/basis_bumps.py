@@ -72,11 +72,6 @@ class BumpTensors(DeformationField):
         return self._columns.count
 
     @property
-    def parameter_count(self) -> int:
-        """See `DeformationField.parameter_count`: of the Gaussians and bumps in use."""
-        return self.count * self.bumps * (2 + BASIS_CHANNELS)
-
-    @property
     def spacing_s(self) -> float:
         """Seconds between neighbouring bumps as they are laid out."""
         return self._columns.spacing_s

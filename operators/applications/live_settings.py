@@ -41,6 +41,10 @@ LIVE_LEAST_STEPS = {"cpu": 2, "cuda": 5}
 """Steps that a frame gets though it is shown late."""
 LIVE_FEWEST_STEPS = {"cpu": 1, "cuda": 5}
 """The same of a frame that others wait behind."""
+LIVE_FIRST_STEPS = {"cpu": 4, "cuda": 10}
+"""Steps of a scene's first frame: its picture, and the frames behind it, wait for them."""
+LIVE_CATCH_UP_INTERVALS = {"cpu": 2.0, "cuda": 4.0}
+"""How long a frame may wait before it is passed over. A GPU catches up within a few frames; two cores would show each of them late."""
 LIVE_STARTS_FROM_MOTION = {"cpu": True, "cuda": False}
 """With few steps a frame, optical flow tells where the tissue is sooner than training does; on a GPU the flow itself takes longer."""
 LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
@@ -97,7 +101,13 @@ class LiveSettings:
         """When frames are shown."""
         at_least = self.clock.at_least_steps or LIVE_LEAST_STEPS[self.device]
         fewest = self.clock.fewest_steps or min(at_least, LIVE_FEWEST_STEPS[self.device])
-        return dataclasses.replace(self.clock, at_least_steps=at_least, fewest_steps=fewest)
+        return dataclasses.replace(
+            self.clock,
+            at_least_steps=at_least,
+            fewest_steps=fewest,
+            first_at_least_steps=self.clock.first_at_least_steps or LIVE_FIRST_STEPS[self.device],
+            catch_up_intervals=self.clock.catch_up_intervals or LIVE_CATCH_UP_INTERVALS[self.device],
+        )
 
     @property
     def chosen_training(self) -> LiveTraining:

@@ -153,6 +153,7 @@ def test_waiting_for_a_picture_ends_when_it_is_shown_or_does_not_come(clock):
         {"at_least_steps": 5, "at_most_steps": 1},
         {"at_least_steps": 2, "fewest_steps": 3},
         {"fewest_steps": 0},
+        {"first_at_least_steps": 61},
         {"catch_up_intervals": 0.0},
         {"catch_up_intervals": float("nan")},
     ],
