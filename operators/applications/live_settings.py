@@ -37,7 +37,7 @@ LIVE_TRAINING = {
 }
 LIVE_SQUARED_ERROR = {"cpu": True, "cuda": False}
 """What colours are corrected by where there are few steps; with many L1 follows motion better."""
-LIVE_LEAST_STEPS = {"cpu": 2, "cuda": 5}
+LIVE_LEAST_STEPS = {"cpu": 1, "cuda": 5}
 """Steps that a frame gets though it is shown late."""
 LIVE_FEWEST_STEPS = {"cpu": 1, "cuda": 5}
 """The same of a frame that others wait behind."""
