@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsplat_core.deformation.newest_state import displaced
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.layout import COLOUR, POSITION, RAW_COLUMNS
 from gsplat_core.training.colour_fit import colour_change
@@ -64,13 +65,13 @@ class LearnedPrior(FlowPrior):
         """See `MotionPrior.horizon_s`. What was learned is said about the next frame only."""
         return HORIZON_S if self._expected is None else min(HORIZON_S, self._interval_s)
 
-    def velocity(self, step: TrainingStep) -> Tensor | None:
+    def velocity(self, step: TrainingStep, deltas: Tensor | None = None) -> Tensor | None:
         """See `MotionPrior.velocity`."""
         expected = self._expected
         if expected is None or self._usable_motion() is None:
-            return super().velocity(step)
+            return super().velocity(step, deltas)
         with torch.no_grad():
-            now = step.at(self.newest_s)
+            now = step.at(self.newest_s) if deltas is None else displaced(step.gaussians, deltas)
             moving = expected.motion.ahead(now.means)
             there = replace(now, means=now.means + moving)
             velocity = moving.new_zeros(moving.shape[0], RAW_COLUMNS)

@@ -153,7 +153,8 @@ class LiveReconstructor(Reconstructor):
 
     def rehearsal_ns(self, steps: int) -> float:
         """How long so many rehearsal steps usually take, together with those that are still under way; 0 before anything was timed."""
-        return (steps + REHEARSED_IN_FLIGHT) * self.step_ns
+        under_way = REHEARSED_IN_FLIGHT if self.device.type == "cuda" else 0
+        return (steps + under_way) * self.step_ns
 
     @property
     def step_ns(self) -> float:

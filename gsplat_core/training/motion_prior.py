@@ -205,5 +205,5 @@ def newest_state(step: TrainingStep, prior: MotionPrior, learned_s: float) -> tu
         velocity = prior.velocity(step, deltas) if prior.newest_s == learned_s else None
         still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
         continuation = Continuation(step.gaussians.count, step.gaussians.device)
-        continuation.write(still if velocity is None else velocity, learned_s, HORIZON_S)
+        continuation.write(still if velocity is None else velocity, learned_s, prior.horizon_s)
         return displaced(step.gaussians, deltas), NewestState(learned_s, continuation)

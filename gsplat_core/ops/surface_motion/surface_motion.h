@@ -7,9 +7,9 @@
 
 namespace gsplat::surface_motion {
 
-constexpr int kViewNumbers = 18;     // the upper three rows of world-to-camera, fx, fy, cx, cy, width, height
-constexpr float kNearest = 1e-6f;    // depth below which a point is not in front of a camera (NEAREST in Python)
-constexpr int kInverseSteps = 2;     // iterations to find where a pixel came from (INVERSE_STEPS in Python)
+constexpr int kViewNumbers = 18;   // the upper three rows of world-to-camera, fx, fy, cx, cy, width, height
+constexpr float kNearest = 1e-6f;  // depth below which a point is not in front of a camera (NEAREST in Python)
+constexpr int kInverseSteps = 2;   // iterations to find where a pixel came from (INVERSE_STEPS in Python)
 
 struct View {
   float rotation[9], translation[3];

@@ -27,12 +27,12 @@ GSPLAT_INLINE Seen seen_by(const View& view, const vfloat* p) {
   Seen s;
   s.depth = max(local[2], splat(kNearest));
   s.at = {local[0] / s.depth * view.fx + view.cx, local[1] / s.depth * view.fy + view.cy};
-  s.inside =
-      (s.at.x >= 0.0f) & (s.at.y >= 0.0f) & (s.at.x <= view.width) & (s.at.y <= view.height) & (local[2] > kNearest);
+  s.inside = (s.at.x >= 0.0f) & (s.at.y >= 0.0f) & (s.at.x <= view.width) & (s.at.y <= view.height) & (local[2] > kNearest);
   return s;
 }
 
-// The flow at pixels, bilinear between the cells' centres; beyond the outermost centres that of the edge, also for what is no number.
+// The flow at pixels, bilinear between the cells' centres; beyond the outermost centres that of the edge, also for what is no
+// number.
 GSPLAT_INLINE Pixels flow_at(const Flow& flow, const Pixels& pixels) {
   const vfloat x = min(max(pixels.x * (float(flow.width) / flow.picture_width) - 0.5f, vfloat{}), splat(float(flow.width - 1)));
   const vfloat y =
