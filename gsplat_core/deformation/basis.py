@@ -164,15 +164,8 @@ class BasisField(BumpTensors):
 
     def move_to(self, time_s: float, deltas: Tensor) -> bool:
         """See `DeformationField.move_to`: each bump's weight changes in proportion to its height then, the smallest change that does it."""
-        return self._move(time_s, deltas, by=False)
-
-    def move_by(self, time_s: float, change: Tensor) -> bool:
-        """See `DeformationField.move_by`; as `move_to`."""
-        return self._move(time_s, change, by=True)
-
-    def _move(self, time_s: float, deltas: Tensor, by: bool) -> bool:
         centers, log_widths, weights = (p.data for p in self._parameters_of(self.count))
-        self._ops.basis_field_move_(centers, log_widths, weights, self.tau(time_s), deltas, by)
+        self._ops.basis_field_move_to_(centers, log_widths, weights, self.tau(time_s), deltas)
         return True
 
     def training_tensors(self) -> tuple[Tensor, ...]:

@@ -42,7 +42,7 @@ class DeformationField(torch.nn.Module):
     continues: ClassVar[bool] = False
     """Whether `continuation` is looked at."""
     can_be_moved: ClassVar[bool] = False
-    """Whether `move_to` and `move_by` are there."""
+    """Whether `move_at` is there."""
 
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__()
@@ -163,10 +163,6 @@ class DeformationField(torch.nn.Module):
     def move_to(self, time_s: float, deltas: Tensor) -> bool:
         """Let the field add `deltas` (as `deltas(time_s)` gives them) at `time_s`, and change other times as little as it can. False, with
         nothing changed, for a field that cannot do that: here."""
-        return False
-
-    def move_by(self, time_s: float, change: Tensor) -> bool:
-        """As `move_to`, but `change` is added to what the field adds then."""
         return False
 
     def scale_positions(self, factor: Tensor) -> None:

@@ -119,8 +119,8 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor(d!) m_centers, Tensor(e!) m_log_widths, Tensor(f!) m_weights, Tensor(g!) v_centers, Tensor(h!) v_log_widths, "
       "Tensor(i!) v_weights, Tensor(j!) steps, Tensor rates, float beta1, float beta2, float epsilon) -> ()");
 
-  // Changes the weights as little as possible so that the deltas at tau become `deltas` [N, 13], or change `by` them. CPU only.
-  m.def("basis_field_move_(Tensor centers, Tensor log_widths, Tensor(a!) weights, Tensor tau, Tensor deltas, bool by) -> ()");
+  // Changes the weights as little as possible so that the deltas at tau are `target` [N, 13]. CPU only.
+  m.def("basis_field_move_to_(Tensor centers, Tensor log_widths, Tensor(a!) weights, Tensor tau, Tensor target) -> ()");
 
   // How points [N, 3] move in the world as flow [h, w, 2] says, where they are in its first picture, or `arrived` in its second
   // one. A camera is 18 numbers: three rows of world-to-camera, fx, fy, cx, cy, width, height. CPU only.

@@ -6,7 +6,7 @@ from gsplat_core.ops.basis_field.plain_torch import (
     basis_field,
     basis_field_backward,
     basis_field_backward_adam_,
-    basis_field_move_,
+    basis_field_move_to_,
 )
 from gsplat_core.ops.hexplane.plain_torch import (
     hexplane_decode,
@@ -20,7 +20,7 @@ __all__ = [
     "basis_field",
     "basis_field_backward",
     "basis_field_backward_adam_",
-    "basis_field_move_",
+    "basis_field_move_to_",
     "hexplane_decode",
     "hexplane_deltas",
     "hexplane_features",

@@ -102,7 +102,7 @@ class TrainingStep:
         self._adam.step(self.gaussians.tensors(), own, self._gaussian_rates(rate_scale))
         if compared.colour_change is not None:
             before_colour = (COLOUR.start, 0)
-            self.field.move_by(observation.time_s, torch.nn.functional.pad(compared.colour_change, before_colour))
+            self.field.move_at(observation.time_s, torch.nn.functional.pad(compared.colour_change, before_colour))
         return compared.loss
 
     def scale_about(self, camera: Camera, factor: Tensor) -> None:

@@ -51,8 +51,8 @@ struct Kernels {
   void (*backward)(const BasisBumps& field, const float* gradient, float* centers, float* log_widths, float* weights,
                    int64_t begin, int64_t end);
   void (*adam)(const BasisAdam& field, const float* gradient, int64_t begin, int64_t end);
-  // Changes `weights`, those of the field, so that its deltas become `wanted` [N, row], or change by that.
-  void (*move)(const BasisBumps& field, float* weights, const float* wanted, bool by, int64_t begin, int64_t end);
+  // Changes `weights`, those of the field, so that its deltas become `target` [N, row].
+  void (*move_to)(const BasisBumps& field, float* weights, const float* target, int64_t begin, int64_t end);
 };
 
 // CUDA: the same with numbers in device memory, as every pointer here.

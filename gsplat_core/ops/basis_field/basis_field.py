@@ -83,22 +83,22 @@ def basis_field_backward_adam_(
     )  # fmt: skip
 
 
-def basis_field_move_(
-    centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, deltas: Tensor, by: bool = False
+def basis_field_move_to_(
+    centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, target: Tensor
 ) -> None:
-    """Change `weights` in place, as little as that can be done, so that at `tau` the field adds `deltas` [N, 13], or so much more with `by`.
+    """Change `weights` in place, as little as that can be done, so that the deltas at `tau` are `target` [N, 13].
 
-    Arguments as `gsplat_core.reference.basis_field_move_`; `weights` must be contiguous. Compiled for the CPU; on CUDA plain torch.
+    Arguments as `gsplat_core.reference.basis_field_move_to_`; `weights` must be contiguous. Compiled for the CPU; on CUDA plain torch.
     """
     _check(centers, log_widths, weights)
-    if deltas.shape != (centers.shape[0], CHANNELS):
-        raise InvalidInput(f"deltas must be [{centers.shape[0]}, {CHANNELS}], got {list(deltas.shape)}")
-    require_float32("basis_field", centers=centers, deltas=deltas)
+    if target.shape != (centers.shape[0], CHANNELS):
+        raise InvalidInput(f"target must be [{centers.shape[0]}, {CHANNELS}], got {list(target.shape)}")
+    require_float32("basis_field", centers=centers, target=target)
     if centers.device.type == "cpu":
         tau = _scalars("tau", tau, centers, 1)
-        torch.ops.gsplat_core.basis_field_move_(centers, log_widths, weights, tau, deltas, by)
+        torch.ops.gsplat_core.basis_field_move_to_(centers, log_widths, weights, tau, target)
     else:
-        plain_torch.basis_field_move_(centers, log_widths, weights, tau, deltas, by)
+        plain_torch.basis_field_move_to_(centers, log_widths, weights, tau, target)
 
 
 def _scalars(name: str, values: float | Sequence[float] | Tensor, like: Tensor, count: int) -> Tensor:
@@ -155,8 +155,8 @@ def _(*arguments: Any) -> None:
     return None
 
 
-@torch.library.register_fake("gsplat_core::basis_field_move_")
-def _(centers: Tensor, log_widths: Tensor, weights: Tensor, tau: Tensor, deltas: Tensor, by: bool) -> None:
+@torch.library.register_fake("gsplat_core::basis_field_move_to_")
+def _(centers: Tensor, log_widths: Tensor, weights: Tensor, tau: Tensor, target: Tensor) -> None:
     return None
 
 

@@ -139,11 +139,10 @@ void backward(const BasisBumps& field, const float* gradient, float* centers, fl
 }
 
 // Two passes over a Gaussian's bumps: what they add up to, then the change. The second finds their rows in the cache.
-void move(const BasisBumps& field, float* weights, const float* wanted, bool by, int64_t begin, int64_t end) {
+void move_to(const BasisBumps& field, float* weights, const float* target, int64_t begin, int64_t end) {
   for (int64_t n = begin; n < end; ++n) {
     const int64_t first = n * field.bumps;
-    Row change = load_row(wanted + n * field.row);
-    if (by && is_zero(change)) continue;
+    Row change = load_row(target + n * field.row);
     float squares = 0;
     for (int64_t from = 0; from < field.bumps; from += kLanes) {
       const int64_t at = first + from;
@@ -153,7 +152,7 @@ void move(const BasisBumps& field, float* weights, const float* wanted, bool by,
       store(heights, b.height);
       squares += sum(b.height * b.height);
       prefetch_rows<true>(weights, at, field.bumps, b.mask);
-      for (uint32_t left = by ? 0 : b.mask; left != 0; left &= left - 1) {
+      for (uint32_t left = b.mask; left != 0; left &= left - 1) {
         const int lane = __builtin_ctz(left);
         const Row w = load_row(weights + (at + lane) * kBasisChannels);
         for (int i = 0; i < kRowVectors; ++i) change.v[i] -= heights[lane] * w.v[i];
@@ -237,6 +236,6 @@ void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t 
 
 }  // namespace
 
-extern const Kernels kernels = {forward, backward, adam, move};
+extern const Kernels kernels = {forward, backward, adam, move_to};
 
 }  // namespace GSPLAT_ISA::basis_field

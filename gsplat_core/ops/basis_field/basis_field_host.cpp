@@ -153,16 +153,16 @@ void update(const Call&, Adam a, const Field& f, const Tensor& gradient, const f
                               [&](int64_t begin, int64_t end) { kernels().adam(a, data(gradient), begin, end); });
 }
 
-void basis_field_move_(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, Tensor deltas, bool by) {
+void basis_field_move_to_(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, Tensor target) {
   const Call call(centers);
   const Field f(call, centers, log_widths, weights, tau);
   call.in_place(weights, "weights");
-  const Tensor wanted = call.floats(deltas, "deltas");
-  check(wanted.dim() == 2 && wanted.size(0) == f.count && wanted.size(1) == kBasisChannels, "the deltas must be [N, ",
+  const Tensor wanted = call.floats(target, "target");
+  check(wanted.dim() == 2 && wanted.size(0) == f.count && wanted.size(1) == kBasisChannels, "the target must be [N, ",
         kBasisChannels, "] with N = ", f.count);
   const BasisBumps field = bumps_of(f, kBasisChannels);
   torch::stable::parallel_for(0, f.count, kGrain, [&](int64_t begin, int64_t end) {
-    kernels().move(field, mutable_data(weights), data(wanted), by, begin, end);
+    kernels().move_to(field, mutable_data(weights), data(wanted), begin, end);
   });
 }
 
@@ -213,7 +213,7 @@ STABLE_TORCH_LIBRARY_IMPL(gsplat_core, GSPLAT_DEVICE, m) {
   m.impl("basis_field_backward", GSPLAT_BOX(&basis_field_backward));
   m.impl("basis_field_backward_adam_", GSPLAT_BOX(&basis_field_backward_adam_));
 #if !defined(GSPLAT_CUDA)
-  m.impl("basis_field_move_", GSPLAT_BOX(&basis_field_move_));
+  m.impl("basis_field_move_to_", GSPLAT_BOX(&basis_field_move_to_));
 #endif
 }
 

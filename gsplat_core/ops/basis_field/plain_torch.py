@@ -97,17 +97,17 @@ def basis_field_backward_adam_(
             parameter.copy_(torch.where(chosen, parameter - step, parameter))
 
 
-def basis_field_move_(
-    centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, deltas: Tensor, by: bool = False
+def basis_field_move_to_(
+    centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, target: Tensor
 ) -> None:
-    """Let the field add `deltas` [N, C] at `tau`, or so much more with `by`, in place, with the least change of the weights.
+    """Let the deltas at `tau` be `target` [N, C], in place, with the least change of the weights.
 
     With heights h_b = exp(-u_b^2) (see `basis_field`), the weights that add up to a change and have the smallest norm are
     h_b / sum(h^2) times it. Other times change by exp(-d^2 / 2) of it, d bump spacings away, as training on that frame alone
     would make them. A row that would not be finite is left alone.
     """
     with torch.no_grad():
-        change = deltas if by else deltas - basis_field(centers, log_widths, weights, tau)
+        change = target - basis_field(centers, log_widths, weights, tau)
         u = (tau - centers) * torch.exp(-log_widths)
         heights = torch.where(u.abs() > BUMP_REACH, torch.zeros_like(u), torch.exp(-u * u))
         squared = (heights * heights).sum(dim=1, keepdim=True)

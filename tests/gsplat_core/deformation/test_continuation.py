@@ -109,13 +109,12 @@ def test_what_makes_no_continuation_is_refused(rows: int, from_s: float, horizon
         Continuation(4).write(torch.ones(rows, 16), from_s, horizon_s)
 
 
-@pytest.mark.parametrize("by", [False, True])
-def test_moving_a_field_at_a_time_changes_it_there_by_just_that(by: bool) -> None:
+def test_moving_a_field_at_a_time_changes_it_there_by_just_that() -> None:
     field = moving_field()
     before, far = field.deltas(0.5).detach(), field.deltas(0.0).detach()
     change = torch.randn(5, 13, generator=torch.Generator().manual_seed(2))
     change[3] = math.nan
-    assert field.move_by(0.5, change) if by else field.move_to(0.5, before + change)
+    assert field.move_to(0.5, before + change)
     expected = before + change
     expected[3] = before[3]
     torch.testing.assert_close(field.deltas(0.5).detach(), expected)
