@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from gsplat_core.ops.basis_field.plain_torch import basis_field, basis_field_backward, basis_field_backward_adam_
+from gsplat_core.ops.basis_field.plain_torch import (
+    basis_field,
+    basis_field_add_colours_,
+    basis_field_backward,
+    basis_field_backward_adam_,
+)
 from gsplat_core.ops.hexplane.plain_torch import (
     hexplane_decode,
     hexplane_deltas,
@@ -13,6 +18,7 @@ from gsplat_core.ops.hexplane.plain_torch import (
 
 __all__ = [
     "basis_field",
+    "basis_field_add_colours_",
     "basis_field_backward",
     "basis_field_backward_adam_",
     "hexplane_decode",

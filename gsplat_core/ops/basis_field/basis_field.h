@@ -11,7 +11,9 @@ namespace gsplat::basis_field {
 
 constexpr int64_t kBasisChannels = kRawBasisChannels;
 constexpr int64_t kBasisPadded =
-    kRawColumns;                     // columns of deltas and gradients as whole raw rows; the field has no part in the last
+    kRawColumns;  // columns of deltas and gradients as whole raw rows; the field has no part in the last
+constexpr float kLeastSquaredHeights =
+    1e-2f;  // of a Gaussian's bumps at a time, below which they take no colour: weights would become huge
 constexpr float kBasisReach = 4.0f;  // widths; a bump further away is left out (BUMP_REACH in Python)
 
 // Learning rates in their order: position, rotation, log-scale, colour; centres, widths.
@@ -49,6 +51,8 @@ struct Kernels {
   void (*backward)(const BasisBumps& field, const float* gradient, float* centers, float* log_widths, float* weights,
                    int64_t begin, int64_t end);
   void (*adam)(const BasisAdam& field, const float* gradient, int64_t begin, int64_t end);
+  // Changes `weights`, which are those of the field, by what adds `change` [N, 3] to the colours.
+  void (*add_colours)(const BasisBumps& field, float* weights, const float* change, int64_t begin, int64_t end);
 };
 
 // CUDA: the same with numbers in device memory, as every pointer here.
@@ -77,6 +81,7 @@ void basis_field_on_device(const DeviceBumps& field, float* deltas, cudaStream_t
 void basis_field_backward_on_device(const DeviceBumps& field, const float* gradient, float* centers, float* log_widths,
                                     float* weights, cudaStream_t stream);
 void basis_field_adam_on_device(const DeviceBasisAdam& field, const float* gradient, cudaStream_t stream);
+void basis_field_add_colours_on_device(const DeviceBumps& field, float* weights, const float* change, cudaStream_t stream);
 
 }  // namespace gsplat::basis_field
 
