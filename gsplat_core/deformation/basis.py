@@ -43,7 +43,7 @@ class BasisField(BumpTensors):
     kind = "basis"
     slot_type = BasisSlot
     continues = True
-    can_be_moved = True
+    takes_colours = True
 
     @classmethod
     def for_gaussians(cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any) -> BasisField:
@@ -167,6 +167,16 @@ class BasisField(BumpTensors):
         centers, log_widths, weights = (p.data for p in self._parameters_of(self.count))
         self._ops.basis_field_move_to_(centers, log_widths, weights, self.tau(time_s), deltas)
         return True
+
+    def add_colours(self, time_s: float, change: Tensor) -> None:
+        """See `DeformationField.add_colours`."""
+        self.add_colours_at(self.tau(time_s), change)
+
+    def add_colours_at(self, tau: float | Tensor, change: Tensor) -> None:
+        """As `add_colours`, at a `tau` of `self.tau`, which may be a float32 tensor [1] on the field's device."""
+        with torch.no_grad():
+            bumps = (p.data for p in self._parameters_of(change.shape[0]))
+            self._ops.basis_field_add_colours_(*bumps, tau, change)
 
     def training_tensors(self) -> tuple[Tensor, ...]:
         """Everything that `adam_step_at` changes: parameters, both moments of each, updates per bump. Made where they are not yet.

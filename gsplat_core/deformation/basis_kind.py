@@ -97,6 +97,9 @@ class CapturedBasisTraining:
         # A frame whose splats did not fit has a gradient of zero, and bumps of Gaussians without gradient are left alone.
         self._field.adam_step_at(time, gradient, rates)
 
+    def add_colours(self, change: Tensor, time: Tensor) -> None:
+        self._field.add_colours_at(time, change)
+
 
 def new_basis_field(wanted: NewField) -> BasisField:
     """Columns `spacing_s` apart over the window; online over what `BasisField.cover` keeps ahead, as a ring where only so much is kept."""

@@ -41,8 +41,8 @@ class DeformationField(torch.nn.Module):
 
     continues: ClassVar[bool] = False
     """Whether `continuation` is looked at."""
-    can_be_moved: ClassVar[bool] = False
-    """Whether `move_at` is there."""
+    takes_colours: ClassVar[bool] = False
+    """Whether `add_colours` is there."""
 
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__()
@@ -164,6 +164,11 @@ class DeformationField(torch.nn.Module):
         """Let the field add `deltas` (as `deltas(time_s)` gives them) at `time_s`, and change other times as little as it can. False, with
         nothing changed, for a field that cannot do that: here."""
         return False
+
+    def add_colours(self, time_s: float, change: Tensor) -> None:
+        """Change what the field adds to the colours of degree 0 at `time_s` by `change` [N, 3], and at other times as little as it can. Raises
+        InvalidInput for a kind that cannot: here."""
+        raise InvalidInput(f"the colours of a {self.kind} field cannot be set at one time")
 
     def scale_positions(self, factor: Tensor) -> None:
         """Multiply what the field adds to each position by `factor` [N], at all times. Raises InvalidInput for a kind that cannot: here."""

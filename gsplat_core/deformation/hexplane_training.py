@@ -102,3 +102,7 @@ class HexPlaneTraining:
         hexplane_planes_adam_(self._planes, self._first, self._second, time, gradient, of_planes)
         network_adam_(self._network, gradient.network, self._network_first, self._network_second, of_network)
         self._state = None
+
+    def add_colours(self, change: Tensor, time: Tensor) -> None:
+        """A HexPlane takes no colours at one time: raises InvalidInput."""
+        raise InvalidInput("the colours of a hexplane field cannot be set at one time; train them")

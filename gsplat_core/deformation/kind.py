@@ -79,6 +79,9 @@ class CapturedTraining(Protocol):
         A field that reads positions adds their part of the gradient to the first three columns of `gradient`.
         """
 
+    def add_colours(self, change: Tensor, time: Tensor) -> None:
+        """See `DeformationField.add_colours`: at the time in the device scalar `time`."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class FieldKind(Generic[Field]):

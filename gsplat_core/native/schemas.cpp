@@ -95,12 +95,15 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor[] forward, Tensor v_image, Tensor? v_alphas, float eps2d, int camera_model, bool deterministic) -> "
       "(Tensor v_raw, Tensor v_sh)");
   // The same and one Adam step of the Gaussians, in place; rates [5] and step [1] are read on the device, rows that were left
-  // unchanged are added to skipped [5]. v_raw is empty if not asked for.
+  // unchanged are added to skipped [5]. v_raw is empty if not asked for. With residuals [H, W, 4] and relaxation [1] its colours
+  // are what to add to them, and sh stays as it is.
   m.def(
       "render_frame_backward_adam_(Tensor(a!)[] gaussians, Tensor(b!)[] first_moments, Tensor(c!)[] second_moments, Tensor "
       "rates, "
       "Tensor step, Tensor(d!) skipped, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, Tensor[] forward, "
-      "Tensor v_image, Tensor? v_alphas, float eps2d, int camera_model, float beta1, float beta2, float epsilon, bool needs_raw, "
+      "Tensor v_image, Tensor? v_alphas, Tensor? residuals, Tensor? relaxation, float eps2d, int camera_model, float beta1, "
+      "float "
+      "beta2, float epsilon, bool needs_raw, "
       "bool deterministic) -> Tensor v_raw");
 
   // Folds a frame's status [4] into `totals`: the maximum of every entry, but the number of frames that overflowed. Unless this
@@ -118,6 +121,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "basis_field_backward_adam_(Tensor gradient, Tensor tau, Tensor(a!) centers, Tensor(b!) log_widths, Tensor(c!) weights, "
       "Tensor(d!) m_centers, Tensor(e!) m_log_widths, Tensor(f!) m_weights, Tensor(g!) v_centers, Tensor(h!) v_log_widths, "
       "Tensor(i!) v_weights, Tensor(j!) steps, Tensor rates, float beta1, float beta2, float epsilon) -> ()");
+  m.def("basis_field_add_colours_(Tensor centers, Tensor log_widths, Tensor(a!) weights, Tensor tau, Tensor change) -> ()");
 
   // Changes the weights as little as possible so that the deltas at tau are `target` [N, 13]. CPU only.
   m.def("basis_field_move_to_(Tensor centers, Tensor log_widths, Tensor(a!) weights, Tensor tau, Tensor target) -> ()");

@@ -5,6 +5,7 @@ from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.covariance import quat_scale_to_covar_preci
 from gsplat_core.reference.deformation import (
     basis_field,
+    basis_field_add_colours_,
     basis_field_backward,
     basis_field_backward_adam_,
     basis_field_move_to_,
@@ -25,6 +26,7 @@ from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 __all__ = [
     "adam_step",
     "basis_field",
+    "basis_field_add_colours_",
     "basis_field_backward",
     "basis_field_backward_adam_",
     "basis_field_move_to_",

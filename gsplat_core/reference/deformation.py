@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from gsplat_core.ops.basis_field.plain_torch import (
     basis_field,
+    basis_field_add_colours_,
     basis_field_backward,
     basis_field_backward_adam_,
     basis_field_move_to_,
@@ -18,6 +19,7 @@ from gsplat_core.ops.hexplane.plain_torch import (
 
 __all__ = [
     "basis_field",
+    "basis_field_add_colours_",
     "basis_field_backward",
     "basis_field_backward_adam_",
     "basis_field_move_to_",

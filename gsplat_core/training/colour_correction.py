@@ -10,6 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsplat_core.ops.frame_gradients.frame_gradients import ColourCorrection
+
 MOST_RELAXATION = 2.0
 """From here on the iteration need not converge."""
 LEAST_WEIGHT_PX = 0.3
@@ -29,3 +31,25 @@ def colour_correction(colours: Tensor, residuals: Tensor, weights: Tensor, relax
     """
     wanted = relaxation * residuals / (weights + LEAST_WEIGHT_PX)[:, None]
     return torch.maximum(wanted, -colours.clamp(min=0))
+
+
+class ResidualTarget:
+    """An observation as a captured step takes residuals against it, at fixed addresses."""
+
+    def __init__(self, image: Tensor) -> None:
+        """`image` [H, W, 3] is one of the size and device of all that come."""
+        shape = (*image.shape[:2], 4)
+        self._wanted = torch.zeros(shape, device=image.device)
+        self._tissue = torch.zeros(shape, device=image.device)
+        """The same three times, then 0."""
+
+    def take(self, image: Tensor, mask: Tensor) -> None:
+        """The next observation: uint8 [H, W, 3] and [H, W]. Queued, without a wait."""
+        tissue = (mask != 0).float()[..., None]
+        self._tissue[..., :3].copy_(tissue.expand(-1, -1, 3))
+        self._wanted[..., :3].copy_(image.float().div_(255).mul_(tissue))
+        self._wanted[..., 3:].copy_(tissue)
+
+    def correction(self, shown: Tensor, relaxation: Tensor) -> ColourCorrection:
+        """For the picture `shown` [H, W, 4], whose fourth channel is not looked at."""
+        return ColourCorrection(torch.addcmul(self._wanted, shown, self._tissue, value=-1), relaxation)

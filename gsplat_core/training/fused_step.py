@@ -18,6 +18,8 @@ from gsplat_core.rendering.frame_renderer import FrameControls
 from gsplat_core.rendering.tile_capacity import FrameStatusCopy, capacity_for
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.layout import COLOUR
+from gsplat_core.training.colour_correction import ResidualTarget
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
 from gsplat_core.training.photometric import LossWeights
@@ -48,8 +50,11 @@ class FusedStep:
         self._image = torch.zeros(*shape, 3, dtype=torch.uint8, device=device)
         self._mask = torch.ones(shape, dtype=torch.uint8, device=device)
         self._depth = torch.zeros(shape, device=device) if weights.depth > 0 else None
-        self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + 1 + field.rates)
-        """Among them the learning rates: of the Gaussians in the frame's backward pass, of the positions after it, of the field."""
+        self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + 1 + field.rates + 1)
+        """Among them the learning rates: of the Gaussians in the frame's backward pass, of the positions after it, of the field; and how
+        much of the residual colours take."""
+        self._target: ResidualTarget | None = None
+        """If colours are corrected."""
         self._step = torch.full((1,), adam.steps, dtype=torch.int64, device=device)
         self._skipped = torch.zeros(len(GAUSSIAN_TENSORS), dtype=torch.int64, device=device)
         self._totals = torch.zeros(4, dtype=torch.int32, device=device)
@@ -68,6 +73,7 @@ class FusedStep:
         time: float,
         gaussian_rates: Mapping[str, float],
         field_rates: Sequence[float],
+        colour_relaxation: float = 0.0,
     ) -> Tensor:
         """Queue one step on the current stream; returns the loss before the update, [] on the device.
 
@@ -77,11 +83,14 @@ class FusedStep:
             time: the field's own, of `DeformationField.frame_time`.
             gaussian_rates: Adam's learning rates of the Gaussians' tensors, by name.
             field_rates: those of the field, as many as it takes.
+            colour_relaxation: above 0 colours are corrected (`colour_correction`), which an observation with depth and a field that takes no
+                colours do not allow.
         """
+        self._correct(colour_relaxation > 0)
         self._take(observation)
         rates = [gaussian_rates[name] for name in GAUSSIAN_TENSORS]
         in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
-        self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates])
+        self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates, colour_relaxation])
         self._gaussians = gaussians
         self._adam.steps += 1
         if not self._warm:  # kernels are loaded by their first launch, which is not possible during a capture
@@ -96,12 +105,21 @@ class FusedStep:
         """The tensors hold another scene and Adam counts its steps from 1 again; nothing is captured anew."""
         self._step.fill_(self._adam.steps)
 
+    def _correct(self, corrects: bool) -> None:
+        """Whether the steps from now on correct colours. A change captures a new graph."""
+        if corrects == (self._target is not None):
+            return
+        self._target = ResidualTarget(self._image) if corrects else None
+        self._taken = self._captured = None
+
     def _take(self, observation: Observation) -> None:
         """Copy an observation to where the graph reads it."""
         if observation is self._taken:
             return
         self._taken = observation
         copy_each([self._image, self._mask], [observation.image, observation.mask])
+        if self._target is not None:
+            self._target.take(self._image, self._mask)
         if self._depth is not None:
             if observation.depth is None:
                 self._depth.zero_()  # unknown everywhere: the term is 0
@@ -135,7 +153,8 @@ class FusedStep:
         return self._addresses != before
 
     def _sequence(self) -> Tensor:
-        in_frame, of_means, of_field = self._controls.rates.split([len(GAUSSIAN_TENSORS), 1, self._field.rates])
+        counts = [len(GAUSSIAN_TENSORS), 1, self._field.rates, 1]
+        in_frame, of_means, of_field, relaxation = self._controls.rates.split(counts)
         scene, controls = self._gaussians, self._controls
         gaussians = tuple(scene.tensors().values())
         deltas = self._field.deltas(scene, controls.time)
@@ -150,9 +169,18 @@ class FusedStep:
         adam = GaussianAdam(
             *self._moments(), in_frame, self._step, self._skipped, betas=self._adam.betas, epsilon=self._adam.epsilon
         )
-        gradient = render_frame_backward_adam_(gaussians, adam, deltas, view, frame, loss.grad_image, loss.grad_alphas)
+        correction = None if self._target is None else self._target.correction(frame.image, relaxation)
+        gradient = render_frame_backward_adam_(
+            gaussians, adam, deltas, view, frame, loss.grad_image, loss.grad_alphas, correction
+        )
         assert gradient is not None
+        change = None
+        if correction is not None:
+            change = gradient[:, COLOUR].clone()
+            gradient[:, COLOUR].zero_()
         self._field.update(gradient, controls.time, of_field, self._step, frame.status)
+        if change is not None:
+            self._field.add_colours(change, controls.time)
         if self._field.reads_positions:
             self._move(scene.means, gradient, of_means, fits)
         return loss.loss

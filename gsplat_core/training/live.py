@@ -51,7 +51,8 @@ class LiveTraining:
     """Share of the rehearsal steps that go to the newest frame; the others are spread evenly over the window."""
     colour_relaxation: float = 0.0
     """Above 0 colours are not trained with a rate but corrected by what the picture is off by, by so many times the mean over the pixels that
-    show them (`colour_correction`), where the field can be moved at one time. On a CPU, with the squared error."""
+    show them (`colour_correction`), where the field takes colours at one time. On a CPU with the squared error; on a GPU with harmonics of
+    degree 0, for frames without depth."""
 
     def __post_init__(self) -> None:
         for name in ("first_rate", "last_rate"):
@@ -280,11 +281,12 @@ class LiveReconstructor(Reconstructor):
 def _check_colours(live: LiveTraining, config: ReconstructorConfig, device: torch.device) -> None:
     if live.colour_relaxation == 0:
         return
-    if device.type != "cpu":
+    if device.type == "cuda" and config.sh_degree > 0:
         raise InvalidSetting(
-            f"colour_relaxation is {live.colour_relaxation} on {device}: colours are corrected on a CPU only; set 0 to train them"
+            f"colour_relaxation is {live.colour_relaxation} with sh_degree {config.sh_degree}: on a GPU colours that depend on the view are"
+            " not corrected; set sh_degree or colour_relaxation to 0"
         )
-    if not config.squared_error or config.ssim_weight > 0:
+    if device.type == "cpu" and (not config.squared_error or config.ssim_weight > 0):
         raise InvalidSetting(
             f"colour_relaxation is {live.colour_relaxation} with squared_error {config.squared_error} and ssim_weight"
             f" {config.ssim_weight}: colours are corrected by the squared error alone; set squared_error and ssim_weight 0"

@@ -10,10 +10,9 @@ from torch import Tensor
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.deformation.kind import FieldTraining
 from gsplat_core.deformation.registry import kind_of
-from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import COLOUR
 from gsplat_core.scene.rows import GaussianRows, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.field_training import AutogradTraining
@@ -71,6 +70,8 @@ class TrainingStep:
         self._captured: FusedStep | None = None
         self._unsettled_steps = 0
         self._has_settled = False
+        self._relaxation = 0.0
+        """That of the newest captured step."""
         self._scaled_for: float | None = None
         self._scaled_rates: tuple[dict[str, float], Sequence[float]] = {}, ()
         if gaussians.device.type == "cuda" and kind.captured_training is not None:
@@ -86,23 +87,20 @@ class TrainingStep:
         """Train on one observation; returns its loss before the update, [] on the Gaussians' device.
 
         With a `colour_relaxation` above 0 colours are not trained but corrected (`colour_correction`) at the observation's time, if the field
-        can be moved at one time. A captured step only queues: ask for the loss's value, or `settle`, to wait for it. Raises InvalidInput for a
-        captured step that is to correct colours.
+        takes colours; a captured step trains them where the observation has depth. A captured step only queues: ask for the loss's value, or
+        `settle`, to wait for it.
         """
         if self._captured is not None:
-            if colour_relaxation > 0:
-                raise InvalidInput(
-                    f"colour_relaxation is {colour_relaxation}: a step in a CUDA graph trains colours; set it to 0"
-                )
+            corrects = self.field.takes_colours and observation.depth is None
+            self._relaxation = colour_relaxation if corrects else 0.0
             return self._captured_step(self._captured, observation, rate_scale)
         deformed = self._training.deform(self.gaussians, observation.time_s)
-        relaxation = colour_relaxation if self.field.can_be_moved else 0.0
+        relaxation = colour_relaxation if self.field.takes_colours else 0.0
         compared = loss_and_gradients(deformed, observation, self._weights, relaxation)
         own = self._training.update(compared.gradients, self._field_rates.scaled(self._mm_per_px, rate_scale))
         self._adam.step(self.gaussians.tensors(), own, self._gaussian_rates(rate_scale))
         if compared.colour_change is not None:
-            before_colour = (COLOUR.start, 0)
-            self.field.move_at(observation.time_s, torch.nn.functional.pad(compared.colour_change, before_colour))
+            self.field.add_colours(observation.time_s, compared.colour_change)
         return compared.loss
 
     def scale_about(self, camera: Camera, factor: Tensor) -> None:
@@ -201,7 +199,7 @@ class TrainingStep:
                 self._rate_values(self._field_rates.scaled(self._mm_per_px, rate_scale)),
             )
         time = self.field.frame_time(observation.time_s)
-        loss = captured(self._all_rows, observation, time, *self._scaled_rates)
+        loss = captured(self._all_rows, observation, time, *self._scaled_rates, self._relaxation)
         first, self._unsettled_steps = not self._has_settled, self._unsettled_steps + 1
         if first or self._unsettled_steps >= SETTLE_EVERY:
             self.settle(observation, rate_scale)

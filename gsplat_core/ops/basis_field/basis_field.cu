@@ -73,7 +73,42 @@ __global__ void __launch_bounds__(kBlock)
   }
 }
 
+// The smallest change of the weights that does it: in proportion to the heights, over the sum of their squares.
+__global__ void __launch_bounds__(kBlock)
+    add_colours(DeviceBumps field, float* __restrict__ weights, const float* __restrict__ change) {
+  const Place at;
+  if (at.gaussian >= field.count) return;
+  const float* const c = change + 3 * at.gaussian;
+  const float red = c[0], green = c[1], blue = c[2], size = red * red + green * green + blue * blue;
+  if (!(size > 0 && isfinite(size))) return;  // the same for the whole warp
+  const float tau = *field.tau;
+  const int64_t first = at.gaussian * field.bumps;
+  float squared = 0;
+  for (int from = 0; from < field.bumps; from += 32) {
+    const Timing t = timing_at(field.centers, field.log_widths, first, from + at.lane, field.bumps);
+    const Bump b = bump_at(t.center, t.log_width, tau, from + at.lane < field.bumps);
+    squared = fmaf(b.height, b.height, squared);
+  }
+  for (int offset = 16; offset > 0; offset /= 2) squared += __shfl_xor_sync(kAll, squared, offset);
+  if (!(squared > kBasisLeastHeight)) return;
+  for (int from = 0; from < field.bumps; from += 32) {
+    const Timing t = timing_at(field.centers, field.log_widths, first, from + at.lane, field.bumps);
+    const Bump b = bump_at(t.center, t.log_width, tau, from + at.lane < field.bumps);
+    if (!b.active) continue;
+    float* const to = weights + (first + from + at.lane) * kBasisChannels + kRawColor;
+    const float share = b.height / squared;
+    to[0] = fmaf(share, red, to[0]);
+    to[1] = fmaf(share, green, to[1]);
+    to[2] = fmaf(share, blue, to[2]);
+  }
+}
+
 }  // namespace
+
+void basis_field_add_colours_on_device(const DeviceBumps& field, float* weights, const float* change, cudaStream_t stream) {
+  if (field.count == 0) return;
+  add_colours<<<unsigned((field.count + kWarps - 1) / kWarps), kBlock, 0, stream>>>(field, weights, change);
+}
 
 void basis_field_on_device(const DeviceBumps& field, float* deltas, cudaStream_t stream) {
   if (field.count == 0) return;

@@ -53,6 +53,8 @@ struct Kernels {
   void (*adam)(const BasisAdam& field, const float* gradient, int64_t begin, int64_t end);
   // Changes `weights`, those of the field, so that its deltas become `target` [N, row].
   void (*move_to)(const BasisBumps& field, float* weights, const float* target, int64_t begin, int64_t end);
+  // Changes `weights`, which are those of the field, by what adds `change` [N, 3] to the colours.
+  void (*add_colours)(const BasisBumps& field, float* weights, const float* change, int64_t begin, int64_t end);
 };
 
 // CUDA: the same with numbers in device memory, as every pointer here.
@@ -81,6 +83,7 @@ void basis_field_on_device(const DeviceBumps& field, float* deltas, cudaStream_t
 void basis_field_backward_on_device(const DeviceBumps& field, const float* gradient, float* centers, float* log_widths,
                                     float* weights, cudaStream_t stream);
 void basis_field_adam_on_device(const DeviceBasisAdam& field, const float* gradient, cudaStream_t stream);
+void basis_field_add_colours_on_device(const DeviceBumps& field, float* weights, const float* change, cudaStream_t stream);
 
 }  // namespace gsplat::basis_field
 

@@ -101,6 +101,22 @@ def basis_field_move_to_(
         plain_torch.basis_field_move_to_(centers, log_widths, weights, tau, target)
 
 
+def basis_field_add_colours_(
+    centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, change: Tensor
+) -> None:
+    """Change `weights` in place so that the colours at `tau` change by `change` [N, 3]; other times change as little as they can.
+
+    Maths and exceptions as `gsplat_core.reference.basis_field_add_colours_`.
+    """
+    _check(centers, log_widths, weights)
+    if change.shape != (centers.shape[0], 3):
+        raise InvalidInput(f"change must be [{centers.shape[0]}, 3], got {list(change.shape)}")
+    require_float32("basis_field_add_colours_", centers=centers, change=change)
+    torch.ops.gsplat_core.basis_field_add_colours_(
+        centers, log_widths, weights, _scalars("tau", tau, centers, 1), change
+    )
+
+
 def _scalars(name: str, values: float | Sequence[float] | Tensor, like: Tensor, count: int) -> Tensor:
     """`count` float32 on the device of `like`. Numbers travel in a launch's arguments, so that the host does not wait."""
     if not isinstance(values, Tensor):
@@ -152,6 +168,11 @@ def _(
 
 @torch.library.register_fake("gsplat_core::basis_field_backward_adam_")
 def _(*arguments: Any) -> None:
+    return None
+
+
+@torch.library.register_fake("gsplat_core::basis_field_add_colours_")
+def _add_colours_fake(*_: Tensor) -> None:
     return None
 
 

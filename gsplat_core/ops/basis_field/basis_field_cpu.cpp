@@ -234,8 +234,37 @@ void adam(const BasisAdam& field, const float* gradient, int64_t begin, int64_t 
   }
 }
 
+// The smallest change of the weights that does it: in proportion to the heights, over the sum of their squares.
+void add_colours(const BasisBumps& field, float* weights, const float* change, int64_t begin, int64_t end) {
+  for (int64_t n = begin; n < end; ++n) {
+    const float* const c = change + 3 * n;
+    const float size = c[0] * c[0] + c[1] * c[1] + c[2] * c[2];
+    if (!(size > 0 && size * 0.0f == 0.0f)) continue;  // none, or not finite
+    const int64_t first = n * field.bumps;
+    float squared = 0;
+    for (int64_t from = 0; from < field.bumps; from += kLanes) {
+      const Bumps b =
+          bumps_at(field.centers + first + from, field.log_widths + first + from, lanes_left(from, field.bumps), field.tau);
+      if (b.mask != 0) squared += sum(b.height * b.height);
+    }
+    if (!(squared > kBasisLeastHeight)) continue;
+    for (int64_t from = 0; from < field.bumps; from += kLanes) {
+      const Bumps b =
+          bumps_at(field.centers + first + from, field.log_widths + first + from, lanes_left(from, field.bumps), field.tau);
+      float heights[kLanes];
+      store(heights, b.height);
+      if (b.mask != 0) prefetch_rows<true>(field.weights, first + from, field.bumps, b.mask);
+      for (uint32_t left = b.mask; left != 0; left &= left - 1) {
+        const int lane = __builtin_ctz(left);
+        float* const to = weights + (first + from + lane) * kBasisChannels + kRawColor;
+        for (int j = 0; j < 3; ++j) to[j] += heights[lane] / squared * c[j];
+      }
+    }
+  }
+}
+
 }  // namespace
 
-extern const Kernels kernels = {forward, backward, adam, move_to};
+extern const Kernels kernels = {forward, backward, adam, move_to, add_colours};
 
 }  // namespace GSPLAT_ISA::basis_field

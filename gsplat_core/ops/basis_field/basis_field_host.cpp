@@ -94,6 +94,10 @@ void update(const Call& call, Adam a, const Field& f, const Tensor& gradient, co
   basis_field_adam_on_device(a, data(gradient), call.stream);
 }
 
+void add_colours(const Call& call, const Field& f, float* weights, const float* change) {
+  basis_field_add_colours_on_device(bumps_of(f, kBasisChannels), weights, change, call.stream);
+}
+
 #else
 
 using Adam = BasisAdam;
@@ -153,6 +157,12 @@ void update(const Call&, Adam a, const Field& f, const Tensor& gradient, const f
                               [&](int64_t begin, int64_t end) { kernels().adam(a, data(gradient), begin, end); });
 }
 
+void add_colours(const Call&, const Field& f, float* weights, const float* change) {
+  const BasisBumps field = bumps_of(f, kBasisChannels);
+  torch::stable::parallel_for(0, f.count, kGrain,
+                              [&](int64_t begin, int64_t end) { kernels().add_colours(field, weights, change, begin, end); });
+}
+
 void basis_field_move_to_(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, Tensor target) {
   const Call call(centers);
   const Field f(call, centers, log_widths, weights, tau);
@@ -206,12 +216,24 @@ void basis_field_backward_adam_(Tensor gradient, Tensor tau, Tensor centers, Ten
   call.finish("basis_field_backward_adam_");
 }
 
+void basis_field_add_colours_(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, Tensor change) {
+  const Call call(centers);
+  const Field field(call, centers, log_widths, weights, tau);
+  call.in_place(weights, "weights");
+  const Tensor colours = call.floats(change, "change");
+  check(colours.dim() == 2 && colours.size(0) == field.count && colours.size(1) == 3,
+        "change must be [N, 3] with N = ", field.count);
+  add_colours(call, field, mutable_data(weights), data(colours));
+  call.finish("basis_field_add_colours_");
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, GSPLAT_DEVICE, m) {
   m.impl("basis_field", GSPLAT_BOX(&basis_field));
   m.impl("basis_field_backward", GSPLAT_BOX(&basis_field_backward));
   m.impl("basis_field_backward_adam_", GSPLAT_BOX(&basis_field_backward_adam_));
+  m.impl("basis_field_add_colours_", GSPLAT_BOX(&basis_field_add_colours_));
 #if !defined(GSPLAT_CUDA)
   m.impl("basis_field_move_to_", GSPLAT_BOX(&basis_field_move_to_));
 #endif

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.scene.layout import BASIS_GROUPS, RAW_COLUMNS, width_of
+from gsplat_core.scene.layout import BASIS_GROUPS, COLOUR, RAW_COLUMNS, width_of
 
 BUMP_REACH = 4.0
 """A bump further than this many widths from the time contributes nothing: exp(-16) is 1e-7 of its height."""
@@ -114,3 +114,20 @@ def basis_field_move_to_(
         usable = (squared > LEAST_HEIGHT) & change.isfinite().all(dim=1, keepdim=True)
         share = torch.where(usable, heights / squared.clamp(min=LEAST_HEIGHT), torch.zeros_like(heights))
         weights += share[..., None] * torch.where(usable, change, torch.zeros_like(change))[:, None]
+
+
+def basis_field_add_colours_(
+    centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor, change: Tensor
+) -> None:
+    """Change `weights` in place so that the colours at `tau` change by `change` [N, 3].
+
+    With heights h_b = exp(-u_b^2) (see `basis_field`) the weights that add up to `change` and have the smallest norm are
+    h_b / sum(h^2) times it. Other times change by exp(-d^2 / 2) of it, d bump spacings away. A Gaussian whose change is not finite, or whose
+    bumps are nearly all over, is left alone.
+    """
+    u = (tau - centers) * torch.exp(-log_widths)
+    heights = torch.where(u.abs() > BUMP_REACH, torch.zeros_like(u), torch.exp(-u * u))
+    squared = heights.square().sum(dim=1, keepdim=True)
+    usable = (squared > LEAST_HEIGHT) & change.square().sum(dim=1, keepdim=True).isfinite()
+    share = torch.where(usable, heights / squared, torch.zeros_like(heights))
+    weights[..., COLOUR] += share[..., None] * torch.where(usable, change, torch.zeros_like(change))[:, None]

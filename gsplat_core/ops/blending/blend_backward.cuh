@@ -110,11 +110,12 @@ __device__ inline void write_row(const BackwardStage<D, kAbs>& stage, const Wind
 
 // `fetch(position)` gives the splat at a position in [w.begin, w.end), `row(position)` where its row goes: the sums over the
 // window's pixels, in quads_of(shape_size(D, kAbs), D) float4s. Every row of the window is written, in a fixed order of
-// additions. `v_color` is dL/dcolour of the thread's pixels, 0 outside of the image.
+// additions. `v_color` is dL/dcolour of the thread's pixels, 0 outside of the image; `summed` is what a row's colours are sums
+// of, by weight: dL/dcolour for its gradient.
 template <int D, bool kAbs, bool kCapped, class Fetch, class Row>
 __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const Pixel (&pixels)[kPixelsEach],
-                                      const float (&v_color)[kPixelsEach][D], const Row& row, BackwardStage<D, kAbs>& stage,
-                                      const AlphaLimit& limit = {}) {
+                                      const float (&v_color)[kPixelsEach][D], const float (&summed)[kPixelsEach][D],
+                                      const Row& row, BackwardStage<D, kAbs>& stage, const AlphaLimit& limit = {}) {
   constexpr int kBatch = kBackwardBatch, kShape = shape_size(D, kAbs), kQuads = BackwardStage<D, kAbs>::kQuads;
   constexpr int kUnrolled = 4;
   const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
@@ -127,7 +128,7 @@ __device__ inline void blend_backward(const Window& w, const Fetch& fetch, const
 
   const float middle_x = float(w.left + kQuadrant), middle_y = float(w.top + kQuadrant), x = float(w.x) + 0.5f - middle_x;
   const uint32_t first_address = shared_address(stage.splats);
-  const PixelFactors<D> factors(v_color, stage.terms[warp]);
+  const PixelFactors<D> factors(summed, stage.terms[warp]);
   float y[kPixelsEach];
   PixelState states[kPixelsEach];
   for (int p = 0; p < kPixelsEach; ++p) {

@@ -81,7 +81,7 @@ __global__ void __launch_bounds__(kBlockThreads, 5)
     for (int d = 0; d < D; ++d) v_color[p][d] = w.inside[p] ? from.v_colors[place.pixel(in, w, p) * D + d] : 0;
   const auto fetch = [&](int position) { return record_at(in, records, position); };
   const auto row = [&](int position) { return rows + row_of(in, position) * stage.kQuads; };
-  blend_backward<D, kAbs, true>(w, fetch, pixels, v_color, row, stage, in.alpha);
+  blend_backward<D, kAbs, true>(w, fetch, pixels, v_color, v_color, row, stage, in.alpha);
 }
 
 // What a splat's gradient needs of a pixel.

@@ -112,6 +112,20 @@ __device__ inline void harmonics_gradient(const Camera& camera, const RawGaussia
     for (int j = 0; j < 3; ++j) c[3 * k + j] = b[k] * v[j];
 }
 
+constexpr float kFirstBasis = 0.28209479177387814f;
+constexpr float kLeastWeightPx = 0.3f;  // LEAST_WEIGHT_PX in Python
+
+// What to add to the coefficients of degree 0, in place of their gradient, for weighted sums of residuals and the sum of the
+// weights; c is what they are without their deltas. A colour below 0 can rise and does not sink further.
+__device__ inline void colour_correction(const RawGaussian& gaussian, const float* residuals, float weight, float relaxation,
+                                         const float* c, RawGradient& to) {
+  for (int j = 0; j < 3; ++j) {
+    const float color = 0.5f + kFirstBasis * (gaussian.color[j] + c[j]);
+    const float wanted = relaxation * residuals[j] / (weight + kLeastWeightPx);
+    to.color[j] = fmaxf(wanted, -fmaxf(color, 0.0f)) / kFirstBasis;
+  }
+}
+
 }  // namespace
 
 }  // namespace gsplat::frame

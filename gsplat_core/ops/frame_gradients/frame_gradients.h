@@ -7,6 +7,13 @@ namespace gsplat::frame {
 
 constexpr int kTensors = 5;  // of the Gaussians: means, quats, log-scales, logit opacities, spherical harmonics
 
+// Colours corrected by what the picture is off by, in place of a gradient (gsplat_core/training/colour_correction.py); null: they
+// have a gradient.
+struct ColourCorrection {
+  const float* residuals;   // [H, W, 4]: tissue (1, else 0) times picture wanted - picture shown; tissue
+  const float* relaxation;  // [1]
+};
+
 // dL/dpicture, and the forward pass's results that are not in `Lists`.
 struct PictureGradient {
   const float* v_image;   // [H, W, 4]: red, green, blue, sum of w z
@@ -15,6 +22,7 @@ struct PictureGradient {
   const int32_t* last;    // [H, W]
   float4* rows;           // scratch: gradient rows, one per instance [capacity, kRowQuads], or, if `atomic`,
   bool atomic;            // one per splat [N, kRowQuads], accumulated in the order in which tiles finish
+  ColourCorrection correction;
 };
 
 // Where the gradient goes; all zero if the frame overflowed, whose picture must not be learned from.

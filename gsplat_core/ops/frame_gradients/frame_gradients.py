@@ -50,6 +50,15 @@ class GaussianAdam(NamedTuple):
     epsilon: float = 1e-8
 
 
+class ColourCorrection(NamedTuple):
+    """Colours corrected by what the picture is off by, in place of a gradient; see `gsplat_core.training.colour_correction`."""
+
+    residuals: Tensor
+    """[H, W, 4]: red, green, blue of tissue (1, else 0) times (picture wanted - picture shown), and tissue."""
+    relaxation: Tensor
+    """float32 [1]."""
+
+
 def render_frame_backward(
     gaussians: Sequence[Tensor],
     deltas: Tensor | None,
@@ -87,6 +96,7 @@ def render_frame_backward_adam_(
     forward: Frame,
     v_image: Tensor,
     v_alphas: Tensor | None = None,
+    correction: ColourCorrection | None = None,
     *,
     needs_raw: bool = True,
     deterministic: bool = True,
@@ -98,6 +108,8 @@ def render_frame_backward_adam_(
 
     Args:
         gaussians: five contiguous tensors, of memory of their own.
+        correction: the raw gradients' `COLOUR` is then what to add to the colours, and `sh` stays as it is. For harmonics of degree 0, and
+            a `v_image` that is 0 for the sum of w z.
         needs_raw: whether the raw gradients are wanted.
 
     Returns the raw gradients [N, 16] for a deformation field, with zeros for a Gaussian that has one that is not finite; None
@@ -105,10 +117,13 @@ def render_frame_backward_adam_(
     """
     _check("render_frame_backward_adam_", gaussians, deltas, view, v_image, v_alphas)
     _check_adam(gaussians, adam)
+    residuals, relaxation = correction or (None, None)
+    if residuals is not None:
+        require_shape("residuals", residuals, (view.height, view.width, 4), "[H, W, 4]")
     raw: Tensor = torch.ops.gsplat_core.render_frame_backward_adam_(
         list(gaussians), list(adam.first_moments), list(adam.second_moments), adam.rates, adam.step, adam.skipped, deltas,
-        *view.tensors, list(forward[1:]), v_image, v_alphas, view.eps2d, view.model_index, *adam.betas, adam.epsilon, needs_raw,
-        deterministic,
+        *view.tensors, list(forward[1:]), v_image, v_alphas, residuals, relaxation, view.eps2d, view.model_index, *adam.betas,
+        adam.epsilon, needs_raw, deterministic,
     )  # fmt: skip
     return raw if needs_raw else None
 

@@ -24,7 +24,7 @@ ViewArguments view_of(const Tensor& v_image, double eps2d, int64_t camera_model)
 // Forward results and picture gradient, checked, as the kernels take them.
 struct Backward {
   Tensor alphas, last, records, tile_offsets, sorted, splat_starts, instance_splats, status, v_image;
-  OptionalTensor v_alphas;
+  OptionalTensor v_alphas, residuals, relaxation;
   Lists lists;
   PictureGradient from;
 
@@ -57,7 +57,20 @@ struct Backward {
             .alphas = data(alphas),
             .last = pointer(last),
             .rows = inputs.call.array<float4>((deterministic ? lists.capacity : scene.count) * kRowQuads),
-            .atomic = !deterministic};
+            .atomic = !deterministic,
+            .correction = {}};
+  }
+
+  // Colours are to be corrected by `residuals`, if they are given.
+  void correct(const Inputs& inputs, const OptionalTensor& residuals_in, const OptionalTensor& relaxation_in) {
+    if (!residuals_in) return;
+    const Scene& scene = inputs.scene;
+    check(bool(relaxation_in) && scene.bases == 1,
+          "render_frame_backward_adam_: residuals go with a relaxation and with harmonics of degree 0");
+    residuals = floats(inputs, *residuals_in, 4 * int64_t(scene.width) * scene.height, "residuals");
+    relaxation = inputs.call.floats(*relaxation_in, "relaxation");
+    check(relaxation->numel() == 1, "relaxation must be one float32, got ", relaxation->numel());
+    from.correction = {data(*residuals), data(*relaxation)};
   }
 
  private:
@@ -103,10 +116,12 @@ std::tuple<Tensor, Tensor> render_frame_backward(Tensors gaussians, OptionalTens
 
 Tensor render_frame_backward_adam_(Tensors gaussians, Tensors first, Tensors second, Tensor rates, Tensor step, Tensor skipped,
                                    OptionalTensor deltas, Tensor viewmat, Tensor intrinsics, OptionalTensor background,
-                                   Tensors forward, Tensor v_image, OptionalTensor v_alphas, double eps2d, int64_t camera_model,
-                                   double beta1, double beta2, double epsilon, bool needs_raw, bool deterministic) {
+                                   Tensors forward, Tensor v_image, OptionalTensor v_alphas, OptionalTensor residuals,
+                                   OptionalTensor relaxation, double eps2d, int64_t camera_model, double beta1, double beta2,
+                                   double epsilon, bool needs_raw, bool deterministic) {
   Inputs inputs(gaussians, deltas, viewmat, intrinsics, background, view_of(v_image, eps2d, camera_model));
-  const Backward pass(inputs, forward, v_image, v_alphas, deterministic);
+  Backward pass(inputs, forward, v_image, v_alphas, deterministic);
+  pass.correct(inputs, residuals, relaxation);
   const CudaCall& call = inputs.call;
   check(first.size() == kTensors && second.size() == kTensors, "render_frame_backward_adam_: there must be ", kTensors,
         " first and second moments, got ", first.size(), " and ", second.size());

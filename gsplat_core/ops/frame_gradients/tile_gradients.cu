@@ -56,10 +56,16 @@ __global__ void __launch_bounds__(kBlockThreads, 5) backward_tiles(Scene scene, 
   const Window w(lists.tile_offsets[tile], lists.tile_offsets[tile + 1], left, top, min(left + kTile, scene.width),
                  min(top + kTile, scene.height));
   Pixel pixels[kPixelsEach];
-  float v_color[kPixelsEach][kChannels] = {};
+  float v_color[kPixelsEach][kChannels] = {}, summed[kPixelsEach][kChannels] = {};
   for (int p = 0; p < kPixelsEach; ++p) {
     pixels[p] = {1, 0, -1};
     if (w.inside[p]) pixels[p] = start_pixel(scene, from, w.x, w.y[p], v_color[p]);
+    for (int d = 0; d < kChannels; ++d) summed[p][d] = v_color[p][d];
+    if (from.correction.residuals != nullptr && w.inside[p]) {
+      const int64_t at = int64_t(w.y[p]) * scene.width + w.x;
+      const float4 r = reinterpret_cast<const float4*>(from.correction.residuals)[at];
+      summed[p][0] = r.x, summed[p][1] = r.y, summed[p][2] = r.z, summed[p][3] = r.w;
+    }
   }
   const auto* const records = static_cast<const Record<kChannels>*>(lists.records);
   const auto fetch = [&](int position) { return records[lists.instance_splats[lists.sorted[position]]]; };
@@ -67,10 +73,10 @@ __global__ void __launch_bounds__(kBlockThreads, 5) backward_tiles(Scene scene, 
     const auto row = [&](int position) {
       return AtomicRow{from.rows + int64_t(lists.instance_splats[lists.sorted[position]]) * kRowQuads};
     };
-    blend_backward<kChannels, false, false>(w, fetch, pixels, v_color, row, stage);
+    blend_backward<kChannels, false, false>(w, fetch, pixels, v_color, summed, row, stage);
   } else {
     const auto row = [&](int position) { return from.rows + int64_t(lists.sorted[position]) * kRowQuads; };
-    blend_backward<kChannels, false, false>(w, fetch, pixels, v_color, row, stage);
+    blend_backward<kChannels, false, false>(w, fetch, pixels, v_color, summed, row, stage);
   }
 }
 

@@ -180,13 +180,21 @@ struct WarpGradients {
     } else if (visible != 0) {
       sum = sum_rows(from.rows, start, count, lane, instances);
     }
+    const bool corrects = kDegree == 0 && from.correction.residuals != nullptr;
+    const float weight = sum.colors[3];  // if it corrects; else dL/dz
+    if (corrects) sum.colors[3] = 0;
     RawGradient g = {};
     if (count > 0) g = projection_gradient(scene, camera, gaussian, sum);
     wait_for_copies();
     float c[kHarmonics] = {};
     if (count > 0) {
       sh.get(lane, c);
-      harmonics_gradient<kDegree>(camera, gaussian, sum.colors, c, g);
+      if (corrects) {
+        colour_correction(gaussian, sum.colors, weight, *from.correction.relaxation, c, g);
+        for (float& value : c) value = 0;
+      } else {
+        harmonics_gradient<kDegree>(camera, gaussian, sum.colors, c, g);
+      }
     }
     sh.put(lane, c);
     float row[kRawColumns] = {};

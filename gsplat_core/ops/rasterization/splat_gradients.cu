@@ -77,7 +77,7 @@ __global__ void __launch_bounds__(kBlockThreads, 5)
   }
   const auto fetch = [&](int position) { return records[lists.flatten_ids[position]]; };
   const auto row = [&](int position) { return RowWriter<kAbsolute>{rows + int64_t(lists.sorted[position]) * kRowFloat4s}; };
-  blend_backward<kChannels, kAbsolute, false>(w, fetch, pixels, v_color, row, stage);
+  blend_backward<kChannels, kAbsolute, false>(w, fetch, pixels, v_color, v_color, row, stage);
 }
 
 __device__ inline float4 plus(const float4& a, const float4& b) {

@@ -33,6 +33,9 @@ class NoField:
     def update(self, gradient, time, rates, step, status):
         self.gradient = gradient
 
+    def add_colours(self, change, time):
+        self.change = change
+
 
 @pytest.fixture
 def camera() -> Camera:
@@ -61,6 +64,43 @@ def train(
     return losses, adam
 
 
+@pytest.mark.parametrize("weights", [LossWeights(squared=True), LossWeights(ssim=0.2, depth=0.5)])
+def test_colours_are_corrected_as_on_the_cpu(make_gaussians, observation, weights):
+    """By the residual, whatever the loss is; the other gradients are those of the loss."""
+    from gsplat_core.training.photometric import loss_and_gradients
+
+    seen = dataclasses.replace(observation, depth=None)
+    start = make_gaussians(800, sh_degree=0)
+    start.sh[::5, 0] = -2.5  # black, and held there by the clamp
+    rates = dict.fromkeys(RATES, 0.0) | {"sh": 1e-2}
+    changes, others = [], []
+    for relaxation in (1.5, 0.75, 0.0):
+        gaussians, field = start.clone().to("cuda"), NoField()
+        step = FusedStep(gaussians, field, FusedAdam(gaussians.tensors()), weights, seen.camera)
+        step(gaussians, seen, 0.0, rates, [], relaxation)
+        if relaxation > 0:
+            assert torch.equal(gaussians.sh.cpu(), start.sh)
+            assert not field.gradient[:, 10:13].any()
+            changes.append(field.change.cpu())
+        else:
+            assert not torch.equal(gaussians.sh.cpu(), start.sh)
+        others.append(torch.cat([field.gradient[:, :10], field.gradient[:, 13:]], 1))
+    for relaxation, change in zip((1.5, 0.75), changes, strict=True):
+        expected = loss_and_gradients(start, seen, LossWeights(squared=True), relaxation).colour_change
+        assert (change - expected).norm() <= 1e-3 * expected.norm()
+    assert torch.equal(others[0], others[1])
+    assert torch.equal(others[0], others[2])
+
+
+def test_steps_that_correct_colours_and_steps_that_train_them_can_alternate(make_gaussians, observation):
+    seen = dataclasses.replace(observation, depth=None)
+    gaussians, field = make_gaussians(300, sh_degree=0).to("cuda"), NoField()
+    step = FusedStep(gaussians, field, FusedAdam(gaussians.tensors()), LossWeights(), seen.camera)
+    losses = [float(step(gaussians, seen, 0.0, RATES, [], relaxation)) for relaxation in (0.0, 1.5, 1.5, 0.0, 1.5) * 4]
+    assert step.settle() == 0
+    assert losses[-1] < 0.95 * losses[0]
+
+
 @pytest.mark.parametrize("weights", [LossWeights(), LossWeights(ssim=0.2, depth=0.5), LossWeights(squared=True)])
 def test_it_learns_as_the_cpu_does(make_gaussians, observation, weights):
     from gsplat_core.training.photometric import loss_and_gradients
@@ -71,7 +111,7 @@ def test_it_learns_as_the_cpu_does(make_gaussians, observation, weights):
 
     on_cpu, adam, expected = start.clone(), FusedAdam(start.tensors(), RATES), []
     for _ in range(12):
-        loss, gradients = loss_and_gradients(on_cpu, observation, weights)
+        loss, gradients, _ = loss_and_gradients(on_cpu, observation, weights)
         expected.append(float(loss))
         adam.step(on_cpu.tensors(), gradients)
     assert losses == pytest.approx(expected, rel=2e-3)

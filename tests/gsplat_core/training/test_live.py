@@ -155,10 +155,11 @@ def test_colours_are_corrected_by_the_squared_error_only(loss):
         LiveReconstructor(ReconstructorConfig(**loss), CAMERA, live=LiveTraining(colour_relaxation=1.0))
 
 
-def test_colours_are_corrected_on_a_cpu_only():
-    live, config = LiveTraining(colour_relaxation=1.0), ReconstructorConfig(squared_error=True)
-    with pytest.raises(InvalidSetting, match="on a CPU only"):
-        LiveReconstructor(config, CAMERA, live=live, device="cuda")
+def test_colours_that_depend_on_the_view_are_not_corrected_on_a_gpu():
+    with pytest.raises(InvalidSetting, match="set sh_degree or colour_relaxation to 0"):
+        LiveReconstructor(
+            ReconstructorConfig(sh_degree=1), CAMERA, live=LiveTraining(colour_relaxation=1.0), device="cuda"
+        )
 
 
 def test_one_step_a_frame_follows_a_light_that_changes_if_it_corrects_colours():

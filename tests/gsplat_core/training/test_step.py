@@ -169,7 +169,7 @@ def test_corrected_colours_change_at_the_time_of_the_frame(make_step, make_frame
     assert (later.sh - far.sh).abs().max() < 0.05 * (at_once.sh - canonical.sh).abs().max()
 
 
-def test_a_field_that_cannot_be_moved_at_one_time_trains_its_colours(make_step, make_frame, camera):
+def test_a_field_that_takes_no_colours_at_one_time_trains_them(make_step, make_frame, camera):
     trained, corrected = make_step("hexplane", squared_error=True), make_step("hexplane", squared_error=True)
     seen = Observation.of(make_frame(4, shift_px=2), camera)
     for _ in range(2):
