@@ -171,6 +171,11 @@ def _(*arguments: Any) -> None:
     return None
 
 
+@torch.library.register_fake("gsplat_core::basis_field_add_colours_")
+def _add_colours_fake(*_: Tensor) -> None:
+    return None
+
+
 @torch.library.register_fake("gsplat_core::basis_field_move_to_")
 def _(centers: Tensor, log_widths: Tensor, weights: Tensor, tau: Tensor, target: Tensor) -> None:
     return None

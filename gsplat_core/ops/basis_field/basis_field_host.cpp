@@ -157,6 +157,12 @@ void update(const Call&, Adam a, const Field& f, const Tensor& gradient, const f
                               [&](int64_t begin, int64_t end) { kernels().adam(a, data(gradient), begin, end); });
 }
 
+void add_colours(const Call&, const Field& f, float* weights, const float* change) {
+  const BasisBumps field = bumps_of(f, kBasisChannels);
+  torch::stable::parallel_for(0, f.count, kGrain,
+                              [&](int64_t begin, int64_t end) { kernels().add_colours(field, weights, change, begin, end); });
+}
+
 void basis_field_move_to_(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, Tensor target) {
   const Call call(centers);
   const Field f(call, centers, log_widths, weights, tau);
@@ -168,12 +174,6 @@ void basis_field_move_to_(Tensor centers, Tensor log_widths, Tensor weights, Ten
   torch::stable::parallel_for(0, f.count, kGrain, [&](int64_t begin, int64_t end) {
     kernels().move_to(field, mutable_data(weights), data(wanted), begin, end);
   });
-}
-
-void add_colours(const Call&, const Field& f, float* weights, const float* change) {
-  const BasisBumps field = bumps_of(f, kBasisChannels);
-  torch::stable::parallel_for(0, f.count, kGrain,
-                              [&](int64_t begin, int64_t end) { kernels().add_colours(field, weights, change, begin, end); });
 }
 
 #endif
@@ -233,10 +233,10 @@ STABLE_TORCH_LIBRARY_IMPL(gsplat_core, GSPLAT_DEVICE, m) {
   m.impl("basis_field", GSPLAT_BOX(&basis_field));
   m.impl("basis_field_backward", GSPLAT_BOX(&basis_field_backward));
   m.impl("basis_field_backward_adam_", GSPLAT_BOX(&basis_field_backward_adam_));
+  m.impl("basis_field_add_colours_", GSPLAT_BOX(&basis_field_add_colours_));
 #if !defined(GSPLAT_CUDA)
   m.impl("basis_field_move_to_", GSPLAT_BOX(&basis_field_move_to_));
 #endif
-  m.impl("basis_field_add_colours_", GSPLAT_BOX(&basis_field_add_colours_));
 }
 
 }  // namespace gsplat::basis_field

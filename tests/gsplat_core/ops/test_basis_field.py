@@ -5,10 +5,8 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field.basis_field import (
     basis_field,
-    basis_field_add_colours_,
     basis_field_backward,
     basis_field_backward_adam_,
     basis_field_move_to_,
@@ -266,41 +264,3 @@ def test_moving_refuses_other_shapes_and_passes_opcheck():
         basis_field_move_to_(*field, 3.0, target[:, :12])
     op = torch.ops.gsplat_core.basis_field_move_to_.default
     torch.library.opcheck(op, (*field, torch.tensor([3.0]), target))
-
-
-@pytest.mark.parametrize("n", [0, 1, 2500])
-@pytest.mark.parametrize("b", [1, 4, 16, 33])
-def test_added_colours_equal_the_reference_and_are_what_was_asked_for(n, b):
-    centers, log_widths, weights = bumps(n, b)
-    change = gradient_of(n)[:, :3]
-    for tau in (-9.0, 0.0, b / 2, b + 30.0):
-        seen, wanted = weights.clone(), weights.clone()
-        basis_field_add_colours_(centers, log_widths, seen, tau, change)
-        reference.basis_field_add_colours_(centers, log_widths, wanted, tau, change)
-        torch.testing.assert_close(seen, wanted, rtol=1e-5, atol=1e-5)
-        assert torch.equal(seen[..., :10], weights[..., :10])
-        shown = basis_field(centers, log_widths, seen, tau) - basis_field(centers, log_widths, weights, tau)
-        taken = (seen != weights).flatten(1).any(1)
-        torch.testing.assert_close(shown[taken][:, 10:], change[taken], rtol=1e-4, atol=1e-4)
-        if n == 2500 and b > 1:
-            assert float(taken.float().mean()) > 0.99 if tau == b / 2 else not (tau > b and taken.any())
-
-
-@pytest.mark.parametrize("module", [compiled, reference])
-def test_colours_that_cannot_be_added_leave_the_others_alone(module):
-    centers, log_widths, weights = bumps(5, 8)
-    centers[1, 3] = float("nan")
-    centers[4] += 5.0  # nearly over
-    change = torch.ones(5, 3)
-    change[2, 1] = float("nan")
-    change[3, 2] = float("inf")
-    after = weights.clone()
-    module.basis_field_add_colours_(centers, log_widths, after, 0.5, change)
-    assert torch.equal(after[1:], weights[1:])
-    assert not torch.equal(after[0], weights[0])
-
-
-@pytest.mark.parametrize("change", [torch.ones(4, 3), torch.ones(5, 4), torch.ones(5, 3, dtype=torch.float64)])
-def test_colours_of_another_shape_or_type_are_refused(change):
-    with pytest.raises(InvalidInput):
-        basis_field_add_colours_(*bumps(5, 8), 0.5, change)
