@@ -21,7 +21,7 @@ FOLLOWS = 0.2
 """How fast the mean of earlier pictures follows the newest one."""
 BLUR_PX = 1.5
 """Standard deviation of the blurred guess, in pixels."""
-SHARES = SharesSettings(at_first=(0.0, 0.0, 0.0, 0.0), decay=0.95, around_cells=3.0, pull=200.0, ridge=1.0)
+SHARES = SharesSettings(at_first=(0.0, 0.0, 0.0, 0.0), decay=0.95, around_cells=3.0, pull=200.0, ridge=30.0)
 """Of the newest picture where it is, the mean, the blurred picture, and the mean of what other motions would bring. In squares of grey levels, 0..255."""
 INVERSE_STEPS = 2
 """Iterations to find where a cell came from, in a flow that says where cells go."""
