@@ -42,7 +42,9 @@ class OnScreenResult:
     """Lowest tissue PSNR of a frame after the first second."""
     worst_seq: int | None
     previous_frame_db: float | None
-    """Mean tissue PSNR of the raw frame before, shown instead."""
+    """Mean tissue PSNR of the raw frame before, shown instead, after the first second ..."""
+    previous_frame_throughout_db: float | None
+    """... and over all frames that were scored."""
     frames: int
     """Frames that were scored."""
     not_on_screen: int
@@ -95,7 +97,7 @@ class OnScreenMetricsOp(Operator):
     def _reset(self) -> None:
         self.quality = QualityTracker()
         """Every frame that was scored."""
-        self.settled, self.before = ScoredMean(), ScoredMean()
+        self.settled, self.before, self.before_throughout = ScoredMean(), ScoredMean(), ScoredMean()
         self.worst: tuple[float, int] | None = None
         self.frames = self.not_on_screen = self.unscored = 0
         self._digest = hashlib.sha256()
@@ -180,6 +182,7 @@ class OnScreenMetricsOp(Operator):
             self.not_on_screen += 1
         if self._first_s is None:
             self._first_s = frame.time_s
+        self.before_throughout.add(before_db)
         if frame.time_s - self._first_s < SETTLING_S:
             return
         value = quality.psnr_tissue_db
@@ -198,9 +201,10 @@ class OnScreenMetricsOp(Operator):
         worst_db, worst_seq = self.worst or (None, None)
         outcome.add(
             OnScreenResult(
-                self.settled.mean, worst_db, worst_seq, self.before.mean, self.frames, self.not_on_screen, self.unscored
+                self.settled.mean, worst_db, worst_seq, self.before.mean, self.before_throughout.mean, self.frames,
+                self.not_on_screen, self.unscored,
             )
-        )
+        )  # fmt: skip
 
 
 def _entry(scored: ScoredFrame, frame: Frame, on_screen: ShownPicture, until_ns: float) -> Mapping[str, Value]:

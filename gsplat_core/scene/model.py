@@ -45,6 +45,9 @@ class Model:
     """First and last time that the model has seen; other times show the nearest of these."""
     training_digest: str | None = None
     """SHA-256 of the recording that it was trained on, where known."""
+    unseen_s: Tensor | None = None
+    """How long each Gaussian had not been seen, float64 [N] in seconds of the stream, when that was looked at last, which is every few frames
+    of a live reconstruction; 0: it was seen. None: it is not known. It is neither saved nor part of the digest."""
 
     _deform: Callable[[float], Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
     _last: tuple[float, Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
@@ -53,6 +56,10 @@ class Model:
         object.__setattr__(self, "time_window_s", checked_window(self.time_window_s))
         if self.version < 1:
             raise InvalidInput(f"a model's version counts from 1, got {self.version}")
+        if self.unseen_s is not None and self.unseen_s.shape != (self.gaussians.count,):
+            raise InvalidInput(
+                f"unseen_s is {list(self.unseen_s.shape)}; it must have a time for each of {self.gaussians.count} Gaussians"
+            )
         learning = [name for name, tensor in self.tensors().items() if tensor.requires_grad]
         if learning:
             raise InvalidInput(
@@ -78,7 +85,8 @@ class Model:
         if self.gaussians.device == torch.device(device):
             return self
         field = None if self.field is None else self.field.detached_copy().to(device)
-        return dataclasses.replace(self, gaussians=self.gaussians.to(device), field=field)
+        seen = None if self.unseen_s is None else self.unseen_s.to(device)
+        return dataclasses.replace(self, gaussians=self.gaussians.to(device), field=field, unseen_s=seen)
 
     @property
     def device(self) -> torch.device:

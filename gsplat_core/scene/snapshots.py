@@ -121,6 +121,7 @@ class Snapshot:
         camera: Camera,
         time_window_s: tuple[float, float],
         training_digest: str | None = None,
+        unseen_s: Tensor | None = None,
     ) -> None:
         self.version = version
         """Counts up with every snapshot, from 1."""
@@ -129,6 +130,7 @@ class Snapshot:
         self.time_window_s = time_window_s
         """First and last time that the model has seen; other times show the nearest of these."""
         self.training_digest = training_digest
+        self._unseen_s = unseen_s
         self.parameter_count = slot.parameter_count
         """Numbers in all tensors, without the slot's spare capacity."""
         self.slot = slot
@@ -169,8 +171,12 @@ class Snapshot:
                 with self.reading() as slot, torch.no_grad():
                     gaussians = slot.gaussians.map(lambda tensor: tensor[: self.gaussian_count].clone())
                     field = None if slot._field is None else slot._field.exact_copy()
+                    seen = None if self._unseen_s is None else self._unseen_s.clone()
+                    if self._unseen_s is not None and self._unseen_s.is_cuda:
+                        # It lies in no slot: whoever published it may let go of it before this stream has read it.
+                        self._unseen_s.record_stream(torch.cuda.current_stream(self.device))
                 self._model = Model(
-                    self.version, gaussians, field, self.camera, self.time_window_s, self.training_digest
+                    self.version, gaussians, field, self.camera, self.time_window_s, self.training_digest, seen
                 )
             return self._model
 
@@ -204,8 +210,10 @@ class SnapshotSlots:
         camera: Camera,
         time_window_s: tuple[float, float],
         training_digest: str | None = None,
+        unseen_s: Tensor | None = None,
     ) -> Snapshot:
-        """Queue a copy of a scene's state on the current stream; the originals may be changed on that stream at once.
+        """Queue a copy of a scene's state on the current stream; the originals may be changed on that stream at once. `unseen_s` is not
+        copied and must stay as it is (`Model.unseen_s`).
 
         Raises InvalidInput when all slots are held, or for a field that cannot lie in one.
         """
@@ -219,6 +227,7 @@ class SnapshotSlots:
             camera=camera,
             time_window_s=time_window_s,
             training_digest=training_digest,
+            unseen_s=unseen_s,
         )
         slot._holder = weakref.ref(snapshot)
         return snapshot

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -251,6 +252,10 @@ class LiveReconstructor(Reconstructor):
                 return
         self._coverage = None
         super()._start(frame, observation, end_s)
+
+    def _facts(self) -> dict[str, Any]:
+        unseen_s = None if self._out_of_view is None else self._out_of_view.unseen_s(self.gaussians)
+        return super()._facts() | {"unseen_s": unseen_s}
 
     def _learn_step_time(self, spending: Spending) -> None:
         """Soon when steps are found to be shorter; slowly when they seem longer, for the first ones on a device take far longer."""

@@ -37,15 +37,25 @@ class OutOfView:
         self._looks = 0
         self._looked_from: Camera | None = None
         """Where the archive was last searched from."""
+        self._unseen_s: torch.Tensor | None = None
+        """What was handed out since the last look."""
 
     def restart(self) -> None:
         """Another scene begins."""
         self.last_seen.restart()
+        self._unseen_s = None
         self.archive = Archive(ARCHIVED_SCENES * self._capacity)
         self._looks = 0
 
+    def unseen_s(self, count: int) -> torch.Tensor:
+        """How long each of the `count` Gaussians that there are now had not been seen at the last look (`Model.unseen_s`); it stays as it is."""
+        if self._unseen_s is None or len(self._unseen_s) != count:
+            self._unseen_s = self.last_seen.unseen_s(count)
+        return self._unseen_s
+
     def follow(self, step: TrainingStep, observation: Observation) -> None:
         """Look at the newest observation, make room where it is short, and bring back what comes into view. Before the scene grows."""
+        self._unseen_s = None
         kept_free = round(ROOM_SHARE * self._capacity)
         if self._looks % SEE_EVERY == 0 or self._capacity - step.gaussians.count < kept_free // 2:
             self.last_seen.see(step.at(observation.time_s), observation)

@@ -39,6 +39,7 @@ class LastSeen:
     def __init__(self, capacity: int, device: torch.device) -> None:
         self._times = torch.zeros(capacity, dtype=torch.float64, device=device)
         self._count = 0
+        self._looked_s = 0.0
 
     def times(self) -> Tensor:
         """For the Gaussians in use, float64 [N]; the same memory."""
@@ -48,6 +49,13 @@ class LastSeen:
         """There are `count` Gaussians now; those that have joined are seen."""
         self._times[self._count : count] = time_s
         self._count = count
+
+    def unseen_s(self, count: int) -> Tensor:
+        """How long each of `count` Gaussians had not been seen at the last look, float64 [count], in memory of its own; 0 for those that were
+        seen and for those that have joined since."""
+        unseen = torch.zeros(count, dtype=self._times.dtype, device=self._times.device)
+        unseen[: self._count] = (self._looked_s - self.times()).clamp(min=0)
+        return unseen
 
     def restart(self) -> None:
         """There are other Gaussians from here on."""
@@ -59,6 +67,7 @@ class LastSeen:
         `now` are the scene's Gaussians at the observation's time. What lies behind other tissue counts as seen.
         """
         self.join(now.count, observation.time_s)
+        self._looked_s = observation.time_s
         pixels, inside = pixels_of(now.means, observation.camera)
         seen = inside & (value_at(observation.mask, pixels) > 0)
         self.times().masked_fill_(seen, observation.time_s)

@@ -13,7 +13,9 @@ from operators.applications.result import RunOutcome
 from operators.display import LiveDisplayResult
 from operators.frame_log import Entry
 from operators.ingest import SourceResult
+from operators.live_reconstruct import TrainingCounts
 from operators.metrics import QualityResult
+from operators.on_screen import OnScreenResult
 from operators.reconstruct import ModelResult
 from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult
@@ -44,14 +46,14 @@ def build_report(outcome: RunOutcome) -> RunReport:
     source, quality = outcome.find(SourceResult), outcome.find(QualityResult)
     if source is None or quality is None:
         raise InvalidInput(f"a report needs a SourceResult and a QualityResult; the {outcome.command} has none")
-    model = outcome.find(ModelResult)
+    model, training = outcome.find(ModelResult), outcome.find(TrainingCounts)
     return RunReport(
         recording=_recording(source.description),
         run=_run(outcome),
         frames=FrameCounts(
             ingested=source.frames,
             displayed=_displayed(outcome, quality),
-            dropped=outcome.dropped,
+            dropped=outcome.dropped + (0 if training is None else training.passed_over),
             damaged=source.damaged,
         ),
         latency_ms={
@@ -127,13 +129,14 @@ def _run(outcome: RunOutcome) -> RunFacts:
 
 def _qualities(outcome: RunOutcome, quality: QualityResult) -> QualityReport:
     offline = outcome.command == "reconstruct"
-    baselines = outcome.find(Baselines)
+    baselines, screen = outcome.find(Baselines), outcome.find(OnScreenResult)
+    previous_db = screen.previous_frame_throughout_db if screen else None
     return QualityReport(
         live=None if offline else _quality(quality.trained),
         training=_quality(quality.trained) if offline else None,
         heldout=_quality(quality.held_out) if outcome.settings.heldout else None,
         baselines=BaselineQuality(
-            previous_frame_db=baselines.previous_frame_db if baselines else None,
+            previous_frame_db=baselines.previous_frame_db if baselines else previous_db,
             train_mean_db=baselines.heldout_train_mean_db if baselines else None,
             heldout_previous_frame_db=baselines.heldout_previous_frame_db if baselines else None,
             heldout_neighbour_mean_db=baselines.heldout_neighbour_mean_db if baselines else None,

@@ -46,7 +46,7 @@ def tiles_section(report: RunReport) -> str:
             f"{frames.dropped:,} dropped{damaged}",
         ),
     ]
-    if report.latency_ms:
+    if report.latency_ms and report.live is None:  # of a live run the age of what is shown says it
         path = _display_path(report)
         latency = report.latency_ms[path]
         tiles.append(
@@ -204,16 +204,27 @@ def baselines_section(report: RunReport) -> str:
     )
 
 
+def _longest_paths(report: RunReport) -> dict[str, str]:
+    """For each operator at which frames end, the longest of the paths from the source to it; `report.json` has the others."""
+    longest: dict[str, str] = {}
+    for path in report.latency_ms:
+        end = path.rsplit(",", 1)[-1]
+        if path.startswith("source,") and path.count(",") > longest.get(end, "").count(","):
+            longest[end] = path
+    return longest
+
+
 def latency_section(report: RunReport) -> str:
-    """How long frames take along each path."""
-    if not report.latency_ms:
+    """How long frames take from the source to where they end."""
+    paths = _longest_paths(report)
+    if not paths:
         return ""
     styles = ("main", "base", "second", "third")
     shares = [k / 100 for k in range(101)]
     lines = tuple(
-        Line(path.rsplit(",", 1)[-1], values, shares, styles[k % len(styles)])
-        for k, (path, values) in enumerate(report.latency_quantiles_ms.items())
-        if len(values) == len(shares)
+        Line(end, values, shares, styles[k % len(styles)])
+        for k, (end, path) in enumerate(paths.items())
+        if len(values := report.latency_quantiles_ms.get(path, [])) == len(shares)
     )
     chart = Chart(
         title="Latency distribution",
@@ -227,9 +238,8 @@ def latency_section(report: RunReport) -> str:
         width=NARROW,
     )
     rows = "".join(
-        f'<tr><th scope="row">{escape(path.rsplit(",", 1)[-1])}</th>'
-        f'<td class="n">{v.p50:,.1f}</td><td class="n">{v.p95:,.1f}</td><td class="n">{v.p99:,.1f}</td><td class="n">{v.max:,.1f}</td></tr>'
-        for path, v in report.latency_ms.items()
+        f'<tr><th scope="row">{escape(end)}</th><td class="n">{v.p50:,.1f}</td><td class="n">{v.p95:,.1f}</td><td class="n">{v.p99:,.1f}</td><td class="n">{v.max:,.1f}</td></tr>'
+        for end, v in ((end, report.latency_ms[path]) for end, path in paths.items())
     )
     return (
         f"<section><h2>Latency</h2>{chart.figure() if lines else ''}"

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
+from gsplat_core.training.metrics import psnr_tissue_db
 from operators.frame_log import FrameLog, read_frames
 from operators.messages import PictureState, ShownPicture
 from operators.metrics import QualityResult
@@ -101,6 +104,9 @@ def test_the_first_second_is_left_out_of_the_settled_figures(frame, rendered, co
     )
     assert result.settled_db == pytest.approx(-20 * np.log10(1 / 255), abs=0.1)
     assert quality.trained.means()["psnr_tissue_db"] < result.settled_db - 5
+    before = [psnr_tissue_db(a.image, b.image, None) for a, b in pairwise(frames)]
+    assert result.previous_frame_throughout_db == pytest.approx(np.mean(before))
+    assert result.previous_frame_db == pytest.approx(np.mean(before[24:]))
 
 
 def test_memory_does_not_grow_when_pictures_come_without_frames(stream, compute_queued):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_core.rendering.remembered import remembered_share
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
@@ -163,3 +164,23 @@ def test_the_archive_is_bounded_and_counts_what_it_drops():
     assert newest.means[:, 0].tolist() == [6.0, 7.0] and len(archive) == 3
     assert archive.take_uncovered(CAMERA, ~covered, 9).means[:, 0].tolist() == [3.0, 4.0, 5.0]
     assert len(archive) == 0 and archive.take_uncovered(CAMERA, ~covered, 9) is None
+
+
+def test_a_published_model_knows_what_was_not_seen(device):
+    """What the scope looked at first is seen then, and is not any more when it has moved on by a picture."""
+    made = reconstructor(2000, device)
+    here, there = frame_at(0, 0), frame_at(60, WIDTH, time_s=2.0)
+
+    def share(frame):
+        model = made.publish().as_model()
+        return remembered_share(model, CAMERA.with_pose(frame.pose), model.time_window_s[1])
+
+    watch(made, [frame_at(k, 0) for k in range(9)])
+    first = made.publish().as_model()
+    before = first.unseen_s.clone()
+    assert share(here).median() < 0.01
+    watch(made, [there.with_fields(seq=60 + k, pts_ns=there.pts_ns + k * 10**7) for k in range(9)])
+    model = made.publish().as_model()
+    assert model.unseen_s.shape == (model.gaussian_count,) and model.unseen_s.max() > 1.5
+    assert share(here).median() > 0.99 and share(there).median() < 0.01
+    assert torch.equal(first.unseen_s, before), "an earlier model stays as it was"

@@ -6,7 +6,7 @@ import pytest
 
 from services.reports.html import render_html
 from services.reports.live_sections import AGE_GROUPS, live_section
-from services.reports.schema import FrameEntry, LiveFacts, RunReport
+from services.reports.schema import FrameEntry, Latency, LiveFacts, RunReport
 
 
 @pytest.fixture
@@ -49,3 +49,18 @@ def test_few_frames_and_missing_figures_are_drawn_as_far_as_they_go(live):
     )
     assert "–" in live_section(live.model_copy(update={"live": live.live.model_copy(update=unknown)}))
     assert "Quality over age" in live_section(live.model_copy(update={"series": live.series[:3]}))
+
+
+def test_each_place_where_frames_end_is_named_once_and_the_age_stands_for_the_latency(live):
+    ways = {
+        "source,analysis,display,recorded": 239.0,
+        "source,on_screen,progress": 41.0,
+        "source,display,on_screen,progress": 318.0,
+        "display,recorded": 0.7,
+    }
+    paths = {path: Latency(p50=p50, p95=p50, p99=p50, max=p50) for path, p50 in ways.items()}
+    text = render_html(live.model_copy(update={"latency_ms": paths, "latency_quantiles_ms": {}}), [])
+    latency = text[text.index("<h2>Latency</h2>") :]
+    assert latency.count(">recorded<") == latency.count(">progress<") == 1
+    assert "239.0" in latency and "318.0" in latency and "41.0" not in latency
+    assert "Latency to display" not in text

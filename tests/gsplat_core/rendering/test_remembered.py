@@ -1,0 +1,80 @@
+"""How much of a picture is of Gaussians that nobody sees, against the reference and where it is known exactly."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsplat_core import Camera, Gaussians, InvalidInput, reference
+from gsplat_core.rendering.remembered import remembered_share, share_of
+from gsplat_core.scene.model import Model
+
+CAMERA = Camera.from_focal(40.0, 37, 29)
+
+
+def cloud(count: int, seed: int = 0) -> Gaussians:
+    g = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.randn(*shape, generator=g)
+    means = draw(count, 3) * torch.tensor([12.0, 9.0, 5.0]) + torch.tensor([0.0, 0.0, 40.0])
+    return Gaussians(means, draw(count, 4), draw(count, 3) * 0.3 + 0.7, draw(count) + 1, draw(count, 4, 3))
+
+
+@pytest.mark.parametrize("count", [0, 1, 200])
+def test_the_share_is_the_reference_picture_of_the_chosen_ones_in_white(count):
+    gaussians = cloud(count)
+    chosen = torch.arange(count) % 3 == 0
+    exact = gaussians.to(dtype=torch.float64)
+    white = chosen.to(torch.float64)[:, None].expand(-1, 3)
+    viewmat, intrinsics = CAMERA.matrices(exact.device, exact.dtype)
+    image, alpha, _ = reference.rasterization(
+        exact.means, exact.quats, exact.scales, exact.opacities, white, viewmat[None], intrinsics[None], 37, 29
+    )
+    alpha = alpha[0, ..., 0]
+    wanted = torch.where(alpha > 0, image[0, ..., 0] / alpha.clamp(min=1e-6), 0)
+    found = share_of(gaussians, chosen, CAMERA)
+    there = alpha > 0.01
+    assert found.shape == (29, 37)
+    assert torch.allclose(found[there].double(), wanted[there], atol=2e-3)
+
+
+def test_all_none_and_the_others():
+    gaussians = cloud(100)
+    everyone = torch.ones(100, dtype=torch.bool)
+    some = torch.arange(100) < 40
+    assert share_of(gaussians, ~everyone, CAMERA).max() < 1e-5
+    shown = share_of(gaussians, everyone, CAMERA) > 0
+    both = share_of(gaussians, some, CAMERA) + share_of(gaussians, ~some, CAMERA)
+    assert shown.float().mean() > 0.5 and torch.allclose(both[shown], torch.ones(()), atol=1e-3)
+    with pytest.raises(InvalidInput, match="chosen"):
+        share_of(gaussians, some[:5], CAMERA)
+
+
+def wall(depth: float) -> Gaussians:
+    """Opaque tissue across the view at one distance."""
+    x, y = torch.meshgrid(torch.arange(-30.0, 31, 2), torch.arange(-30.0, 31, 2), indexing="xy")
+    means = torch.stack([x.ravel(), y.ravel(), torch.full((x.numel(),), depth)], 1)
+    count = len(means)
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1)
+    return Gaussians(means, quats, torch.full((count, 3), 0.5), torch.full((count,), 8.0), torch.zeros(count, 1, 3))
+
+
+def test_remembered_tissue_counts_where_it_is_shown_and_not_behind_what_is_seen():
+    near, far = wall(40.0), wall(60.0)
+    near = near.select(near.means[:, 0] < 0)
+    scene = near.append(far)
+    unseen_s = torch.cat([torch.zeros(near.count), torch.full((far.count,), 3.0)]).double()
+    model = Model(1, scene, None, CAMERA, (0.0, 1.0), unseen_s=unseen_s)
+    share = remembered_share(model, CAMERA, 0.0)
+    assert share[:, :12].max() < 0.1 and share[:, -12:].min() > 0.99
+    unknown = remembered_share(dataclasses.replace(model, unseen_s=None), CAMERA, 0.0)
+    assert unknown.shape == share.shape and not unknown.any()
+
+
+def test_a_model_says_how_long_as_many_gaussians_were_not_seen_as_it_has():
+    with pytest.raises(InvalidInput, match="unseen_s"):
+        Model(1, wall(40.0), None, CAMERA, (0.0, 1.0), unseen_s=torch.zeros(3))
+    model = Model(1, wall(40.0), None, CAMERA, (0.0, 1.0))
+    known = dataclasses.replace(model, unseen_s=torch.ones(model.gaussian_count))
+    assert known.sha256() == model.sha256() and known.parameter_count == model.parameter_count
