@@ -21,6 +21,8 @@ REHEARSAL_MARGIN_NS = 300_000
 """Rehearsal ends so long before the next frame is due."""
 SHOWN_WITHIN_S = 0.005
 """Rehearsal waits so long for a picture to be shown."""
+AUTO_SHARE, AUTO_MOST_MS = 0.6, 18.3
+"""Used where `ClockSettings` says nothing."""
 CATCH_UP_SHARE = 0.8
 """Frames that take a larger share of the time between them, with the fewest steps, cannot be caught up with."""
 CATCH_UP_INTERVALS = 4.0
@@ -33,8 +35,9 @@ class ClockSettings:
 
     budget_ms: float | None = None
     """A frame is to be shown so long after it has come; None: `auto_share` of the time between frames, at most `auto_most_ms`."""
-    auto_share: float = 0.6
-    auto_most_ms: float = 18.3
+    auto_share: float | None = None
+    auto_most_ms: float | None = None
+    """Both None: as suits the device."""
     least_share: float = 0.34
     """Training gets so much of the time between frames, though a frame that had to wait is shown later for it."""
     at_least_steps: int | None = None
@@ -57,8 +60,11 @@ class ClockSettings:
         if self.budget_ms is not None and not 0 < self.budget_ms <= 10_000:
             raise InvalidSetting(f"budget-ms is {self.budget_ms}; it must be auto, or between 0 and 10000 milliseconds")
         for name in ("auto_share", "least_share"):
-            if not 0 < getattr(self, name) <= 1:
-                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be in (0, 1]")
+            value = getattr(self, name)
+            if value is not None and not 0 < value <= 1:
+                raise InvalidSetting(f"{name} is {value}; it must be in (0, 1]")
+        if self.auto_most_ms is not None and not 0 < self.auto_most_ms <= 10_000:
+            raise InvalidSetting(f"auto_most_ms is {self.auto_most_ms}; it must be above 0 and at most 10000")
         if self.at_least_steps is not None and not 0 < self.at_least_steps <= self.at_most_steps:
             raise InvalidSetting(
                 f"at_least_steps is {self.at_least_steps} and at_most_steps {self.at_most_steps}; they must be in order"
@@ -122,7 +128,9 @@ class FrameClock:
         settings = self.settings
         if settings.budget_ms is not None:
             return settings.budget_ms * 1e6
-        return min(settings.auto_share * self.interval_ns, settings.auto_most_ms * 1e6)
+        return min(
+            (settings.auto_share or AUTO_SHARE) * self.interval_ns, (settings.auto_most_ms or AUTO_MOST_MS) * 1e6
+        )
 
     def may_rehearse(self, made: int, ahead_ns: float) -> bool:
         """Whether there is room for more rehearsal: `made` steps were made since the last frame, and those that would be under way take

@@ -41,6 +41,9 @@ LIVE_LEAST_STEPS = {"cpu": 1, "cuda": 5}
 """Steps that a frame gets though it is shown late."""
 LIVE_FEWEST_STEPS = {"cpu": 1, "cuda": 5}
 """The same of a frame that others wait behind."""
+LIVE_SHOW_AFTER = {"cpu": (0.85, 28.3), "cuda": (0.6, 18.3)}
+"""A frame is shown after this share of the time between frames, and at most so many milliseconds. A step on a CPU is worth more than showing it
+sooner, as long as it is shown before the next frame comes."""
 LIVE_FIRST_STEPS = {"cpu": 4, "cuda": 10}
 """Steps of a scene's first frame: its picture, and the frames behind it, wait for them."""
 LIVE_CATCH_UP_INTERVALS = {"cpu": 2.0, "cuda": 4.0}
@@ -101,8 +104,11 @@ class LiveSettings:
         """When frames are shown."""
         at_least = self.clock.at_least_steps or LIVE_LEAST_STEPS[self.device]
         fewest = self.clock.fewest_steps or min(at_least, LIVE_FEWEST_STEPS[self.device])
+        share, most_ms = LIVE_SHOW_AFTER[self.device]
         return dataclasses.replace(
             self.clock,
+            auto_share=self.clock.auto_share or share,
+            auto_most_ms=self.clock.auto_most_ms or most_ms,
             at_least_steps=at_least,
             fewest_steps=fewest,
             first_at_least_steps=self.clock.first_at_least_steps or LIVE_FIRST_STEPS[self.device],

@@ -45,6 +45,12 @@ def test_a_fixed_budget_does_not_depend_on_the_rate(fake_time):
     assert clock.show_after_ns == 12e6
 
 
+def test_a_picture_is_shown_after_a_share_of_the_time_between_frames_but_not_very_late(fake_time):
+    shown = [FrameClock(ClockSettings(auto_share=0.85, auto_most_ms=28.0), fps, fake_time) for fps in (60.0, 10.0)]
+    assert [clock.show_after_ns for clock in shown] == [pytest.approx(0.85e9 / 60), 28e6]
+    assert FrameClock(ClockSettings(), 60.0, fake_time).show_after_ns == pytest.approx(0.6e9 / 60)
+
+
 def test_the_interval_follows_the_frames_and_not_a_pause(clock, frame, fake_time):
     for k in range(60):
         fake_time.pass_ms(20)
@@ -149,6 +155,7 @@ def test_waiting_for_a_picture_ends_when_it_is_shown_or_does_not_come(clock):
         {"budget_ms": 0.0},
         {"budget_ms": float("nan")},
         {"auto_share": 0.0},
+        {"auto_most_ms": 0.0},
         {"at_least_steps": 0},
         {"at_least_steps": 5, "at_most_steps": 1},
         {"at_least_steps": 2, "fewest_steps": 3},
