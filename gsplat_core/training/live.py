@@ -16,6 +16,7 @@ from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.colour_correction import MOST_RELAXATION
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.into_view import fill_new_tissue
 from gsplat_core.training.motion_prior import newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
@@ -106,6 +107,7 @@ class LiveReconstructor(Reconstructor):
         self._places = Places()
         self._taken_up: tuple[int, Place] | None = None
         """The number of a frame and the place that it shows, from which its scene starts."""
+        self._camera_before: Camera | None = None
         self._out_of_view = OutOfView(config.max_gaussians, self.device) if config.preallocate else None
 
     def kept(self) -> dict[str, int]:
@@ -191,15 +193,19 @@ class LiveReconstructor(Reconstructor):
         self._to_follow.clear()
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
-        # `grow` adds Gaussians, later.
+        # `grow` adds what is missing to the picture, later.
         if not self._follows_at_once:
             self._to_follow.append((frame, observation))
+        assert self._step is not None
+        before, self._camera_before = self._camera_before, observation.camera
+        if before is not None and before != observation.camera:
+            fill_new_tissue(self._step, frame, observation, before, self.config, self._out_of_view)
 
     def forget(self) -> None:
         """As if no frame had been observed, but for what is known about the device: the memory that was taken, how long a step takes."""
         self._settle()
         self._kept = self._step or self._kept
-        self._step = self._taken_up = None
+        self._step = self._taken_up = self._camera_before = None
         self._to_follow.clear()
         self._places = Places()
         self._version = 0

@@ -49,6 +49,7 @@ class TrainingStep:
     ) -> None:
         self.field = field
         self._rates = config.rates
+        self._has_no_end = config.history_s is not None
         self._weights = LossWeights(config.ssim_weight, config.depth_weight, config.squared_error)
         self._mm_per_px = mm_per_px(gaussians, camera)
         self._adam = FusedAdam(gaussians.tensors())
@@ -120,6 +121,10 @@ class TrainingStep:
         """Let rates that are given in pixels follow the scene's distance from the camera. Waits for it."""
         self._mm_per_px, self._scaled_for = mm_per_px(self.gaussians, camera), None
 
+    def distance(self, camera: Camera) -> float:
+        """How far away the scene typically is, in its own units, as far as the host knows."""
+        return self._mm_per_px * float(camera.K[0, 0])
+
     def settle(self, observation: Observation, rate_scale: float = 1.0) -> None:
         """Wait for the captured steps. Those that changed nothing, because a tile list was beyond its capacity, are taken again on
         `observation`."""
@@ -146,7 +151,7 @@ class TrainingStep:
         else:
             self.gaussians = self.gaussians.append(added)
         self.field.append(added, parents)
-        self._adam.append(added.count)
+        self._adam.append(added.count, usual=self._has_no_end)
 
     def split(self, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
         """Put two Gaussians, made by `halves`, in the place of each of those at `parents` (int64 indices); both move as their parent does.
