@@ -13,6 +13,7 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth import gaussians_beside, grid_of, grid_spacing
 from gsplat_core.training.initialisation import unprojected
+from gsplat_core.training.neighbourhood import around_cells
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.out_of_view import OutOfView
 from gsplat_core.training.step import TrainingStep
@@ -35,22 +36,6 @@ def entered(
     to_world = np.linalg.inv(camera.world_to_camera)
     points = points @ to_world[:3, :3].T + to_world[:3, 3]
     return ~pixels_of(torch.from_numpy(points), before, -edge_px)[1].numpy()
-
-
-def around_cells(now: Gaussians, camera: Camera, spacing: float, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """How many centres of Gaussians lie in each cell of a grid and its eight neighbours, and how deep they lie on average (0: there are none);
-    float32 [rows, columns] each. What lies just beyond the picture's edge counts."""
-    rows, columns = shape
-    pixels, near = pixels_of(now.means, camera, margin_px=spacing)
-    cells = torch.floor(pixels / spacing).long() + 1
-    inside = near & (cells[:, 0] < columns + 2) & (cells[:, 1] < rows + 2) & (cells >= 0).all(1)
-    index = torch.where(inside, cells[:, 1] * (columns + 2) + cells[:, 0], 0)
-    viewmat, _ = camera.matrices(now.device)
-    depth = now.means @ viewmat[2, :3] + viewmat[2, 3]
-    each = torch.stack([torch.ones_like(depth), depth]) * inside
-    sums = each.new_zeros(2, (rows + 2) * (columns + 2)).index_add_(1, index, each)
-    count, total = torch.nn.functional.avg_pool2d(sums.view(2, rows + 2, columns + 2), 3, stride=1) * 9
-    return count, total / count.clamp(min=1)
 
 
 class NewTissue:

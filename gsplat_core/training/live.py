@@ -25,6 +25,7 @@ from gsplat_core.training.places import Place, Places
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.start_on_device import StartOnDevice
 from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.upkeep import Upkeep
 from gsplat_core.transfers import HostCopy
 
 REHEARSED_IN_FLIGHT = 2
@@ -108,6 +109,7 @@ class LiveReconstructor(Reconstructor):
         self._taken_up: tuple[int, Place] | None = None
         """The number of a frame and the place that it shows, from which its scene starts."""
         self._camera_before: Camera | None = None
+        self._upkeep: Upkeep | None = None
         self._out_of_view = OutOfView(config.max_gaussians, self.device) if config.preallocate else None
 
     def kept(self) -> dict[str, int]:
@@ -171,6 +173,8 @@ class LiveReconstructor(Reconstructor):
         observation = self._window.newest
         if self._out_of_view is not None:
             self._out_of_view.follow(self._step, observation)
+        if self._upkeep is not None:
+            self._upkeep(self._step, observation, None if self._out_of_view is None else self._out_of_view.last_seen)
         super()._grow(frame, observation)
 
     def observe(
@@ -246,6 +250,9 @@ class LiveReconstructor(Reconstructor):
         if self._out_of_view is not None:
             self._out_of_view.restart()
         camera = observation.camera
+        self._upkeep = None
+        if self.config.history_s is not None:
+            self._upkeep = Upkeep(camera, self.config)
         same_size = self._kept_size == (camera.width_px, camera.height_px)
         self._kept_size = camera.width_px, camera.height_px
         if kept is not None and same_size and end_s is None:
