@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-import torch
-
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
@@ -14,7 +12,7 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
-from gsplat_core.training.colour_correction import MOST_RELAXATION
+from gsplat_core.training.colour_correction import MOST_RELAXATION, check_colours
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.into_view import fill_new_tissue
 from gsplat_core.training.motion_prior import newest_state
@@ -95,7 +93,7 @@ class LiveReconstructor(Reconstructor):
     ) -> None:
         super().__init__(config, camera, seed=seed, recording_digest=recording_digest, device=device)
         self._live = live or LiveTraining()
-        _check_colours(self._live, config, self.device)
+        check_colours(self._live.colour_relaxation, config, self.device)
         # Where training starts from the motion, it has to be known before.
         self._follows_at_once = config.start_from_motion
         self._to_follow: deque[tuple[Frame, Observation]] = deque(maxlen=2)
@@ -289,18 +287,3 @@ class LiveReconstructor(Reconstructor):
         if budget.is_timed:
             self._learn_step_time(spending)
         return ObserveReport(observation.seq, spending.made, HostCopy(loss), self.gaussians, spending.ending)
-
-
-def _check_colours(live: LiveTraining, config: ReconstructorConfig, device: torch.device) -> None:
-    if live.colour_relaxation == 0:
-        return
-    if device.type == "cuda" and config.sh_degree > 0:
-        raise InvalidSetting(
-            f"colour_relaxation is {live.colour_relaxation} with sh_degree {config.sh_degree}: on a GPU colours that depend on the view are"
-            " not corrected; set sh_degree or colour_relaxation to 0"
-        )
-    if device.type == "cpu" and (not config.squared_error or config.ssim_weight > 0):
-        raise InvalidSetting(
-            f"colour_relaxation is {live.colour_relaxation} with squared_error {config.squared_error} and ssim_weight"
-            f" {config.ssim_weight}: colours are corrected by the squared error alone; set squared_error and ssim_weight 0"
-        )
