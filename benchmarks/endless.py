@@ -1,11 +1,15 @@
 """A recording looped for as long as a stream may last: are memory, time per frame and quality as flat as they should be?
 
-Usage: python benchmarks/endless.py RECORDING [--minutes 60] [--device cuda] [--steps 4] [--rehearse 0] [--scale 1] [--places]
+Usage: python benchmarks/endless.py RECORDING [--minutes 60] [--device cuda] [--steps 4] [--rehearse 4] [--scale 1] [--places] [--out FILE]
 
 The stream is not played to a clock: each frame gets a fixed number of steps, so that an hour takes as long as its work. Per frame it does
-what a live run does: observe, publish, render, rehearse. One JSON line per minute of stream, then one with the growth since the second
-minute and with what the last 5 s look like when they are rendered again at the end. With `--places` each loop begins as a new scene, as
-after a cut, so that the place is left and found again.
+what a live run does: observe, publish, render, grow, rehearse. The next frame is begun while a GPU still works on the last picture, as a live
+run's threads do.
+
+One JSON line for each minute of stream, then one with the growth since the second minute and with what the last 5 s look like when they are
+rendered again at the end. A minute is as many whole turns of the recording as come closest to 60 s, and in each the same frames are scored, so
+that minutes can be compared. `--out` also writes the lines into a file, each at once; a run that is stopped (Ctrl-C, SIGTERM) ends with what it
+reached. With `--places` each turn begins as a new scene, as after a cut, so that the place is left and found again.
 """
 
 from __future__ import annotations
@@ -13,9 +17,11 @@ from __future__ import annotations
 import argparse
 import json
 import resource
+import signal
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +31,7 @@ import torch
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.memory import return_freed_memory
 from gsplat_core.rendering.alpha import AlphaRenderer
+from gsplat_core.rendering.renderer import PendingFrame
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.live import LiveReconstructor
@@ -35,9 +42,9 @@ SCORED_EVERY = 10
 RETAINED_S = 5.0
 
 
-def looped(frames: list[Frame], fps: float, count: int, new_scenes: bool) -> Iterator[Frame]:
-    """`count` frames in an order of time that never runs back."""
-    for seq in range(count):
+def looped(frames: list[Frame], fps: float, new_scenes: bool, first: int = 0) -> Iterator[Frame]:
+    """The frames again and again, from number `first` on, in an order of time that never runs back."""
+    for seq in count(first):
         turn, index = divmod(seq, len(frames))
         begins = "loop" if new_scenes and index == 0 and turn else None
         yield replace(frames[index], seq=seq, pts_ns=round(seq * 1e9 / fps), new_scene=begins)
@@ -70,85 +77,128 @@ class Stream:
         self.reconstructor = LiveReconstructor(config, recording.camera, device=arguments.device)
         self.renderer = AlphaRenderer(recording.camera, torch.device(arguments.device))
         self.new_scenes = arguments.places
+        self.shown: PendingFrame | None = None
 
-    def show(self, frame: Frame) -> torch.Tensor:
-        """The picture of the newest model at a frame's time."""
+    @property
+    def turns_of_minute(self) -> int:
+        """Whole turns of the recording that come closest to a minute."""
+        return max(1, round(60 * self.fps / len(self.frames)))
+
+    def show(self, frame: Frame) -> PendingFrame:
+        """The picture of the newest model at a frame's time, queued. The one before is finished then."""
+        if self.shown is not None:
+            self.shown.result()
         camera = self.reconstructor.camera
         pose = camera if frame.pose is None else camera.with_pose(frame.pose)
-        return self.renderer.render(pose, frame.time_s, ["image"]).result().image
+        self.shown = self.renderer.render(pose, frame.time_s, ["image"])
+        return self.shown
+
+    def work(self, frame: Frame) -> PendingFrame:
+        """What a live run does with a frame."""
+        if frame.new_scene is not None:
+            self.reconstructor.begin_scene(frame)
+        self.reconstructor.observe(frame, budget=self.steps)
+        self.renderer.prepare(self.reconstructor.publish())
+        picture = self.show(frame)
+        self.reconstructor.grow(frame)
+        if self.rehearse:
+            self.reconstructor.rehearse(self.rehearse)
+        return picture
 
     def minute(self, frames: Iterator[Frame]) -> dict[str, Any]:
-        """Work through some frames."""
+        """Work through a minute's frames."""
         took_ms, psnr_db = [], []
-        for frame in frames:
+        turns, length = self.turns_of_minute, len(self.frames)
+        for number, frame in enumerate(islice(frames, turns * length)):
             start = time.perf_counter()
-            if frame.new_scene is not None:
-                self.reconstructor.begin_scene(frame)
-            self.reconstructor.observe(frame, budget=self.steps)
-            self.renderer.prepare(self.reconstructor.publish())
-            image = self.show(frame)
-            self.reconstructor.grow(frame)
-            if self.rehearse:
-                self.reconstructor.rehearse(self.rehearse)
-            if self.device == "cuda":
-                torch.cuda.current_stream().synchronize()
+            picture = self.work(frame)
             took_ms.append(1e3 * (time.perf_counter() - start))
-            if frame.seq % SCORED_EVERY == 0:
-                psnr_db.append(self.score(image, frame))
+            # Within ten turns every frame of the recording is scored once.
+            turn, index = divmod(number, length)
+            if (turn + index) % SCORED_EVERY == 0:
+                psnr_db.append(self.score(picture, frame))
+        if self.device == "cuda":
+            start = time.perf_counter()
+            torch.cuda.synchronize()
+            took_ms[-1] += 1e3 * (time.perf_counter() - start)
         return {
             "frames": len(took_ms),
             "frames_per_s": round(1e3 * len(took_ms) / sum(took_ms), 1),
             "p50_ms": round(float(np.percentile(took_ms, 50)), 3),
             "p99_ms": round(float(np.percentile(took_ms, 99)), 3),
             "mean_ms": round(float(np.mean(took_ms)), 3),
-            "psnr_db": round(float(np.mean(psnr_db)), 2),
+            "psnr_db": round(float(np.mean(psnr_db)), 3),
+            "worst_db": round(min(psnr_db), 2),
             **memory_mib(self.device),
             "gaussians": self.reconstructor.gaussians,
             **self.reconstructor.kept(),
         }
 
-    def score(self, image: torch.Tensor, frame: Frame) -> float:
+    def score(self, picture: PendingFrame, frame: Frame) -> float:
         """PSNR over tissue of a picture as it is displayed."""
-        return psnr_tissue_db((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy(), frame.image, frame.mask)
+        image = (picture.result().image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+        return psnr_tissue_db(image, frame.image, frame.mask)
 
-    def retention(self, count: int) -> dict[str, float]:
+    def retention(self, frames_so_far: int) -> dict[str, float]:
         """What the last seconds look like now, from the model as it ended."""
-        first = max(0, count - round(RETAINED_S * self.fps))
-        psnr_db = [self.score(self.show(frame), frame) for frame in self.newest(first, count)]
+        newest = min(frames_so_far, round(RETAINED_S * self.fps))
+        frames = islice(looped(self.frames, self.fps, False, frames_so_far - newest), newest)
+        self.renderer.prepare(self.reconstructor.publish())
+        psnr_db = [self.score(self.show(frame), frame) for frame in frames]
         return {"retention_db": round(float(np.mean(psnr_db)), 2), "retention_worst_db": round(min(psnr_db), 2)}
-
-    def newest(self, first: int, count: int) -> Iterator[Frame]:
-        """The frames of the loop from number `first` on."""
-        return (frame for frame in looped(self.frames, self.fps, count, False) if frame.seq >= first)
 
 
 def growth(minutes: list[dict[str, Any]]) -> dict[str, float]:
-    """The last minute over the second one, in percent."""
+    """The last minute beside the second one: memory and time in percent, quality in decibels."""
     early, late = minutes[min(1, len(minutes) - 1)], minutes[-1]
     names = [name for name in ("process_mib", "device_mib", "allocated_mib", "p50_ms", "mean_ms") if name in early]
-    return {f"{name}_growth_percent": round(100 * (late[name] / early[name] - 1), 2) for name in names}
+    grown = {f"{name}_growth_percent": round(100 * (late[name] / early[name] - 1), 2) for name in names}
+    return {**grown, "psnr_db_change": round(late["psnr_db"] - early["psnr_db"], 3)}
+
+
+class Lines:
+    """JSON lines on the screen and in a file; each is written before the next one is computed."""
+
+    def __init__(self, out: Path | None) -> None:
+        self._file = None if out is None else out.open("w", encoding="utf-8")
+
+    def write(self, **values: Any) -> None:
+        """Add a line."""
+        print(json.dumps(values), flush=True)
+        if self._file is not None:
+            print(json.dumps(values), file=self._file, flush=True)
+
+
+def interrupted(number: int, _: object) -> None:
+    """SIGTERM is as good as Ctrl-C."""
+    raise KeyboardInterrupt(signal.Signals(number).name)
 
 
 def main() -> None:
     """Run the stream."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--minutes", type=int, default=60)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--steps", type=int, default=4)
-    parser.add_argument("--rehearse", type=int, default=0)
+    parser.add_argument("--rehearse", type=int, default=4)
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--places", action="store_true")
+    parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
-    stream = Stream(arguments)
-    of_minute = round(60 * stream.fps)
-    count = of_minute * arguments.minutes
-    frames = looped(stream.frames, stream.fps, count, stream.new_scenes)
-    minutes = []
-    for minute in range(arguments.minutes):
-        minutes.append(stream.minute(next(frames) for _ in range(of_minute)))
-        print(json.dumps({"minute": minute + 1, **minutes[-1]}), flush=True)
-    print(json.dumps({"recording": arguments.recording.name, **growth(minutes), **stream.retention(count)}))
+    signal.signal(signal.SIGTERM, interrupted)
+    lines, stream = Lines(arguments.out), Stream(arguments)
+    frames = looped(stream.frames, stream.fps, stream.new_scenes)
+    minutes: list[dict[str, Any]] = []
+    try:
+        while len(minutes) < arguments.minutes:
+            minutes.append(stream.minute(frames))
+            lines.write(minute=len(minutes), **minutes[-1])
+    except KeyboardInterrupt as stopped:
+        lines.write(stopped=str(stopped) or "Ctrl-C", after_minutes=len(minutes))
+    if minutes:
+        seen = next(frames).seq
+        lines.write(recording=arguments.recording.name, **growth(minutes), **stream.retention(seen))
 
 
 if __name__ == "__main__":

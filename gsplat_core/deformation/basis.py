@@ -27,7 +27,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import BASIS_CHANNELS, BASIS_GROUPS, POSITION, width_of
+from gsplat_core.scene.layout import BASIS_CHANNELS, BASIS_GROUPS, POSITION, ROTATION, width_of
 
 
 class BasisField(BumpTensors):
@@ -149,11 +149,19 @@ class BasisField(BumpTensors):
 
     def scale_positions(self, factor: Tensor) -> None:
         """See `DeformationField.scale_positions`; Adam's moments follow."""
+        self._scale(POSITION, factor)
+
+    def scale_rotations(self, factor: Tensor) -> bool:
+        """See `DeformationField.scale_rotations`; Adam's moments follow."""
+        self._scale(ROTATION, factor)
+        return True
+
+    def _scale(self, channels: slice, factor: Tensor) -> None:
         count, each = len(factor), factor[:, None, None]
-        self.weights.data[:count, :, POSITION] *= each
+        self.weights.data[:count, :, channels] *= each
         if self._moments is not None:
-            self._moments.first[2][:count, :, POSITION] /= each
-            self._moments.second[2][:count, :, POSITION] /= each.square()
+            self._moments.first[2][:count, :, channels] /= each
+            self._moments.second[2][:count, :, channels] /= each.square()
 
     def continue_with(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
         """See `DeformationField.continue_with`."""

@@ -174,6 +174,11 @@ class DeformationField(torch.nn.Module):
         """Multiply what the field adds to each position by `factor` [N], at all times. Raises InvalidInput for a kind that cannot: here."""
         raise InvalidInput(f"a {self.kind} field cannot be scaled")
 
+    def scale_rotations(self, factor: Tensor) -> bool:
+        """Multiply what the field adds to each quaternion by `factor` [N], at all times. False, with nothing changed, for a field that
+        cannot do that: here."""
+        return False
+
     def continue_with(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
         """Go on with `velocity` [N, 16] per second after `from_s`, for `horizon_s`; see `Continuation`.
 

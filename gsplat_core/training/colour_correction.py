@@ -10,7 +10,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsplat_core.errors import InvalidSetting
 from gsplat_core.ops.frame_gradients.frame_gradients import ColourCorrection
+from gsplat_core.training.config import ReconstructorConfig
 
 MOST_RELAXATION = 2.0
 """From here on the iteration need not converge."""
@@ -53,3 +55,19 @@ class ResidualTarget:
     def correction(self, shown: Tensor, relaxation: Tensor) -> ColourCorrection:
         """For the picture `shown` [H, W, 4], whose fourth channel is not looked at."""
         return ColourCorrection(torch.addcmul(self._wanted, shown, self._tissue, value=-1), relaxation)
+
+
+def check_colours(relaxation: float, config: ReconstructorConfig, device: torch.device) -> None:
+    """Raises InvalidSetting where colours cannot be corrected by so much of what a picture is off by."""
+    if relaxation == 0:
+        return
+    if device.type == "cuda" and config.sh_degree > 0:
+        raise InvalidSetting(
+            f"colour_relaxation is {relaxation} with sh_degree {config.sh_degree}: on a GPU colours that depend on the view are"
+            " not corrected; set sh_degree or colour_relaxation to 0"
+        )
+    if device.type == "cpu" and (not config.squared_error or config.ssim_weight > 0):
+        raise InvalidSetting(
+            f"colour_relaxation is {relaxation} with squared_error {config.squared_error} and ssim_weight"
+            f" {config.ssim_weight}: colours are corrected by the squared error alone; set squared_error and ssim_weight 0"
+        )

@@ -7,6 +7,7 @@ import math
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.frames import Frame
@@ -18,6 +19,18 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.transfers import HostCopy
 
 
+def grid_spacing(pixels: int, gaussians: int) -> float:
+    """Pixels between neighbours where so many Gaussians are spread evenly over a picture of so many pixels."""
+    return math.sqrt(pixels / gaussians)
+
+
+def grid_of(height_px: int, width_px: int, spacing: float) -> tuple[NDArray[np.float64], tuple[int, int]]:
+    """Pixel coordinates [rows * columns, 2] of a grid over the picture, and (rows, columns)."""
+    columns = np.arange(spacing / 2, width_px, spacing)
+    rows = np.arange(spacing / 2, height_px, spacing)
+    return np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2), (len(rows), len(columns))
+
+
 def gaussians_for_uncovered_tissue(
     frame: Frame, observation: Observation, current: Gaussians, config: ReconstructorConfig, most: int
 ) -> Gaussians | None:
@@ -26,29 +39,44 @@ def gaussians_for_uncovered_tissue(
     At most `most`, as dense as the first frame's. Their depth is measured where the frame has depth, else that of the nearest covered
     pixel. None when there is nothing worth adding.
 
-    They are on the device of `current`, which also looks for uncovered pixels; a frame that has few costs the host one number.
+    They are on the observation's device, which also looks for uncovered pixels; a frame that has few costs the host one number.
     """
-    camera = observation.camera
     with torch.no_grad():
-        output = render(current, camera, depth=frame.depth is None)
+        output = render(current, observation.camera, depth=frame.depth is None)
         uncovered = uncovered_pixels(output.alpha, observation.mask)
-    height, width = frame.image.shape[:2]
     if not are_worth_filling(uncovered):
         return None
     is_uncovered = HostCopy(uncovered).numpy()
-    spacing = math.sqrt(height * width / config.gaussians)
-    columns = np.arange(spacing / 2, width, spacing)
-    rows = np.arange(spacing / 2, height, spacing)
-    grid = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    height, width = frame.image.shape[:2]
+    grid, _ = grid_of(height, width, grid_spacing(height * width, config.gaussians))
     wanted = grid[is_uncovered[grid[:, 1].astype(np.int64), grid[:, 0].astype(np.int64)]]
-    if len(wanted) == 0:
-        return None
-    wanted = wanted[:: math.ceil(len(wanted) / most)]
-    if frame.depth is None:
+    depth_mm = frame.depth
+    if depth_mm is None:
         covered = torch.where(output.alpha >= UNCOVERED_ALPHA, output.depth, 0)
-        covered_mm = cv2.medianBlur(HostCopy(covered).numpy(), 5)
-        depth = tissue_depth(frame.with_fields(depth=covered_mm), config.default_depth_mm)
-    else:
-        depth = tissue_depth(frame, config.default_depth_mm)
-    added = gaussians_at_pixels(wanted, spacing, tissue_colours(frame), depth, camera, sh_degree=config.sh_degree)
-    return added.to(current.device)
+        depth_mm = np.asarray(cv2.medianBlur(HostCopy(covered).numpy(), 5))
+    return gaussians_beside(wanted, frame, depth_mm, observation, config, most)
+
+
+def gaussians_beside(
+    wanted: NDArray[np.float64],
+    frame: Frame,
+    depth_mm: NDArray[np.floating],
+    observation: Observation,
+    config: ReconstructorConfig,
+    most: int,
+) -> Gaussians | None:
+    """One Gaussian at each of the pixels `wanted` [M, 2], or at `most` of them, coloured by the frame and at the nearest depth that is known
+    in `depth_mm` [H, W] (0: unknown)."""
+    if len(wanted) == 0 or most <= 0:
+        return None
+    height, width = frame.image.shape[:2]
+    depth = tissue_depth(frame.with_fields(depth=depth_mm), config.default_depth_mm)
+    added = gaussians_at_pixels(
+        wanted[:: math.ceil(len(wanted) / most)],
+        grid_spacing(height * width, config.gaussians),
+        tissue_colours(frame),
+        depth,
+        observation.camera,
+        sh_degree=config.sh_degree,
+    )
+    return added.to(observation.image.device)

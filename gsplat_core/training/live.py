@@ -6,8 +6,6 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
@@ -15,8 +13,9 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
-from gsplat_core.training.colour_correction import MOST_RELAXATION
+from gsplat_core.training.colour_correction import MOST_RELAXATION, check_colours
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.into_view import fill_new_tissue
 from gsplat_core.training.motion_prior import newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
@@ -25,6 +24,7 @@ from gsplat_core.training.places import Place, Places
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.start_on_device import StartOnDevice
 from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.upkeep import Upkeep
 from gsplat_core.transfers import HostCopy
 
 REHEARSED_IN_FLIGHT = 2
@@ -94,7 +94,7 @@ class LiveReconstructor(Reconstructor):
     ) -> None:
         super().__init__(config, camera, seed=seed, recording_digest=recording_digest, device=device)
         self._live = live or LiveTraining()
-        _check_colours(self._live, config, self.device)
+        check_colours(self._live.colour_relaxation, config, self.device)
         # Where training starts from the motion, it has to be known before.
         self._follows_at_once = config.start_from_motion
         self._to_follow: deque[tuple[Frame, Observation]] = deque(maxlen=2)
@@ -107,6 +107,8 @@ class LiveReconstructor(Reconstructor):
         self._places = Places()
         self._taken_up: tuple[int, Place] | None = None
         """The number of a frame and the place that it shows, from which its scene starts."""
+        self._camera_before: Camera | None = None
+        self._upkeep: Upkeep | None = None
         self._out_of_view = OutOfView(config.max_gaussians, self.device) if config.preallocate else None
 
     def kept(self) -> dict[str, int]:
@@ -170,6 +172,8 @@ class LiveReconstructor(Reconstructor):
         observation = self._window.newest
         if self._out_of_view is not None:
             self._out_of_view.follow(self._step, observation)
+        if self._upkeep is not None:
+            self._upkeep(self._step, observation, None if self._out_of_view is None else self._out_of_view.last_seen)
         super()._grow(frame, observation)
 
     def observe(
@@ -192,15 +196,19 @@ class LiveReconstructor(Reconstructor):
         self._to_follow.clear()
 
     def _grow(self, frame: Frame, observation: Observation) -> None:
-        # `grow` adds Gaussians, later.
+        # `grow` adds what is missing to the picture, later.
         if not self._follows_at_once:
             self._to_follow.append((frame, observation))
+        assert self._step is not None
+        before, self._camera_before = self._camera_before, observation.camera
+        if before is not None and before != observation.camera:
+            fill_new_tissue(self._step, frame, observation, before, self.config, self._out_of_view)
 
     def forget(self) -> None:
         """As if no frame had been observed, but for what is known about the device: the memory that was taken, how long a step takes."""
         self._settle()
         self._kept = self._step or self._kept
-        self._step = self._taken_up = None
+        self._step = self._taken_up = self._camera_before = None
         self._to_follow.clear()
         self._places = Places()
         self._version = 0
@@ -241,6 +249,9 @@ class LiveReconstructor(Reconstructor):
         if self._out_of_view is not None:
             self._out_of_view.restart()
         camera = observation.camera
+        self._upkeep = None
+        if self.config.history_s is not None:
+            self._upkeep = Upkeep(camera, self.config)
         same_size = self._kept_size == (camera.width_px, camera.height_px)
         self._kept_size = camera.width_px, camera.height_px
         if kept is not None and same_size and end_s is None:
@@ -281,18 +292,3 @@ class LiveReconstructor(Reconstructor):
         if budget.is_timed:
             self._learn_step_time(spending)
         return ObserveReport(observation.seq, spending.made, HostCopy(loss), self.gaussians, spending.ending)
-
-
-def _check_colours(live: LiveTraining, config: ReconstructorConfig, device: torch.device) -> None:
-    if live.colour_relaxation == 0:
-        return
-    if device.type == "cuda" and config.sh_degree > 0:
-        raise InvalidSetting(
-            f"colour_relaxation is {live.colour_relaxation} with sh_degree {config.sh_degree}: on a GPU colours that depend on the view are"
-            " not corrected; set sh_degree or colour_relaxation to 0"
-        )
-    if device.type == "cpu" and (not config.squared_error or config.ssim_weight > 0):
-        raise InvalidSetting(
-            f"colour_relaxation is {live.colour_relaxation} with squared_error {config.squared_error} and ssim_weight"
-            f" {config.ssim_weight}: colours are corrected by the squared error alone; set squared_error and ssim_weight 0"
-        )

@@ -165,13 +165,18 @@ class FusedAdam:
                 moments[name] = moment[index].contiguous()
         self._spare_rows = 0
 
-    def append(self, count: int) -> None:
-        """Add rows with zero moments at the end; they share the step count, so their first steps are up to 3 times the usual."""
+    def append(self, count: int, *, usual: bool = False) -> None:
+        """Add rows at the end, which share the step count. Their moments are zero: then their first steps are 3 to 6 times the usual ones,
+        the more so the longer the others have been trained. With `usual` their second moments are the mean of the others'."""
         self._need_rows()
         if count < 0:
             raise InvalidInput(f"cannot append {count} rows")
-        self.reserve(self.count + count)
+        used = self.count
+        self.reserve(used + count)
         self._spare_rows -= count
+        if usual and used:
+            for moment in self.second_moments.values():
+                moment[used : used + count] = moment[:used].mean(0)
 
     def follow(self, parameters: Mapping[str, Tensor]) -> None:
         """Make the moments fit tensors that were replaced by others of another shape.

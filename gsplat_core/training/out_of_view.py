@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
@@ -12,6 +13,7 @@ from gsplat_core.training.coverage import uncovered_pixels
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.unseen import Archive, LastSeen, pixels_of
+from gsplat_core.transfers import HostCopy
 
 SEE_EVERY = 8
 """Frames between two looks at which Gaussians are seen; while rows are short, every frame is looked at."""
@@ -21,7 +23,7 @@ UNSEEN_S = 0.5
 """Seconds after which a Gaussian that nobody saw may leave."""
 MARGIN_SHARE = 0.1
 """Gaussians this close to the picture, in widths of it, stay: their extent may reach into it."""
-ARCHIVED_SCENES = 4
+ARCHIVED_SCENES = 8
 """The archive's capacity, in multiples of the scene's."""
 REACH_PX = 5
 """Archived Gaussians come back this close to where something is uncovered: their centre may lie where tissue is still shown."""
@@ -59,15 +61,20 @@ class OutOfView:
         kept_free = round(ROOM_SHARE * self._capacity)
         if self._looks % SEE_EVERY == 0 or self._capacity - step.gaussians.count < kept_free // 2:
             self.last_seen.see(step.at(observation.time_s), observation)
-            self._make_room(step, observation, kept_free, UNSEEN_S)
+            self.make_room(step, observation, kept_free, UNSEEN_S)
         self._looks += 1
         if len(self.archive) and observation.camera != self._looked_from:
             self._looked_from = observation.camera
-            in_view = int(torch.count_nonzero(self.archive.in_view(observation.camera)))
-            if in_view:
-                self._bring_back(step, observation, in_view)
+            if self.has_in_view(observation.camera):
+                with torch.no_grad():
+                    alpha = render(step.at(observation.time_s), observation.camera, depth=False).alpha
+                self.bring_back(step, observation, uncovered_pixels(alpha, torch.ones_like(observation.mask)))
 
-    def _make_room(self, step: TrainingStep, observation: Observation, wanted: int, unseen_s: float) -> None:
+    def has_in_view(self, camera: Camera) -> bool:
+        """Whether anything that is archived lies in a camera's picture."""
+        return bool(self.archive.in_view(camera).any())
+
+    def make_room(self, step: TrainingStep, observation: Observation, wanted: int, unseen_s: float) -> None:
         """Let Gaussians leave until `wanted` rows are free, as far as there are any outside of the picture that were not seen for `unseen_s`.
 
         What a tool hides stays: it can be uncovered at any moment.
@@ -83,21 +90,19 @@ class OutOfView:
             self.archive.put(now.select(leaving))
             self.last_seen.close_gaps(step.remove(leaving))
 
-    def _bring_back(self, step: TrainingStep, observation: Observation, in_view: int) -> None:
-        now = step.at(observation.time_s)
-        with torch.no_grad():
-            alpha = render(now, observation.camera, depth=False).alpha
-        uncovered = uncovered_pixels(alpha, torch.ones_like(observation.mask)).cpu().numpy().astype(np.uint8)
-        if not uncovered.any():
+    def bring_back(self, step: TrainingStep, observation: Observation, wanted: Tensor) -> None:
+        """Let what is archived come back where its centre is near a pixel of `wanted`, bool [H, W]. Waits for the device."""
+        marks = HostCopy(wanted).numpy().astype(np.uint8)
+        if not marks.any():
             return
-        near = torch.from_numpy(cv2.dilate(uncovered, np.ones((2 * REACH_PX + 1,) * 2, np.uint8)) > 0)
+        near = torch.from_numpy(cv2.dilate(marks, np.ones((2 * REACH_PX + 1,) * 2, np.uint8)) > 0)
         back = self.archive.take_uncovered(observation.camera, near, self._capacity)
         if back is None:
             return
-        self.last_seen.see(now, observation)
-        self._make_room(step, observation, back.count, unseen_s=0.0)
+        self.last_seen.see(step.at(observation.time_s), observation)
+        self.make_room(step, observation, back.count, unseen_s=0.0)
         room = self._capacity - step.gaussians.count
         if back.count > room:
             self.archive.put(back.select(slice(room, None)))
-        step.append(back.select(slice(0, room)).to(alpha.device))
+        step.append(back.select(slice(0, room)).to(wanted.device))
         self.last_seen.join(step.gaussians.count, observation.time_s)

@@ -49,6 +49,7 @@ class TrainingStep:
     ) -> None:
         self.field = field
         self._rates = config.rates
+        self._has_no_end = config.history_s is not None
         self._weights = LossWeights(config.ssim_weight, config.depth_weight, config.squared_error)
         self._mm_per_px = mm_per_px(gaussians, camera)
         self._adam = FusedAdam(gaussians.tensors())
@@ -116,9 +117,40 @@ class TrainingStep:
             self._adam.first_moments["means"][:count].div_(each)
             self._adam.second_moments["means"][:count].div_(each.square())
 
+    @property
+    def steps(self) -> int:
+        """Steps taken on this scene."""
+        return self._adam.steps
+
+    def shorten_rotations(self) -> None:
+        """Give every rotation the length 1, the field's part of it in proportion: the scene is the same at all times. Steps across it make a
+        quaternion longer and longer, and then turn it less and less. Nothing changes where the field cannot follow."""
+        quats, count = self.gaussians.quats, self.gaussians.count
+        factor = 1 / quats.norm(dim=1).clamp(min=1e-6)
+        if not self.field.scale_rotations(factor):
+            return
+        quats.mul_(factor[:, None])
+        self._adam.first_moments["quats"][:count].div_(factor[:, None])
+        self._adam.second_moments["quats"][:count].div_(factor.square()[:, None])
+
+    def idle(self, part: float) -> Tensor:
+        """Marks, bool [N], of Gaussians whose squared gradients are on average below this part of the usual ones."""
+        squared = self._adam.second_moments["logit_opacities"][: self.gaussians.count]
+        return squared < part * squared.mean()
+
+    def busiest(self, count: int, among: Tensor) -> Tensor:
+        """The indices, int64 [at most count], of the Gaussians in `among`, bool [N], whose positions have the largest gradients."""
+        squared = self._adam.second_moments["means"][: self.gaussians.count].sum(1).masked_fill(~among, -1.0)
+        order = squared.argsort(descending=True, stable=True)[:count]
+        return order[among[order]]
+
     def take_distance(self, camera: Camera) -> None:
         """Let rates that are given in pixels follow the scene's distance from the camera. Waits for it."""
         self._mm_per_px, self._scaled_for = mm_per_px(self.gaussians, camera), None
+
+    def distance(self, camera: Camera) -> float:
+        """How far away the scene typically is, in its own units, as far as the host knows."""
+        return self._mm_per_px * float(camera.K[0, 0])
 
     def settle(self, observation: Observation, rate_scale: float = 1.0) -> None:
         """Wait for the captured steps. Those that changed nothing, because a tile list was beyond its capacity, are taken again on
@@ -146,17 +178,18 @@ class TrainingStep:
         else:
             self.gaussians = self.gaussians.append(added)
         self.field.append(added, parents)
-        self._adam.append(added.count)
+        self._adam.append(added.count, usual=self._has_no_end)
 
     def split(self, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
         """Put two Gaussians, made by `halves`, in the place of each of those at `parents` (int64 indices); both move as their parent does.
 
-        The second ones come last. All of them start with fresh moments.
+        The second ones come last. All of them start with fresh moments; in a stream without an end the first ones keep their parent's.
         """
         first, second = halves(self.gaussians.select(parents))
         for name, tensor in self.gaussians.tensors().items():
             tensor[parents] = first.tensors()[name]
-            self._adam.reset(name, parents)
+            if not self._has_no_end:
+                self._adam.reset(name, parents)
         self.append(second, parents)
 
     def remove(self, leaving: Tensor) -> RowMoves:

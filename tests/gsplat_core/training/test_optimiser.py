@@ -64,6 +64,27 @@ def test_appended_rows_start_without_moments_and_leave_the_others_alone():
         optimiser.step(whole, gradients)
 
 
+def test_appended_rows_can_start_with_steps_of_the_usual_size():
+    """Rows that join after many steps share a bias correction that is over."""
+    moved = {}
+    for usual in (False, True):
+        whole, gradients = tensors(6), tensors(6, seed=1)
+        optimiser = FusedAdam(whole, RATES)
+        for _ in range(2000):
+            optimiser.step(whole, gradients)
+        joined = {name: torch.cat([tensor, tensor[:2]]) for name, tensor in whole.items()}
+        more = {name: torch.cat([gradient, gradient[:2]]) for name, gradient in gradients.items()}
+        optimiser.append(2, usual=usual)
+        longest = 0.0
+        for _ in range(30):
+            before = joined["sh"].clone()
+            optimiser.step(joined, more)
+            longest = max(longest, float((joined["sh"] - before)[6:].abs().max()) / RATES["sh"])
+        moved[usual] = longest
+    assert moved[False] > 5
+    assert moved[True] < moved[False] / 2
+
+
 def test_rows_with_gradients_that_are_not_finite_are_counted_and_kept():
     values, gradients = tensors(6), tensors(6, seed=1)
     before = {name: tensor.clone() for name, tensor in values.items()}

@@ -65,12 +65,8 @@ def there_and_on(first, columns):
 
 
 @pytest.mark.parametrize("rows", [6000, 700])
-def test_a_scope_that_is_back_after_a_minute_finds_what_it_left(device, rows, request):
+def test_a_scope_that_is_back_after_a_minute_finds_what_it_left(device, rows):
     """With room for all of it, and with room for two pictures only, so that most of it is archived meanwhile."""
-    if device.type == "cuda" and rows == 700:
-        request.applymarker(
-            pytest.mark.xfail(strict=True, reason="31.7 dB on an H200: what comes back from the archive is at rest")
-        )
     made = reconstructor(rows, device)
     watch(made, there_and_on(0, [0] * 30), steps=8)
     watch(made, there_and_on(30, range(0, 380, 4)))

@@ -1,0 +1,110 @@
+"""Tissue that a moving camera brings into view: which of it the scene has nothing for, before training on the frame stretches what lies beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.growth import gaussians_beside, grid_of, grid_spacing
+from gsplat_core.training.initialisation import unprojected
+from gsplat_core.training.neighbourhood import around_cells
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.out_of_view import OutOfView
+from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.unseen import pixels_of, value_at
+from gsplat_core.transfers import HostCopy, tensor_of
+
+USUAL_DENSITY = 0.3
+"""Share of the usual number of Gaussians around a cell below which the scene has nothing there."""
+
+EDGE_CELLS = 1.0
+"""What the camera before had this close to its edge, in cells, counts as new, so that a slow camera leaves nothing out."""
+
+
+def entered(
+    pixels: NDArray[np.float64], camera: Camera, before: Camera, distance: float, edge_px: float = 0.0
+) -> NDArray[np.bool_]:
+    """Which of `pixels` [M, 2] show something, at that distance from the camera, that the camera `before` did not have in its picture,
+    or only this close to its edge."""
+    points, _ = unprojected(pixels, np.full(len(pixels), distance), camera)
+    to_world = np.linalg.inv(camera.world_to_camera)
+    points = points @ to_world[:3, :3].T + to_world[:3, 3]
+    return ~pixels_of(torch.from_numpy(points), before, -edge_px)[1].numpy()
+
+
+class NewTissue:
+    """Cells of a grid over the picture that came into view with the newest frame."""
+
+    def __init__(self, observation: Observation, before: Camera, spacing: float, distance: float) -> None:
+        self._camera, self._spacing = observation.camera, spacing
+        self._grid, self._shape = grid_of(self._camera.height_px, self._camera.width_px, spacing)
+        self._entered = entered(self._grid, self._camera, before, distance, EDGE_CELLS * spacing)
+
+    def __bool__(self) -> bool:
+        return bool(self._entered.any())
+
+    def _empty(self, now: Gaussians) -> tuple[Tensor, Tensor]:
+        """Which cells the scene has next to nothing for, bool [rows, columns], and how deep it is around each."""
+        count, depth = around_cells(now, self._camera, self._spacing, self._shape)
+        return tensor_of(self._entered.reshape(self._shape), now.device) & (count < 9 * USUAL_DENSITY), depth
+
+    def pixels(self, now: Gaussians) -> Tensor:
+        """Marks, bool [H, W], of the pixels in cells for which the scene `now` has no Gaussians. Nothing waits."""
+        return self._of_cells(self._empty(now)[0])
+
+    def unfilled(self, now: Gaussians, mask: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """The middles [M, 2] of those cells that lie on tissue, `mask` [H, W], and the scene's depth [H, W], 0 where there is nothing yet.
+
+        It is the mean of what lies there. A picture's depth is that of what lies in front, and tissue that is placed by it comes nearer and
+        nearer as the camera moves on. Waits for the device.
+        """
+        empty, depth = self._empty(now)
+        wanted = HostCopy(empty.flatten() & (value_at(mask, tensor_of(self._grid, mask.device)) > 0))
+        depth_mm = HostCopy(self._of_cells(depth))
+        return self._grid[wanted.numpy()], depth_mm.numpy()
+
+    def _of_cells(self, values: Tensor) -> Tensor:
+        """Values of cells [rows, columns] as those of their pixels [H, W]."""
+        size = self._camera.height_px, self._camera.width_px
+        row, column = (
+            (torch.arange(pixels, device=values.device) / self._spacing).long().clamp(max=cells - 1)
+            for pixels, cells in zip(size, self._shape, strict=True)
+        )
+        return values[row][:, column]
+
+
+def fill_new_tissue(
+    step: TrainingStep,
+    frame: Frame,
+    observation: Observation,
+    before: Camera,
+    config: ReconstructorConfig,
+    out_of_view: OutOfView | None,
+) -> None:
+    """Before the first step on a frame whose camera moved: what comes into view is there already, from the archive or as new Gaussians.
+
+    Else training would stretch the Gaussians beside it over it, and they would follow the picture for as long as the camera moves.
+    """
+    camera = observation.camera
+    spacing = grid_spacing(camera.width_px * camera.height_px, config.gaussians)
+    new = NewTissue(observation, before, spacing, step.distance(camera))
+    if not new:
+        return
+    if out_of_view is not None and out_of_view.has_in_view(camera):
+        out_of_view.bring_back(step, observation, new.pixels(step.at(observation.time_s)))
+    now = step.at(observation.time_s)
+    wanted, depth_mm = new.unfilled(now, observation.mask)
+    if out_of_view is not None and len(wanted):
+        out_of_view.last_seen.see(now, observation)
+        out_of_view.make_room(step, observation, len(wanted), unseen_s=0.0)
+    most = config.max_gaussians - step.gaussians.count
+    known_mm = depth_mm if frame.depth is None else frame.depth
+    added = gaussians_beside(wanted, frame, known_mm, observation, config, most)
+    if added is not None:
+        step.append(added)

@@ -1,0 +1,39 @@
+"""What lies around each cell of a grid over the picture, by the centres of Gaussians."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.training.unseen import pixels_of
+
+DEPTH_STEPS = 2**24
+"""As finely as float32, depths are counted in parts of the largest one."""
+
+
+def depth_of(means: Tensor, camera: Camera) -> Tensor:
+    """How far points [N, 3] lie from the camera along its axis, [N]."""
+    viewmat, _ = camera.matrices(means.device)
+    return means @ viewmat[2, :3] + viewmat[2, 3]
+
+
+def around_cells(
+    now: Gaussians, camera: Camera, spacing: float, shape: tuple[int, int], reach: int = 1
+) -> tuple[Tensor, Tensor]:
+    """How many centres of Gaussians lie in each cell of a grid and in the cells up to `reach` beside it, and how deep they lie on average
+    (0: there are none); float32 [rows, columns] each. What lies just beyond the picture's edge counts."""
+    rows, columns = (cells + 2 * reach for cells in shape)
+    pixels, near = pixels_of(now.means, camera, margin_px=reach * spacing)
+    cells = torch.floor(pixels / spacing).long() + reach
+    inside = near & (cells[:, 0] < columns) & (cells[:, 1] < rows) & (cells >= 0).all(1)
+    index = torch.where(inside, cells[:, 1] * columns + cells[:, 0], 0)
+    depth = depth_of(now.means, camera)
+    # Whole numbers: on a GPU their sums do not depend on the order in which they come.
+    quantum = depth.abs().amax().clamp(min=1e-30) / DEPTH_STEPS if len(depth) else depth.new_ones(())
+    each = torch.stack([torch.ones_like(index), torch.round(depth / quantum).long()]) * inside
+    sums = each.new_zeros(2, rows * columns).index_add_(1, index, each).to(torch.float32)
+    width = 2 * reach + 1
+    count, total = torch.nn.functional.avg_pool2d(sums.view(2, rows, columns), width, stride=1) * width**2
+    return count, total / count.clamp(min=1) * quantum

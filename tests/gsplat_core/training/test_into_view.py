@@ -1,0 +1,102 @@
+"""What a moving camera brings into view is there before training on the frame."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.training.budget import Budget
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.into_view import NewTissue, entered
+from gsplat_core.training.live import LiveReconstructor, LiveTraining
+from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.neighbourhood import around_cells
+from gsplat_core.training.observations import Observation
+
+WIDTH, HEIGHT, FOCAL, DEPTH_MM = 48, 40, 50.0, 60.0
+CAMERA = Camera.from_focal(FOCAL, WIDTH, HEIGHT)
+WALL = cv2.resize(
+    np.random.default_rng(3).uniform(40, 215, (8, 60, 3)).astype(np.float32),
+    (480, HEIGHT),
+    interpolation=cv2.INTER_CUBIC,
+)
+
+
+def seen_from(column):
+    pose = np.eye(4)
+    pose[0, 3] = -column * DEPTH_MM / FOCAL
+    return CAMERA.with_pose(pose)
+
+
+def frame_at(seq, column, **fields):
+    image = np.clip(np.rint(WALL[:, column : column + WIDTH]), 0, 255).astype(np.uint8)
+    return Frame(seq, round(seq * 1e9 / 30), image, pose=seen_from(column).world_to_camera, **fields)
+
+
+def wall_of(columns, rows=range(HEIGHT)):
+    """A Gaussian for each pixel of the wall in these columns and rows."""
+    u, v = np.meshgrid(np.array(columns) + 0.5, np.array(rows) + 0.5)
+    points = np.stack([u.ravel() - WIDTH / 2, v.ravel() - HEIGHT / 2, np.full(u.size, FOCAL)], -1) * DEPTH_MM / FOCAL
+    means = torch.tensor(points, dtype=torch.float32)
+    one = torch.ones(len(means), 4)
+    return Gaussians(means, one, one[:, :3], one[:, 0], torch.zeros(len(means), 1, 3))
+
+
+@pytest.mark.parametrize("model", ["pinhole", "fisheye"])
+def test_what_the_camera_before_did_not_have_has_entered(model):
+    before = Camera(CAMERA.K, WIDTH, HEIGHT, model=model)
+    after = before.with_pose(seen_from(10).world_to_camera)
+    pixels = np.array([[5.5, 20.5], [30.5, 20.5], [36.5, 20.5], [46.5, 20.5]])
+    assert entered(pixels, after, before, DEPTH_MM).tolist() == [False, False, False, True]
+    assert entered(pixels, after, before, DEPTH_MM, edge_px=4).tolist() == [False, False, True, True]
+    assert not entered(pixels, before, before, DEPTH_MM).any()
+
+
+def test_cells_count_what_lies_around_them_and_how_deep():
+    count, depth = around_cells(wall_of(range(WIDTH)), CAMERA, 4.0, (10, 12))
+    assert count.shape == depth.shape == (10, 12)
+    assert float(count[5, 5]) == 9 * 16
+    torch.testing.assert_close(depth, torch.full_like(depth, DEPTH_MM))
+    nothing = wall_of(range(WIDTH)).select(slice(0, 0))
+    count, depth = around_cells(nothing, CAMERA, 4.0, (10, 12))
+    assert not count.any() and not depth.any()
+
+
+def test_cells_are_unfilled_where_tissue_entered_that_the_scene_does_not_have():
+    mask = np.ones((HEIGHT, WIDTH), np.uint8)
+    mask[:12] = 0
+    observation = Observation.of(frame_at(1, 16, mask=mask), CAMERA)
+    new = NewTissue(observation, CAMERA, 4.0, DEPTH_MM)
+    assert new
+    wanted, depth_mm = new.unfilled(wall_of(range(WIDTH)), observation.mask)
+    assert wanted[:, 0].min() > 36 and wanted[:, 1].min() > 12 and len(wanted) == 3 * 7
+    assert depth_mm.shape == (HEIGHT, WIDTH) and depth_mm[0, 0] == pytest.approx(DEPTH_MM)
+    marks = new.pixels(wall_of(range(WIDTH)))
+    assert marks.shape == (HEIGHT, WIDTH) and bool(marks[:, 36:].all()) and not bool(marks[:, :36].any())
+    everything = wall_of(range(WIDTH + 20))
+    assert len(new.unfilled(everything, observation.mask)[0]) == 0 and not new.pixels(everything).any()
+
+
+@pytest.mark.parametrize(("pixels_a_frame", "frames"), [(1, 60), (4, 60)])
+def test_a_camera_that_moves_on_does_not_drag_the_scene_along(device, pixels_a_frame, frames):
+    config = ReconstructorConfig(
+        gaussians=300, max_gaussians=6000, window_frames=20, bump_spacing_s=0.1, history_s=1.0, preallocate=True,
+        default_depth_mm=DEPTH_MM,
+    )  # fmt: skip
+    made = LiveReconstructor(config, CAMERA, live=LiveTraining(first_rate=1.0, last_rate=1.0), device=device)
+    columns = [0] * 15 + [pixels_a_frame * k for k in range(frames)]
+    scores = []
+    for seq, column in enumerate(columns):
+        frame = frame_at(seq, column)
+        made.observe(frame, budget=Budget.of_steps(8))
+        made.grow(frame)
+        image = made.snapshot().render(frame.time_s, CAMERA.with_pose(frame.pose)).image.clamp(0, 1)
+        scores.append(psnr_tissue_db((image * 255).round().to(torch.uint8).cpu().numpy(), frame.image))
+    pictures = 1 + column / WIDTH
+    assert np.mean(scores[-10:]) > 26
+    assert 300 * pictures * 0.6 < made.gaussians < 300 * pictures * 1.5

@@ -1,0 +1,153 @@
+"""What no picture shows stays where it is, and what no picture needs leaves."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.training.budget import Budget
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.unseen import LastSeen, pixels_of
+from gsplat_core.training.upkeep import EVERY_STEPS, MOST_SPLIT, THINNEST_PX, Upkeep
+
+CONFIG = ReconstructorConfig(
+    gaussians=300, max_gaussians=600, window_frames=10, bump_spacing_s=0.1, history_s=1.0, preallocate=True
+)
+SPACING_PX = math.sqrt(48 * 40 / 300)
+
+
+def trained(make_frame, camera, frames=6, **fields):
+    """The step of a scene that was trained on a moving pattern, and its newest observation."""
+    made = LiveReconstructor(CONFIG, camera)
+    for seq in range(frames):
+        made.observe(make_frame(seq, shift_px=seq, **fields), budget=Budget.of_steps(4))
+    return made._step, made._window.newest
+
+
+def round_of(step, observation, camera, upkeep=None):
+    upkeep = upkeep or Upkeep(camera, CONFIG)
+    step._adam.steps = upkeep._done_at + EVERY_STEPS
+    last_seen = LastSeen(CONFIG.max_gaussians, torch.device("cpu"))
+    upkeep(step, observation, last_seen)
+    assert len(last_seen.times()) == step.gaussians.count
+
+
+def with_room(most):
+    return dataclasses.replace(CONFIG, gaussians=300, max_gaussians=most)
+
+
+def test_a_rotation_of_length_one_turns_as_the_longer_one_did_at_all_times(make_frame, camera):
+    step, _ = trained(make_frame, camera)
+    step.gaussians.quats.mul_(torch.linspace(0.5, 4, step.gaussians.count)[:, None])
+    times = [0.0, 0.1, 0.17]
+    before = [render(step.at(time_s), camera).image for time_s in times]
+    step.shorten_rotations()
+    torch.testing.assert_close(step.gaussians.quats.norm(dim=1), torch.ones(step.gaussians.count))
+    for time_s, image in zip(times, before, strict=True):
+        torch.testing.assert_close(render(step.at(time_s), camera).image, image, atol=2e-5, rtol=0)
+
+
+def test_a_field_that_cannot_follow_keeps_its_rotations(make_frame, camera):
+    config = dataclasses.replace(CONFIG, field="hexplane", history_s=None)
+    made = LiveReconstructor(config, camera)
+    made.observe(make_frame(0), budget=Budget.of_steps(2))
+    made._step.gaussians.quats.mul_(3)
+    made._step.shorten_rotations()
+    assert float(made._step.gaussians.quats.norm(dim=1).min()) > 2
+
+
+def test_only_what_the_picture_shows_falls_back_to_usual_values(make_frame, camera):
+    mask = np.ones((40, 48), np.uint8)
+    mask[:, 24:] = 0
+    step, observation = trained(make_frame, camera, mask=mask)
+    scene = step.gaussians
+    scene.logit_opacities.fill_(4.0)
+    pixels, inside = pixels_of(step.at(observation.time_s).means, camera)
+    shown = inside & (pixels[:, 0] < 24)
+    assert 50 < int(shown.sum()) < 250
+    colours = scene.sh.clone()
+    step._adam.second_moments["logit_opacities"].fill_(1.0)  # nobody leaves
+    round_of(step, observation, camera, Upkeep(camera, with_room(scene.count)))
+    assert bool((scene.logit_opacities[shown] < 4).all()) and bool((scene.logit_opacities[~shown] == 4).all())
+    assert bool((scene.sh[shown].abs() <= colours[shown].abs()).all()) and torch.equal(
+        scene.sh[~shown], colours[~shown]
+    )
+
+
+def test_needles_and_sheets_are_no_thinner_and_wider_than_a_picture_shows(make_frame, camera):
+    step, observation = trained(make_frame, camera)
+    step.gaussians.log_scales[:20, 0] = -20
+    step.gaussians.log_scales[20:40, 1] = 20
+    round_of(step, observation, camera)
+    pixel = 60 / 50
+    assert float(step.gaussians.log_scales.min()) == pytest.approx(math.log(THINNEST_PX * pixel), abs=5e-3)
+    assert float(step.gaussians.log_scales.max()) < math.log(10 * SPACING_PX * pixel)
+
+
+def test_idle_gaussians_leave_where_others_hide_beside_them_or_nobody_will_see_them(make_frame, camera):
+    step, observation = trained(make_frame, camera)
+    moments = step._adam.second_moments["logit_opacities"]
+    moments[: step.gaussians.count] = 1.0
+    count = step.gaussians.count
+    moved = Upkeep(camera, with_room(300))  # no room to split any
+    moved._has_moved = True
+    round_of(step, observation, camera, moved)
+    assert step.gaussians.count == count
+    step.gaussians.means[:3] = step.gaussians.means[:1]
+    step.field.weights.data[:3] = step.field.weights.data[:1]
+    step.gaussians.means[10, 0] = 1000.0
+    moments[:3] = moments[10] = 0.0
+    assert step.idle(1e-3).sum() == 4
+    round_of(step, observation, camera, moved)
+    assert step.gaussians.count == count - 2
+    assert float(step.gaussians.means[:, 0].max()) == 1000
+    still = Upkeep(camera, with_room(300))
+    round_of(step, observation, camera, still)
+    assert float(step.gaussians.means[:, 0].max()) < 1000
+
+
+def test_tissue_with_too_few_gaussians_gets_halves_of_the_busiest(make_frame, camera):
+    step, observation = trained(make_frame, camera)
+    seen = step.at(observation.time_s)
+    inside = pixels_of(seen.means, camera)[1]
+    step.remove(inside & (torch.arange(seen.count) % 3 == 0))
+    step._adam.second_moments["logit_opacities"][: step.gaussians.count] = 1.0
+    count = step.gaussians.count
+    busiest = int(step._adam.second_moments["means"][:count].sum(1).argmax())
+    sizes, picture = step.gaussians.log_scales.clone(), render(step.at(observation.time_s), camera).image
+    round_of(step, observation, camera, upkeep := Upkeep(camera, CONFIG))
+    assert step.gaussians.count == count + round(MOST_SPLIT * count)
+    assert float(step.gaussians.log_scales[busiest].sum()) < float(sizes[busiest].sum()) - 0.3
+    assert float((render(step.at(observation.time_s), camera).image - picture).abs().mean()) < 0.02
+    for _ in range(40):
+        round_of(step, observation, camera, upkeep)
+    shown = pixels_of(step.at(observation.time_s).means, camera)[1]
+    assert int(shown.sum()) == pytest.approx(300, abs=6)
+    full = Upkeep(camera, with_room(step.gaussians.count))
+    step.remove(shown & (torch.arange(len(shown)) % 3 == 0))
+    full._capacity = count = step.gaussians.count
+    round_of(step, observation, camera, full)
+    assert step.gaussians.count == count
+
+
+def test_a_stream_that_has_gone_on_for_days_learns_as_well_as_one_that_begins(make_frame, camera):
+    scores = []
+    for start_s in (0.0, 3.6e5):
+        made = LiveReconstructor(CONFIG, camera)
+        for seq in range(80):
+            frame = make_frame(seq, shift_px=0.2 * seq)
+            frame = dataclasses.replace(frame, pts_ns=round((start_s + seq / 30) * 1e9))
+            made.observe(frame, budget=Budget.of_steps(3))
+            made.grow(frame)
+            made.rehearse(1)
+        image = made.snapshot().render(frame.time_s).image.clamp(0, 1)
+        scores.append(psnr_tissue_db((image * 255).round().to(torch.uint8).numpy(), frame.image))
+    # Rounding of times is noise, from which single runs part.
+    assert scores[1] > scores[0] - 1.5 and min(scores) > 24
