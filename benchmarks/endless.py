@@ -74,7 +74,9 @@ class Stream:
         self.steps, self.rehearse = Budget.of_steps(arguments.steps), arguments.rehearse
         settings = LiveSettings(source=str(arguments.recording), out=Path("unused"), device=arguments.device)
         config = settings.reconstructor_config(recording.camera.width_px * recording.camera.height_px)
-        self.reconstructor = LiveReconstructor(config, recording.camera, device=arguments.device)
+        self.reconstructor = LiveReconstructor(
+            config, recording.camera, live=settings.chosen_training, device=arguments.device
+        )
         self.renderer = AlphaRenderer(recording.camera, torch.device(arguments.device))
         self.new_scenes = arguments.places
         self.shown: PendingFrame | None = None

@@ -22,8 +22,10 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.unseen import LastSeen, pixels_of, value_at
 
-EVERY_STEPS = 128
-"""Training steps between two rounds."""
+RELAX_EVERY = 128
+"""Training steps between two rounds of relaxing."""
+RENEW_EVERY = 512
+"""Training steps between two looks for Gaussians that are of no use, and for tissue that has too few: on a GPU that takes some milliseconds."""
 RELAXING_STEPS = 3600
 """Steps within which sizes, opacities and colours fall back to usual ones by 1 - 1/e where training does not hold them."""
 THINNEST_PX = 0.2
@@ -42,31 +44,44 @@ class Upkeep:
     def __init__(self, camera: Camera, config: ReconstructorConfig) -> None:
         self._first_camera, self._capacity = camera, config.max_gaussians
         self._spacing_px = grid_spacing(camera.width_px * camera.height_px, config.gaussians)
-        self._done_at = 0
+        self._relaxed_at = self._renewed_at = 0
         self._has_moved = False
 
     def __call__(self, step: TrainingStep, observation: Observation, last_seen: LastSeen | None = None) -> None:
         """Look after the scene where it is time. Waits for the device then. `last_seen` follows the rows."""
         self._has_moved = self._has_moved or observation.camera != self._first_camera
-        since = step.steps - self._done_at
-        if since < EVERY_STEPS:
+        since = step.steps - self._relaxed_at
+        if since < RELAX_EVERY:
             return
-        self._done_at = step.steps
-        if last_seen is not None:
-            last_seen.join(step.gaussians.count, observation.time_s)
+        self._relaxed_at = step.steps
         with torch.no_grad():
             step.shorten_rotations()
             pixels, inside = pixels_of(step.at(observation.time_s).means, observation.camera)
             shown = inside & (value_at(observation.mask, pixels) > 0)
             self._relax(step, shown, 1 - math.exp(-since / RELAXING_STEPS), observation.camera)
-            leaving = self._useless(step, pixels, inside)
-            shown &= ~leaving
-            if bool(leaving.any()):
-                moves = step.remove(leaving)
-                shown = shown[moves.order]
-                if last_seen is not None:
-                    last_seen.close_gaps(moves)
-            self._fill_up(step, observation, shown)
+            if step.steps - self._renewed_at >= RENEW_EVERY:
+                self._renewed_at = step.steps
+                self._renew(step, observation, (pixels, inside, shown), last_seen)
+
+    def _renew(
+        self,
+        step: TrainingStep,
+        observation: Observation,
+        where: tuple[Tensor, Tensor, Tensor],
+        last_seen: LastSeen | None,
+    ) -> None:
+        """Let go what is of no use, and split what has too much to do. `where`: pixels, and which Gaussians are in the picture and on tissue."""
+        pixels, inside, shown = where
+        if last_seen is not None:
+            last_seen.join(step.gaussians.count, observation.time_s)
+        leaving = self._useless(step, pixels, inside)
+        shown &= ~leaving
+        if bool(leaving.any()):
+            moves = step.remove(leaving)
+            shown = shown[moves.order]
+            if last_seen is not None:
+                last_seen.close_gaps(moves)
+        self._fill_up(step, observation, shown)
         if last_seen is not None:
             last_seen.join(step.gaussians.count, observation.time_s)
 

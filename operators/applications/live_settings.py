@@ -33,18 +33,18 @@ LIVE_PIXELS_PER_GAUSSIAN = 13
 """On a GPU, for pictures that are larger than the usual ones."""
 LIVE_TRAINING = {
     "cpu": LiveTraining(first_rate=2.0, last_rate=1.5, rate_steps=2, colour_relaxation=1.5),
-    "cuda": LiveTraining(),
+    "cuda": LiveTraining(colour_relaxation=1.5),
 }
 LIVE_SQUARED_ERROR = {"cpu": True, "cuda": False}
 """What colours are corrected by where there are few steps; with many L1 follows motion better."""
-LIVE_LEAST_STEPS = {"cpu": 1, "cuda": 5}
+LIVE_LEAST_STEPS = {"cpu": 1, "cuda": 3}
 """Steps that a frame gets though it is shown late."""
-LIVE_FEWEST_STEPS = {"cpu": 1, "cuda": 5}
+LIVE_FEWEST_STEPS = {"cpu": 1, "cuda": 3}
 """The same of a frame that others wait behind."""
 LIVE_SHOW_AFTER = {"cpu": (0.85, 28.3), "cuda": (0.6, 18.3)}
 """A frame is shown after this share of the time between frames, and at most so many milliseconds. A step on a CPU is worth more than showing it
 sooner, as long as it is shown before the next frame comes."""
-LIVE_FIRST_STEPS = {"cpu": 4, "cuda": 10}
+LIVE_FIRST_STEPS = {"cpu": 4, "cuda": 5}
 """Steps of a scene's first frame: its picture, and the frames behind it, wait for them."""
 LIVE_CATCH_UP_INTERVALS = {"cpu": 2.0, "cuda": 4.0}
 """How long a frame may wait before it is passed over. A GPU catches up within a few frames; two cores would show each of them late."""

@@ -15,7 +15,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.unseen import LastSeen, pixels_of
-from gsplat_core.training.upkeep import EVERY_STEPS, MOST_SPLIT, THINNEST_PX, Upkeep
+from gsplat_core.training.upkeep import MOST_SPLIT, RELAX_EVERY, RENEW_EVERY, THINNEST_PX, Upkeep
 
 CONFIG = ReconstructorConfig(
     gaussians=300, max_gaussians=600, window_frames=10, bump_spacing_s=0.1, history_s=1.0, preallocate=True
@@ -33,7 +33,8 @@ def trained(make_frame, camera, frames=6, **fields):
 
 def round_of(step, observation, camera, upkeep=None):
     upkeep = upkeep or Upkeep(camera, CONFIG)
-    step._adam.steps = upkeep._done_at + EVERY_STEPS
+    step._adam.steps = upkeep._renewed_at + RENEW_EVERY
+    upkeep._relaxed_at = step._adam.steps - RELAX_EVERY
     last_seen = LastSeen(CONFIG.max_gaussians, torch.device("cpu"))
     upkeep(step, observation, last_seen)
     assert len(last_seen.times()) == step.gaussians.count
