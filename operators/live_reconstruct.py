@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import torch
+
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
@@ -112,6 +114,12 @@ class LiveReconstructOp(Operator):
         self.counts, self.newest, self.model, self._learned = TrainingCounts(), None, None, None
         self._scene = self._since_grown = 0
         self._reconstructor = self.make_reconstructor()
+
+    def prepare_thread(self) -> None:
+        """cuBLAS makes what it needs at the first matrix product of a thread, which takes longer than a frame."""
+        assert self._reconstructor is not None
+        one = torch.ones(1, 1, device=self._reconstructor.device)
+        torch.mm(one, one)
 
     def stop(self) -> None:
         if self.newest is not None and self._reconstructor is not None:

@@ -23,8 +23,25 @@ from gsplat_core.transfers import HostCopy, tensor_of
 USUAL_DENSITY = 0.3
 """Share of the usual number of Gaussians around a cell below which the scene has nothing there."""
 
+LOOKS_AFTER = 0.02
+"""A picture that has moved by this part of its width since the last look is looked at again: each look takes some milliseconds."""
 EDGE_CELLS = 1.0
 """What the camera before had this close to its edge, in cells, counts as new, so that a slow camera leaves nothing out."""
+
+
+def has_moved(camera: Camera, before: Camera, distance: float) -> bool:
+    """Whether what lies at that distance has moved far enough in the picture since `before` for another look."""
+    sides = np.array([0.0, 0.5, 1.0])
+    pixels = np.stack(np.meshgrid(sides * camera.width_px, sides * camera.height_px), -1).reshape(-1, 2)
+    earlier = pixels_of(_points_of(pixels, camera, distance), before)[0].numpy()
+    return bool(np.abs(earlier - pixels).max() >= LOOKS_AFTER * camera.width_px)
+
+
+def _points_of(pixels: NDArray[np.float64], camera: Camera, distance: float) -> Tensor:
+    """The points [M, 3] in the world that a camera has at `pixels` [M, 2] and at that distance."""
+    points, _ = unprojected(pixels, np.full(len(pixels), distance), camera)
+    to_world = np.linalg.inv(camera.world_to_camera)
+    return torch.from_numpy((points @ to_world[:3, :3].T + to_world[:3, 3]).astype(np.float32))
 
 
 def entered(
@@ -32,10 +49,7 @@ def entered(
 ) -> NDArray[np.bool_]:
     """Which of `pixels` [M, 2] show something, at that distance from the camera, that the camera `before` did not have in its picture,
     or only this close to its edge."""
-    points, _ = unprojected(pixels, np.full(len(pixels), distance), camera)
-    to_world = np.linalg.inv(camera.world_to_camera)
-    points = points @ to_world[:3, :3].T + to_world[:3, 3]
-    return ~pixels_of(torch.from_numpy(points), before, -edge_px)[1].numpy()
+    return ~pixels_of(_points_of(pixels, camera, distance), before, -edge_px)[1].numpy()
 
 
 class NewTissue:

@@ -15,7 +15,7 @@ from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.colour_correction import MOST_RELAXATION, check_colours
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.into_view import fill_new_tissue
+from gsplat_core.training.into_view import fill_new_tissue, has_moved
 from gsplat_core.training.motion_prior import newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
@@ -108,6 +108,7 @@ class LiveReconstructor(Reconstructor):
         self._taken_up: tuple[int, Place] | None = None
         """The number of a frame and the place that it shows, from which its scene starts."""
         self._camera_before: Camera | None = None
+        """As it was when the scene was last looked at for what came into view."""
         self._upkeep: Upkeep | None = None
         self._out_of_view = OutOfView(config.max_gaussians, self.device) if config.preallocate else None
 
@@ -200,8 +201,11 @@ class LiveReconstructor(Reconstructor):
         if not self._follows_at_once:
             self._to_follow.append((frame, observation))
         assert self._step is not None
-        before, self._camera_before = self._camera_before, observation.camera
-        if before is not None and before != observation.camera:
+        before, camera = self._camera_before, observation.camera
+        if before is None:
+            self._camera_before = camera
+        elif before != camera and has_moved(camera, before, self._step.distance(camera)):
+            self._camera_before = camera
             fill_new_tissue(self._step, frame, observation, before, self.config, self._out_of_view)
 
     def forget(self) -> None:

@@ -15,8 +15,8 @@ DEPTH_STEPS = 2**24
 
 def depth_of(means: Tensor, camera: Camera) -> Tensor:
     """How far points [N, 3] lie from the camera along its axis, [N]."""
-    viewmat, _ = camera.matrices(means.device)
-    return means @ viewmat[2, :3] + viewmat[2, 3]
+    x, y, z, offset = camera.world_to_camera[2].tolist()
+    return x * means[:, 0] + y * means[:, 1] + z * means[:, 2] + offset
 
 
 def around_cells(

@@ -12,7 +12,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.into_view import NewTissue, entered
+from gsplat_core.training.into_view import NewTissue, entered, has_moved
 from gsplat_core.training.live import LiveReconstructor, LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.neighbourhood import around_cells
@@ -65,6 +65,14 @@ def test_cells_count_what_lies_around_them_and_how_deep():
     nothing = wall_of(range(WIDTH)).select(slice(0, 0))
     count, depth = around_cells(nothing, CAMERA, 4.0, (10, 12))
     assert not count.any() and not depth.any()
+
+
+def test_a_camera_has_moved_once_its_picture_has_by_a_fiftieth_of_the_width():
+    step_mm = 0.02 * CAMERA.width_px * DEPTH_MM / float(CAMERA.K[0, 0])
+    for share, expected in ((0.0, False), (0.9, False), (1.1, True)):
+        pose = np.eye(4)
+        pose[1, 3] = share * step_mm
+        assert has_moved(CAMERA.with_pose(pose), CAMERA, DEPTH_MM) is expected
 
 
 def test_cells_are_unfilled_where_tissue_entered_that_the_scene_does_not_have():
