@@ -55,7 +55,6 @@ class Upkeep:
             return
         self._relaxed_at = step.steps
         with torch.no_grad():
-            step.shorten_rotations()
             pixels, inside = pixels_of(step.at(observation.time_s).means, observation.camera)
             shown = inside & (value_at(observation.mask, pixels) > 0)
             self._relax(step, shown, 1 - math.exp(-since / RELAXING_STEPS), observation.camera)
@@ -72,6 +71,7 @@ class Upkeep:
     ) -> None:
         """Let go what is of no use, and split what has too much to do. `where`: pixels, and which Gaussians are in the picture and on tissue."""
         pixels, inside, shown = where
+        step.shorten_rotations()
         if last_seen is not None:
             last_seen.join(step.gaussians.count, observation.time_s)
         leaving = self._useless(step, pixels, inside)
