@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from typing import Any
 
-from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
-from gsplat_core.training.colour_correction import MOST_RELAXATION, check_colours
+from gsplat_core.training.colour_correction import check_colours
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.into_view import fill_new_tissue, has_moved
+from gsplat_core.training.live_training import LiveTraining
 from gsplat_core.training.motion_prior import newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
@@ -29,49 +29,12 @@ from gsplat_core.transfers import HostCopy
 
 REHEARSED_IN_FLIGHT = 2
 """Rehearsal steps that may be queued on a GPU and not finished: the next frame's first step waits for them."""
-
-
 REHEARSED_CORRECTION = 0.5
 """Share of `colour_relaxation` in a rehearsal step: what is corrected at one time shows at the times around it, which had their turn."""
-
+OPENED_SHARE = 0.01
+"""Of the picture's width: when so wide a strip has come into view, new tissue is looked for before the first step."""
 LONGER_STEP_DECAY = 0.1
 """How fast the usual time of a step follows longer ones."""
-
-
-@dataclass(frozen=True)
-class LiveTraining:
-    """How the steps beside a live stream are taken. Raises InvalidSetting for a value out of its range."""
-
-    first_rate: float = 2.0
-    """Factor of all learning rates in a frame's first step: large steps follow a large motion."""
-    last_rate: float = 0.5
-    """The factor that they end with: small steps settle."""
-    rate_steps: int = 30
-    """Steps from the first factor to the last, in equal ratios; a frame that gets more goes on with the last one."""
-    recent_share: float = 0.6
-    """Share of the rehearsal steps that go to the newest frame; the others are spread evenly over the window."""
-    colour_relaxation: float = 0.0
-    """Above 0 colours are not trained with a rate but corrected by what the picture is off by, by so many times the mean over the pixels that
-    show them (`colour_correction`), where the field takes colours at one time. On a CPU with the squared error; on a GPU with harmonics of
-    degree 0, for frames without depth."""
-
-    def __post_init__(self) -> None:
-        for name in ("first_rate", "last_rate"):
-            if not 0 < getattr(self, name) <= 100:
-                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be in (0, 100]")
-        if self.rate_steps < 1:
-            raise InvalidSetting(f"rate_steps is {self.rate_steps}; it must be at least 1")
-        if not 0 <= self.recent_share <= 1:
-            raise InvalidSetting(f"recent_share is {self.recent_share}; it must be between 0 and 1")
-        if not 0 <= self.colour_relaxation < MOST_RELAXATION:
-            raise InvalidSetting(
-                f"colour_relaxation is {self.colour_relaxation}; it must be at least 0 and below {MOST_RELAXATION:g}"
-            )
-
-    def rate_at(self, step: int) -> float:
-        """The factor of a frame's step, counted from 0."""
-        progress = min(1.0, step / max(1, self.rate_steps - 1))
-        return self.first_rate * (self.last_rate / self.first_rate) ** progress
 
 
 class LiveReconstructor(Reconstructor):
@@ -175,7 +138,12 @@ class LiveReconstructor(Reconstructor):
             self._out_of_view.follow(self._step, observation)
         if self._upkeep is not None:
             self._upkeep(self._step, observation, None if self._out_of_view is None else self._out_of_view.last_seen)
+        self._add_uncovered(frame, observation)
+
+    def _add_uncovered(self, frame: Frame, observation: Observation) -> None:
         super()._grow(frame, observation)
+        if self._prior is not None:
+            self._prior.opened_px = 0.0
 
     def observe(
         self, frame: Frame, *, budget: Budget | None = None, steps: int | None = None, train: bool = True
@@ -207,6 +175,10 @@ class LiveReconstructor(Reconstructor):
         elif before != camera and has_moved(camera, before, self._step.distance(camera)):
             self._camera_before = camera
             fill_new_tissue(self._step, frame, observation, before, self.config, self._out_of_view)
+        # The scene has been moved by the flow: at an edge that it left there is nothing to train.
+        prior = self._prior
+        if prior is not None and self._follows_at_once and prior.opened_px >= OPENED_SHARE * camera.width_px:
+            self._add_uncovered(frame, observation)
 
     def forget(self) -> None:
         """As if no frame had been observed, but for what is known about the device: the memory that was taken, how long a step takes."""

@@ -25,7 +25,7 @@ from gsplat_core.scene.layout import LOG_SCALE, POSITION, RAW_COLUMNS
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.damping import Damping
 from gsplat_core.training.depth_from_motion import DepthFromMotion
-from gsplat_core.training.image_motion import Flow, ImageMotion, typical_px
+from gsplat_core.training.image_motion import Flow, ImageMotion, opened_px, typical_px
 from gsplat_core.training.motion_priors import MOTION_PRIORS
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import SurfaceMotion
@@ -65,6 +65,9 @@ class MotionPrior(Protocol):
     def horizon_s(self) -> float:
         """How long after the newest frame its velocity goes on; then the model holds still."""
 
+    opened_px: float
+    """How wide a strip at an edge the picture shows that it did not show when this was set to 0 last."""
+
     def forget(self) -> None:
         """A new scene begins."""
 
@@ -90,7 +93,7 @@ class FlowPrior:
         self._interval_s = 0.0
         self._usual_px: float | None = None
         self._is_sudden = False
-        self.newest_s = 0.0
+        self.newest_s = self.opened_px = 0.0
 
     @property
     def horizon_s(self) -> float:
@@ -108,6 +111,7 @@ class FlowPrior:
             return
         self._interval_s = time_s - before_s
         self._judge(typical_px(flow))
+        self.opened_px += opened_px(flow)
         self._motion = SurfaceMotion(tensor_of(flow, step.gaussians.device), before, camera)
         self._take(frame, flow, step.gaussians.device)
         if self._finds_depth and frame.pose is not None and frame.depth is None:

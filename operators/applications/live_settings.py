@@ -11,7 +11,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.sessions import WriterOptions
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.image_motion import Detail
-from gsplat_core.training.live import LiveTraining
+from gsplat_core.training.live_training import LiveTraining
 from operators.applications.limits import check_max_frames, check_scale, check_seed
 from operators.applications.replay import PIXELS_PER_GAUSSIAN
 from operators.applications.result import RunSettings

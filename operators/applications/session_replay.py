@@ -14,7 +14,8 @@ from gsplat_core.io.sessions import SessionReader, is_session
 from gsplat_core.io.sessions.schedule import ReconstructorMade
 from gsplat_core.io.sessions.session_file import camera_of
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
+from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.live_training import LiveTraining
 from operators.applications.device import seeded
 from operators.applications.limits import check_seed
 from operators.applications.warm_reconstructor import warm_reconstructor

@@ -11,7 +11,8 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.live import LiveReconstructor, LiveTraining
+from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.live_training import LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
 
 WIDTH, HEIGHT = 48, 40
@@ -205,3 +206,17 @@ def test_where_nothing_can_be_trained_on_the_motion_of_the_last_two_frames_goes_
     made.observe(frames[0], budget=Budget.of_steps(5))
     made.observe(frames[1], train=False)  # after one frame there is no motion yet
     assert torch.equal(made.publish().at(frames[1].time_s).means, made._step.at(frames[0].time_s).means)
+
+
+def test_what_a_moving_picture_opens_is_covered_before_it_is_shown():
+    config = ReconstructorConfig(
+        gaussians=600, max_gaussians=1200, motion_prior="flow", motion_detail="half", start_from_motion=True
+    )
+    made = LiveReconstructor(config, Camera.from_focal(120.0, 2 * WIDTH, 2 * HEIGHT))
+    wide = frame_at(0, 4 * WIDTH, 2 * HEIGHT).image
+    for k in range(8):
+        left = WIDTH - 3 * k  # content moves to the right, 3 pixels a frame
+        image = np.ascontiguousarray(wide[:, left : left + 2 * WIDTH])
+        made.observe(Frame(k, k * 33_000_000, image), budget=Budget.of_steps(2))
+    alpha = made.publish().render(7 * 0.033).alpha
+    assert float(alpha[:, :6].mean()) > 0.8
