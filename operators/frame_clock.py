@@ -43,7 +43,7 @@ class ClockSettings:
     at_least_steps: int | None = None
     """Steps that a frame gets, though it is shown late; None: as suits the device."""
     fewest_steps: int | None = None
-    """The same of a frame that others wait behind: so that all of them can be shown; None: as suits the device."""
+    """The same of a frame that others wait behind: so that all of them can be shown; None: as any other."""
     catch_up_intervals: float | None = None
     """A frame that has waited for longer than so many times the time between frames is passed over for newer ones; None: as suits the device."""
     at_most_steps: int = 80

@@ -20,6 +20,7 @@ from torch import Tensor
 from gsplat_core.deformation.basis_adam import BasisRates
 from gsplat_core.deformation.basis_bumps import BumpTensors
 from gsplat_core.deformation.continuation import Continuation
+from gsplat_core.deformation.displacement import displaced
 from gsplat_core.deformation.field import ops_for
 from gsplat_core.deformation.field_slots import BasisSlot
 from gsplat_core.deformation.smoothing import towards_neighbours_
@@ -27,7 +28,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import BASIS_CHANNELS, BASIS_GROUPS, POSITION, ROTATION, width_of
+from gsplat_core.scene.layout import BASIS_CHANNELS, POSITION, ROTATION
 
 
 class BasisField(BumpTensors):
@@ -64,16 +65,7 @@ class BasisField(BumpTensors):
                 f"the field holds bumps for {deltas.shape[0]} Gaussians, got {gaussians.count}; call"
                 " select or append when Gaussians are removed or added"
             )
-        position, rotation, log_scale, colour = torch.split(deltas, [width_of(group) for group in BASIS_GROUPS], dim=1)
-        sh = gaussians.sh
-        base = sh[:, :1] + colour[:, None]
-        return Gaussians(
-            means=gaussians.means + position,
-            quats=gaussians.quats + rotation,
-            log_scales=gaussians.log_scales + log_scale,
-            logit_opacities=gaussians.logit_opacities,
-            sh=base if sh.shape[1] == 1 else torch.cat([base, sh[:, 1:]], dim=1),
-        )
+        return displaced(gaussians, deltas)
 
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
         """The Gaussians at `time_s`; outside the window the state of its nearest end."""

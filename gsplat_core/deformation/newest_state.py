@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from torch import Tensor
-
 from gsplat_core.deformation.continuation import Continuation
+from gsplat_core.deformation.displacement import displaced
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION
 
 
 class NewestState(DeformationField):
@@ -27,19 +25,3 @@ class NewestState(DeformationField):
         if added is None:
             return gaussians
         return displaced(gaussians, added)
-
-
-def displaced(gaussians: Gaussians, deltas: Tensor) -> Gaussians:
-    """The Gaussians with `deltas` [N, 13] or [N, 16] added, in memory of their own."""
-    sh = gaussians.sh.clone()
-    sh[:, 0] += deltas[:, COLOUR]
-    opacities = gaussians.logit_opacities.clone()
-    if deltas.shape[1] >= OPACITY.stop:
-        opacities += deltas[:, OPACITY.start]
-    return Gaussians(
-        means=gaussians.means + deltas[:, POSITION],
-        quats=gaussians.quats + deltas[:, ROTATION],
-        log_scales=gaussians.log_scales + deltas[:, LOG_SCALE],
-        logit_opacities=opacities,
-        sh=sh,
-    )

@@ -19,7 +19,7 @@ LEAST_WEIGHT = 1e-6
 def colour_change(gaussians: Gaussians, camera: Camera, picture: Tensor, counts: Tensor, steps: int) -> Tensor:
     """What to add to the constant coefficients, [N, 3], so that the camera sees `picture` [H, W, 3], 0 to 1, where `counts` [H, W] is 1.
 
-    Simultaneous iterative reconstruction with Nesterov's momentum: each Gaussian takes the mean of what its pixels lack, weighted as it is
+    The update of `colour_correction`, repeated, with Nesterov's momentum: each Gaussian takes the mean of what its pixels lack, weighted as it is
     blended into them. No rate has to be chosen, since the weights of a pixel sum to at most 1. Few steps correct what is large; what it takes
     many for is smaller than a Gaussian.
     """

@@ -94,7 +94,7 @@ def typical_px(flow: Flow) -> float:
     return float(np.median(np.linalg.norm(flow, axis=2)))
 
 
-def opened_px(flow: Flow) -> float:
+def revealed_px(flow: Flow) -> float:
     """How far the picture's content moved inwards, away from the edge where it did so most: a strip of that width shows something new."""
     inwards = (flow[:, 0, 0], -flow[:, -1, 0], flow[0, :, 1], -flow[-1, :, 1])
     return max(float(np.maximum(each, 0).mean()) for each in inwards)

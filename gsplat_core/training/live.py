@@ -31,7 +31,7 @@ REHEARSED_IN_FLIGHT = 2
 """Rehearsal steps that may be queued on a GPU and not finished: the next frame's first step waits for them."""
 REHEARSED_CORRECTION = 0.5
 """Share of `colour_relaxation` in a rehearsal step: what is corrected at one time shows at the times around it, which had their turn."""
-OPENED_SHARE = 0.01
+REVEALED_SHARE = 0.01
 """Of the picture's width: when so wide a strip has come into view, new tissue is looked for before the first step."""
 LONGER_STEP_DECAY = 0.1
 """How fast the usual time of a step follows longer ones."""
@@ -143,7 +143,7 @@ class LiveReconstructor(Reconstructor):
     def _add_uncovered(self, frame: Frame, observation: Observation) -> None:
         super()._grow(frame, observation)
         if self._prior is not None:
-            self._prior.opened_px = 0.0
+            self._prior.revealed_px = 0.0
 
     def observe(
         self, frame: Frame, *, budget: Budget | None = None, steps: int | None = None, train: bool = True
@@ -177,7 +177,7 @@ class LiveReconstructor(Reconstructor):
             fill_new_tissue(self._step, frame, observation, before, self.config, self._out_of_view)
         # The scene has been moved by the flow: at an edge that it left there is nothing to train.
         prior = self._prior
-        if prior is not None and self._follows_at_once and prior.opened_px >= OPENED_SHARE * camera.width_px:
+        if prior is not None and self._follows_at_once and prior.revealed_px >= REVEALED_SHARE * camera.width_px:
             self._add_uncovered(frame, observation)
 
     def forget(self) -> None:

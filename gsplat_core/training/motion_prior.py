@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.deformation.continuation import Continuation
+from gsplat_core.deformation.displacement import displaced
 from gsplat_core.deformation.field import DeformationField
-from gsplat_core.deformation.newest_state import NewestState, displaced
+from gsplat_core.deformation.newest_state import NewestState
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
@@ -25,7 +27,7 @@ from gsplat_core.scene.layout import LOG_SCALE, POSITION, RAW_COLUMNS
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.damping import Damping
 from gsplat_core.training.depth_from_motion import DepthFromMotion
-from gsplat_core.training.image_motion import Flow, ImageMotion, opened_px, typical_px
+from gsplat_core.training.image_motion import Flow, ImageMotion, revealed_px, typical_px
 from gsplat_core.training.motion_priors import MOTION_PRIORS
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import SurfaceMotion
@@ -65,7 +67,7 @@ class MotionPrior(Protocol):
     def horizon_s(self) -> float:
         """How long after the newest frame its velocity goes on; then the model holds still."""
 
-    opened_px: float
+    revealed_px: float
     """How wide a strip at an edge the picture shows that it did not show when this was set to 0 last."""
 
     def forget(self) -> None:
@@ -93,7 +95,7 @@ class FlowPrior:
         self._interval_s = 0.0
         self._usual_px: float | None = None
         self._is_sudden = False
-        self.newest_s = self.opened_px = 0.0
+        self.newest_s = self.revealed_px = 0.0
 
     @property
     def horizon_s(self) -> float:
@@ -111,7 +113,7 @@ class FlowPrior:
             return
         self._interval_s = time_s - before_s
         self._judge(typical_px(flow))
-        self.opened_px += opened_px(flow)
+        self.revealed_px += revealed_px(flow)
         self._motion = SurfaceMotion(tensor_of(flow, step.gaussians.device), before, camera)
         self._take(frame, flow, step.gaussians.device)
         if self._finds_depth and frame.pose is not None and frame.depth is None:
@@ -210,4 +212,6 @@ def newest_state(step: TrainingStep, prior: MotionPrior, learned_s: float) -> tu
         still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
         continuation = Continuation(step.gaussians.count, step.gaussians.device)
         continuation.write(still if velocity is None else velocity, learned_s, prior.horizon_s)
-        return displaced(step.gaussians, deltas), NewestState(learned_s, continuation)
+        now = displaced(step.gaussians, deltas)
+        # The field adds nothing to opacities, so that these are still those that training changes.
+        return replace(now, logit_opacities=now.logit_opacities.clone()), NewestState(learned_s, continuation)

@@ -7,16 +7,10 @@ from torch import Tensor
 
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.unseen import pixels_of
+from gsplat_core.training.unseen import depth_of, pixels_of
 
 DEPTH_STEPS = 2**24
 """As finely as float32, depths are counted in parts of the largest one."""
-
-
-def depth_of(means: Tensor, camera: Camera) -> Tensor:
-    """How far points [N, 3] lie from the camera along its axis, [N]."""
-    x, y, z, offset = camera.world_to_camera[2].tolist()
-    return x * means[:, 0] + y * means[:, 1] + z * means[:, 2] + offset
 
 
 def around_cells(

@@ -20,6 +20,7 @@ from gsplat_core.training.fused_step import FusedStep
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
 from gsplat_core.training.photometric import LossWeights, loss_and_gradients
+from gsplat_core.training.unseen import depth_of
 
 SETTLE_EVERY = 32
 """Captured steps after which the host waits for them, so that tile lists beyond their capacity are noticed soon; also after the first."""
@@ -29,11 +30,7 @@ def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
     """World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres."""
     if not gaussians.count:
         return 1 / float(camera.K[0, 0])
-    x, y, z, offset = camera.world_to_camera[2].tolist()
-    # Not a matrix product: cuBLAS takes tens of milliseconds for its first one in a thread, and a stream's first picture waits for this.
-    distance = (
-        (x * gaussians.means[:, 0] + y * gaussians.means[:, 1] + z * gaussians.means[:, 2] + offset).abs().median()
-    )
+    distance = depth_of(gaussians.means, camera).abs().median()
     return float(distance) / float(camera.K[0, 0])
 
 

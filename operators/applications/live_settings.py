@@ -39,8 +39,6 @@ LIVE_SQUARED_ERROR = {"cpu": True, "cuda": False}
 """What colours are corrected by where there are few steps; with many L1 follows motion better."""
 LIVE_LEAST_STEPS = {"cpu": 1, "cuda": 3}
 """Steps that a frame gets though it is shown late."""
-LIVE_FEWEST_STEPS = {"cpu": 1, "cuda": 3}
-"""The same of a frame that others wait behind."""
 LIVE_SHOW_AFTER = {"cpu": (0.85, 28.3), "cuda": (0.6, 18.3)}
 """A frame is shown after this share of the time between frames, and at most so many milliseconds. A step on a CPU is worth more than showing it
 sooner, as long as it is shown before the next frame comes."""
@@ -103,7 +101,7 @@ class LiveSettings:
     def chosen_clock(self) -> ClockSettings:
         """When frames are shown."""
         at_least = self.clock.at_least_steps or LIVE_LEAST_STEPS[self.device]
-        fewest = self.clock.fewest_steps or min(at_least, LIVE_FEWEST_STEPS[self.device])
+        fewest = self.clock.fewest_steps or at_least
         share, most_ms = LIVE_SHOW_AFTER[self.device]
         return dataclasses.replace(
             self.clock,

@@ -89,3 +89,21 @@ def fingerprints() -> Callable[[Path], dict[str, str]]:
         }
 
     return take
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 12 MiB: a tmpfs where this process may mount one."""
+    if os.geteuid() != 0:
+        pytest.skip(
+            "only root may mount a small tmpfs; tests/operators/sinks/test_video.py shows the same with a reserve"
+        )
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", str(folder)], capture_output=True, check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip(f"this container may not mount a tmpfs: {mounted.stderr.decode().strip()}")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)

@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import struct
-import subprocess
 
 import cv2
 import numpy as np
@@ -137,24 +136,6 @@ def test_a_model_of_a_later_format(bundle, tmp_path, refused):
 def test_no_model_at_all(tmp_path, refused):
     (tmp_path / "model").mkdir()
     refused("render", tmp_path / "model", "--out", tmp_path / "v.mp4", match="missing")
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of 12 MiB: a tmpfs where this process may mount one."""
-    if os.geteuid() != 0:
-        pytest.skip(
-            "only root may mount a small tmpfs; tests/operators/sinks/test_video.py shows the same with a reserve"
-        )
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", str(folder)], capture_output=True, check=False
-    )
-    if mounted.returncode != 0:
-        pytest.skip(f"this container may not mount a tmpfs: {mounted.stderr.decode().strip()}")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
 
 
 def fill(folder, leave_bytes):

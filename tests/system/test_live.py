@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -126,22 +125,6 @@ def test_a_device_without_memory(scope, tmp_path, monkeypatch):
     assert sentence is not None and "there is not enough memory (CUDA out of memory." in sentence
     assert load_bundle(tmp_path / "out" / "model").gaussians.count > 0
     assert len(list(read_frames(tmp_path / "out" / "frames.jsonl"))) >= 5
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of 12 MiB: a tmpfs where this process may mount one."""
-    if os.geteuid() != 0:
-        pytest.skip("only root may mount a small tmpfs")
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=12m", "tmpfs", str(folder)], capture_output=True, check=False
-    )
-    if mounted.returncode != 0:
-        pytest.skip(f"this container may not mount a tmpfs: {mounted.stderr.decode().strip()}")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
 
 
 def test_a_disk_that_fills_up(scope, small_disk, start):

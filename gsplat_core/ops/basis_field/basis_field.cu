@@ -90,7 +90,7 @@ __global__ void __launch_bounds__(kBlock)
     squared = fmaf(b.height, b.height, squared);
   }
   for (int offset = 16; offset > 0; offset /= 2) squared += __shfl_xor_sync(kAll, squared, offset);
-  if (!(squared > kBasisLeastHeight)) return;
+  if (!(squared > kLeastSquaredHeights)) return;
   for (int from = 0; from < field.bumps; from += 32) {
     const Timing t = timing_at(field.centers, field.log_widths, first, from + at.lane, field.bumps);
     const Bump b = bump_at(t.center, t.log_width, tau, from + at.lane < field.bumps);

@@ -13,8 +13,8 @@ constexpr int64_t kBasisChannels = kRawBasisChannels;
 constexpr int64_t kBasisPadded =
     kRawColumns;                     // columns of deltas and gradients as whole raw rows; the field has no part in the last
 constexpr float kBasisReach = 4.0f;  // widths; a bump further away is left out (BUMP_REACH in Python)
-constexpr float kBasisLeastHeight =
-    1e-2f;  // sum of squared heights below which bumps cannot move a Gaussian (LEAST_HEIGHT in Python)
+constexpr float kLeastSquaredHeights =
+    1e-2f;  // sum of squared heights below which bumps cannot move a Gaussian (LEAST_SQUARED_HEIGHTS in Python)
 
 // Learning rates in their order: position, rotation, log-scale, colour; centres, widths.
 constexpr int kBasisRates = 6, kBasisCenterRate = 4, kBasisWidthRate = 5;

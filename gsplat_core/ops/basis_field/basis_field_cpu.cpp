@@ -158,7 +158,7 @@ void move_to(const BasisBumps& field, float* weights, const float* target, int64
         for (int i = 0; i < kRowVectors; ++i) change.v[i] -= heights[lane] * w.v[i];
       }
     }
-    if (!(squares > kBasisLeastHeight) || !is_finite(change)) continue;
+    if (!(squares > kLeastSquaredHeights) || !is_finite(change)) continue;
     for (int64_t from = 0; from < field.bumps; from += kLanes) {
       const int64_t at = first + from;
       const Bumps b = bumps_at(field.centers + at, field.log_widths + at, lanes_left(from, field.bumps), field.tau);
@@ -247,7 +247,7 @@ void add_colours(const BasisBumps& field, float* weights, const float* change, i
           bumps_at(field.centers + first + from, field.log_widths + first + from, lanes_left(from, field.bumps), field.tau);
       if (b.mask != 0) squared += sum(b.height * b.height);
     }
-    if (!(squared > kBasisLeastHeight)) continue;
+    if (!(squared > kLeastSquaredHeights)) continue;
     for (int64_t from = 0; from < field.bumps; from += kLanes) {
       const Bumps b =
           bumps_at(field.centers + first + from, field.log_widths + first + from, lanes_left(from, field.bumps), field.tau);

@@ -15,7 +15,7 @@ from gsplat_core.scene.layout import BASIS_GROUPS, COLOUR, RAW_COLUMNS, width_of
 BUMP_REACH = 4.0
 """A bump further than this many widths from the time contributes nothing: exp(-16) is 1e-7 of its height."""
 
-LEAST_HEIGHT = 1e-2
+LEAST_SQUARED_HEIGHTS = 1e-2
 """Sum of the squared heights of the bumps at a time below which they are left alone: weights would become huge."""
 
 
@@ -111,8 +111,8 @@ def basis_field_move_to_(
         u = (tau - centers) * torch.exp(-log_widths)
         heights = torch.where(u.abs() > BUMP_REACH, torch.zeros_like(u), torch.exp(-u * u))
         squared = (heights * heights).sum(dim=1, keepdim=True)
-        usable = (squared > LEAST_HEIGHT) & change.isfinite().all(dim=1, keepdim=True)
-        share = torch.where(usable, heights / squared.clamp(min=LEAST_HEIGHT), torch.zeros_like(heights))
+        usable = (squared > LEAST_SQUARED_HEIGHTS) & change.isfinite().all(dim=1, keepdim=True)
+        share = torch.where(usable, heights / squared.clamp(min=LEAST_SQUARED_HEIGHTS), torch.zeros_like(heights))
         weights += share[..., None] * torch.where(usable, change, torch.zeros_like(change))[:, None]
 
 
@@ -128,6 +128,6 @@ def basis_field_add_colours_(
     u = (tau - centers) * torch.exp(-log_widths)
     heights = torch.where(u.abs() > BUMP_REACH, torch.zeros_like(u), torch.exp(-u * u))
     squared = heights.square().sum(dim=1, keepdim=True)
-    usable = (squared > LEAST_HEIGHT) & change.square().sum(dim=1, keepdim=True).isfinite()
+    usable = (squared > LEAST_SQUARED_HEIGHTS) & change.square().sum(dim=1, keepdim=True).isfinite()
     share = torch.where(usable, heights / squared, torch.zeros_like(heights))
     weights[..., COLOUR] += share[..., None] * torch.where(usable, change, torch.zeros_like(change))[:, None]

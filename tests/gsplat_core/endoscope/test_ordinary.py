@@ -22,9 +22,9 @@ def stream(rng):
     return [np.clip(picture, 0, 255).astype(np.uint8) for picture in noisy]
 
 
-def judged(pictures, **settings):
+def judged(pictures, frame_ns=FRAME_NS, **settings):
     follower = OrdinaryPictures(OrdinarySettings(**settings))
-    return [follower.is_ordinary(picture, k * FRAME_NS) for k, picture in enumerate(pictures)]
+    return [follower.is_ordinary(picture, k * frame_ns) for k, picture in enumerate(pictures)]
 
 
 def test_most_pictures_of_an_even_stream_are_ordinary_and_every_few_are_looked_at(stream):
@@ -32,6 +32,13 @@ def test_most_pictures_of_an_even_stream_are_ordinary_and_every_few_are_looked_a
     assert sum(ordinary) > 0.7 * len(ordinary)
     longest = max(len(run) for run in "".join("o" if each else "-" for each in ordinary).split("-"))
     assert longest < 6
+
+
+def test_how_often_is_looked_depends_on_the_time_and_not_on_the_frame_rate(stream):
+    def looks(frame_ns):
+        return judged(stream, frame_ns, look_every_s=0.2, most_change=50.0, least_change=0.01)[10:].count(False)
+
+    assert looks(FRAME_NS) == 2 * looks(FRAME_NS // 2)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsplat_core.training.image_motion import ImageMotion, opened_px, typical_px
+from gsplat_core.training.image_motion import ImageMotion, revealed_px, typical_px
 
 
 def texture(shift_x: float, shift_y: float, size: tuple[int, int] = (96, 128)) -> NDArray[np.uint8]:
@@ -70,15 +70,15 @@ def test_pictures_without_tissue_or_texture_give_finite_flow() -> None:
     assert not flow.any()
 
 
-def test_a_picture_opens_at_the_edges_that_its_content_leaves():
+def test_a_picture_reveals_something_at_the_edges_that_its_content_leaves():
     flow = np.zeros((8, 10, 2), np.float32)
-    assert opened_px(flow) == 0
+    assert revealed_px(flow) == 0
     flow[..., 0] = 3.0  # to the right: the left edge shows something new
-    assert opened_px(flow) == 3
+    assert revealed_px(flow) == 3
     flow[..., 0] = -2.0
-    assert opened_px(flow) == 2
+    assert revealed_px(flow) == 2
     flow[..., 1] = np.linspace(-1, 1, 8)[:, None]  # apart from the middle: nothing comes in above or below
-    assert opened_px(flow) == 2
+    assert revealed_px(flow) == 2
     flow[...] = 0
     flow[..., 1] = np.linspace(4, -4, 8)[:, None]  # the picture shrinks
-    assert opened_px(flow) == 4
+    assert revealed_px(flow) == 4

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.rendering.registry import new_renderer
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.learned_prior import LearnedPrior
-from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
+from tests.gsplat_core.training.continuation_checks import check_published_continuations
 from tests.gsplat_core.training.test_motion_prior import CAMERA, INTERVAL_S, SIZE, picture, scored, stream
 
 
@@ -128,13 +127,4 @@ def test_another_scene_begins_without_what_was_learned() -> None:
 
 
 def test_every_published_state_shows_its_own_continuation(device: str) -> None:
-    reconstructor, renderer = learner(device=device), new_renderer("alpha", CAMERA, device)
-    for frame in stream([0.0, 1.0, 2.2, 3.0, 3.1]):
-        reconstructor.observe(frame, steps=4)
-        published = reconstructor.publish()
-        renderer.prepare(published)
-        later_s = frame.time_s + INTERVAL_S
-        shown = renderer.render(CAMERA, later_s).result().image.cpu()
-        expected = published.as_model().to("cpu").render(later_s, depth=False).image
-        assert psnr_tissue_db(shown.numpy(), expected.numpy()) > 45
-    assert not torch.equal(published.at(frame.time_s).means, published.at(later_s).means)
+    check_published_continuations(learner(device=device), stream([0.0, 1.0, 2.2, 3.0, 3.1]), CAMERA, INTERVAL_S)

@@ -208,7 +208,7 @@ def test_where_nothing_can_be_trained_on_the_motion_of_the_last_two_frames_goes_
     assert torch.equal(made.publish().at(frames[1].time_s).means, made._step.at(frames[0].time_s).means)
 
 
-def test_what_a_moving_picture_opens_is_covered_before_it_is_shown():
+def test_what_a_moving_picture_reveals_is_covered_before_it_is_shown():
     config = ReconstructorConfig(
         gaussians=600, max_gaussians=1200, motion_prior="flow", motion_detail="half", start_from_motion=True
     )
@@ -220,3 +220,16 @@ def test_what_a_moving_picture_opens_is_covered_before_it_is_shown():
         made.observe(Frame(k, k * 33_000_000, image), budget=Budget.of_steps(2))
     alpha = made.publish().render(7 * 0.033).alpha
     assert float(alpha[:, :6].mean()) > 0.8
+
+
+def test_a_published_picture_stays_as_it_is_while_training_goes_on():
+    config = ReconstructorConfig(gaussians=120, max_gaussians=240, motion_prior="flow", start_from_motion=True)
+    made = LiveReconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT))
+    made.observe(frame_at(0), budget=Budget.of_steps(4))
+    published = made.publish()
+    before = {name: tensor.clone() for name, tensor in published.gaussians.tensors().items()}
+    made.rehearse(5)
+    made.observe(frame_at(1), budget=Budget.of_steps(4))
+    assert all(torch.equal(tensor, before[name]) for name, tensor in published.gaussians.tensors().items())
+    trained = made._step.gaussians.logit_opacities
+    assert not torch.equal(trained, before["logit_opacities"])

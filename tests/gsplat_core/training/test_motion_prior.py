@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.rendering.registry import new_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
@@ -20,6 +19,7 @@ from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.motion_prior import HORIZON_S, FlowPrior, new_motion_prior, widened
 from gsplat_core.training.reconstructor import Reconstructor
+from tests.gsplat_core.training.continuation_checks import check_published_continuations
 
 SIZE = 64, 96
 CAMERA = Camera.from_focal(90.0, SIZE[1], SIZE[0])
@@ -202,16 +202,9 @@ def test_every_published_state_shows_its_own_continuation(device: str) -> None:
     config = ReconstructorConfig(
         gaussians=700, max_gaussians=900, motion_prior="flow", start_from_motion=True, history_s=1.0, preallocate=True
     )
-    reconstructor, renderer = Reconstructor(config, CAMERA, device=device), new_renderer("alpha", CAMERA, device)
-    for frame in stream([0.0, 1.0, 2.2, 3.0, 3.1]):
-        reconstructor.observe(frame, steps=4)
-        published = reconstructor.publish()
-        renderer.prepare(published)
-        later_s = frame.time_s + INTERVAL_S
-        shown = renderer.render(CAMERA, later_s).result().image.cpu()
-        expected = published.as_model().to("cpu").render(later_s, depth=False).image
-        assert psnr_tissue_db(shown.numpy(), expected.numpy()) > 45
-    assert not torch.equal(published.at(frame.time_s).means, published.at(later_s).means)
+    check_published_continuations(
+        Reconstructor(config, CAMERA, device=device), stream([0.0, 1.0, 2.2, 3.0, 3.1]), CAMERA, INTERVAL_S
+    )
 
 
 @pytest.mark.parametrize("start_from_motion", [False, True])

@@ -152,3 +152,21 @@ def test_a_stream_that_has_gone_on_for_days_learns_as_well_as_one_that_begins(ma
         scores.append(psnr_tissue_db((image * 255).round().to(torch.uint8).numpy(), frame.image))
     # Rounding of times is noise, from which single runs part.
     assert scores[1] > scores[0] - 1.5 and min(scores) > 24
+
+
+def test_between_two_renewals_it_only_relaxes(make_frame, camera):
+    step, observation = trained(make_frame, camera)
+    seen = step.at(observation.time_s)
+    step.remove(pixels_of(seen.means, camera)[1] & (torch.arange(seen.count) % 3 == 0))
+    count, opacities = step.gaussians.count, step.gaussians.logit_opacities.clone()
+    upkeep = Upkeep(camera, CONFIG)
+    step._adam.steps = RELAX_EVERY - 1
+    upkeep(step, observation)
+    assert torch.equal(step.gaussians.logit_opacities, opacities)
+    step._adam.steps = RELAX_EVERY
+    upkeep(step, observation)
+    assert step.gaussians.count == count
+    assert not torch.equal(step.gaussians.logit_opacities, opacities)
+    step._adam.steps = RENEW_EVERY
+    upkeep(step, observation)
+    assert step.gaussians.count > count

@@ -112,6 +112,18 @@ def test_a_frame_that_is_decoded_late_is_counted_and_the_others_keep_their_times
     assert source.counts() == {"decoded_late": 1}
 
 
+def test_the_time_that_opening_takes_does_not_come_out_of_the_second_frames(recording, clock, monkeypatch):
+    source = RealtimeSource(recording)
+    numbered = source._numbered
+
+    def slow_to_open():
+        clock.ns += 30_000_000
+        yield from numbered()
+
+    monkeypatch.setattr(source, "_numbered", slow_to_open)
+    assert [at_ms - 30 for _, _, at_ms in released(source, clock)] == [0, 40, 80, 120, 160]
+
+
 def test_after_a_long_pause_of_the_machine_the_clock_starts_again(recording, clock, monkeypatch):
     source = RealtimeSource(recording)
     frames = iter(recording)
