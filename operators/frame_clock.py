@@ -21,7 +21,7 @@ REHEARSAL_MARGIN_NS = 300_000
 """Rehearsal ends so long before the next frame is due."""
 SHOWN_WITHIN_S = 0.005
 """Rehearsal waits so long for a picture to be shown."""
-AUTO_SHARE, AUTO_MOST_MS = 0.6, 18.3
+AUTO_SHARE, AUTO_MOST_MS, LEAST_SHARE = 0.6, 18.3, 0.34
 """Used where `ClockSettings` says nothing."""
 CATCH_UP_SHARE = 0.8
 """Frames that take a larger share of the time between them, with the fewest steps, cannot be caught up with."""
@@ -38,8 +38,8 @@ class ClockSettings:
     auto_share: float | None = None
     auto_most_ms: float | None = None
     """Both None: as suits the device."""
-    least_share: float = 0.34
-    """Training gets so much of the time between frames, though a frame that had to wait is shown later for it."""
+    least_share: float | None = None
+    """Training gets so much of the time between frames, though a frame that had to wait is shown later for it; None: as suits the device."""
     at_least_steps: int | None = None
     """Steps that a frame gets, though it is shown late; None: as suits the device."""
     fewest_steps: int | None = None
@@ -109,7 +109,7 @@ class FrameClock:
         self._learn_interval(arrived_ns, frame.seq)
         until_ns = arrived_ns + (settings.first_ms * 1e6 if first else self.show_after_ns) - self.display_ns
         if settings.budget_ms is None and not first and not behind:
-            until_ns = max(until_ns, self.now_ns() + settings.least_share * self.interval_ns)
+            until_ns = max(until_ns, self.now_ns() + (settings.least_share or LEAST_SHARE) * self.interval_ns)
         return Budget.until(
             until_ns * 1e-9,
             at_least=settings.first_at_least_steps or 1 if first else self.least_steps(behind),

@@ -140,6 +140,13 @@ class LiveReconstructor(Reconstructor):
             self._upkeep(self._step, observation, None if self._out_of_view is None else self._out_of_view.last_seen)
         self._add_uncovered(frame, observation)
 
+    def look_after_once(self) -> None:
+        """All that `grow` does from time to time, now, and as if something had to leave: what takes long the first time has been done then."""
+        assert self._step is not None
+        if self._upkeep is not None:
+            last_seen = None if self._out_of_view is None else self._out_of_view.last_seen
+            self._upkeep.once(self._step, self._window.newest, last_seen)
+
     def _add_uncovered(self, frame: Frame, observation: Observation) -> None:
         super()._grow(frame, observation)
         if self._prior is not None:

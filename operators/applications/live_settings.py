@@ -39,7 +39,9 @@ LIVE_SQUARED_ERROR = {"cpu": True, "cuda": False}
 """What colours are corrected by where there are few steps; with many L1 follows motion better."""
 LIVE_LEAST_STEPS = {"cpu": 1, "cuda": 3}
 """Steps that a frame gets though it is shown late."""
-LIVE_SHOW_AFTER = {"cpu": (0.85, 28.3), "cuda": (0.6, 18.3)}
+LIVE_LEAST_SHARE = {"cpu": 0.34, "cuda": 0.2}
+"""Share of the time between frames that training gets though a frame is shown later for it: a few steps."""
+LIVE_SHOW_AFTER = {"cpu": (0.85, 28.3), "cuda": (0.6, 17.0)}
 """A frame is shown after this share of the time between frames, and at most so many milliseconds. A step on a CPU is worth more than showing it
 sooner, as long as it is shown before the next frame comes."""
 LIVE_FIRST_STEPS = {"cpu": 4, "cuda": 5}
@@ -107,6 +109,7 @@ class LiveSettings:
             self.clock,
             auto_share=self.clock.auto_share or share,
             auto_most_ms=self.clock.auto_most_ms or most_ms,
+            least_share=self.clock.least_share or LIVE_LEAST_SHARE[self.device],
             at_least_steps=at_least,
             fewest_steps=fewest,
             first_at_least_steps=self.clock.first_at_least_steps or LIVE_FIRST_STEPS[self.device],

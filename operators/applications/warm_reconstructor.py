@@ -41,6 +41,7 @@ def warm_reconstructor(
             drawn.append((model, draw(frame, model)))
             reconstructor.rehearse(2)
             reconstructor.grow(frame)
+        reconstructor.look_after_once()
         reconstructor.forget()
 
 

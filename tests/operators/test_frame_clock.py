@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from operators.frame_clock import ClockSettings, FrameClock
+from operators.frame_clock import LEAST_SHARE, ClockSettings, FrameClock
 
 
 @pytest.fixture
@@ -24,7 +24,10 @@ def test_a_late_frame_still_gets_its_least_share(clock, frame, fake_time):
     arrived_ns = fake_time.ns
     fake_time.pass_ms(200)
     left_s = clock.budget(frame(0, arrived_ns=arrived_ns)).deadline_s - fake_time.ns * 1e-9
-    assert left_s == pytest.approx(clock.settings.least_share * clock.interval_ns * 1e-9)
+    assert left_s == pytest.approx(LEAST_SHARE * clock.interval_ns * 1e-9)
+    short = FrameClock(ClockSettings(least_share=0.1), 30.0, fake_time)
+    left_s = short.budget(frame(0, arrived_ns=arrived_ns)).deadline_s - fake_time.ns * 1e-9
+    assert left_s == pytest.approx(0.1 * short.interval_ns * 1e-9)
 
 
 def test_a_late_frame_that_others_wait_behind_gets_no_extra_time(clock, frame, fake_time):

@@ -15,7 +15,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.unseen import LastSeen, pixels_of
-from gsplat_core.training.upkeep import MOST_SPLIT, RELAX_EVERY, RENEW_EVERY, THINNEST_PX, Upkeep
+from gsplat_core.training.upkeep import MOST_SPLIT, RELAX_EVERY, RENEW_EVERY, SURFACE_STEPS, THINNEST_PX, Upkeep
 
 CONFIG = ReconstructorConfig(
     gaussians=300, max_gaussians=600, window_frames=10, bump_spacing_s=0.1, history_s=1.0, preallocate=True
@@ -170,3 +170,45 @@ def test_between_two_renewals_it_only_relaxes(make_frame, camera):
     step._adam.steps = RENEW_EVERY
     upkeep(step, observation)
     assert step.gaussians.count > count
+
+
+def spread_of(depth, pixels):
+    """How far depths lie from the plane that fits them best, as a share of their mean."""
+    plane = torch.cat([pixels, torch.ones(len(pixels), 1)], 1)
+    rest = depth - plane @ torch.linalg.lstsq(plane, depth[:, None]).solution[:, 0]
+    return float(rest.std() / depth.mean())
+
+
+def test_depths_come_back_to_a_surface_that_keeps_its_slope_and_its_picture(make_frame, camera):
+    mask = np.ones((40, 48), np.uint8)
+    mask[:, 24:] = 0
+    step, observation = trained(make_frame, camera, mask=mask)
+    step._adam.second_moments["logit_opacities"].fill_(1.0)  # nobody leaves
+    pixels, inside = pixels_of(step.at(observation.time_s).means, camera)
+    shown = inside & (pixels[:, 0] < 24)
+    random = torch.Generator().manual_seed(3)
+    step.scale_about(camera, 0.7 + 0.01 * pixels[:, 0] + 0.3 * torch.rand(len(pixels), generator=random))
+    upkeep = Upkeep(camera, with_room(step.gaussians.count))
+    before, hidden = step.at(observation.time_s).means.clone(), step.gaussians.means[~shown].clone()
+    for _ in range(round(3 * SURFACE_STEPS / RENEW_EVERY)):
+        step.scale_about(camera, upkeep._towards_surface(upkeep._look(step, observation), RENEW_EVERY, camera))
+    after = step.at(observation.time_s).means
+    torch.testing.assert_close(pixels_of(after, camera)[0], pixels, atol=1e-3, rtol=0)
+    assert torch.equal(step.gaussians.means[~shown], hidden)
+    assert spread_of(before[shown, 2], pixels[shown]) > 0.06 > 0.03 > spread_of(after[shown, 2], pixels[shown])
+    left, right = shown & (pixels[:, 0] < 8), shown & (pixels[:, 0] > 16)
+    slope = [float(means[right, 2].mean() - means[left, 2].mean()) for means in (before, after)]
+    assert slope[1] > 0.4 * slope[0] > 0
+
+
+def test_everything_can_be_done_once_before_it_is_time(make_frame, camera):
+    step, observation = trained(make_frame, camera)
+    last_seen = LastSeen(CONFIG.max_gaussians, torch.device("cpu"))
+    first, count = step.gaussians.means[0].clone(), step.gaussians.count
+    sizes = step.gaussians.log_scales.clone()
+    Upkeep(camera, with_room(count)).once(step, observation, last_seen)
+    assert step.gaussians.count == count == len(last_seen.times())
+    Upkeep(camera, CONFIG).once(step, observation, last_seen)
+    assert step.gaussians.count == len(last_seen.times()) >= count
+    assert not bool((step.gaussians.means == first).all(1).any())
+    assert not torch.equal(step.gaussians.log_scales, sizes)
