@@ -75,7 +75,10 @@ class Spending:
         self._budget = budget
         self._expected_s = step_s or 0.0
         self._in_flight = 0
+        self._has_queued = False
         self._started_s = budget.clock() if budget.is_timed else 0.0
+        self._first: tuple[int, float] | None = None
+        """Of queued steps: how many were finished when the first was seen to be, and when that was."""
         self.made = 0
         """Steps made or queued so far."""
 
@@ -95,10 +98,13 @@ class Spending:
         """One more step was made, or queued; `in_flight` queued ones are not finished."""
         self.made += 1
         self._in_flight = in_flight
+        self._has_queued = self._has_queued or in_flight > 0
+        self._look()
 
     def all_finished(self) -> None:
         """No step is in flight any more."""
         self._in_flight = 0
+        self._look()
 
     def planned(self) -> int:
         """How many steps are still to come, at least 1: exactly, or estimated from the time that is left."""
@@ -114,11 +120,21 @@ class Spending:
 
     @property
     def step_s(self) -> float:
-        """How long a step takes: measured on this frame once a step of it is finished; 0 where nothing is known. Timed budgets only."""
+        """How long a step takes: measured on this frame once a step of it is finished; 0 where nothing is known. Timed budgets only.
+
+        The first of several queued steps may have waited for other work on the device, so the time after it counts; before there is another
+        one, it is what was known before the frame."""
         finished = self.made - self._in_flight
-        if finished < 1:
+        if self._first is not None and finished > self._first[0]:
+            return max(0.0, self._budget.clock() - self._first[1]) / (finished - self._first[0])
+        if finished < 1 or (self._first is not None and self._expected_s > 0):
             return self._expected_s
         return max(0.0, self._budget.clock() - self._started_s) / finished
+
+    def _look(self) -> None:
+        finished = self.made - self._in_flight
+        if self._first is None and finished >= 1 and self._has_queued and self._budget.is_timed:
+            self._first = finished, self._budget.clock()
 
     @property
     def ending(self) -> Ending:

@@ -157,13 +157,26 @@ def test_queued_steps_count_against_the_deadline(clock):
 def test_the_time_of_a_step_is_that_of_the_finished_ones(clock):
     spending = Spending(Budget.until(clock() + 100, clock=clock))
     assert spending.planned() == 1  # nothing is known yet
-    for _ in range(6):
-        spending.step_made(in_flight=4)
     clock.now_s += 4
+    spending.step_made()
+    assert spending.step_s == 4
+    assert spending.planned() == (100 - 4) // 4
+
+
+def test_what_the_first_queued_step_waited_for_is_not_its_length(clock):
+    spending = Spending(Budget.until(clock() + 100, clock=clock), step_s=3.0)
+    spending.step_made(in_flight=1)
+    spending.step_made(in_flight=2)
+    clock.now_s += 30  # the device was busy with something else
+    spending.step_made(in_flight=2)
+    assert spending.step_s == 3  # as it was known
+    clock.now_s += 2
+    spending.step_made(in_flight=2)
     assert spending.step_s == 2
-    assert spending.planned() == (100 - 4 - 4 * 2) // 2
+    assert spending.planned() == (100 - 32 - 2 * 2) // 2
+    clock.now_s += 4
     spending.all_finished()
-    assert spending.step_s == pytest.approx(4 / 6)
+    assert spending.step_s == 2
 
 
 class Event:
