@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -130,7 +131,7 @@ class FoundToolMaskOp(Operator):
         if frame.mask is None:
             mask = self._finder.find(frame.image)
             self._found += 1
-            self._tool_shares += 1 - np.count_nonzero(mask) / mask.size
+            self._tool_shares += 1 - cv2.countNonZero(mask) / mask.size
             frame = frame.with_fields(mask=mask)
         else:
             self._recorded += 1

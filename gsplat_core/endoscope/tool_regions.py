@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Plane = NDArray[np.float32]
-Flags = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
 
 SMALLEST_REGION = 0.003
 """Share of the field of view; what is smaller is glare or noise."""
@@ -44,92 +44,121 @@ class Regions:
     redness: Plane
     threshold: float
     """Below it a pixel is grey."""
-    brightness: Plane
-    inside: Flags
-    """The field of view."""
-    previous: Flags | None
-    """The frame before's tools."""
+    brightness: Bytes
+    inside: Bytes
+    """The field of view: 1 inside, 0 outside."""
+    levels: NDArray[np.float64]
+    """How many pixels inside have each brightness, [256]."""
+    previous: Bytes | None
+    """The frame before's tools: 255, 0 elsewhere."""
     sharp_edge: float = SHARP_EDGE
     """What a tool's outline must have."""
 
+    @property
+    def whole(self) -> bool:
+        """Whether the field of view is all of the picture."""
+        return bool(self.levels.sum() == self.inside.size)
+
 
 @cache
-def neighbourhood(size_px: int) -> NDArray[np.uint8]:
+def neighbourhood(size_px: int) -> Bytes:
     """A square of ones, for morphology."""
     return np.ones((size_px, size_px), np.uint8)
 
 
-def tool_regions(view: Regions) -> Flags:
-    """The pixels of those connected grey regions that are tools."""
-    area_inside = float(view.inside.sum())
-    mean = float(view.brightness[view.inside].mean())
-    grey = (view.redness < view.threshold) & (view.brightness > DARKEST * mean) & view.inside
-    count, found, stats, _ = cv2.connectedComponentsWithStats(grey.astype(np.uint8), connectivity=4)
-    labels = np.asarray(found, np.int32)
-    area = np.maximum(stats[:, cv2.CC_STAT_AREA], 1).astype(np.float64)
-    if not (area[1:] >= SMALLEST_REGION * KNOWN_DISCOUNT * area_inside).any():
-        return np.zeros(grey.shape, np.bool_)
+CROSS: Bytes = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 
-    def share(flags: Flags) -> NDArray[np.float64]:
-        return np.bincount(labels[flags], minlength=count) / area
 
-    less = np.ones(count)
-    if view.previous is not None:
-        less[share(view.previous) > KNOWN] = KNOWN_DISCOUNT
-    border = _border(view.inside)
-    reaches = np.bincount(labels[border], minlength=count) > 0
-    glare = share(view.brightness > _glare(view.brightness[view.inside]))
-    enough = area >= less * area_inside * np.where(reaches, SMALLEST_REGION, SMALLEST_INNER_REGION)
-    lit = reaches | (glare < MOST_GLARE)
-    core = share(view.redness < view.threshold - CLEARLY_BELOW) > less * CORE
-    sharp = _sharpness(view, grey, labels, count) > less * view.sharp_edge
-    tool = enough & lit & core & sharp
-    tool[0] = False
-    tools: Flags = tool[labels]
+def mean_level(levels: NDArray[np.float64]) -> float:
+    """The mean of the brightness that is counted there; 0 of nothing."""
+    return float(levels @ np.arange(256)) / max(1.0, float(levels.sum()))
+
+
+def tool_regions(view: Regions) -> Bytes:
+    """255 on the pixels of those connected grey regions that are tools, 0 elsewhere."""
+    area_inside = float(view.levels.sum())
+    _, bright = cv2.threshold(view.brightness, int(DARKEST * mean_level(view.levels)), 1, cv2.THRESH_BINARY)
+    below = cv2.bitwise_and(cv2.compare(view.redness, view.threshold, cv2.CMP_LT), bright)
+    grey = np.asarray(below if view.whole else cv2.bitwise_and(below, view.inside), np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(grey, connectivity=4)
+    tools = np.zeros(grey.shape, np.uint8)
+    large = stats[:, cv2.CC_STAT_AREA] >= SMALLEST_REGION * KNOWN_DISCOUNT * area_inside
+    large[0] = False
+    if not large.any():
+        return tools
+    evidence = _evidence(view)
+    change, outline = _change(view), _outline(view, grey)
+    for label in np.flatnonzero(large):
+        left, top, width, height, area = (int(value) for value in stats[label])
+        box = slice(top, top + height), slice(left, left + width)
+        region = cv2.compare(labels[box], float(label), cv2.CMP_EQ)
+        known, core, glare, reaches = (share / 255 for share in cv2.mean(evidence[box], region))
+        less = KNOWN_DISCOUNT if known > KNOWN else 1.0
+        enough = area >= less * area_inside * (SMALLEST_REGION if reaches > 0 else SMALLEST_INNER_REGION)
+        if not enough or core <= less * CORE or (reaches == 0 and glare >= MOST_GLARE):
+            continue
+        sharpness = cv2.mean(change[box], cv2.bitwise_and(outline[box], region))[0]
+        if sharpness > less * view.sharp_edge:
+            tools[box] |= region
     return tools
 
 
-def whole_tools(view: Regions, found: Flags) -> Flags:
-    """Tools with the edges that reflect the tissue around them, closed, and with a margin."""
-    if not found.any():
+def whole_tools(view: Regions, found: Bytes) -> Bytes:
+    """Tools with the edges that reflect the tissue around them, closed, and with a margin; 255 on tools in and out."""
+    if not cv2.countNonZero(found):
         return found
-    own = float(view.redness[found].mean())
-    around = cv2.dilate(np.where(view.inside, view.redness, np.float32(-1)), neighbourhood(9))
-    like_tool = ((view.redness < own + EDGE_AT * (around - own)) & view.inside).astype(np.uint8)
-    tools = found.astype(np.uint8)
-    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    own = cv2.mean(view.redness, found)[0]
+    seen = view.redness if view.whole else np.where(view.inside.view(np.bool_), view.redness, np.float32(-1))
+    around = cv2.dilate(seen, neighbourhood(9))
+    # Nearer to the tool's own redness than to that around it.
+    like_tool = cv2.compare(cv2.scaleAdd(around, -EDGE_AT, view.redness), (1 - EDGE_AT) * own, cv2.CMP_LT)
+    if not view.whole:
+        like_tool = cv2.bitwise_and(like_tool, like_tool, mask=view.inside)
+    reach = cv2.bitwise_or(like_tool, found)
+    tools = found
     for _ in range(GROWTH_PX):
-        tools |= np.asarray(cv2.dilate(tools, cross), np.uint8) & like_tool
+        tools = np.asarray(cv2.bitwise_and(cv2.dilate(tools, CROSS), reach), np.uint8)
     closed = cv2.morphologyEx(tools, cv2.MORPH_CLOSE, neighbourhood(5))
-    return np.asarray(cv2.dilate(closed, neighbourhood(3), iterations=MARGIN_PX), np.bool_)
+    return np.asarray(cv2.dilate(closed, neighbourhood(3), iterations=MARGIN_PX), np.uint8)
 
 
-def _sharpness(view: Regions, grey: Flags, labels: NDArray[np.int32], count: int) -> NDArray[np.float64]:
-    """By how much redness changes across each region's outline, on average; the border of the view is no outline."""
-    square = neighbourhood(7)
-    highest = cv2.dilate(np.where(view.inside, view.redness, np.float32(-1)), square)
-    lowest = cv2.erode(np.where(view.inside, view.redness, np.float32(9)), square)
-    eroded = cv2.erode(grey.astype(np.uint8), neighbourhood(3), borderType=cv2.BORDER_CONSTANT, borderValue=1)
-    outline = grey & (eroded == 0) & (_near_outside(view.inside) == 0)
-    at = labels[outline]
-    change = np.bincount(at, weights=(highest - lowest)[outline], minlength=count)
-    return change / np.maximum(np.bincount(at, minlength=count), 1)
+def _evidence(view: Regions) -> Bytes:
+    """[h, w, 4], 255 where a pixel was a tool before, is clearly grey, is as bright as the brightest ones, and is next to the end of the picture or of the
+    field of view."""
+    core = cv2.compare(view.redness, view.threshold - CLEARLY_BELOW, cv2.CMP_LT)
+    _, glare = cv2.threshold(view.brightness, int(_glare(view.levels)), 255, cv2.THRESH_BINARY)
+    previous = np.zeros_like(view.inside) if view.previous is None else view.previous
+    return np.asarray(cv2.merge([previous, core, glare, _border(view)]), np.uint8)
 
 
-def _near_outside(inside: Flags) -> NDArray[np.uint8]:
-    return np.asarray(cv2.dilate((~inside).astype(np.uint8), neighbourhood(7)), np.uint8)
+def _change(view: Regions) -> Plane:
+    """How much redness differs within three pixels to either side. It counts where nothing of that lies outside of the view."""
+    return np.asarray(cv2.morphologyEx(view.redness, cv2.MORPH_GRADIENT, neighbourhood(7)), np.float32)
 
 
-def _border(inside: Flags) -> Flags:
-    """Pixels next to the end of the picture or of the field of view."""
-    border = _near_outside(inside).astype(np.bool_)
-    border[0] = border[-1] = True
-    border[:, 0] = border[:, -1] = True
-    return border & inside
+def _outline(view: Regions, grey: Bytes) -> Bytes:
+    """1 on the outlines of grey regions; the border of the view is none."""
+    eroded = cv2.erode(grey, neighbourhood(3), borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    outline = cv2.subtract(grey, eroded)
+    return np.asarray(outline if view.whole else cv2.bitwise_and(outline, _well_inside(view.inside)), np.uint8)
 
 
-def _glare(brightness: Plane) -> float:
+def _well_inside(inside: Bytes) -> Bytes:
+    """1 where nothing within three pixels is outside of the field of view; what lies beyond the picture is not."""
+    return np.asarray(cv2.erode(inside, neighbourhood(7)), np.uint8)
+
+
+def _border(view: Regions) -> Bytes:
+    """255 on pixels next to the end of the picture or of the field of view."""
+    if view.whole:
+        border = np.zeros_like(view.inside)
+    else:
+        border = np.asarray(cv2.subtract(view.inside, _well_inside(view.inside)), np.uint8)
+    border[0], border[-1] = view.inside[0], view.inside[-1]
+    border[:, 0], border[:, -1] = view.inside[:, 0], view.inside[:, -1]
+    return np.asarray(cv2.threshold(border, 0, 255, cv2.THRESH_BINARY, dst=border)[1], np.uint8)
+
+
+def _glare(levels: NDArray[np.float64]) -> float:
     """From here on a pixel is as bright as the brightest ones: a highlight, or overexposed."""
-    some = brightness[::4]
-    at = int(0.995 * (some.size - 1))
-    return 0.9 * float(np.partition(some, at)[at])
+    return 0.9 * float(np.searchsorted(np.cumsum(levels), 0.995 * levels.sum()))

@@ -8,6 +8,7 @@ of the view or is large, and that most of it is not overexposed.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -15,11 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.small_picture import averaged
-from gsplat_core.endoscope.tool_regions import SHARP_EDGE, Regions, neighbourhood, tool_regions, whole_tools
+from gsplat_core.endoscope.tool_regions import (
+    SHARP_EDGE,
+    Bytes,
+    Plane,
+    Regions,
+    mean_level,
+    neighbourhood,
+    tool_regions,
+    whole_tools,
+)
 from gsplat_core.errors import InvalidInput
-
-Plane = NDArray[np.float32]
-Flags = NDArray[np.bool_]
 
 LONG_SIDE_PX = 160
 """The picture is analysed at this size."""
@@ -33,6 +40,8 @@ BINS, LOWEST, HIGHEST = 100, -0.3, 0.7
 """Of the distribution of redness; values beyond count into its first and last bin."""
 MEMORY = 0.9
 """What of the distribution stays from one frame to the next: it follows the stream within about ten frames."""
+FINE_BINS, FINE_REACH = 4500, 4.5
+"""A frame's redness is counted in so many bins from minus to plus this, more than bytes can have; everything else follows from the counts."""
 OTHER_SCENE = 0.7
 """A frame whose distribution differs by this much (0..2, sum of absolute differences) is of another scene: everything starts again."""
 EXPECTED_VALLEY, VALLEY_SPREAD, HIGHEST_VALLEY = 0.15, 0.3, 0.33
@@ -46,6 +55,14 @@ SMALLEST_SHARE = 0.003
 HELD_FRAMES = 3
 """For how long tools whose evidence is gone from one frame to the next (glare, blur) are kept."""
 
+BIN_EDGES = np.linspace(LOWEST, HIGHEST, BINS + 1)
+BIN_CENTRES = 0.5 * (BIN_EDGES[1:] + BIN_EDGES[:-1])
+FINE_EDGES = np.linspace(-FINE_REACH, FINE_REACH, FINE_BINS + 1)
+EXPECTATION = np.exp(-0.5 * ((BIN_CENTRES - EXPECTED_VALLEY) / VALLEY_SPREAD) ** 2)
+LEVELS = np.arange(256, dtype=np.float32)
+RED_OVER_OTHERS = np.array([[1, -0.25, -0.25, -0.5]], np.float32)
+"""What the logarithms of red, green, blue and the smaller one of green and blue count in the redness."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -53,10 +70,12 @@ class View:
 
     redness: Plane
     """Log of red over the other two channels, [h, w]."""
-    brightness: Plane
-    """Largest channel, 0..255."""
-    inside: Flags
-    """The field of view."""
+    brightness: Bytes
+    """Largest channel."""
+    inside: Bytes
+    """The field of view: 1 inside, 0 outside."""
+    levels: NDArray[np.float64]
+    """How many pixels inside have each brightness, [256]."""
 
 
 class ToolFinder:
@@ -74,7 +93,8 @@ class ToolFinder:
         """Forget the stream: the next frame is the first one."""
         self._histogram: NDArray[np.float64] | None = None
         self._stretch = 1.0
-        self._previous: Flags | None = None
+        self._previous: Bytes | None = None
+        self._previous_area = 0
         self._held = 0
 
     def find(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -92,43 +112,44 @@ class ToolFinder:
             self.reset()
         tools = self._find(view)
         # Between the pixels of the working size the outline runs straight.
-        large = cv2.resize(tools.astype(np.uint8) * 255, (width, height), interpolation=cv2.INTER_LINEAR)
-        return (large < 128).astype(np.uint8)
+        large = cv2.resize(tools, (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(cv2.threshold(large, 127, 1, cv2.THRESH_BINARY_INV, dst=large)[1], np.uint8)
 
-    def _find(self, view: View) -> Flags:
-        lit = view.inside & (view.brightness > 0.25 * _mean(view.brightness, view.inside))
-        if lit.sum() < SMALLEST_SHARE * lit.size:
+    def _find(self, view: View) -> Bytes:
+        """255 on tools, at working size."""
+        least_lit = int(0.25 * mean_level(view.levels))
+        if view.levels[least_lit + 1 :].sum() < SMALLEST_SHARE * view.redness.size:
             self.reset()
-            return np.zeros(view.redness.shape, np.bool_)
-        redness = self._stretched(view.redness, lit)
+            return np.zeros(view.redness.shape, np.uint8)
+        _, lit = cv2.threshold(view.brightness, least_lit, 1, cv2.THRESH_BINARY)
+        redness = self._stretched(view.redness, np.asarray(cv2.bitwise_and(lit, view.inside), np.uint8))
         threshold, clear = valley(self._histogram)
         sharp = SHARP_EDGE if clear else SHARPER_EDGE
-        regions = Regions(redness, threshold, view.brightness, view.inside, self._previous, sharp)
+        regions = Regions(redness, threshold, view.brightness, view.inside, view.levels, self._previous, sharp)
         tools = whole_tools(regions, tool_regions(regions))
-        if self._previous is not None and self._held < HELD_FRAMES and tools.sum() < 0.4 * self._previous.sum():
+        area = cv2.countNonZero(tools)
+        if self._previous is not None and self._held < HELD_FRAMES and area < 0.4 * self._previous_area:
             self._held += 1
-            return tools | self._previous
+            return np.asarray(cv2.bitwise_or(tools, self._previous), np.uint8)
         self._held = 0
-        self._previous = tools
+        self._previous, self._previous_area = tools, area
         return tools
 
-    def _stretched(self, redness: Plane, lit: Flags) -> Plane:
+    def _stretched(self, redness: Plane, lit: Bytes) -> Plane:
         """Redness with the scene's contrast taken out, after the running distribution has taken in this frame's."""
-        values = redness[lit]
-        some = values[::4]
-        at = int(0.75 * (some.size - 1))
-        reach = float(np.partition(some, at)[at])
+        counts = cv2.calcHist([redness], [0], lit, [FINE_BINS], [-FINE_REACH, FINE_REACH])
+        below = np.append(0.0, np.cumsum(counts, dtype=np.float64))
+        reach = float(np.interp(0.75 * below[-1], below, FINE_EDGES))
         stretch = RED_SCENE / min(max(reach, PALEST_SCENE), RED_SCENE)
-        histogram = _histogram(values * np.float32(stretch))
+        histogram = _histogram(below, stretch)
         if self._histogram is not None and np.abs(histogram - self._histogram).sum() > OTHER_SCENE:
             self.reset()
         if self._histogram is None:
             self._histogram, self._stretch = histogram, stretch
         else:
             self._stretch += (1 - MEMORY) * (stretch - self._stretch)
-            histogram = _histogram(values * np.float32(self._stretch))
-            self._histogram = MEMORY * self._histogram + (1 - MEMORY) * histogram
-        return redness * np.float32(self._stretch)
+            self._histogram = MEMORY * self._histogram + (1 - MEMORY) * _histogram(below, self._stretch)
+        return redness if self._stretch == 1 else redness * np.float32(self._stretch)
 
 
 def view_of(image: NDArray[np.uint8]) -> View:
@@ -136,51 +157,46 @@ def view_of(image: NDArray[np.uint8]) -> View:
     height, width = image.shape[:2]
     scale = min(1.0, LONG_SIDE_PX / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = averaged(image, size)
-    red, green, blue = cv2.split(small)
+    red, green, blue = cv2.split(averaged(image, size))
     brightness = np.asarray(cv2.max(cv2.max(red, green), blue), np.uint8)
     inside = field_of_view(brightness)
+    levels = cv2.calcHist([brightness], [0], inside, [256], [0, 256]).ravel().astype(np.float64)
     # In the dark the ratio of channels is noise, and this term pulls it to 0.
-    floor = max(3.0, 0.06 * _mean(brightness, inside))
-    log_red, log_green, log_blue = (
-        cv2.log(channel.astype(np.float32) + np.float32(floor)) for channel in (red, green, blue)
-    )
+    floor = max(3.0, 0.06 * mean_level(levels))
     # Halfway between the mean of the other two channels, which is less noisy, and the smaller one, which keeps yellow apart from grey.
-    other = 0.25 * (log_green + log_blue) + 0.5 * cv2.min(log_green, log_blue)
-    redness = np.asarray(cv2.GaussianBlur(log_red - other, (0, 0), 0.8), np.float32)
-    return View(redness, brightness.astype(np.float32), inside)
+    channels = cv2.merge([red, green, blue, cv2.min(green, blue)])
+    logs = cv2.LUT(channels, np.log(LEVELS + np.float32(floor)))
+    redness = cv2.transform(logs, RED_OVER_OTHERS)
+    return View(np.asarray(cv2.GaussianBlur(redness, (0, 0), 0.8), np.float32), brightness, inside, levels)
 
 
-def field_of_view(brightness: NDArray[np.uint8]) -> Flags:
-    """What is not black and connected to the border of the picture; brightness: uint8 [h, w]."""
-    black = min(24.0, 0.15 * float(brightness.max()))
-    dark = cv2.copyMakeBorder((brightness < black).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
-    _, labels = cv2.connectedComponents(dark, connectivity=4)
-    inside = ((labels != labels[0, 0])[1:-1, 1:-1]).astype(np.uint8)
+def field_of_view(brightness: Bytes) -> Bytes:
+    """1 on what is not black and connected to the border of the picture, 0 elsewhere; brightness: uint8 [h, w]."""
+    darkest = math.ceil(min(24.0, 0.15 * cv2.minMaxLoc(brightness)[1])) - 1
+    _, dark = cv2.threshold(brightness, darkest, 1, cv2.THRESH_BINARY_INV)
+    around = cv2.copyMakeBorder(dark, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
+    cv2.floodFill(around, None, (0, 0), 2)
+    _, inside = cv2.threshold(around[1:-1, 1:-1], 1, 1, cv2.THRESH_BINARY_INV)
     # Its outermost pixels mix with the black around.
-    return cv2.erode(inside, neighbourhood(3), borderType=cv2.BORDER_CONSTANT, borderValue=1).astype(np.bool_)
+    return np.asarray(cv2.erode(inside, neighbourhood(3), borderType=cv2.BORDER_CONSTANT, borderValue=1), np.uint8)
 
 
 def valley(histogram: NDArray[np.float64] | None) -> tuple[float, bool]:
     """The redness between a grey peak of a distribution and the rest, and True; NO_VALLEY and False where there is no clear one."""
     if histogram is None:
         return NO_VALLEY, False
-    kernel = cv2.getGaussianKernel(21, 2.5)[:, 0]
-    density = np.convolve(np.pad(histogram, 10, mode="edge"), kernel, "valid")
-    at = LOWEST + (np.arange(BINS) + 0.5) * (HIGHEST - LOWEST) / BINS
+    density = cv2.GaussianBlur(histogram[None], (21, 1), 2.5, borderType=cv2.BORDER_REPLICATE)[0]
     left, right = np.maximum.accumulate(density), np.maximum.accumulate(density[::-1])[::-1]
     # A high peak makes no valley clearer, and the constant is a pixel or two of noise.
     clear = np.minimum(np.minimum(left, right), 0.02) / (density + 4e-4)
-    clear[(np.cumsum(histogram) < SMALLEST_SHARE) | (at > HIGHEST_VALLEY)] = 0
-    best = int(np.argmax(clear * np.exp(-0.5 * ((at - EXPECTED_VALLEY) / VALLEY_SPREAD) ** 2)))
+    clear[(np.cumsum(histogram) < SMALLEST_SHARE) | (BIN_CENTRES > HIGHEST_VALLEY)] = 0
+    best = int(np.argmax(clear * EXPECTATION))
     found = bool(clear[best] > CLEAR_VALLEY)
-    return (float(at[best]) if found else NO_VALLEY), found
+    return (float(BIN_CENTRES[best]) if found else NO_VALLEY), found
 
 
-def _histogram(values: Plane) -> NDArray[np.float64]:
-    bins = np.clip((values - LOWEST) * (BINS / (HIGHEST - LOWEST)), 0, BINS - 1).astype(np.intp)
-    return np.bincount(bins, minlength=BINS) / values.size
-
-
-def _mean(plane: NDArray, where: Flags) -> float:
-    return float(cv2.mean(plane, where.astype(np.uint8))[0])
+def _histogram(below: NDArray[np.float64], stretch: float) -> NDArray[np.float64]:
+    """Shares of the stretched redness, [BINS], from how many pixels lie below each of FINE_EDGES before it was stretched."""
+    at_edges = np.interp(BIN_EDGES / stretch, FINE_EDGES, below)
+    at_edges[0], at_edges[-1] = 0, below[-1]
+    return np.diff(at_edges) / below[-1]
