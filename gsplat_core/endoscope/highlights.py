@@ -7,12 +7,13 @@ area, is not brighter than its surroundings.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.reduced import lowest_and_highest, sampled
+from gsplat_core.endoscope.reduced import sampled
 from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
@@ -59,30 +60,56 @@ DEFAULTS = HighlightSettings()
 
 def without_highlights(image: NDArray[np.uint8], settings: HighlightSettings = DEFAULTS) -> NDArray[np.uint8] | None:
     """uint8 [H, W], 0 on highlights and 1 elsewhere, of RGB uint8 [H, W, 3]; None where there are none."""
-    height, width = image.shape[:2]
-    step = -(-max(height, width) // LONG_SIDE_PX)
-    low, high = lowest_and_highest(sampled(image, step))
-    found = (low >= settings.darkest_channel) & (high >= settings.brightest_channel)
-    if not found.any():
-        return None
-    least = np.clip(_surroundings(low, high, settings) + settings.above_surroundings, 0, 255).astype(np.uint8)
-    found &= low >= cv2.resize(least, found.shape[::-1])
-    if not 0 < np.count_nonzero(found) <= settings.most * found.size:
-        return None
-    highlights = found.view(np.uint8)
-    grown = max(1, round(settings.grown * max(found.shape)))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grown + 1, 2 * grown + 1))
-    highlights = np.asarray(cv2.dilate(highlights, disc), np.uint8)
-    if step > 1:
-        highlights = np.asarray(cv2.resize(highlights, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
-    return highlights ^ np.uint8(1)
+    return HighlightFinder(settings).without(image)
 
 
-def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8], settings: HighlightSettings) -> NDArray[np.float32]:
-    """Mean of the darkest channel around each pixel, SHRINK times smaller (rounded up); what is black does not count."""
+class HighlightFinder:
+    """Finds highlights in one picture after another; keeps the memory that it works in, of the size of the last one."""
+
+    def __init__(self, settings: HighlightSettings = DEFAULTS) -> None:
+        self.settings = settings
+        self._planes: list[NDArray[np.uint8]] = []
+
+    def without(self, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
+        """See `without_highlights`."""
+        settings, (height, width) = self.settings, image.shape[:2]
+        step = -(-max(height, width) // LONG_SIDE_PX)
+        some = sampled(image, step)
+        if not self._planes or self._planes[0].shape != some.shape[:2]:
+            self._planes = [np.empty(some.shape[:2], np.uint8) for _ in range(4)]
+        high, green, blue, low = self._planes
+        cv2.split(some, [high, green, blue])
+        cv2.min(cv2.min(high, green, dst=low), blue, dst=low)
+        cv2.max(cv2.max(high, green, dst=high), blue, dst=high)
+        found, other = green, blue
+        cv2.threshold(low, settings.darkest_channel - 1, 1, cv2.THRESH_BINARY, dst=found)
+        cv2.threshold(high, settings.brightest_channel - 1, 1, cv2.THRESH_BINARY, dst=other)
+        if not cv2.countNonZero(cv2.bitwise_and(found, other, dst=found)):
+            return None
+        least = cv2.resize(_surroundings(low, high, settings), found.shape[::-1], dst=other)
+        cv2.bitwise_and(found, cv2.compare(low, least, cv2.CMP_GE, dst=other), dst=found)
+        if not 0 < cv2.countNonZero(found) <= settings.most * found.size:
+            return None
+        grown = cv2.dilate(found, _disc(max(1, round(settings.grown * max(found.shape)))), dst=other)
+        if step > 1:
+            grown = cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST)
+        return np.asarray(cv2.threshold(grown, 0, 1, cv2.THRESH_BINARY_INV)[1], np.uint8)
+
+
+@cache
+def _disc(radius_px: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1, 2 * radius_px + 1)), np.uint8)
+
+
+def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8], settings: HighlightSettings) -> NDArray[np.uint8]:
+    """What the darkest channel of a highlight has at least: so many levels more than its mean around, SHRINK times smaller (rounded up).
+    What is black does not count."""
     width, height = (-(-side // SHRINK) for side in low.shape[::-1])
     small, lit = (cv2.resize(sampled(plane, 2), (width, height), interpolation=cv2.INTER_AREA) for plane in (low, high))
-    weight = (lit >= BLACK).astype(np.float32)
+    _, weight = cv2.threshold(lit, BLACK - 1, 1, cv2.THRESH_BINARY)
     side = 2 * int(settings.surroundings * max(width, height) / 2) + 1
-    mean = cv2.blur(small * weight, (side, side)) / np.maximum(cv2.blur(weight, (side, side)), 1e-6)
-    return np.asarray(mean, np.float32)
+    total, count = (
+        cv2.boxFilter(plane, cv2.CV_32F, (side, side), normalize=False) for plane in (cv2.multiply(small, weight), weight)
+    )
+    least = cv2.divide(total, cv2.max(count, 1.0)) + np.float32(settings.above_surroundings)
+    return np.minimum(least, 255).astype(np.uint8)

@@ -114,17 +114,19 @@ class OrdinaryPictures:
 def _sampled(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:
     """Some of the pixels, their mean colour, and the mean difference of neighbours in some of the rows."""
     height, width = image.shape[:2]
-    small = np.ascontiguousarray(image[:: max(1, height // SAMPLES_PER_SIDE), :: max(1, width // SAMPLES_PER_SIDE)])
-    rows = np.ascontiguousarray(image[:: max(1, height // 24)])
+    size = min(width, SAMPLES_PER_SIDE), min(height, SAMPLES_PER_SIDE)
+    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
     colour = np.array(cv2.mean(small)[:3])
     if width < 2:
         return small, colour, 0.0
-    sharpness = float(np.mean(cv2.mean(cv2.absdiff(rows[:, 1:], rows[:, :-1]))[:3]))
-    return small, colour, sharpness
+    rows = np.ascontiguousarray(image[:: max(1, height // 24)])
+    left, right = rows[:, :-1], rows[:, 1:]
+    return small, colour, cv2.norm(left, right, cv2.NORM_L1) / left.size
 
 
 def _change_of_bands(small: NDArray[np.uint8], before: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Mean absolute change of each horizontal band."""
-    edges = np.linspace(0, len(small), BANDS + 1).astype(int)
-    difference = cv2.absdiff(small, before)
-    return np.array([np.mean(cv2.mean(difference[a:b])[:3]) if b > a else 1.0 for a, b in pairwise(edges)])
+    difference = cv2.absdiff(small, before).reshape(len(small), -1)
+    rows = cv2.reduce(difference, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
+    edges = [band * len(rows) // BANDS for band in range(BANDS + 1)]
+    return np.array([rows[a:b].mean() if b > a else 1.0 for a, b in pairwise(edges)])

@@ -24,6 +24,9 @@ DARKEST = 25
 """Brightness (largest channel, 0..255) below which a pixel has no colour to judge."""
 NOISE = 6.0
 """Added to each channel before ratios are taken."""
+LOGS = np.log(np.arange(256, dtype=np.float32) + np.float32(NOISE))
+RATIOS = np.array([[1, -1, 0], [0, 1, -1]], np.float32)
+"""From logarithms of red, green and blue to those of red over green and green over blue."""
 
 
 @dataclass(frozen=True)
@@ -79,22 +82,25 @@ def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
     scale = min(1.0, LONG_SIDE_PX / max(height, width))
     size = max(8, round(width * scale)), max(8, round(height * scale))
     # Averaging leaves little of noise, whose colours would look varied.
-    small = averaged(image, size)
+    small = averaged(image, size, samples=3)
     small = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0), np.uint8)
-    brightness = np.asarray(cv2.max(cv2.max(small[..., 0], small[..., 1]), small[..., 2]), np.uint8)
-    seen = brightness >= DARKEST
-    if not seen.any():
+    red, green, blue = cv2.split(small)
+    brightness = np.asarray(cv2.max(cv2.max(red, green), blue), np.uint8)
+    levels = cv2.calcHist([brightness], [0], None, [256], [0, 256]).ravel()
+    seen = float(levels[DARKEST:].sum())
+    if not seen:
         return None
-    lit = brightness >= max(DARKEST, 0.25 * float(brightness[seen].mean()))
-    red, green, blue = cv2.split(cv2.log(small[lit].astype(np.float32)[None] + np.float32(NOISE)))
-    red_green, green_blue = (red - green).ravel(), (green - blue).ravel()
-    red_least = np.maximum(red_green, red_green + green_blue)
+    lit = brightness >= max(DARKEST, 0.25 * float(levels[DARKEST:] @ np.arange(DARKEST, 256)) / seen)
+    red_green, green_blue = (plane[lit] for plane in cv2.split(cv2.transform(cv2.LUT(small, LOGS), RATIOS)))
+    red_blue = red_green + green_blue
     ordered = np.sort(red_green)
     low, middle, high, top = (float(ordered[int(share * (ordered.size - 1))]) for share in (0.3, 0.5, 0.75, 0.9))
+    # Red over whichever of green and blue it exceeds more, and less.
+    tissue = (red_green > -0.03) & (np.maximum(red_green, red_blue) > 0.18)
     return Evidence(
-        lit=float(lit.mean()),
-        tissue=float(((red_least > 0.18) & (red_green > -0.03)).mean()),
-        cool=float((np.minimum(red_green, red_green + green_blue) < -0.06).mean()),
+        lit=ordered.size / brightness.size,
+        tissue=np.count_nonzero(tissue) / ordered.size,
+        cool=np.count_nonzero(np.minimum(red_green, red_blue) < -0.06) / ordered.size,
         redness=high,
         spread=top - low,
         yellowness=float(np.median(green_blue) / max(middle, 0.05)),
@@ -168,10 +174,7 @@ class BodyGate:
 def _corners(brightness: NDArray[np.uint8]) -> float:
     height, width = brightness.shape
     rows, columns = max(1, height // 8), max(1, width // 8)
-    corners = [
-        brightness[y, x].mean()
-        for y in (slice(rows), slice(-rows, None))
-        for x in (slice(columns), slice(-columns, None))
-    ]
-    middle = brightness[2 * rows : -2 * rows, 2 * columns : -2 * columns]
-    return float(np.mean(corners) / max(1.0, float(middle.mean())))
+    top, bottom, left, right = slice(rows), slice(-rows, None), slice(columns), slice(-columns, None)
+    corners = sum(cv2.mean(brightness[y, x])[0] for y in (top, bottom) for x in (left, right)) / 4
+    middle = cv2.mean(brightness[2 * rows : -2 * rows, 2 * columns : -2 * columns])[0]
+    return corners / max(1.0, middle)

@@ -86,12 +86,13 @@ class SequenceCheck:
             self._row_moves = np.zeros(height)
             self._new_since_ns = pts_ns
             return self._unusable(image, small)
-        # By channel: [rows, columns * 3].
-        differs = (cv2.absdiff(small, previous) > self.settings.same_levels).reshape(height, -1)
-        if differs.mean() <= 1 - self.settings.same_share:
+        _, differs = cv2.threshold(cv2.absdiff(small, previous), self.settings.same_levels, 1, cv2.THRESH_BINARY)
+        # By row; each channel counts.
+        share = cv2.reduce(differs.reshape(height, -1), 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
+        if share.mean() <= 1 - self.settings.same_share:
             return self._unusable(image, small) or self._repeated(pts_ns)
         self._new_since_ns, self._same_run = pts_ns, 0
-        changed = differs.mean(axis=1) > 0.01
+        changed = share > 0.01
         torn = self._torn(small, changed)
         if not torn:
             # Quick at first, then over about the last 50 frames.
@@ -101,17 +102,28 @@ class SequenceCheck:
 
     def _unusable(self, image: NDArray[np.uint8], small: NDArray[np.uint8]) -> str | None:
         settings = self.settings
-        grey = luma(small)
-        if np.count_nonzero(grey >= settings.black_level) <= settings.odd_share * grey.size:
+        levels = cv2.calcHist([luma(small)], [0], None, [256], [0, 256]).ravel()
+        pixels = small.shape[0] * small.shape[1]
+        if levels[settings.black_level :].sum() <= settings.odd_share * pixels:
             return "black"
-        levels = settings.one_colour_levels
-        most = [int(np.bincount(small[:, :, channel].ravel(), minlength=1).argmax()) for channel in range(3)]
-        of_it = cv2.inRange(small, tuple(level - levels for level in most), tuple(level + levels for level in most))
-        if np.count_nonzero(of_it) >= (1 - settings.odd_share) * of_it.size:
+        if self._one_grey(levels, pixels) and self._one_colour(small):
             return "one colour"
         if min(image.shape[:2]) >= SMALLEST_FOR_NOISE_PX and _roughness(image) > settings.noise_share:
             return "noise"
         return None
+
+    def _one_grey(self, levels: NDArray[np.float32], pixels: int) -> bool:
+        """Whether so many pixels are of one grey that they may be of one colour; quicker than to look at the colours."""
+        # A level more to either side: grey is rounded.
+        wide = min(2 * self.settings.one_colour_levels + 3, len(levels))
+        below = np.append(0, levels.cumsum())
+        return bool((below[wide:] - below[:-wide]).max() >= (1 - self.settings.odd_share) * pixels)
+
+    def _one_colour(self, small: NDArray[np.uint8]) -> bool:
+        levels = self.settings.one_colour_levels
+        most = [int(np.bincount(small[:, :, channel].ravel(), minlength=1).argmax()) for channel in range(3)]
+        of_it = cv2.inRange(small, tuple(level - levels for level in most), tuple(level + levels for level in most))
+        return np.count_nonzero(of_it) >= (1 - self.settings.odd_share) * of_it.size
 
     def _repeated(self, pts_ns: int) -> str:
         self._same_run += 1
@@ -123,12 +135,16 @@ class SequenceCheck:
         """Whether the lowest rows are the ones of the picture before, or of one colour, while what is above moved as usual."""
         if self._frames_seen < 5:
             return False
-        moving = self._row_moves >= self.settings.moving_share
-        flat = np.ptp(small[:, ::4], axis=1).max(axis=1) <= 2 * self.settings.one_colour_levels
+        moving = np.flatnonzero(self._row_moves >= self.settings.moving_share)
+        level = 2 * self.settings.one_colour_levels
+        if not len(moving) or (changed[moving[-1]] and np.ptp(small[moving[-1], ::4], axis=0).max() > level):
+            # The lowest row that moves is new and shows something, so none above is stale.
+            return False
+        flat = np.ptp(small[:, ::4], axis=1).max(axis=1) <= level
         least = max(3, round(self.settings.torn_share * len(small)))
         for stale in (~changed, flat & changed):
             # From the lowest row that moves, upwards: all rows that move must be stale.
-            rows = np.flatnonzero(moving)[::-1]
+            rows = moving[::-1]
             fresh = np.flatnonzero(~stale[rows])
             below = len(rows) if len(fresh) == 0 else int(fresh[0])
             above = rows[below:]
@@ -139,6 +155,7 @@ class SequenceCheck:
 
 def _roughness(image: NDArray[np.uint8]) -> float:
     """Mean squared difference of neighbours in a row, over that of unrelated pixels (twice the variance): 0 smooth, 1 noise."""
-    rows = image[:: max(1, image.shape[0] // 32), :, 1].astype(np.float32)
-    variance = float(rows.var())
-    return float(np.square(rows[:, 1:] - rows[:, :-1]).mean()) / (2 * variance) if variance > 0 else 0.0
+    rows = np.ascontiguousarray(image[:: max(1, image.shape[0] // 32), :, 1])
+    variance = float(cv2.meanStdDev(rows)[1].item()) ** 2
+    left, right = rows[:, :-1], rows[:, 1:]
+    return cv2.norm(left, right, cv2.NORM_L2SQR) / left.size / (2 * variance) if variance > 0 else 0.0

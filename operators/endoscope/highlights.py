@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsplat_core.endoscope.highlights import HighlightSettings, without_highlights
+from gsplat_core.endoscope.highlights import HighlightFinder, HighlightSettings
 from gsplat_core.scene.frames import Frame
 from operators.endoscope.stage import Stage, StageCounts
 
@@ -23,8 +23,11 @@ class HighlightStage(Stage):
         self.settings = settings or HighlightSettings()
         super().__init__()
 
+    def reset(self) -> None:
+        self._finder = HighlightFinder(self.settings)
+
     def annotate(self, frame: Frame) -> Frame:
-        kept = None if frame.withheld is not None else without_highlights(frame.image, self.settings)
+        kept = None if frame.withheld is not None else self._finder.without(frame.image)
         if kept is None:
             return frame
         self.found["frames with highlights"] += 1
