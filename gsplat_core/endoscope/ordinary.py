@@ -1,4 +1,4 @@
-"""Whether a picture is an ordinary next one, by a few numbers that cost next to nothing: then the closer looks can wait for a few frames."""
+"""Whether a picture is an ordinary next one, by a few numbers that cost next to nothing: then the closer looks can take turns."""
 
 from __future__ import annotations
 
@@ -24,14 +24,15 @@ class OrdinarySettings:
     """How far an ordinary picture may be from what is usual. Raises InvalidSetting for a value out of its range."""
 
     look_every_s: float = 0.2
-    """The closer look is taken so often whatever the pictures are: every sixth of 30 a second."""
+    """Each closer look is taken so often whatever the pictures are, at every sixth of 30 a second; and so often what pictures are compared with is
+    renewed."""
     most_change: float = 2.0
     """Change of a band from the picture before, as a multiple of its usual change."""
     least_change: float = 0.4
     brightness_levels: float = 2.0
-    """Shift of a channel's mean since the last closer look, in levels of 255."""
+    """Shift of a channel's mean since the last comparison was renewed, in levels of 255."""
     sharpness_share: float = 0.08
-    """Change of the mean difference of neighbouring pixels since the last closer look."""
+    """Change of the mean difference of neighbouring pixels since then."""
     interval_share: float = 1.7
     """A longer time since the last frame, as a multiple of the usual one, is not ordinary."""
 
@@ -60,7 +61,7 @@ class OrdinaryPictures:
         self._shape: tuple[int, ...] = ()
         self._usual = np.zeros(BANDS)
         self._looked: tuple[NDArray[np.float64], float] | None = None
-        """Mean colour and sharpness at the last closer look."""
+        """Mean colour and sharpness that pictures are compared with."""
         self._looked_ns = 0
         self._last_ns: int | None = None
         self._interval_ns = 0.0
@@ -82,9 +83,9 @@ class OrdinaryPictures:
         self._usual = np.where(usual > 0, usual + USUAL_DECAY * (np.minimum(change, 3 * usual) - usual), change)
         if not (expected and in_time and self._like_the_looked(colour, sharpness)):
             return self._look(colour, sharpness, pts_ns)
-        # By the stream's time; the frame that comes nearest to when it is due.
-        due_ns = self._looked_ns + 1e9 * settings.look_every_s - 0.5 * self._interval_ns
-        return pts_ns < due_ns or self._look(colour, sharpness, pts_ns)
+        if pts_ns >= self._looked_ns + 1e9 * settings.look_every_s:
+            self._look(colour, sharpness, pts_ns)
+        return True
 
     def _look(self, colour: NDArray[np.float64], sharpness: float, pts_ns: int) -> bool:
         self._looked, self._looked_ns = (colour, sharpness), pts_ns

@@ -35,8 +35,9 @@ class ExposureStage(Stage):
         if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
             self._estimator.observe(frame.image, tissue_of(frame), frame.pts_ns)
             self.found["changing"] += self._estimator.following
+        self.found["other than the scene's"] += self._estimator.gains != UNCHANGED
+        return self.carried(frame)
+
+    def carried(self, frame: Frame) -> Frame:
         gains = self._estimator.gains
-        if gains == UNCHANGED:
-            return frame
-        self.found["other than the scene's"] += 1
-        return frame.with_fields(exposure=gains)
+        return frame if gains == UNCHANGED else frame.with_fields(exposure=gains)

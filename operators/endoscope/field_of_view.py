@@ -29,8 +29,10 @@ class FieldOfViewStage(Stage):
     def annotate(self, frame: Frame) -> Frame:
         if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
             self._view.observe(frame.image)
+        masked = self.carried(frame)
+        self.found["limited"] += masked is not frame
+        return masked
+
+    def carried(self, frame: Frame) -> Frame:
         mask = self._view.mask
-        if mask is None or mask.shape != frame.image.shape[:2]:
-            return frame
-        self.found["limited"] += 1
-        return left_out(frame, mask)
+        return frame if mask is None or mask.shape != frame.image.shape[:2] else left_out(frame, mask)

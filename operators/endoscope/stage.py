@@ -33,7 +33,8 @@ class StageCounts:
 class Stage:
     """Adds fields to one frame after another; keeps no more state than it needs for that.
 
-    A subclass sets `counts_type`, makes its state in `reset` and works in `annotate`. It never raises for what a picture shows.
+    A subclass sets `counts_type`, makes its state in `reset` and works in `annotate`. It never raises for what a picture shows. What it adds to every
+    frame it adds in `carried`, too, where it is among those that look at some of the frames only.
     """
 
     counts_type: ClassVar[type[StageCounts]] = StageCounts
@@ -49,6 +50,10 @@ class Stage:
     def annotate(self, frame: Frame) -> Frame:
         """The frame with what was found on it."""
         raise NotImplementedError(f"{type(self).__name__} has no annotate method")
+
+    def carried(self, frame: Frame) -> Frame:
+        """The frame with what holds on from the last one that was looked at, without a look at this one."""
+        return frame
 
     def apply(self, frame: Frame) -> Frame:
         """`annotate`, counted."""

@@ -29,8 +29,10 @@ class StripStage(Stage):
     def annotate(self, frame: Frame) -> Frame:
         if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
             self._detector.observe(frame.image)
+        masked = self.carried(frame)
+        self.found["strip or text"] += masked is not frame
+        return masked
+
+    def carried(self, frame: Frame) -> Frame:
         mask = self._detector.mask
-        if mask is None or mask.shape != frame.image.shape[:2]:
-            return frame
-        self.found["strip or text"] += 1
-        return left_out(frame, mask)
+        return frame if mask is None or mask.shape != frame.image.shape[:2] else left_out(frame, mask)

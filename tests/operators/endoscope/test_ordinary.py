@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from gsplat_core.endoscope.ordinary import OrdinarySettings
 from operators.endoscope.ordinary import OrdinaryFrames, OrdinaryStream, PictureStagesOp, TissueStagesOp
 from operators.endoscope.stage import Stage, StageOp, left_out
 from operators.endoscope.stages import PICTURE_STAGES, new_stages
@@ -55,6 +56,8 @@ class LeavesOutTheTop(Stage):
         kept[:4] = 0
         return left_out(frame, kept)
 
+    carried = annotate
+
 
 class Nothing(Stage):
     def annotate(self, frame):
@@ -65,24 +68,25 @@ class Brighter(Stage):
     def annotate(self, frame):
         return frame.with_fields(exposure=(1.2, 1.2, 1.2))
 
+    carried = annotate
+
 
 class Calm(OrdinaryStream):
     """Every frame but the first is ordinary."""
 
-    class pictures:
-        calls = 0
+    class Pictures:
+        settings = OrdinarySettings()
 
-        @classmethod
-        def is_ordinary(cls, image, pts_ns):
-            cls.calls += 1
-            return cls.calls > 1
+        def reset(self):
+            self.calls = 0
 
-        @classmethod
-        def reset(cls):
-            cls.calls = 0
+        def is_ordinary(self, image, pts_ns):
+            self.calls += 1
+            return self.calls > 1
 
-    def __init__(self):
-        self.frame_is_ordinary = False
+    def reset(self):
+        self.pictures = self.Pictures()
+        super().reset()
 
 
 def test_ordinary_frames_keep_what_was_left_out_and_the_exposure(frame):
@@ -96,7 +100,8 @@ def test_ordinary_frames_keep_what_was_left_out_and_the_exposure(frame):
     passed = [through(chain, frame(k)) for k in range(4)]
     assert all(not each.loss_mask[:4].any() and each.loss_mask[4:].all() for each in passed)
     assert [each.exposure for each in passed] == [(1.2, 1.2, 1.2)] * 4
-    assert chain[0].stages[1].frames == 1
+    # The first frame, and one in turn.
+    assert chain[0].stages[1].frames == 2
 
 
 def test_nothing_is_ordinary_after_a_withheld_frame(frame):
@@ -108,3 +113,38 @@ def test_nothing_is_ordinary_after_a_withheld_frame(frame):
     operator.start()
     assert [through([operator], frame(k)).withheld for k in range(3)] == ["odd", None, None]
     assert operator.stages[1].frames == 2
+
+
+def test_stages_look_at_ordinary_frames_in_turn(frame):
+    stages = [Nothing() for _ in range(7)]
+    operator = PictureStagesOp(None, stages=stages, stream=Calm())
+    operator.start()
+    looked = []
+    for k in range(31):
+        before = [stage.frames for stage in stages]
+        through([operator], frame(k).with_fields(pts_ns=k * 33_333_333))
+        looked.append([stage.frames - count for stage, count in zip(stages, before, strict=True)])
+    assert looked[0] == [1] * 7
+    assert all(each[0] == 1 and sum(each[1:]) == 1 for each in looked[1:])
+    assert [sum(each) for each in zip(*looked, strict=True)] == [31] + [6] * 6
+
+
+def test_what_one_stage_finds_makes_those_after_it_look(frame):
+    class Finds(Stage):
+        def annotate(self, frame):
+            return self.withhold(frame, "odd") if frame.seq else frame
+
+    stages = [Nothing(), Finds(), Nothing()]
+    stream = Calm()
+    chain = [
+        PictureStagesOp(None, stages=stages, stream=stream),
+        TissueStagesOp(None, always=[], stages=[tissue := Nothing()], stream=stream),
+    ]
+    for operator in chain:
+        operator.start()
+    seen = []
+    # Every frame is one at which only the first of those that take turns is due, then none.
+    for k, pts_ns in enumerate([0, 60_000_000, 70_000_000]):
+        through(chain, frame(k).with_fields(pts_ns=pts_ns))
+        seen.append((stages[1].frames, stages[2].frames, tissue.frames))
+    assert seen == [(1, 1, 1), (2, 2, 2), (3, 3, 3)]
