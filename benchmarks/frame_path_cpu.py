@@ -17,7 +17,6 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import islice
 
 import cv2
 import numpy as np
@@ -136,7 +135,11 @@ def main() -> int:
         for stage, spent in path.spent.items():
             p50, p95, most = np.percentile(spent[SETTLED_AFTER:], [50, 95, 100]).round(2).tolist()
             size = f"{kept[0].width_px}x{kept[0].height_px}"
-            print(json.dumps({"source": address, "size": size, "stage": stage, "p50_ms": p50, "p95_ms": p95, "most_ms": most}))
+            print(
+                json.dumps(
+                    {"source": address, "size": size, "stage": stage, "p50_ms": p50, "p95_ms": p95, "most_ms": most}
+                )
+            )
     return 0
 
 

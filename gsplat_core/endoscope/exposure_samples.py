@@ -9,9 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.endoscope.median import median_of
 from gsplat_core.endoscope.reduced import reduced, reduced_mask
 
-WIDTH_PX, HEIGHT_PX = 32, 24
+WIDTH_PX, HEIGHT_PX = 24, 20
+"""Fewer pixels than numpy gives Python's interpreter lock away for, and has to wait for it again: 500."""
 AGREEMENT = 0.05
 """Logarithms of ratios that differ by no more agree."""
 
@@ -37,7 +39,7 @@ class Reference:
 
 def sample_of(image: NDArray[np.uint8], kept: NDArray[np.generic] | None, darkest: int, brightest: int) -> Sample:
     """Of RGB uint8 [H, W, 3]; comparable where `kept` [H, W] is not 0 and a channel lies between the two levels."""
-    # Averaged from 8-bit values in floats: at 32x24 in 8 bits a step of 1 % in a dark channel would be lost.
+    # Averaged from 8-bit values in floats: at this size in 8 bits a step of 1 % in a dark channel would be lost.
     small = reduced(image, 4 * WIDTH_PX, 4 * HEIGHT_PX).astype(np.float32)
     small = np.asarray(cv2.resize(small, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA), np.float32)
     valid = (small > darkest) & (small < brightest)
@@ -52,12 +54,14 @@ def ratio(sample: Sample, reference: Sample, channel: int) -> tuple[float, float
     difference = (sample.logs[:, channel] - reference.logs[:, channel])[both]
     if len(difference) < len(both) // 20:
         return 0.0, math.inf
-    shift = float(np.median(difference))
-    spread = float(np.median(np.abs(difference - shift)))
+    shift = median_of(difference)
+    away = np.abs(difference - shift)
+    spread = median_of(away)
     # The mean of those near the median: what moved, or is a tool, lies further away on one side.
     for _ in range(2):
-        near = np.abs(difference - shift) <= max(2 * spread, 0.02)
-        shift = float(difference[near].mean()) if near.any() else shift
+        near = difference[away <= max(2 * spread, 0.02)]
+        shift = float(near.mean()) if len(near) else shift
+        away = np.abs(difference - shift)
     return shift, spread
 
 

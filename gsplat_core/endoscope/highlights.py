@@ -109,7 +109,8 @@ def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8], settings: Hig
     _, weight = cv2.threshold(lit, BLACK - 1, 1, cv2.THRESH_BINARY)
     side = 2 * int(settings.surroundings * max(width, height) / 2) + 1
     total, count = (
-        cv2.boxFilter(plane, cv2.CV_32F, (side, side), normalize=False) for plane in (cv2.multiply(small, weight), weight)
+        cv2.boxFilter(plane, cv2.CV_32F, (side, side), normalize=False)
+        for plane in (cv2.multiply(small, weight), weight)
     )
-    least = cv2.divide(total, cv2.max(count, 1.0)) + np.float32(settings.above_surroundings)
+    least = total / np.maximum(count, 1) + np.float32(settings.above_surroundings)
     return np.minimum(least, 255).astype(np.uint8)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,9 @@ from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 STEP_PX = 4
-"""Every fourth row and column is looked at."""
+"""At most every fourth row and column is looked at ..."""
+SAMPLES = 128
+"""... of larger pictures about so many of the shorter side."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,8 @@ class MaskCheck:
 
     def fault(self, mask: NDArray[np.generic]) -> str | None:
         """ "no tissue" or "tool mask lost" of the mask [H, W], 1 = tissue; None where it can be one."""
-        tissue = float((mask[::STEP_PX, ::STEP_PX] != 0).mean())
+        some = _some(mask)
+        tissue = np.count_nonzero(some) / some.size
         if tissue < self.settings.least_tissue:
             return "no tissue"
         if (
@@ -93,17 +97,17 @@ class DepthCheck:
     def checked(self, depth: NDArray[np.floating]) -> CheckedDepth:
         """The depth [H, W] of a frame, in millimetres, 0 = unknown."""
         settings = self.settings
-        sampled = depth[::STEP_PX, ::STEP_PX]
-        wrong_share = 1 - float(self._possible(sampled).mean())
-        if wrong_share > settings.wrong_depth_share:
+        sampled = _some(depth)
+        possible = self._possible(sampled)
+        if 1 - np.count_nonzero(possible) / possible.size > settings.wrong_depth_share:
             return CheckedDepth(None, "depth not usable")
-        known = sampled[self._possible(sampled) & (sampled > 0)]
+        known = sampled[possible & (sampled > 0)]
         if len(known) and self._at_another_scale(float(np.median(known))):
             return CheckedDepth(None, "depth at another scale")
-        possible = self._possible(depth)
-        if possible.all():
+        # Both are NaN where a value is.
+        if depth.min() >= 0 and depth.max() <= settings.farthest_mm:
             return CheckedDepth(depth)
-        return CheckedDepth(np.where(possible, depth, 0).astype(np.float32), "depth repaired")
+        return CheckedDepth(np.where(self._possible(depth), depth, 0).astype(np.float32), "depth repaired")
 
     def _possible(self, depth: NDArray[np.floating]) -> NDArray[np.bool_]:
         # Comparisons with NaN are false.
@@ -120,3 +124,9 @@ class DepthCheck:
         self._unusual = 0
         self._medians.append(median_mm)
         return False
+
+
+def _some(plane: NDArray[Any]) -> NDArray[Any]:
+    """Some of a plane's rows and columns."""
+    step = max(STEP_PX, min(plane.shape) // SAMPLES)
+    return np.ascontiguousarray(plane[::step, ::step])

@@ -27,9 +27,16 @@ def reduced(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[
     return np.asarray(cv2.resize(some, (width_px, height_px), interpolation=cv2.INTER_AREA), np.uint8)
 
 
+def sampled_mask(mask: NDArray[np.generic], step: int) -> NDArray[np.uint8]:
+    """1 where the sampled pixels of a mask [H, W] are not 0, 0 elsewhere."""
+    # Only what is sampled is looked at, where bytes are as good as they are.
+    plane = mask.view(np.uint8) if mask.dtype in (np.uint8, np.bool_) else (mask != 0).view(np.uint8)
+    return (sampled(plane, step) != 0).view(np.uint8)
+
+
 def reduced_mask(mask: NDArray[np.generic], width_px: int, height_px: int) -> NDArray[np.bool_]:
     """Where all of a small pixel's sampled pixels are not 0; bool [height_px, width_px]."""
-    some = sampled((mask != 0).view(np.uint8), max(1, min(mask.shape[:2]) // SAMPLES))
+    some = sampled_mask(mask, max(1, min(mask.shape[:2]) // SAMPLES))
     return np.asarray(cv2.resize(some * np.uint8(255), (width_px, height_px), interpolation=cv2.INTER_AREA) == 255)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -112,7 +113,7 @@ class SequenceCheck:
             return "noise"
         return None
 
-    def _one_grey(self, levels: NDArray[np.float32], pixels: int) -> bool:
+    def _one_grey(self, levels: NDArray[Any], pixels: int) -> bool:
         """Whether so many pixels are of one grey that they may be of one colour; quicker than to look at the colours."""
         # A level more to either side: grey is rounded.
         wide = min(2 * self.settings.one_colour_levels + 3, len(levels))
@@ -123,7 +124,7 @@ class SequenceCheck:
         levels = self.settings.one_colour_levels
         most = [int(np.bincount(small[:, :, channel].ravel(), minlength=1).argmax()) for channel in range(3)]
         of_it = cv2.inRange(small, tuple(level - levels for level in most), tuple(level + levels for level in most))
-        return np.count_nonzero(of_it) >= (1 - self.settings.odd_share) * of_it.size
+        return cv2.countNonZero(of_it) >= (1 - self.settings.odd_share) * of_it.size
 
     def _repeated(self, pts_ns: int) -> str:
         self._same_run += 1

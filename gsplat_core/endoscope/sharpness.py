@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.reduced import lowest_and_highest, luma, reduced, reduced_mask, sampled
+from gsplat_core.endoscope.median import median_of
+from gsplat_core.endoscope.reduced import lowest_and_highest, luma, reduced, reduced_mask, sampled, sampled_mask
 from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
@@ -87,7 +88,7 @@ class SharpnessGate:
 
     def __init__(self, settings: SharpnessSettings | None = None) -> None:
         self.settings = settings or SharpnessSettings()
-        self._usual: deque[tuple[float, ...]] = deque(maxlen=self.settings.usual_frames)
+        self._usual: deque[NDArray[np.float64]] = deque(maxlen=self.settings.usual_frames)
         self._fault: str | None = None
         self._withheld = 0
 
@@ -101,12 +102,12 @@ class SharpnessGate:
         seen = appearance(image, kept)
         if seen is None:
             return self._fault
-        values = (seen.rows, seen.columns, seen.contrast, seen.saturation, seen.haze)
+        values = np.array([seen.rows, seen.columns, seen.contrast, seen.saturation, seen.haze])
         if len(self._usual) < self.settings.first_frames:
             self._usual.append(values)
             return None
-        usual = np.maximum(np.median(np.array(self._usual), axis=0), 1e-6)
-        rows, columns, contrast, saturation = (np.array(values) / usual)[:4]
+        usual = np.maximum(np.median(np.stack(self._usual), axis=0), 1e-6)
+        rows, columns, contrast, saturation = (values / usual)[:4]
         self._fault = self._judged(min(rows, columns), contrast, saturation, seen.haze - usual[4])
         if self._fault is None:
             self._withheld = 0
@@ -137,10 +138,10 @@ def appearance(image: NDArray[np.uint8], kept: NDArray[np.generic] | None = None
     grey = luma(sampled(image, step))
     if min(grey.shape) <= 2 * APART_PX:
         return None
-    counted = (grey >= DARK).astype(np.uint8)
+    counted = np.asarray(cv2.threshold(grey, DARK - 1, 1, cv2.THRESH_BINARY)[1], np.uint8)
     if kept is not None:
-        counted &= sampled((kept != 0).view(np.uint8), step)
-    rows, columns = _sharpness(grey, counted), _sharpness(np.ascontiguousarray(grey.T), np.ascontiguousarray(counted.T))
+        counted &= sampled_mask(kept, step)
+    rows, columns = (_sharpness(grey, counted, axis) for axis in (0, 1))
     small = reduced(image, WIDTH_PX, HEIGHT_PX)
     low, high = lowest_and_highest(small)
     lit = high >= DARK
@@ -148,19 +149,20 @@ def appearance(image: NDArray[np.uint8], kept: NDArray[np.generic] | None = None
         lit &= reduced_mask(kept, WIDTH_PX, HEIGHT_PX)
     if rows is None or columns is None or lit.sum() < lit.size // 50:
         return None
-    low, high = low[lit], high[lit]
+    darkest, brightest = low[lit].astype(np.float32), high[lit].astype(np.float32)
     contrast = float(np.log(luma(small)[lit] + 1.0).std())
-    saturation = float(np.median(1 - low / high))
-    return Appearance(rows, columns, contrast, saturation, float(np.percentile(low, 10)))
+    saturation = median_of(1 - darkest / brightest)
+    return Appearance(rows, columns, contrast, saturation, median_of(darkest, 0.1))
 
 
-def _sharpness(grey: NDArray[np.uint8], counted: NDArray[np.uint8]) -> float | None:
-    """Mean difference between rows that are next to each other, over that between rows APART_PX apart; None for a flat picture."""
+def _sharpness(grey: NDArray[np.uint8], counted: NDArray[np.uint8], axis: int) -> float | None:
+    """Mean difference between rows (or columns, axis 1) that are next to each other, over that between some APART_PX apart; None for a flat picture."""
     means = []
     for apart in (1, APART_PX):
-        both = counted[apart:] & counted[:-apart]
-        pairs = int(np.count_nonzero(both))
+        here, there = ((slice(None),) * axis + (part,) for part in (slice(apart, None), slice(-apart)))
+        both = cv2.bitwise_and(counted[here], counted[there])
+        pairs = cv2.countNonZero(both)
         if pairs < both.size // 50 or pairs == 0:
             return None
-        means.append(cv2.norm(grey[apart:], grey[:-apart], cv2.NORM_L1, both) / pairs)
+        means.append(cv2.norm(grey[here], grey[there], cv2.NORM_L1, both) / pairs)
     return means[0] / means[1] if means[1] >= 0.5 else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -50,7 +51,7 @@ class Regions:
     levels: NDArray[np.float64]
     """How many pixels inside have each brightness, [256]."""
     previous: Bytes | None
-    """The frame before's tools: 255, 0 elsewhere."""
+    """The frame before's tools: 1, 0 elsewhere."""
     sharp_edge: float = SHARP_EDGE
     """What a tool's outline must have."""
 
@@ -75,10 +76,10 @@ def mean_level(levels: NDArray[np.float64]) -> float:
 
 
 def tool_regions(view: Regions) -> Bytes:
-    """255 on the pixels of those connected grey regions that are tools, 0 elsewhere."""
+    """1 on the pixels of those connected grey regions that are tools, 0 elsewhere."""
     area_inside = float(view.levels.sum())
     _, bright = cv2.threshold(view.brightness, int(DARKEST * mean_level(view.levels)), 1, cv2.THRESH_BINARY)
-    below = cv2.bitwise_and(cv2.compare(view.redness, view.threshold, cv2.CMP_LT), bright)
+    below = cv2.bitwise_and(_less(view.redness, view.threshold), bright)
     grey = np.asarray(below if view.whole else cv2.bitwise_and(below, view.inside), np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(grey, connectivity=4)
     tools = np.zeros(grey.shape, np.uint8)
@@ -91,8 +92,8 @@ def tool_regions(view: Regions) -> Bytes:
     for label in np.flatnonzero(large):
         left, top, width, height, area = (int(value) for value in stats[label])
         box = slice(top, top + height), slice(left, left + width)
-        region = cv2.compare(labels[box], float(label), cv2.CMP_EQ)
-        known, core, glare, reaches = (share / 255 for share in cv2.mean(evidence[box], region))
+        region = (labels[box] == label).view(np.uint8)
+        known, core, glare, reaches = cv2.mean(evidence[box], region)
         less = KNOWN_DISCOUNT if known > KNOWN else 1.0
         enough = area >= less * area_inside * (SMALLEST_REGION if reaches > 0 else SMALLEST_INNER_REGION)
         if not enough or core <= less * CORE or (reaches == 0 and glare >= MOST_GLARE):
@@ -104,16 +105,16 @@ def tool_regions(view: Regions) -> Bytes:
 
 
 def whole_tools(view: Regions, found: Bytes) -> Bytes:
-    """Tools with the edges that reflect the tissue around them, closed, and with a margin; 255 on tools in and out."""
+    """Tools with the edges that reflect the tissue around them, closed, and with a margin; 1 on tools in and out."""
     if not cv2.countNonZero(found):
         return found
     own = cv2.mean(view.redness, found)[0]
     seen = view.redness if view.whole else np.where(view.inside.view(np.bool_), view.redness, np.float32(-1))
     around = cv2.dilate(seen, neighbourhood(9))
     # Nearer to the tool's own redness than to that around it.
-    like_tool = cv2.compare(cv2.scaleAdd(around, -EDGE_AT, view.redness), (1 - EDGE_AT) * own, cv2.CMP_LT)
+    like_tool = _less(cv2.scaleAdd(around, -EDGE_AT, view.redness), (1 - EDGE_AT) * own)
     if not view.whole:
-        like_tool = cv2.bitwise_and(like_tool, like_tool, mask=view.inside)
+        like_tool &= view.inside
     reach = cv2.bitwise_or(like_tool, found)
     tools = found
     for _ in range(GROWTH_PX):
@@ -122,11 +123,16 @@ def whole_tools(view: Regions, found: Bytes) -> Bytes:
     return np.asarray(cv2.dilate(closed, neighbourhood(3), iterations=MARGIN_PX), np.uint8)
 
 
+def _less(plane: NDArray[Any], value: float) -> Bytes:
+    """1 where a plane is below a value."""
+    return (plane < np.float32(value)).view(np.uint8)
+
+
 def _evidence(view: Regions) -> Bytes:
-    """[h, w, 4], 255 where a pixel was a tool before, is clearly grey, is as bright as the brightest ones, and is next to the end of the picture or of the
-    field of view."""
-    core = cv2.compare(view.redness, view.threshold - CLEARLY_BELOW, cv2.CMP_LT)
-    _, glare = cv2.threshold(view.brightness, int(_glare(view.levels)), 255, cv2.THRESH_BINARY)
+    """[h, w, 4], 1 where a pixel was a tool before, is clearly grey, is as bright as the brightest ones, and is next to the end of the picture or of
+    the field of view."""
+    core = _less(view.redness, view.threshold - CLEARLY_BELOW)
+    _, glare = cv2.threshold(view.brightness, int(_glare(view.levels)), 1, cv2.THRESH_BINARY)
     previous = np.zeros_like(view.inside) if view.previous is None else view.previous
     return np.asarray(cv2.merge([previous, core, glare, _border(view)]), np.uint8)
 
@@ -149,14 +155,14 @@ def _well_inside(inside: Bytes) -> Bytes:
 
 
 def _border(view: Regions) -> Bytes:
-    """255 on pixels next to the end of the picture or of the field of view."""
+    """1 on pixels next to the end of the picture or of the field of view."""
     if view.whole:
         border = np.zeros_like(view.inside)
     else:
         border = np.asarray(cv2.subtract(view.inside, _well_inside(view.inside)), np.uint8)
     border[0], border[-1] = view.inside[0], view.inside[-1]
     border[:, 0], border[:, -1] = view.inside[:, 0], view.inside[:, -1]
-    return np.asarray(cv2.threshold(border, 0, 255, cv2.THRESH_BINARY, dst=border)[1], np.uint8)
+    return border
 
 
 def _glare(levels: NDArray[np.float64]) -> float:

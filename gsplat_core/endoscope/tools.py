@@ -113,10 +113,10 @@ class ToolFinder:
         tools = self._find(view)
         # Between the pixels of the working size the outline runs straight.
         large = cv2.resize(tools, (width, height), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(cv2.threshold(large, 127, 1, cv2.THRESH_BINARY_INV, dst=large)[1], np.uint8)
+        return np.asarray(cv2.threshold(large, 0, 1, cv2.THRESH_BINARY_INV, dst=large)[1], np.uint8)
 
     def _find(self, view: View) -> Bytes:
-        """255 on tools, at working size."""
+        """1 on tools, at working size."""
         least_lit = int(0.25 * mean_level(view.levels))
         if view.levels[least_lit + 1 :].sum() < SMALLEST_SHARE * view.redness.size:
             self.reset()
