@@ -78,7 +78,8 @@ class ReconstructorConfig:
     start_from_motion: bool = False
     """Whether a motion prior moves the scene to where a new frame shows it, before the first step on that frame."""
     depth_from_motion: bool = False
-    """Whether the motion prior finds the depth of the scene where the camera moves, its poses are given, and no depth is."""
+    """Whether the depth of the scene is found where the camera moves, its poses are given, and no depth is: online by the motion prior,
+    offline before training."""
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:
@@ -121,7 +122,14 @@ class ReconstructorConfig:
 
         It starts with `gaussians` and ends with `max_gaussians`.
         """
-        return cls(field=field, gaussians=60_000, max_gaussians=80_000, bump_spacing_s=1 / 15, squared_error=True)
+        return cls(
+            field=field,
+            gaussians=60_000,
+            max_gaussians=80_000,
+            bump_spacing_s=1 / 15,
+            squared_error=True,
+            depth_from_motion=True,
+        )
 
     @property
     def chosen_field(self) -> str:

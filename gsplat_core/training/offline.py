@@ -1,18 +1,23 @@
-"""Training on all frames of a recording at once: their order, the learning rates' decay, smoothing, and when Gaussians are split."""
+"""Training on all frames of a recording at once: where the scene starts, the frames' order, the learning rates' decay, smoothing, and when
+Gaussians are split."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.densification import densify, shares_of
 from gsplat_core.training.observations import Observation
+from gsplat_core.training.parallax import depth_by_parallax
 from gsplat_core.training.step import TrainingStep
 
 SMOOTH_EVERY = 20
@@ -55,6 +60,25 @@ class FitSettings:
     def rounds(self, steps: int) -> list[int]:
         """After how many of the steps each round of densification is."""
         return [round(steps * self.densify_until * (k + 1) / self.densify_rounds) for k in range(self.densify_rounds)]
+
+
+def observed(frames: Sequence[Frame], camera: Camera, device: torch.device) -> list[Observation]:
+    """The frames in the types of training. Raises InvalidInput when there are none, or when they are not in order."""
+    if not frames:
+        raise InvalidInput("there are no frames to train on")
+    for before, frame in pairwise(frames):
+        if frame.time_s < before.time_s:
+            raise InvalidInput(
+                f"frame {frame.seq} is at {frame.time_s:.3f} s, before the last one at {before.time_s:.3f} s;"
+                " frames must come in order"
+            )
+    return [Observation.of(frame, camera, device) for frame in frames]
+
+
+def with_depth(frames: Sequence[Frame], observations: Sequence[Observation]) -> Frame:
+    """The first frame, from which the scene starts, with the depth that the camera's motion shows, if it shows any."""
+    depth = depth_by_parallax(frames, [observation.camera for observation in observations])
+    return frames[0] if depth is None else frames[0].with_fields(depth=depth)
 
 
 class OfflineTraining:

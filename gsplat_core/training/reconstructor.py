@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -26,7 +25,7 @@ from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion_prior
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
-from gsplat_core.training.offline import FitSettings, OfflineTraining
+from gsplat_core.training.offline import FitSettings, OfflineTraining, observed, with_depth
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
@@ -204,28 +203,20 @@ class Reconstructor:
         `progress(step, loss)` is called after each step; on a GPU reading the loss, a tensor [] on the device, waits for the step. All
         frames are held in the device's memory (1 byte per channel).
         """
-        observations = [(frame, Observation.of(frame, self.camera, self.device)) for frame in frames]
-        if not observations:
-            raise InvalidInput("there are no frames to train on")
+        frames = list(frames)
+        seen = observed(frames, self.camera, self.device)
         if steps < 1:
             raise InvalidInput(f"steps is {steps}; it must be at least 1")
-        for (_, before), (frame, after) in pairwise(observations):
-            if after.time_s < before.time_s:
-                raise InvalidInput(
-                    f"frame {frame.seq} is at {after.time_s:.3f} s, before the last one at {before.time_s:.3f} s;"
-                    " frames must come in order"
-                )
-        first_frame, first = observations[0]
-        self._start(first_frame, first, end_s=observations[-1][1].time_s)
+        start = with_depth(frames, seen) if self.config.depth_from_motion else frames[0]
+        self._start(start, seen[0], end_s=seen[-1].time_s)
         assert self._step is not None
-        self._last_time_s = observations[-1][1].time_s
-        for frame, observation in observations[1:]:
+        self._last_time_s = seen[-1].time_s
+        for frame, observation in zip(frames[1:], seen[1:], strict=True):
             self._grow(frame, observation)
-        seen = [observation for _, observation in observations]
         most = self.config.max_gaussians
         training = OfflineTraining(self._step, seen, settings or FitSettings(), most_gaussians=most, seed=self._seed)
         loss = training(steps, progress)
-        return ObserveReport(observations[-1][0].seq, steps, HostCopy(loss), self.gaussians)
+        return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)
 
     def snapshot(self) -> Model:
         """An immutable copy of the model as it is now; each one has the next version number."""
