@@ -267,8 +267,10 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
         )
     notes.extend(description.notes)
     if "depth" not in description.fields:
+        finds_depth = config.depth_from_motion and "pose" in description.fields
+        found = "unless the given poses show how far away it is, " if finds_depth else ""
         notes.append(
-            f"the recording has no depth: the scene starts on a plane {config.default_depth_mm:g} mm away, and its"
+            f"the recording has no depth: {found}the scene starts on a plane {config.default_depth_mm:g} mm away, and its"
             " depth has no measured scale"
         )
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
