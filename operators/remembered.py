@@ -25,7 +25,6 @@ class RememberedTissue:
 
     def __init__(self) -> None:
         self._resize(0, 0)
-        self._darkened = np.rint(np.arange(256) * DARKENED).astype(np.uint8)
 
     def _resize(self, height_px: int, width_px: int) -> None:
         self._grey, self._tools, self._scratch = (np.empty((height_px, width_px), np.uint8) for _ in range(3))
@@ -44,10 +43,13 @@ class RememberedTissue:
             return None
         else:
             _, layer = cv2.threshold(np.asarray(seen, np.uint8), 0, 255, cv2.THRESH_BINARY_INV)
-            if self._grey.shape != layer.shape:
-                self._resize(*layer.shape)
-            covered = cv2.inRange(rendered.alpha, COVERED, np.inf, dst=self._scratch)
-            cv2.bitwise_and(layer, covered, dst=layer)
+            left, top, wide, high = cv2.boundingRect(layer)
+            if not wide:
+                return None
+            hidden, alpha = (plane[top : top + high, left : left + wide] for plane in (layer, rendered.alpha))
+            # Most often the picture is opaque there; NaN is not.
+            if not alpha.min() >= COVERED:
+                cv2.bitwise_and(hidden, cv2.inRange(alpha, COVERED, np.inf), dst=hidden)
         return np.asarray(layer, np.uint8) if cv2.countNonZero(layer) else None
 
     def mark(
@@ -67,7 +69,7 @@ class RememberedTissue:
         marked, pixels = layer[rows, columns], picture[rows, columns]
         grey, colourless = self._grey[rows, columns], self._colourless[rows, columns]
         cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY, dst=grey)
-        cv2.LUT(grey, self._darkened, dst=grey)
+        cv2.convertScaleAbs(grey, dst=grey, alpha=DARKENED)
         if tissue is not None and tissue.shape == layer.shape:
             cv2.max(grey, self._line(tissue, rows, columns, line), dst=grey)
         cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB, dst=colourless)

@@ -35,7 +35,7 @@ _UNIT_OF_BYTE: NDArray[np.float32] = (torch.arange(256, dtype=torch.float32) / 2
 
 @dataclass(frozen=True)
 class _MaskedPair:
-    """Two images [H, W, 3] that are 0 where there is no tissue: both uint8, or both float32 in 0..1.
+    """Two images [H, W, 3], both uint8, or both float32 in 0..1, and what counts of them.
 
     Bytes are compared as they are. OpenCV lets other threads run meanwhile, which counts beside a GPU: there a thread scores frames while
     another one queues the training on the next.
@@ -43,6 +43,8 @@ class _MaskedPair:
 
     image: NDArray[Any]
     target: NDArray[Any]
+    tissue: NDArray[np.uint8] | None
+    """[H, W], 0 where there is no tissue; None where all is tissue."""
     tissue_pixels: int
 
     @property
@@ -50,13 +52,20 @@ class _MaskedPair:
         """Of the whole frame."""
         return int(self.image.shape[0] * self.image.shape[1])
 
+    def masked(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Both images, 0 where there is no tissue."""
+        if self.tissue is None:
+            return self.image, self.target
+        # Without a destination, what the mask leaves out is 0.
+        return cv2.copyTo(self.image, self.tissue), cv2.copyTo(self.target, self.tissue)
+
     def squared_error(self) -> float:
-        """Sum over all pixels and channels, for values in 0..1; exact for bytes."""
+        """Sum over all pixels and channels of tissue, for values in 0..1; exact for bytes."""
         if self.image.dtype == np.uint8:
-            return float(cv2.norm(self.image, self.target, cv2.NORM_L2SQR)) / 255**2
-        error = torch.from_numpy(self.image) - torch.from_numpy(self.target)
+            return float(cv2.norm(self.image, self.target, cv2.NORM_L2SQR, self.tissue)) / 255**2
+        image, target = (torch.from_numpy(values) for values in self.masked())
         # Summed in float64: a frame has a million terms.
-        return float(error.mul_(error).sum(dtype=torch.float64))
+        return float((image - target).square_().sum(dtype=torch.float64))
 
     def psnrs_db(self) -> tuple[float, float]:
         """Over tissue, and over the whole frame; NaN where there is no tissue."""
@@ -65,7 +74,7 @@ class _MaskedPair:
 
     def mean_ssim(self) -> float:
         """Mean of the similarity of every pixel and channel."""
-        image, target = (torch.from_numpy(unit_image(values)) for values in (self.image, self.target))
+        image, target = (torch.from_numpy(unit_image(values)) for values in self.masked())
         # OpenCV sums in float64 as it reads; torch first makes a float64 copy of the map, for many times as long.
         return sum(cv2.mean(ssim_map(image, target).numpy())[:3]) / 3
 
@@ -98,14 +107,14 @@ def _masked_pair(image: ImageLike, target: ImageLike, mask: ImageLike | None) ->
     if x.dtype != np.uint8 or y.dtype != np.uint8:
         x, y = unit_image(x), unit_image(y)
     if mask is None:
-        return _MaskedPair(x, y, x.shape[0] * x.shape[1])
+        return _MaskedPair(x, y, None, x.shape[0] * x.shape[1])
     tissue = _host_array(mask)
     if tissue.shape != x.shape[:2]:
         raise InvalidInput(f"mask must be [H, W] = {list(x.shape[:2])}, got {list(tissue.shape)}")
     if tissue.dtype != np.uint8:
         tissue = (tissue != 0).astype(np.uint8)
-    # Without a destination, what the mask leaves out is 0.
-    return _MaskedPair(cv2.copyTo(x, tissue), cv2.copyTo(y, tissue), cv2.countNonZero(tissue))
+    pixels = cv2.countNonZero(tissue)
+    return _MaskedPair(x, y, None if pixels == tissue.size else tissue, pixels)
 
 
 def _psnr_db(squared_error: float, pixels: int) -> float:
