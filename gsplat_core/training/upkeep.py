@@ -105,7 +105,7 @@ class Upkeep:
     ) -> None:
         """Bring depths and rotations back, let those `leaving`, bool [N], go, and split what has too much to do."""
         since, self._renewed_at = step.steps - self._renewed_at, step.steps
-        step.scale_about(observation.camera, self._towards_surface(seen, since, observation.camera))
+        step.scale_about(observation.camera, self._towards_surface(step, seen, since, observation))
         step.shorten_rotations()
         if last_seen is not None:
             last_seen.join(step.gaussians.count, observation.time_s)
@@ -131,14 +131,21 @@ class Upkeep:
         scene.logit_opacities.sub_(part * scene.logit_opacities)
         scene.sh.sub_(part[:, None, None] * scene.sh)
 
-    def _towards_surface(self, seen: Seen, since: int, camera: Camera) -> Tensor:
+    def _towards_surface(self, step: TrainingStep, seen: Seen, since: int, observation: Observation) -> Tensor:
         """Factors [N] of the distances from the camera that bring what is shown nearer to the depth of what lies around it, `since` so many steps.
-        The camera sees the same picture; where it moves or depth is known, training holds against it."""
+        The camera sees the same picture; where it moves or depth is known, training holds against it.
+
+        Where neither is so all depths together drift, too: steps along the line of sight that are equally long are not equally far in a picture.
+        What is shown then keeps its typical distance."""
+        camera = observation.camera
         spacing = SURFACE_CELL * self._spacing_px
         cells = math.ceil(camera.height_px / spacing), math.ceil(camera.width_px / spacing)
         _, around = around_cells(seen.now, camera, spacing, cells, SURFACE_REACH)
+        depth = depth_of(seen.now.means, camera)
         share = 1 - math.exp(-since / SURFACE_STEPS)
-        factor = 1 + share * (value_at(around, seen.pixels / spacing) / depth_of(seen.now.means, camera) - 1)
+        factor = 1 + share * (value_at(around, seen.pixels / spacing) / depth - 1)
+        if observation.depth is None and not self._has_moved:
+            factor = factor * (step.distance(camera) / depth.masked_fill(~seen.shown, torch.nan).nanmedian())
         return torch.where(seen.shown, factor, 1.0)
 
     def _useless(self, step: TrainingStep, seen: Seen) -> Tensor:
