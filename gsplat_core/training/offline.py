@@ -18,6 +18,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.densification import densify, shares_of
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.parallax import depth_by_parallax
+from gsplat_core.training.steadiness import steadiness
 from gsplat_core.training.step import TrainingStep
 
 SMOOTH_EVERY = 20
@@ -34,7 +35,8 @@ class FitSettings:
     """What is left of every learning rate at the end, as a share; on the way there they follow half a cosine."""
     smoothing: float = 1.5
     """How far, in a pass over all frames, what the field learned for each time is moved to the mean of its neighbours in time, times the
-    factor of the learning rates: a frame between two others is then shown between them, not with the noise of both. 0: not at all."""
+    factor of the learning rates: a frame between two others is then shown between them, not with the noise of both. Where frames are not
+    between their neighbours, because things move fast, it is less (`steadiness`). 0: not at all."""
     densify_rounds: int = 6
     """How often Gaussians that nobody sees are dropped and those with the largest error are split; 0: never."""
     densify_until: float = 0.7
@@ -95,6 +97,7 @@ class OfflineTraining:
     ) -> None:
         self._step, self._observations, self._settings = step, observations, settings
         self._first_count, self._most = step.gaussians.count, most_gaussians
+        self._smoothing = settings.smoothing and settings.smoothing * steadiness(observations)
         self._random = np.random.default_rng(seed)
         self._order: list[int] = []
         self._rate = 1.0
@@ -109,7 +112,7 @@ class OfflineTraining:
                 rounds.pop(0)
             self._rate = self._settings.rate_at(number / steps)
             loss = self._step(self._next(), rate_scale=self._rate)
-            if (number + 1) % SMOOTH_EVERY == 0 and self._settings.smoothing:
+            if (number + 1) % SMOOTH_EVERY == 0 and self._smoothing:
                 self._smooth()
             if progress is not None:
                 progress(number + 1, loss)
@@ -124,7 +127,7 @@ class OfflineTraining:
 
     def _smooth(self) -> None:
         """As much as belongs to the steps since the last time."""
-        amount = self._settings.smoothing * self._rate * SMOOTH_EVERY / len(self._observations)
+        amount = self._smoothing * self._rate * SMOOTH_EVERY / len(self._observations)
         self._step.field.smooth_in_time(min(amount, MOST_AT_ONCE))
 
     def _densify(self, share: float) -> None:
