@@ -25,6 +25,8 @@ class RememberedTissue:
 
     def __init__(self) -> None:
         self._resize(0, 0)
+        self._found: tuple[NDArray[np.uint8], tuple[int, int, int, int]] | None = None
+        """The last layer, and a box with all of it: left, top, width and height."""
 
     def _resize(self, height_px: int, width_px: int) -> None:
         self._grey, self._tools, self._scratch = (np.empty((height_px, width_px), np.uint8) for _ in range(3))
@@ -38,19 +40,22 @@ class RememberedTissue:
         """
         seen = tissue_of(rendered.content or rendered.frame)
         if whole or (seen is not None and seen.shape != rendered.alpha.shape):
-            layer = cv2.inRange(rendered.alpha, COVERED, np.inf)
+            layer = np.asarray(cv2.inRange(rendered.alpha, COVERED, np.inf), np.uint8)
         elif seen is None:
             return None
         else:
-            _, layer = cv2.threshold(np.asarray(seen, np.uint8), 0, 255, cv2.THRESH_BINARY_INV)
-            left, top, wide, high = cv2.boundingRect(layer)
+            layer = np.empty(seen.shape, np.uint8)
+            cv2.threshold(np.asarray(seen, np.uint8), 0, 255, cv2.THRESH_BINARY_INV, dst=layer)
+            left, top, wide, high = box = _box(layer)
             if not wide:
                 return None
+            self._found = layer, box
             hidden, alpha = (plane[top : top + high, left : left + wide] for plane in (layer, rendered.alpha))
             # Most often the picture is opaque there; NaN is not.
-            if not alpha.min() >= COVERED:
-                cv2.bitwise_and(hidden, cv2.inRange(alpha, COVERED, np.inf), dst=hidden)
-        return np.asarray(layer, np.uint8) if cv2.countNonZero(layer) else None
+            if alpha.min() >= COVERED:
+                return layer
+            cv2.bitwise_and(hidden, cv2.inRange(alpha, COVERED, np.inf), dst=hidden)
+        return layer if cv2.countNonZero(layer) else None
 
     def mark(
         self, picture: NDArray[np.uint8], layer: NDArray[np.uint8], tissue: NDArray[np.uint8] | None = None
@@ -63,7 +68,8 @@ class RememberedTissue:
         if self._grey.shape != layer.shape:
             self._resize(height, width)
         line = max(1, round(height / LINES_PER_HEIGHT))
-        left, top, wide, high = cv2.boundingRect(layer)
+        known = self._found is not None and self._found[0] is layer
+        left, top, wide, high = self._found[1] if known and self._found is not None else _box(layer)
         rows = slice(max(0, top - line), min(height, top + high + line))
         columns = slice(max(0, left - line), min(width, left + wide + line))
         marked, pixels = layer[rows, columns], picture[rows, columns]
@@ -82,6 +88,12 @@ class RememberedTissue:
         # What lies beyond the picture's border counts as tool: no line is drawn along it.
         cv2.erode(tools, np.ones((2 * width_px + 1, 2 * width_px + 1), np.uint8), dst=inner)
         return np.asarray(cv2.subtract(tools, inner, dst=inner), np.uint8)
+
+
+def _box(layer: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+    """Left, top, width and height of the smallest box with all that is not 0."""
+    left, top, wide, high = cv2.boundingRect(layer)
+    return left, top, wide, high
 
 
 def marked(rendered: RenderedFrame) -> NDArray[np.uint8]:

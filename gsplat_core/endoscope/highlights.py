@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.reduced import sampled
+from gsplat_core.endoscope.reduced import enlarged, sampled
 from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
@@ -91,9 +91,8 @@ class HighlightFinder:
         if not 0 < cv2.countNonZero(found) <= settings.most * found.size:
             return None
         grown = cv2.dilate(found, _disc(max(1, round(settings.grown * max(found.shape)))), dst=other)
-        if step > 1:
-            grown = cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST)
-        return np.asarray(cv2.threshold(grown, 0, 1, cv2.THRESH_BINARY_INV)[1], np.uint8)
+        kept = np.asarray(cv2.threshold(grown, 0, 1, cv2.THRESH_BINARY_INV)[1], np.uint8)
+        return enlarged(kept, width, height) if step > 1 else kept
 
 
 @cache

@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.small_picture import averaged
+from gsplat_core.endoscope.median import median_of
+from gsplat_core.endoscope.reduced import averaged, channels
 from gsplat_core.errors import InvalidInput
 
 LONG_SIDE_PX = 96
@@ -83,15 +84,15 @@ def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
     size = max(8, round(width * scale)), max(8, round(height * scale))
     # Averaging leaves little of noise, whose colours would look varied.
     small = averaged(image, size, samples=3)
-    small = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0), np.uint8)
-    red, green, blue = cv2.split(small)
-    brightness = np.asarray(cv2.max(cv2.max(red, green), blue), np.uint8)
+    cv2.GaussianBlur(small, (0, 0), 1.0, dst=small)
+    brightness, green, blue = channels(small)
+    cv2.max(cv2.max(brightness, green, dst=brightness), blue, dst=brightness)
     levels = cv2.calcHist([brightness], [0], None, [256], [0, 256]).ravel()
     seen = float(levels[DARKEST:].sum())
     if not seen:
         return None
     lit = brightness >= max(DARKEST, 0.25 * float(levels[DARKEST:] @ np.arange(DARKEST, 256)) / seen)
-    red_green, green_blue = (plane[lit] for plane in cv2.split(cv2.transform(cv2.LUT(small, LOGS), RATIOS)))
+    red_green, green_blue = (plane[lit] for plane in channels(cv2.transform(cv2.LUT(small, LOGS), RATIOS)))
     red_blue = red_green + green_blue
     ordered = np.sort(red_green)
     low, middle, high, top = (float(ordered[int(share * (ordered.size - 1))]) for share in (0.3, 0.5, 0.75, 0.9))
@@ -103,7 +104,7 @@ def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
         cool=np.count_nonzero(np.minimum(red_green, red_blue) < -0.06) / ordered.size,
         redness=high,
         spread=top - low,
-        yellowness=float(np.median(green_blue) / max(middle, 0.05)),
+        yellowness=median_of(green_blue) / max(middle, 0.05),
         corners=_corners(brightness),
     )
 

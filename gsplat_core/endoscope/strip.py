@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.reduced import luma
+from gsplat_core.endoscope.reduced import enlarged, luma
 from gsplat_core.endoscope.setting_ranges import check_settings
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
@@ -122,7 +122,7 @@ class StripDetector:
             return
         kept = (~found).view(np.uint8)
         if self._step > 1:
-            kept = np.asarray(cv2.resize(kept, self._shape[1::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+            kept = enlarged(kept, self._shape[1], self._shape[0])
         if self.mask is None or not np.array_equal(self.mask, kept):
             self.mask = kept
 

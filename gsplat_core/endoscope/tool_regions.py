@@ -79,8 +79,9 @@ def tool_regions(view: Regions) -> Bytes:
     """1 on the pixels of those connected grey regions that are tools, 0 elsewhere."""
     area_inside = float(view.levels.sum())
     _, bright = cv2.threshold(view.brightness, int(DARKEST * mean_level(view.levels)), 1, cv2.THRESH_BINARY)
-    below = cv2.bitwise_and(_less(view.redness, view.threshold), bright)
-    grey = np.asarray(below if view.whole else cv2.bitwise_and(below, view.inside), np.uint8)
+    grey = np.asarray(cv2.bitwise_and(_less(view.redness, view.threshold), bright, dst=bright), np.uint8)
+    if not view.whole:
+        grey &= view.inside
     _, labels, stats, _ = cv2.connectedComponentsWithStats(grey, connectivity=4)
     tools = np.zeros(grey.shape, np.uint8)
     large = stats[:, cv2.CC_STAT_AREA] >= SMALLEST_REGION * KNOWN_DISCOUNT * area_inside
@@ -110,17 +111,17 @@ def whole_tools(view: Regions, found: Bytes) -> Bytes:
         return found
     own = cv2.mean(view.redness, found)[0]
     seen = view.redness if view.whole else np.where(view.inside.view(np.bool_), view.redness, np.float32(-1))
-    around = cv2.dilate(seen, neighbourhood(9))
+    around = cv2.dilate(seen, neighbourhood(9), dst=np.empty_like(seen))
     # Nearer to the tool's own redness than to that around it.
-    like_tool = _less(cv2.scaleAdd(around, -EDGE_AT, view.redness), (1 - EDGE_AT) * own)
+    like_tool = _less(cv2.scaleAdd(around, -EDGE_AT, view.redness, dst=around), (1 - EDGE_AT) * own)
     if not view.whole:
         like_tool &= view.inside
-    reach = cv2.bitwise_or(like_tool, found)
-    tools = found
+    reach = cv2.bitwise_or(like_tool, found, dst=like_tool)
+    tools = found.copy()
     for _ in range(GROWTH_PX):
-        tools = np.asarray(cv2.bitwise_and(cv2.dilate(tools, CROSS), reach), np.uint8)
-    closed = cv2.morphologyEx(tools, cv2.MORPH_CLOSE, neighbourhood(5))
-    return np.asarray(cv2.dilate(closed, neighbourhood(3), iterations=MARGIN_PX), np.uint8)
+        cv2.bitwise_and(cv2.dilate(tools, CROSS, dst=tools), reach, dst=tools)
+    cv2.morphologyEx(tools, cv2.MORPH_CLOSE, neighbourhood(5), dst=tools)
+    return np.asarray(cv2.dilate(tools, neighbourhood(3), dst=tools, iterations=MARGIN_PX), np.uint8)
 
 
 def _less(plane: NDArray[Any], value: float) -> Bytes:
@@ -144,9 +145,10 @@ def _change(view: Regions) -> Plane:
 
 def _outline(view: Regions, grey: Bytes) -> Bytes:
     """1 on the outlines of grey regions; the border of the view is none."""
-    eroded = cv2.erode(grey, neighbourhood(3), borderType=cv2.BORDER_CONSTANT, borderValue=1)
-    outline = cv2.subtract(grey, eroded)
-    return np.asarray(outline if view.whole else cv2.bitwise_and(outline, _well_inside(view.inside)), np.uint8)
+    outline = np.empty_like(grey)
+    cv2.erode(grey, neighbourhood(3), dst=outline, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    cv2.subtract(grey, outline, dst=outline)
+    return outline if view.whole else outline & _well_inside(view.inside)
 
 
 def _well_inside(inside: Bytes) -> Bytes:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.small_picture import averaged
+from gsplat_core.endoscope.reduced import averaged, channels
 from gsplat_core.endoscope.tool_regions import (
     SHARP_EDGE,
     Bytes,
@@ -112,8 +112,10 @@ class ToolFinder:
             self.reset()
         tools = self._find(view)
         # Between the pixels of the working size the outline runs straight.
-        large = cv2.resize(tools, (width, height), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(cv2.threshold(large, 0, 1, cv2.THRESH_BINARY_INV, dst=large)[1], np.uint8)
+        tissue = np.empty((height, width), np.uint8)
+        cv2.resize(tools, (width, height), dst=tissue, interpolation=cv2.INTER_LINEAR)
+        cv2.threshold(tissue, 0, 1, cv2.THRESH_BINARY_INV, dst=tissue)
+        return tissue
 
     def _find(self, view: View) -> Bytes:
         """1 on tools, at working size."""
@@ -157,28 +159,32 @@ def view_of(image: NDArray[np.uint8]) -> View:
     height, width = image.shape[:2]
     scale = min(1.0, LONG_SIDE_PX / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    red, green, blue = cv2.split(averaged(image, size))
-    brightness = np.asarray(cv2.max(cv2.max(red, green), blue), np.uint8)
+    red, green, blue = channels(averaged(image, size))
+    brightness, other = np.empty_like(red), np.empty_like(red)
+    cv2.max(cv2.max(red, green, dst=brightness), blue, dst=brightness)
     inside = field_of_view(brightness)
     levels = cv2.calcHist([brightness], [0], inside, [256], [0, 256]).ravel().astype(np.float64)
     # In the dark the ratio of channels is noise, and this term pulls it to 0.
     floor = max(3.0, 0.06 * mean_level(levels))
     # Halfway between the mean of the other two channels, which is less noisy, and the smaller one, which keeps yellow apart from grey.
-    channels = cv2.merge([red, green, blue, cv2.min(green, blue)])
-    logs = cv2.LUT(channels, np.log(LEVELS + np.float32(floor)))
-    redness = cv2.transform(logs, RED_OVER_OTHERS)
-    return View(np.asarray(cv2.GaussianBlur(redness, (0, 0), 0.8), np.float32), brightness, inside, levels)
+    values = cv2.merge([red, green, blue, cv2.min(green, blue, dst=other)])
+    logs = cv2.LUT(values, np.log(LEVELS + np.float32(floor)))
+    redness = np.empty(red.shape, np.float32)
+    cv2.GaussianBlur(cv2.transform(logs, RED_OVER_OTHERS, dst=redness), (0, 0), 0.8, dst=redness)
+    return View(redness, brightness, inside, levels)
 
 
 def field_of_view(brightness: Bytes) -> Bytes:
     """1 on what is not black and connected to the border of the picture, 0 elsewhere; brightness: uint8 [h, w]."""
     darkest = math.ceil(min(24.0, 0.15 * cv2.minMaxLoc(brightness)[1])) - 1
-    _, dark = cv2.threshold(brightness, darkest, 1, cv2.THRESH_BINARY_INV)
+    dark = np.empty_like(brightness)
+    cv2.threshold(brightness, darkest, 1, cv2.THRESH_BINARY_INV, dst=dark)
     around = cv2.copyMakeBorder(dark, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
     cv2.floodFill(around, None, (0, 0), 2)
-    _, inside = cv2.threshold(around[1:-1, 1:-1], 1, 1, cv2.THRESH_BINARY_INV)
+    inside = cv2.threshold(around[1:-1, 1:-1], 1, 1, cv2.THRESH_BINARY_INV, dst=dark)[1]
     # Its outermost pixels mix with the black around.
-    return np.asarray(cv2.erode(inside, neighbourhood(3), borderType=cv2.BORDER_CONSTANT, borderValue=1), np.uint8)
+    cv2.erode(inside, neighbourhood(3), dst=dark, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    return dark
 
 
 def valley(histogram: NDArray[np.float64] | None) -> tuple[float, bool]:

@@ -1,0 +1,49 @@
+"""Small pictures and masks from large ones, and back, of any size."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.endoscope.median import median_of
+from gsplat_core.endoscope.reduced import averaged, enlarged, reduced_mask, sampled_mask
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (40, 30)])
+@pytest.mark.parametrize("larger", [(1, 0, 0), (2, 0, 0), (3, 0, 0), (2, 1, 0), (2, 1, 1), (3, 2, 2)])
+def test_a_plane_is_enlarged_as_by_its_nearest_pixels(rng, size, larger):
+    step, right, below = larger
+    plane = rng.integers(0, 256, size, np.uint8)
+    width, height = step * size[1] + right, step * size[0] + below
+    large = enlarged(plane, width, height)
+    assert large.flags.c_contiguous and large.dtype == np.uint8
+    assert np.array_equal(large, cv2.resize(plane, (width, height), interpolation=cv2.INTER_NEAREST))
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.bool_, np.float32, np.int64])
+@pytest.mark.parametrize("step", [1, 2, 7])
+def test_masks_of_any_type_are_sampled_alike(rng, kind, step):
+    mask = rng.random((33, 50)) > 0.4
+    expected = sampled_mask(mask.astype(np.uint8) * 200, step)
+    assert set(np.unique(expected)) <= {0, 1}
+    assert np.array_equal(sampled_mask(mask.astype(kind), step), expected)
+    assert np.array_equal(reduced_mask(mask.astype(kind), 5, 4), reduced_mask(mask, 5, 4))
+
+
+@pytest.mark.parametrize("size", [(16, 16), (31, 47), (240, 320), (512, 640)])
+@pytest.mark.parametrize("samples", [1, 2, 3])
+def test_averages_keep_the_colour_and_lose_noise(rng, size, samples):
+    noisy = np.clip(rng.normal((150, 90, 60), 20, (*size, 3)), 0, 255).astype(np.uint8)
+    small = averaged(noisy, (8, 8), samples)
+    assert small.shape == (8, 8, 3)
+    assert np.abs(small.mean(axis=(0, 1)) - (150, 90, 60)).max() < 20
+    averaged_px = min(samples, size[0] // 8, size[1] // 8) ** 2
+    assert small.std(axis=(0, 1)).max() < 20 * 1.6 / averaged_px**0.5
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 101])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9])
+def test_quantiles_are_values_with_as_many_below(rng, count, share):
+    values = rng.random(count)
+    assert median_of(values, share) == np.sort(values)[int(share * count)]
