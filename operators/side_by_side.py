@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from typing import Any
 
@@ -75,13 +75,15 @@ class SideBySideOp(Operator):
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         assert self._pool is not None
         frame: Frame = op_input.receive("frame")
-        others = [self._pool.submit(through, part, frame) for part in (self.gate, *self.beside)]
+        # The longest begin first.
+        others = [self._pool.submit(through, part, frame) for part in (*self.beside, self.gate)]
         try:
             decided = through(self.first, frame)
         finally:
             # Whatever the first chain raises, the others are out of the way of the next frame.
-            wait(others)
-        gated, *found = [other.result() for other in others]
+            for other in others:
+                other.exception()
+        *found, gated = [other.result() for other in others]
         if gated.withheld is None:
             for each in found:
                 decided = with_findings(decided, each)

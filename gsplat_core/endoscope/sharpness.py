@@ -7,7 +7,6 @@ Smoke takes contrast (the spread of the logarithm of brightness) and saturation,
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 import cv2
@@ -88,13 +87,15 @@ class SharpnessGate:
 
     def __init__(self, settings: SharpnessSettings | None = None) -> None:
         self.settings = settings or SharpnessSettings()
-        self._usual: deque[NDArray[np.float64]] = deque(maxlen=self.settings.usual_frames)
+        self._good: NDArray[np.float64] = np.empty((self.settings.usual_frames, 5))
+        """Values of good frames, in a ring."""
+        self._count = 0
         self._fault: str | None = None
         self._withheld = 0
 
     def start_scene(self) -> None:
         """Another scene begins, with a usual of its own."""
-        self._usual.clear()
+        self._count = 0
         self._fault, self._withheld = None, 0
 
     def fault(self, image: NDArray[np.uint8], kept: NDArray[np.generic] | None = None) -> str | None:
@@ -103,21 +104,26 @@ class SharpnessGate:
         if seen is None:
             return self._fault
         values = np.array([seen.rows, seen.columns, seen.contrast, seen.saturation, seen.haze])
-        if len(self._usual) < self.settings.first_frames:
-            self._usual.append(values)
+        known = min(self._count, len(self._good))
+        if known < min(self.settings.first_frames, len(self._good)):
+            self._keep(values)
             return None
-        usual = np.maximum(np.median(np.stack(self._usual), axis=0), 1e-6)
+        usual = np.maximum(np.partition(self._good[:known], known // 2, axis=0)[known // 2], 1e-6)
         rows, columns, contrast, saturation = (values / usual)[:4]
         self._fault = self._judged(min(rows, columns), contrast, saturation, seen.haze - usual[4])
         if self._fault is None:
             self._withheld = 0
-            self._usual.append(values)
+            self._keep(values)
             return None
         self._withheld += 1
         if self._withheld > self.settings.longest_frames:
             self.start_scene()
-            self._usual.append(values)
+            self._keep(values)
         return self._fault
+
+    def _keep(self, values: NDArray[np.float64]) -> None:
+        self._good[self._count % len(self._good)] = values
+        self._count += 1
 
     def _judged(self, sharpness: float, contrast: float, saturation: float, haze: float) -> str | None:
         settings = self.settings
