@@ -14,6 +14,7 @@ measure() {
 measure replay_cpu replay_cutting "$recordings/cutting"
 measure replay_cpu replay_sinus "$recordings/sinus" --fields basis --engines embedded
 measure graph_overhead graph --holoscan
+measure frame_path_cpu frame_path "$recordings/cutting" "synthetic:?width=1280&height=1024&frames=12"
 measure losses_cpu losses
 measure deformation_cpu deformation
 measure training_cpu training

@@ -104,7 +104,9 @@ def _surroundings(low: NDArray[np.uint8], high: NDArray[np.uint8], settings: Hig
     """What the darkest channel of a highlight has at least: so many levels more than its mean around, SHRINK times smaller (rounded up).
     What is black does not count."""
     width, height = (-(-side // SHRINK) for side in low.shape[::-1])
-    small, lit = (cv2.resize(sampled(plane, SHRINK // 2), (width, height), interpolation=cv2.INTER_AREA) for plane in (low, high))
+    small, lit = (
+        cv2.resize(sampled(plane, SHRINK // 2), (width, height), interpolation=cv2.INTER_AREA) for plane in (low, high)
+    )
     _, weight = cv2.threshold(lit, BLACK - 1, 1, cv2.THRESH_BINARY)
     side = 2 * int(settings.surroundings * max(width, height) / 2) + 1
     total, count = (
