@@ -90,7 +90,8 @@ class LiveApplication(Application):
             source_state=lambda: self.frame_source.state,
             settings=settings.display,
         )
-        self.metrics = OnScreenMetricsOp(self, name="on_screen", log=FrameLog(out / FRAMES_FILE, reserve))
+        log = FrameLog(out / FRAMES_FILE, reserve) if settings.frame_log else None
+        self.metrics = OnScreenMetricsOp(self, name="on_screen", log=log)
         self.add_flow(analysis, self.reconstruct, {("frame", "frame")})
         self.add_flow(
             self.reconstruct, deform, {("reconstruction", "reconstruction")}, policy="drop_oldest", capacity=2

@@ -77,6 +77,8 @@ class LiveSettings:
     """Record the session into this folder, which is not there yet; None: it is not recorded."""
     recording: WriterOptions = dataclasses.field(default_factory=WriterOptions)
     """How it is recorded."""
+    frame_log: bool = True
+    """Write a line of figures for each frame; a run without an end leaves it out, since the file grows."""
     tool_mask: str = "builtin"
     """How tools are found in frames that come without a mask (`operators.tool_mask.TOOL_MASKS`)."""
     out_of_body: Policy = "withhold"

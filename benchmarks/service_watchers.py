@@ -1,0 +1,72 @@
+"""Subscribers that measure what they see of a stream, each in a thread."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import zmq
+
+from services.bus.messages import parsed_json
+from services.bus.pictures import subscribe
+
+
+class Watch:
+    """Subscribes to pictures and keeps the time between them."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.gaps_ms: list[float] = []
+        """Between two pictures, when they came here."""
+        self.sent_gaps_ms: list[float] = []
+        """Between the same two, when they came in at the capture process."""
+        self.ages_ms: list[float] = []
+        self.pictures = 0
+        self.last_ns = 0
+        self._sent_ns = 0
+        self._stop = threading.Event()
+        self._endpoint = endpoint
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    def begin(self) -> None:
+        """Forget what was measured so far."""
+        self.gaps_ms.clear()
+        self.sent_gaps_ms.clear()
+        self.ages_ms.clear()
+
+    def last_from_after(self, at_ns: int) -> bool:
+        """Whether a picture of something that came in after that time is there."""
+        return self._sent_ns > at_ns
+
+    def close(self) -> None:
+        """Watch no more."""
+        self._stop.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        socket = subscribe(zmq.Context.instance().socket(zmq.SUB), self._endpoint)
+        while not self._stop.is_set():
+            if not socket.poll(100):
+                continue
+            header = parsed_json(socket.recv_multipart(copy=False)[0].buffer)
+            now_ns = time.monotonic_ns()
+            if header.get("new") is False:
+                continue
+            sent_ns = header["arrived_ns"]
+            if self.last_ns:
+                self.gaps_ms.append((now_ns - self.last_ns) * 1e-6)
+                self.sent_gaps_ms.append((sent_ns - self._sent_ns) * 1e-6)
+            self.ages_ms.append((now_ns - sent_ns) * 1e-6)
+            self.last_ns, self._sent_ns = now_ns, sent_ns
+            self.pictures += 1
+        socket.close()
+
+
+def quantiles(values: list[float]) -> dict[str, float]:
+    """Median, 99th percentile and most."""
+    ordered = sorted(values)
+    return {
+        "p50": round(ordered[len(ordered) // 2], 3),
+        "p99": round(ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))], 3),
+        "most": round(ordered[-1], 3),
+    }

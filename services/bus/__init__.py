@@ -1,0 +1,1 @@
+"""How the service's processes meet: the runtime folder, and what goes over its sockets."""

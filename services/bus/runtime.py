@@ -1,0 +1,186 @@
+"""The runtime folder: sockets, and who serves them. Only its owner may look into it.
+
+    RUNTIME/                     0700
+      launcher, launcher.json    (`services.supervisor.launcher`)
+      STREAM/                    0700
+        capture.json  capture.spec  capture.log  capture.lock    engine.…  the same
+        raw   capture.status   capture.ctl          sockets of the capture process
+        shown engine.status    engine.ctl           sockets of the engine process
+
+A file of a process that has ended is recognised by the process's number *and* its start, and removed.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from services.bus.errors import AlreadyRunning, RuntimeFolderUnusable
+from services.bus.messages import packed_json, parsed_json
+from services.bus.process_identity import ProcessIdentity
+
+Role = Literal["capture", "engine"]
+ROLES: tuple[Role, ...] = get_args(Role)
+PICTURES: Mapping[Role, str] = {"capture": "raw", "engine": "shown"}
+"""The socket at which each process publishes pictures."""
+MOST_PATH_BYTES = 100
+"""A socket's path may not be longer (`man 7 unix`: 108, and libzmq needs some)."""
+_LONGEST_NAME = "capture.status"
+
+
+@dataclass(frozen=True)
+class ProcessRecord:
+    """What a process has written about itself."""
+
+    identity: ProcessIdentity
+    spec_digest: str
+    """Of the specification that it runs with."""
+
+
+def default_runtime_folder() -> Path:
+    """Where the system keeps such folders for this user."""
+    own = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(own) / "intrasplat" if own else Path(f"/tmp/intrasplat-{os.geteuid()}")
+
+
+class RuntimeFolder:
+    """The runtime folder of one service. Raises RuntimeFolderUnusable."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(os.path.abspath(path))
+        own_folder(self.path)
+
+    def stream(self, name: str) -> StreamFolder:
+        """The folder of a stream, made where it is missing. Raises RuntimeFolderUnusable."""
+        return StreamFolder(self.path / name)
+
+    def streams(self) -> list[str]:
+        """Names of the streams whose folders are there."""
+        return sorted(entry.name for entry in self.path.iterdir() if entry.is_dir() and not entry.is_symlink())
+
+
+class StreamFolder:
+    """What belongs to one stream. Raises RuntimeFolderUnusable."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        check_path(path / _LONGEST_NAME)
+        own_folder(path)
+
+    def endpoint(self, name: str) -> str:
+        """ZeroMQ's address of a socket."""
+        return f"ipc://{self.path / name}"
+
+    def pictures(self, role: Role) -> str:
+        """Where a process publishes pictures."""
+        return self.endpoint(PICTURES[role])
+
+    def status(self, role: Role) -> str:
+        """Where it publishes heartbeats."""
+        return self.endpoint(f"{role}.status")
+
+    def commands(self, role: Role) -> str:
+        """Where it takes commands."""
+        return self.endpoint(f"{role}.ctl")
+
+    def spec(self, role: Role) -> Path:
+        """The file with its specification."""
+        return self.path / f"{role}.spec"
+
+    def log(self, role: Role) -> Path:
+        """The file that it prints to."""
+        return self.path / f"{role}.log"
+
+    def record(self, role: Role) -> ProcessRecord | None:
+        """The process that serves this part now; None when none does. What one that has ended left behind is removed."""
+        try:
+            content = parsed_json((self.path / f"{role}.json").read_bytes())
+            identity = ProcessIdentity(int(content["pid"]), str(content["started"]))
+        except FileNotFoundError:
+            return None
+        if identity.is_alive:
+            return ProcessRecord(identity, str(content["spec_digest"]))
+        self.clean(role)
+        return None
+
+    def write_record(self, role: Role, spec_digest: str) -> None:
+        """Say that this process serves that part."""
+        identity = ProcessIdentity.of(os.getpid())
+        assert identity is not None
+        write_json(
+            self.path / f"{role}.json",
+            {"pid": identity.pid, "started": identity.started, "spec_digest": spec_digest},
+        )
+
+    def lock(self, role: Role) -> int:
+        """Take the part for this process, until it ends. Raises AlreadyRunning."""
+        held = os.open(self.path / f"{role}.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(held)
+            raise AlreadyRunning(
+                f"another {role} process serves {self.path}; stop it, or choose another runtime folder"
+            ) from None
+        return held
+
+    def clean(self, role: Role) -> None:
+        """Remove the sockets and the record of a process that has ended."""
+        for name in (PICTURES[role], f"{role}.status", f"{role}.ctl", f"{role}.json"):
+            (self.path / name).unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        """Remove the folder with all that the processes of this stream left behind; they have ended."""
+        for role in ROLES:
+            self.clean(role)
+            for path in (self.spec(role), self.log(role), self.path / f"{role}.lock"):
+                path.unlink(missing_ok=True)
+        self.path.rmdir()
+
+
+def own_folder(path: Path) -> None:
+    """Make a folder for this user alone, or check that one is it. Raises RuntimeFolderUnusable."""
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = path.lstat()
+    except OSError as error:
+        raise RuntimeFolderUnusable(f"{path} cannot be made: {error.strerror}; choose another runtime folder") from None
+    if not stat.S_ISDIR(found.st_mode):
+        raise RuntimeFolderUnusable(f"{path} is no folder; remove it, or choose another runtime folder")
+    if found.st_uid != os.geteuid():
+        raise RuntimeFolderUnusable(
+            f"{path} belongs to user {found.st_uid} and this process to {os.geteuid()}; choose another runtime folder"
+        )
+    if found.st_mode & 0o077:
+        raise RuntimeFolderUnusable(
+            f"{path} may be looked into by others (mode {stat.S_IMODE(found.st_mode):04o}), and patients' pictures go through it;"
+            f" run `chmod 700 {path}`"
+        )
+
+
+def check_path(path: Path) -> None:
+    """Raises RuntimeFolderUnusable for a socket whose path is too long."""
+    length = len(os.fsencode(path))
+    if length > MOST_PATH_BYTES:
+        raise RuntimeFolderUnusable(
+            f"{path} has {length} bytes, and a socket's path may have {MOST_PATH_BYTES}; choose a shorter runtime folder or stream name"
+        )
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Replace a file of this folder as a whole; nobody else may read it."""
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    descriptor = os.open(part, os.O_CREAT | os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+    with open(descriptor, "wb") as file:
+        file.write(packed_json(content))
+    os.replace(part, path)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """What `write_json` wrote. Raises BadMessage and OSError."""
+    return parsed_json(path.read_bytes())

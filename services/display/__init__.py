@@ -1,0 +1,1 @@
+"""Pictures for people: encoded once, handed to any number of viewers."""

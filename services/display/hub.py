@@ -1,0 +1,147 @@
+"""From a stream's processes to its viewers: each picture is encoded once for each quality that somebody watches, and not at all without viewers."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Literal
+
+import zmq
+import zmq.asyncio
+
+from services.bus.errors import BadMessage
+from services.bus.pictures import Picture, picture_from, subscribe
+from services.bus.runtime import Role, StreamFolder
+from services.display.encoder import EncodedPicture, check_quality, dimmed, encoded
+from services.display.viewer import Viewer
+
+log = logging.getLogger(__name__)
+Pictures = Literal["raw", "shown"]
+PUBLISHERS: dict[Pictures, Role] = {"raw": "capture", "shown": "engine"}
+QUALITY = 80
+STALE_S, FROZEN_S = 0.5, 1.0
+"""When no picture has come for so long, its process has died: the last one is shown once more, dimmed, and then again and again with its age."""
+REPEAT_S = 1.0
+
+
+class DisplayHub:
+    """The viewers of one stream, in an event loop. `counts` has what was encoded and dropped, by reason."""
+
+    def __init__(self, folder: StreamFolder) -> None:
+        self._folder = folder
+        self._channels: dict[Pictures, _Channel] = {}
+        self._encoders = ThreadPoolExecutor(max_workers=2, thread_name_prefix="jpeg")
+
+    def subscribe(self, kind: Pictures, quality: int = QUALITY) -> Viewer:
+        """A new viewer; it is one until it is closed. Raises InvalidSetting for a quality out of range."""
+        check_quality(quality)
+        channel = self._channels.get(kind)
+        if channel is None:
+            channel = self._channels[kind] = _Channel(self._folder.pictures(PUBLISHERS[kind]), kind, self._encoders)
+        return channel.add(quality)
+
+    def viewers(self, kind: Pictures) -> int:
+        """How many there are."""
+        channel = self._channels.get(kind)
+        return 0 if channel is None else len(channel.viewers)
+
+    def counts(self, kind: Pictures) -> dict[str, int]:
+        """`encoded`, and pictures that viewers missed, by reason."""
+        channel = self._channels.get(kind)
+        return {} if channel is None else dict(channel.counts)
+
+    async def close(self) -> None:
+        """Let all viewers go."""
+        for channel in self._channels.values():
+            await channel.close()
+        self._encoders.shutdown(wait=False)
+
+
+class _Channel:
+    """The viewers of one of a stream's two kinds of picture. It listens only while there are any."""
+
+    def __init__(self, endpoint: str, kind: Pictures, encoders: ThreadPoolExecutor) -> None:
+        self._endpoint, self._kind, self._encoders = endpoint, kind, encoders
+        self.viewers: set[Viewer] = set()
+        self.counts: Counter[str] = Counter()
+        self._task: asyncio.Task[None] | None = None
+
+    def add(self, quality: int) -> Viewer:
+        viewer = Viewer(quality, self._left, self.counts)
+        self.viewers.add(viewer)
+        if self._task is None or self._task.done():
+            self._task = asyncio.create_task(self._show(), name=f"display {self._kind}")
+        return viewer
+
+    def _left(self, viewer: Viewer) -> None:
+        self.viewers.discard(viewer)
+        if not self.viewers and self._task is not None:
+            self._task.cancel()
+            self._task = None
+
+    async def close(self) -> None:
+        task = self._task
+        for viewer in list(self.viewers):
+            viewer.close()
+        if task is not None:
+            await asyncio.gather(task, return_exceptions=True)
+
+    async def _show(self) -> None:
+        """Encode and hand out what comes, until the last viewer has left."""
+        socket = subscribe(zmq.asyncio.Context.instance().socket(zmq.SUB), self._endpoint)
+        last: Picture | None = None
+        came_s = time.monotonic()
+        try:
+            while True:
+                picture = await self._newest(
+                    socket, STALE_S if last is None or time.monotonic() - came_s < FROZEN_S else REPEAT_S
+                )
+                now_s = time.monotonic()
+                if picture is not None:
+                    last, came_s = picture, now_s
+                    await self._hand_out(_header(picture, self._kind), picture)
+                elif last is not None:
+                    state = "stale" if now_s - came_s < FROZEN_S else "frozen"
+                    again = Picture({**_header(last, self._kind), "state": state, "new": False}, dimmed(last.image))
+                    await self._hand_out(dict(again.header), again)
+        finally:
+            socket.close()
+
+    async def _newest(self, socket: Any, timeout_s: float) -> Picture | None:
+        """The newest picture that waits; None when none comes in time."""
+        if not await socket.poll(round(timeout_s * 1000)):
+            return None
+        parts = await socket.recv_multipart(copy=False)
+        while await socket.poll(0):
+            self.counts["encoder busy"] += 1
+            parts = await socket.recv_multipart(copy=False)
+        try:
+            return picture_from(parts)
+        except BadMessage as error:
+            self.counts["bad message"] += 1
+            log.warning("%s: %s", self._endpoint, error)
+            return None
+
+    async def _hand_out(self, header: dict[str, object], picture: Picture) -> None:
+        loop = asyncio.get_running_loop()
+        for quality in {viewer.quality for viewer in self.viewers}:
+            jpeg = await loop.run_in_executor(self._encoders, encoded, picture.image, quality)
+            self.counts["encoded"] += 1
+            said = EncodedPicture(header, jpeg)
+            for viewer in [viewer for viewer in self.viewers if viewer.quality == quality]:
+                viewer.offer(said)
+
+
+def _header(picture: Picture, kind: Pictures) -> dict[str, object]:
+    """What is said to viewers; the age is that at this moment."""
+    header = {name: value for name, value in picture.header.items() if name not in ("pixels", "run")}
+    arrived_ns = header.get("arrived_ns")
+    if isinstance(arrived_ns, int):
+        header["age_ms"] = round((time.monotonic_ns() - arrived_ns) * 1e-6, 3)
+    height_px, width_px = picture.image.shape[:2]
+    if kind == "raw":
+        header["state"] = "live"
+    return {**header, "picture": kind, "width_px": width_px, "height_px": height_px}

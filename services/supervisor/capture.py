@@ -1,0 +1,135 @@
+"""The capture process of a stream, `python -m services.supervisor.capture --spec FILE`: owns the source, and publishes its frames whatever
+becomes of everybody else. It loads no torch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from gsplat_core.errors import UserError
+from gsplat_core.scene.frames import Frame
+from operators.errors import SourceError, SourceUnavailable
+from operators.sources.backoff import Backoff
+from operators.sources.options import SourceOptions
+from operators.sources.registry import open_source
+from operators.sources.source import FrameSource, ReportingSource, SourceState
+from operators.sources.wire import description_to, frame_header, planes_of
+from operators.sources.zeromq_message import packed
+from services.bus.errors import CommandRefused
+from services.bus.pictures import PicturePublisher
+from services.supervisor.exit_codes import NO_USE
+from services.supervisor.specs import SourceSpec
+from services.supervisor.worker import Worker, stream_folder_of
+
+LOOK_S = 0.1
+"""How often the source is asked for its state while no frame comes."""
+
+
+class Capture:
+    """Reads one source after another from the same address, and publishes what they give."""
+
+    def __init__(self, spec: SourceSpec) -> None:
+        self.spec = spec
+        self._lock = threading.Lock()
+        self._source: FrameSource | None = None
+        self._run = time.time_ns()
+        """Tells readers that numbers and times begin anew."""
+        self.frames = 0
+        self._last_ns: int | None = None
+
+    def describe(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        """The command `describe`: what is known of the source. Raises CommandRefused while it is not open."""
+        with self._lock:
+            if self._source is None:
+                raise CommandRefused("the source is not open")
+            return {"description": description_to(self._source.description)}
+
+    def figures(self) -> dict[str, Any]:
+        """For the heartbeats."""
+        with self._lock:
+            source = self._source
+            counts: dict[str, int] = dict(source.counts()) if isinstance(source, ReportingSource) else {}
+        return {"frames": self.frames, "last_frame_ns": self._last_ns, "counts": counts}
+
+    def publish(self, worker: Worker, publisher: PicturePublisher) -> None:
+        """Until the process is to end. Raises a UserError for an address that will never work."""
+        backoff = Backoff()
+        while not worker.stop_requested():
+            try:
+                source = open_source(self.spec.address, self._options())
+            except SourceUnavailable as error:
+                worker.say("opening", str(error))
+                worker.wait(backoff.failed())
+                continue
+            with self._lock:
+                self._source = source
+                self._run += 1
+            try:
+                self._publish(source, worker, publisher, backoff)
+            except SourceError as error:
+                worker.say("lost", str(error))
+                worker.wait(backoff.failed())
+            finally:
+                with self._lock:
+                    self._source = None
+                source.close()
+
+    def _options(self) -> SourceOptions:
+        spec = self.spec
+        return SourceOptions(scale=spec.scale, fps=spec.fps, loop=spec.loop, realtime=True)
+
+    def _publish(self, source: FrameSource, worker: Worker, publisher: PicturePublisher, backoff: Backoff) -> None:
+        source.open()
+        while not worker.stop_requested():
+            frame = source.read(LOOK_S)
+            if frame is not None:
+                self._send(frame, publisher)
+                backoff.worked()
+                worker.say("live", f"{source.description.name} gives frames")
+            else:
+                state = source.state
+                worker.say(state.value, _sentence(source))
+                if state is SourceState.ENDED:
+                    worker.wait(LOOK_S)
+
+    def _send(self, frame: Frame, publisher: PicturePublisher) -> None:
+        header = {**frame_header(frame), "run": self._run}
+        publisher.publish_frame(header, packed(frame.seq, frame.pts_ns, planes_of(frame)))
+        self.frames += 1
+        self._last_ns = time.monotonic_ns()
+
+
+def _sentence(source: FrameSource) -> str:
+    return source.state_sentence if isinstance(source, ReportingSource) else f"the source is {source.state.value}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run until told to stop; returns the exit code."""
+    parser = argparse.ArgumentParser(description="Capture process of a stream.")
+    parser.add_argument("--spec", required=True, help="file with the specification")
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        folder, spec = stream_folder_of(parser.parse_args(arguments).spec, "capture")
+        assert spec.capture is not None
+        capture = Capture(spec.capture)
+        with Worker(folder, spec, {"describe": capture.describe}) as worker:
+            worker.tell_figures(capture.figures)
+            publisher = PicturePublisher(folder.pictures("capture"))
+            try:
+                capture.publish(worker, publisher)
+            finally:
+                publisher.close()
+    except UserError as error:
+        logging.getLogger(__name__).error("%s", error)
+        return NO_USE
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,134 @@
+"""The frames of a stream's capture process, as a source of its engine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import zmq
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.frames import Frame
+from operators.errors import SourceUnavailable
+from operators.sources.live import LiveSource
+from operators.sources.order import FrameOrder
+from operators.sources.shared_memory import BadHeader
+from operators.sources.source import SourceDescription, SourceState
+from operators.sources.wire import description_from, frame_from
+from operators.sources.zeromq_message import BadMessage as BadFrame
+from operators.sources.zeromq_message import unpacked
+from services.bus.commands import ask
+from services.bus.errors import BadMessage, BusError
+from services.bus.messages import parsed_json
+from services.bus.pictures import split, subscribe
+from services.bus.runtime import StreamFolder
+
+LOOK_MS = 50
+ASK_AGAIN_S = 0.1
+SILENT_S = 1.0
+"""A capture process that has said nothing for so long is gone, or hangs."""
+WAITING = 4
+
+
+class CapturedSource(LiveSource):
+    """Frames that a capture process publishes, with the times at which they came in there.
+
+    It has no end: while there is no capture process, or its source gives nothing, `state` and `state_sentence` say so; numbers and times go on
+    when it is back.
+    """
+
+    def __init__(self, folder: StreamFolder, stop_requested: Callable[[], bool] = lambda: False) -> None:
+        """Waits until the source is open there. Raises SourceUnavailable when it is told to stop before."""
+        super().__init__(waiting=WAITING, order=FrameOrder(trusted=True))
+        self._folder = folder
+        self._told: tuple[SourceState, str] | None = None
+        self._heard_s = time.monotonic()
+        self.description = self._described(stop_requested)
+
+    @property
+    def state(self) -> SourceState:
+        """See `FrameSource`."""
+        state, told = super().state, self._told
+        if state is SourceState.LIVE and told is not None and not self._ready:
+            return told[0]
+        return state
+
+    @property
+    def state_sentence(self) -> str:
+        """See `LiveSource`."""
+        told = self._told
+        return told[1] if told is not None and self.state is told[0] else super().state_sentence
+
+    def frames(self) -> Iterator[Frame]:
+        """See `LiveSource`."""
+        context: zmq.Context = zmq.Context.instance()
+        pictures = subscribe(context.socket(zmq.SUB), self._folder.pictures("capture"), waiting=WAITING)
+        status = subscribe(context.socket(zmq.SUB), self._folder.status("capture"), waiting=8)
+        poller = zmq.Poller()
+        poller.register(pictures, zmq.POLLIN)
+        poller.register(status, zmq.POLLIN)
+        run: Any = None
+        try:
+            while not self.wait(0):
+                found = dict(poller.poll(LOOK_MS))
+                if status in found:
+                    self._note(status.recv())
+                elif time.monotonic() - self._heard_s > SILENT_S:
+                    self.lost("the capture process says nothing; it is being started again")
+                if pictures not in found:
+                    continue
+                received = self._frame(pictures.recv_multipart(copy=False))
+                if received is None:
+                    continue
+                header, frame = received
+                if run is not None and header.get("run") != run:
+                    self._begin_anew()
+                run = header.get("run")
+                self._told = None
+                yield frame
+        finally:
+            pictures.close()
+            status.close()
+
+    def _begin_anew(self) -> None:
+        """The next frame is the first one of another process or of another connection there."""
+        if self._order is not None:
+            self._order.restart()
+
+    def _frame(self, parts: list[zmq.Frame]) -> tuple[dict[str, Any], Frame] | None:
+        try:
+            header, pixels = split(parts)
+            _, _, arrays = unpacked(pixels)
+            return header, frame_from(header, arrays)
+        except (BadMessage, BadFrame, BadHeader, InvalidInput):
+            self.count("bad_messages")
+            return None
+
+    def _note(self, data: bytes) -> None:
+        """A heartbeat of the capture process."""
+        try:
+            said = parsed_json(data)
+        except BadMessage:
+            self.count("bad_messages")
+            return
+        self._heard_s = time.monotonic()
+        state, reason = said.get("state"), str(said.get("reason", ""))
+        if state == "live":
+            self._told = None
+        elif state == SourceState.ENDED.value:
+            self._told = SourceState.STALLED, reason  # a stream without an end: it may be played again
+        elif state == SourceState.STALLED.value:
+            self._told = SourceState.STALLED, reason
+        else:
+            self._told = SourceState.RECONNECTING, reason
+
+    def _described(self, stop_requested: Callable[[], bool]) -> SourceDescription:
+        while True:
+            try:
+                answer = ask(self._folder.commands("capture"), "describe", timeout_s=1.0)
+                return description_from(answer.get("description", {}))
+            except (BusError, BadHeader) as error:
+                if stop_requested():
+                    raise SourceUnavailable(f"the capture process has not opened its source: {error}") from error
+                time.sleep(ASK_AGAIN_S)

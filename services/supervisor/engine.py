@@ -1,0 +1,121 @@
+"""The engine process of a stream, `python -m services.supervisor.engine --spec FILE [--again]`: reconstructs the frames of the stream's capture process
+live, and publishes what is shown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from gsplat_core.errors import UserError
+from gsplat_core.rendering.registry import check_renderer
+from operators.applications.device import check_device
+from operators.applications.limits import check_picture
+from operators.applications.live import LiveApplication
+from operators.applications.live_settings import LiveSettings
+from operators.applications.live_start import LiveParts, low_latency, new_parts, warm_up
+from operators.applications.session import Session
+from operators.applications.trial_run import trial_run
+from operators.frame_clock import ClockSettings
+from operators.metrics import ScoredFrame
+from services.bus.pictures import PicturePublisher
+from services.supervisor.captured_source import CapturedSource
+from services.supervisor.exit_codes import NO_USE
+from services.supervisor.screen import Screen
+from services.supervisor.specs import EngineSpec
+from services.supervisor.worker import Worker, stream_folder_of
+
+
+def live_settings(spec: EngineSpec, out: Path, source: str) -> LiveSettings:
+    """The settings of a live run without an end: nothing is written that grows with it."""
+    return LiveSettings(
+        source=source,
+        out=out,
+        device=spec.device,
+        field=spec.field,
+        renderer=spec.renderer,
+        seed=spec.seed,
+        tool_mask=spec.tool_mask,
+        out_of_body=spec.out_of_body,
+        clock=ClockSettings(budget_ms=spec.budget_ms),
+        frame_log=False,
+    )
+
+
+def started(settings: LiveSettings, source: CapturedSource, again: bool) -> LiveParts:
+    """What a live run works with. The first time everything is done once before the first frame; again, a picture soon counts for more."""
+    if again:
+        return new_parts(settings, source)
+    trial_run(settings, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
+    return warm_up(settings, source)
+
+
+def reconstruct(worker: Worker, spec: EngineSpec, screen: Screen, *, again: bool) -> None:
+    """Reconstruct and show until the process is to end. Raises a UserError for what cannot work, RunFailed when a part failed."""
+    worker.say("starting", "waits for the source to be opened by the capture process")
+    source = CapturedSource(worker.folder, worker.stop_requested)
+    check_device(spec.device)
+    check_renderer(spec.renderer, spec.device)
+    check_picture(source.description.camera, 1.0)
+    with TemporaryDirectory(prefix="intrasplat-engine-") as folder, low_latency():
+        settings = live_settings(spec, Path(folder), source.description.name)
+        worker.say("starting", "prepares the reconstruction")
+        parts = started(settings, source, again)
+
+        def scored(graph: LiveApplication, score: ScoredFrame) -> None:
+            screen.scored(score)
+
+        graph = LiveApplication(
+            source, settings, parts, stop_requested=worker.stop_requested, on_scored=scored, on_shown=screen.show
+        )
+        worker.tell_figures(lambda: {**screen.figures(), **graph_figures(graph)})
+        worker.say("running", "reconstructs")
+        Session(graph, settings.stated(), command="live", stop_requested=worker.stop_requested).execute()
+
+
+def graph_figures(graph: LiveApplication) -> dict[str, object]:
+    """What a graph has done so far, by name; nothing before it runs."""
+    if getattr(graph, "metrics", None) is None:
+        return {}
+    counts = graph.reconstruct.counts
+    source = graph.frame_source
+    return {
+        "frames": graph.source_op.emitted,
+        "trained": counts.frames,
+        "steps": counts.steps,
+        "passed_over": counts.passed_over,
+        "withheld": dict(counts.withheld),
+        "gaussians": graph.reconstruct.newest_gaussians,
+        "source": source.state.value,
+        "source_counts": dict(source.counts()) if isinstance(source, CapturedSource) else {},
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run until told to stop; returns the exit code."""
+    parser = argparse.ArgumentParser(description="Engine process of a stream.")
+    parser.add_argument("--spec", required=True, help="file with the specification")
+    parser.add_argument("--again", action="store_true", help="an engine of this stream ran before: show a picture soon")
+    given = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        folder, spec = stream_folder_of(given.spec, "engine")
+        assert spec.engine is not None
+        with Worker(folder, spec, {}) as worker:
+            publisher = PicturePublisher(folder.pictures("engine"))
+            try:
+                reconstruct(worker, spec.engine, Screen(publisher), again=given.again)
+            finally:
+                publisher.close()
+    except UserError as error:
+        logging.getLogger(__name__).error("%s", error)
+        return NO_USE
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,176 @@
+"""The launcher, `python -m services.supervisor.launcher --folder RUNTIME`: has loaded everything that an engine needs, and forks engines.
+
+Loading torch takes seconds, forking milliseconds: an engine that has died is there again before anybody has looked twice. The launcher computes
+nothing, has one thread, and touches no GPU, so that what it forks begins as if newly started; its memory is shared with the engines.
+
+It takes one JSON object for each connection to its socket, and answers with one:
+
+| request | answer |
+|---|---|
+| `{"command": "start", "arguments": [...], "log": PATH, "environment": {...}}` | `{"ok": true, "pid": N}` |
+| `{"command": "status", "pid": N}` | `{"ok": true, "status": "signal 9"}`, null while it runs or when it is not known |
+| `{"command": "ping"}`, `{"command": "stop"}` | `{"ok": true}` |
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import logging
+import os
+import select
+import signal
+import socket
+import sys
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from gsplat_core.errors import UserError
+from services.bus.errors import AlreadyRunning, BadMessage
+from services.bus.messages import MOST_BYTES, packed_json, parsed_json
+from services.bus.process_identity import ProcessIdentity
+from services.bus.runtime import RuntimeFolder, check_path, write_json
+from services.supervisor.launching import RECORD, SOCKET, recorded_launcher
+from services.supervisor.process_end import ended_how
+
+log = logging.getLogger(__name__)
+LOOK_S = 0.2
+REQUEST_S = 1.0
+"""A request takes no longer to be read."""
+MOST_REMEMBERED = 256
+"""Ends of engines that nobody has asked for."""
+
+
+class Launcher:
+    """Listens at its socket and forks until it is told to stop, or nobody has asked for anything in `orphan_after_s`."""
+
+    def __init__(self, path: Path, orphan_after_s: float) -> None:
+        self._path, self._orphan_after_s = path, orphan_after_s
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        path.unlink(missing_ok=True)
+        self._listener.bind(os.fspath(path))
+        self._listener.listen(16)
+        self._stopped = False
+        self._ends: dict[int, str] = {}
+        self._heard_s = time.monotonic()
+
+    def stop(self, *_: Any) -> None:
+        """End soon; also a signal's handler."""
+        self._stopped = True
+
+    def serve(self) -> None:
+        """Until the end."""
+        while not self._stopped and time.monotonic() - self._heard_s < self._orphan_after_s:
+            self._reap()
+            if not select.select([self._listener], [], [], LOOK_S)[0]:
+                continue
+            connection, _ = self._listener.accept()
+            with connection:
+                connection.settimeout(REQUEST_S)
+                with contextlib.suppress(OSError):  # whoever asked is gone
+                    connection.sendall(packed_json(self._answer(connection)))
+        self._listener.close()
+        self._path.unlink(missing_ok=True)
+
+    def _answer(self, connection: socket.socket) -> dict[str, Any]:
+        try:
+            told = parsed_json(connection.recv(MOST_BYTES))
+            self._heard_s = time.monotonic()
+            command = told.get("command")
+            if command == "start":
+                return {"ok": True, "pid": self._start(told, connection)}
+            if command == "status":
+                self._reap()
+                return {"ok": True, "status": self._ends.get(int(told["pid"]))}
+            if command == "stop":
+                self.stop()
+            return {"ok": command in ("stop", "ping")}
+        except (BadMessage, KeyError, TypeError, ValueError, OSError) as error:
+            return {"ok": False, "error": f"{type(error).__name__}: {error}"}
+
+    def _start(self, told: Mapping[str, Any], connection: socket.socket) -> int:
+        arguments = [str(argument) for argument in told["arguments"]]
+        environment = {str(name): str(value) for name, value in dict(told["environment"]).items()}
+        output = os.open(str(told["log"]), os.O_CREAT | os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC, 0o600)
+        try:
+            pid = os.fork()
+            if pid == 0:
+                self._listener.close()
+                connection.close()
+                _become_engine(arguments, environment, output)
+            return pid
+        finally:
+            os.close(output)
+
+    def _reap(self) -> None:
+        """Take note of engines that have ended."""
+        while True:
+            try:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+            except ChildProcessError:
+                return
+            if pid == 0:
+                return
+            self._ends[pid] = ended_how(status)
+            while len(self._ends) > MOST_REMEMBERED:
+                del self._ends[next(iter(self._ends))]
+
+
+def _become_engine(arguments: Sequence[str], environment: Mapping[str, str], output: int) -> NoReturn:
+    """The rest of the life of a forked process."""
+    code = 1
+    try:
+        os.setsid()
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, signal.SIG_DFL)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        os.environ.update(environment)
+        from services.supervisor.engine import main as engine
+
+        code = engine(arguments)
+    except BaseException:  # noqa: BLE001 - nothing of this process may go on as the launcher
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run until told to stop; returns the exit code."""
+    parser = argparse.ArgumentParser(description="Forks engine processes.")
+    parser.add_argument("--folder", required=True, help="runtime folder")
+    parser.add_argument("--orphan-after-s", type=float, default=600.0)
+    given = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    # By NVML it can be asked whether there is a GPU without using it, after which no engine could.
+    os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
+    try:
+        folder = RuntimeFolder(Path(given.folder))
+        check_path(folder.path / SOCKET)
+        if recorded_launcher(folder) is not None:
+            raise AlreadyRunning(f"another launcher serves {folder.path}; stop it, or choose another runtime folder")
+    except UserError as error:
+        log.error("%s", error)
+        return 2
+    import services.supervisor.engine  # noqa: F401 - what it loads is what the launcher is for
+
+    identity = ProcessIdentity.of(os.getpid())
+    assert identity is not None
+    launcher = Launcher(folder.path / SOCKET, given.orphan_after_s)
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, launcher.stop)
+    write_json(folder.path / RECORD, {"pid": identity.pid, "started": identity.started})
+    try:
+        launcher.serve()
+    finally:
+        (folder.path / RECORD).unlink(missing_ok=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

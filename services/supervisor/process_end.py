@@ -1,0 +1,44 @@
+"""How a process has ended, in words."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+from services.supervisor.exit_codes import NO_USE
+
+_TAIL_BYTES = 4096
+
+
+def ended_how(status: int) -> str:
+    """From what `os.waitpid` gives."""
+    if os.WIFSIGNALED(status):
+        number = os.WTERMSIG(status)
+        return f"killed by {signal.Signals(number).name}"
+    return f"exit code {os.waitstatus_to_exitcode(status)}"
+
+
+def status_of_child(pid: int) -> str | None:
+    """How a process that this one has started ended; None where another one has started it, or it has not ended."""
+    try:
+        found, status = os.waitpid(pid, os.WNOHANG)
+    except ChildProcessError:
+        return None
+    return ended_how(status) if found else None
+
+
+def is_of_no_use(how: str | None) -> bool:
+    """Whether the process would end in the same way again."""
+    return how == f"exit code {NO_USE}"
+
+
+def last_words(log: Path) -> str:
+    """The last line that a process has printed; empty where there is none."""
+    try:
+        with open(log, "rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
+            lines = file.read().decode(errors="replace").split("\n")
+    except FileNotFoundError:
+        return ""
+    return next((line.strip()[:500] for line in reversed(lines) if line.strip()), "")

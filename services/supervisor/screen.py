@@ -1,0 +1,67 @@
+"""What an engine shows, published with what is known about it."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from operators.messages import ShownPicture
+from operators.metrics import ScoredFrame
+from services.bus.pictures import PicturePublisher
+
+
+class Screen:
+    """The one place from which an engine's pictures go out, so that each is of one model as a whole."""
+
+    def __init__(self, publisher: PicturePublisher) -> None:
+        self._publisher = publisher
+        self._lock = threading.Lock()
+        self.pictures = 0
+        """New pictures that were shown."""
+        self.published = 0
+        """With those that were shown again, with another state or age."""
+        self._last: dict[str, Any] = {}
+        self._psnr_db: float | None = None
+
+    def show(self, shown: ShownPicture) -> None:
+        """Publish a picture of the live reconstruction."""
+        rendered = shown.rendered
+        content = rendered.content or rendered.frame
+        self.publish(
+            {
+                "show": "live",
+                "seq": rendered.frame.seq,
+                "pts_ns": rendered.frame.pts_ns,
+                "arrived_ns": content.arrived_ns,
+                "shown_ns": shown.shown_ns,
+                "age_ms": round(shown.age_ns * 1e-6, 3),
+                "state": shown.state.value,
+                "new": shown.new,
+                "model_version": rendered.model_version,
+                "steps": rendered.steps,
+                "psnr_db": self._psnr_db,
+            },
+            shown.image,
+        )
+
+    def scored(self, scored: ScoredFrame) -> None:
+        """What the newest scored picture's tissue PSNR was: the next ones tell it."""
+        value = scored.quality.psnr_tissue_db
+        self._psnr_db = round(value, 3) if math.isfinite(value) else None
+
+    def publish(self, header: Mapping[str, Any], image: Any) -> None:
+        """Publish a picture."""
+        with self._lock:
+            self._publisher.publish(header, image)
+            self.published += 1
+            self.pictures += bool(header["new"])
+            self._last = {name: header[name] for name in ("show", "state", "age_ms", "model_version", "psnr_db")}
+            self._last["shown_ns"] = time.monotonic_ns()
+
+    def figures(self) -> dict[str, Any]:
+        """For the heartbeats."""
+        with self._lock:
+            return {"pictures": self.pictures, "published": self.published, "picture": dict(self._last)}

@@ -1,0 +1,135 @@
+"""What the capture and the engine process have in common: one of them a stream, heartbeats, commands, an orderly end, an end without a supervisor."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping
+from types import FrameType, TracebackType
+from typing import Any
+
+from services.bus.commands import CommandServer, Handler
+from services.bus.heartbeats import Heartbeats
+from services.bus.runtime import Role, StreamFolder
+from services.supervisor.specs import ProcessSpec
+
+log = logging.getLogger(__name__)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+LOOK_S = 0.25
+
+
+class Worker:
+    """This process as part of a stream, while entered.
+
+    `say` sets what the heartbeats tell; `stop_requested` answers whether the process is to finish: after a command, after a signal, or when no
+    supervisor has asked for anything in `orphan_after_s`. One that does not finish within `drain_s` is ended.
+
+    Raises AlreadyRunning where another process serves this part.
+    """
+
+    def __init__(self, folder: StreamFolder, spec: ProcessSpec, handlers: Mapping[str, Handler]) -> None:
+        """handlers: commands beside `ping` and `stop`."""
+        self.folder, self.spec, self.role = folder, spec, spec.role
+        self._own: dict[str, Handler] = {"ping": lambda _: {"pid": os.getpid()}, "stop": self._told_to_stop}
+        self._handlers = {**self._own, **handlers}
+        self._stop = threading.Event()
+        self._over = threading.Event()
+        self._saying = threading.Lock()
+        self._said: dict[str, Any] = {"state": "starting", "reason": f"the {spec.role} process starts"}
+        self._figures: Callable[[], Mapping[str, Any]] = dict
+        self.stop_reason = ""
+
+    def __enter__(self) -> Worker:
+        self._lock = self.folder.lock(self.role)
+        self.folder.clean(self.role)
+        self._before = {number: signal.signal(number, self._signalled) for number in SIGNALS}
+        self._heartbeats = Heartbeats(self.folder.status(self.role), self._report)
+        self._commands = CommandServer(self.folder.commands(self.role), self._handlers)
+        self.folder.write_record(self.role, self.spec.digest)
+        self._watch = threading.Thread(target=self._look_after, name="watch", daemon=True)
+        self._watch.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.say("ended", self.stop_reason or "it has nothing more to do")
+        else:
+            self.say("failed", str(error) or type(error).__name__)
+        self._over.set()
+        self._watch.join()
+        self._commands.close()
+        self._heartbeats.close()
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self.folder.clean(self.role)
+        os.close(self._lock)
+
+    def say(self, state: str, reason: str) -> None:
+        """What the process is doing, and why, in a sentence."""
+        with self._saying:
+            changed = self._said["state"] != state
+            self._said = {"state": state, "reason": reason[:2000]}
+        if changed:
+            log.info("%s: %s", state, reason)
+            self._heartbeats.say_now()
+
+    def tell_figures(self, figures: Callable[[], Mapping[str, Any]]) -> None:
+        """What each heartbeat tells besides; called in its thread."""
+        self._figures = figures
+
+    def stop_requested(self) -> bool:
+        """Whether the process is to finish what it has and to end."""
+        return self._stop.is_set()
+
+    def wait(self, seconds: float) -> bool:
+        """Wait; True at once when the process is to end."""
+        return self._stop.wait(seconds)
+
+    def request_stop(self, reason: str) -> None:
+        """Ask this process to finish."""
+        if not self._stop.is_set():
+            self.stop_reason = reason
+            self._stop.set()
+
+    def _signalled(self, number: int, frame: FrameType | None) -> None:
+        self.request_stop(f"it got {signal.Signals(number).name}")
+
+    def _told_to_stop(self, arguments: Mapping[str, Any]) -> None:
+        self.request_stop(str(arguments.get("reason", "it was told to stop"))[:200])
+
+    def _report(self) -> Mapping[str, Any]:
+        with self._saying:
+            said = dict(self._said)
+        return {"role": self.role, **said, "figures": dict(self._figures())}
+
+    def _look_after(self) -> None:
+        limits = self.spec.limits
+        asked_s: float | None = None
+        while not self._over.wait(LOOK_S):
+            now_s = time.monotonic()
+            if now_s - self._commands.heard_s > limits.orphan_after_s:
+                self.request_stop(f"no supervisor has asked for anything in {limits.orphan_after_s:g} s")
+            if self._stop.is_set():
+                asked_s = asked_s or now_s
+                if now_s - asked_s > limits.drain_s:
+                    log.error("not finished within %g s; ended", limits.drain_s)
+                    self.folder.clean(self.role)
+                    os._exit(1)
+
+
+def stream_folder_of(spec_file: Any, role: Role) -> tuple[StreamFolder, ProcessSpec]:
+    """The folder of the stream and the specification, from the specification's file. Raises InvalidSetting and RuntimeFolderUnusable."""
+    from pathlib import Path
+
+    from gsplat_core.errors import InvalidSetting
+
+    path = Path(os.path.abspath(spec_file))
+    spec = ProcessSpec.read(path)
+    if spec.role != role:
+        raise InvalidSetting(f"{path} is for the {spec.role} process, and this is the {role} process")
+    return StreamFolder(path.parent), spec
