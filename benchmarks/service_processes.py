@@ -15,7 +15,6 @@ import json
 import os
 import random
 import signal
-import statistics
 import tempfile
 import time
 from pathlib import Path
@@ -49,7 +48,9 @@ async def killed(options: argparse.Namespace, role: Role) -> dict[str, object]:
         runtime = RuntimeFolder(Path(folder))
         launcher = ByLauncher(runtime)
         launcher.open()
-        stream = StreamSupervisor(StreamSpec(name="bench", source=SourceSpec(address=options.source)), runtime, start=launcher)
+        stream = StreamSupervisor(
+            StreamSpec(name="bench", source=SourceSpec(address=options.source)), runtime, start=launcher
+        )
         await stream.start()
         raw = [Watch(stream.folder.pictures("capture")) for _ in range(2)]
         shown = [Watch(stream.folder.pictures("engine")) for _ in range(2)]

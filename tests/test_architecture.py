@@ -90,3 +90,18 @@ assert "torch.utils.cpp_extension" not in sys.modules
 def test_import_opens_no_socket_starts_no_process_and_compiles_nothing(package):
     done = subprocess.run([sys.executable, "-c", PROGRAM, package], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
+
+
+WITHOUT_TORCH = [
+    *(f"services.bus.{name}" for name in ("commands", "heartbeats", "pictures", "runtime")),
+    *(f"services.supervisor.{name}" for name in ("launching", "process", "specs", "stream")),
+    "services.display.hub",
+]
+"""What the control plane's process loads."""
+
+
+@pytest.mark.parametrize("module", WITHOUT_TORCH)
+def test_the_control_plane_loads_neither_torch_nor_opencv(module):
+    program = f"import sys, {module}; assert not {{'torch', 'cv2'}} & set(sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr

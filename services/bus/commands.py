@@ -104,7 +104,7 @@ class CommandServer:
             told = parsed_json(data)
             name = told.pop("command", None)
             if name not in self._handlers:
-                raise CommandRefused(f"there is no command {name!s:.60!r}; there are {', '.join(self._handlers)}")
+                raise CommandRefused(f"there is no command {str(name)[:60]!r}; there are {', '.join(self._handlers)}")
             return packed_json({"ok": True, **(self._handlers[name](told) or {})})
         except (UserError, BusError) as error:
             return _refusal(str(error))

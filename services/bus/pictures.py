@@ -19,8 +19,9 @@ from operators.sources import zeromq_message
 from services.bus.errors import BadMessage
 from services.bus.messages import MOST_BYTES, packed_json, parsed_json
 
-HIGH_WATER = 2
-"""Pictures that wait for a reader that does not keep up, on either side; others are not kept for it."""
+HIGH_WATER = 4
+"""Pictures that wait for a reader that does not keep up, on either side; what comes then is dropped for it. Readers take all that waits and use the
+newest. Fewer would be lost to readers that do keep up: ZeroMQ takes note of what was read only now and then."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import os
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from signal import pidfd_send_signal
 
 _STATE, _STARTED = 0, 19
 """Where they stand in /proc/PID/stat after the name, which may hold anything but ends with the last bracket."""
@@ -46,7 +47,7 @@ class ProcessIdentity:
             # The handle stays with the process, so what is asked now holds when the signal is sent.
             if not self.is_alive:
                 return False
-            signal_process(handle, number)
+            pidfd_send_signal(handle, number)
         except ProcessLookupError:
             return False
         finally:
@@ -70,13 +71,6 @@ class ProcessIdentity:
         finally:
             loop.remove_reader(handle)
             os.close(handle)
-
-
-def signal_process(handle: int, number: int) -> None:
-    """Send a signal through a handle of `os.pidfd_open`. Raises ProcessLookupError."""
-    from signal import pidfd_send_signal
-
-    pidfd_send_signal(handle, number)
 
 
 @cache

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.frames import Frame
@@ -65,13 +66,17 @@ class CapturedSource(LiveSource):
         context: zmq.Context = zmq.Context.instance()
         pictures = subscribe(context.socket(zmq.SUB), self._folder.pictures("capture"), waiting=WAITING)
         status = subscribe(context.socket(zmq.SUB), self._folder.status("capture"), waiting=8)
+        ended = pictures.get_monitor_socket(zmq.EVENT_DISCONNECTED)
         poller = zmq.Poller()
-        poller.register(pictures, zmq.POLLIN)
-        poller.register(status, zmq.POLLIN)
+        for socket in (pictures, status, ended):
+            poller.register(socket, zmq.POLLIN)
         run: Any = None
         try:
             while not self.wait(0):
                 found = dict(poller.poll(LOOK_MS))
+                if ended in found:
+                    recv_monitor_message(ended)
+                    self.lost("the capture process has ended; it is being started again")
                 if status in found:
                     self._note(status.recv())
                 elif time.monotonic() - self._heard_s > SILENT_S:
@@ -88,8 +93,9 @@ class CapturedSource(LiveSource):
                 self._told = None
                 yield frame
         finally:
-            pictures.close()
-            status.close()
+            pictures.disable_monitor()
+            for socket in (ended, pictures, status):
+                socket.close(0)
 
     def _begin_anew(self) -> None:
         """The next frame is the first one of another process or of another connection there."""

@@ -19,6 +19,7 @@ from operators.endoscope.sequence import MaskAndDepthCounts, SequenceCounts
 from operators.ingest import SourceResult
 from operators.live_reconstruct import TrainingCounts
 from operators.messages import PictureState
+from operators.on_screen import OnScreenResult
 from operators.out_of_body import OutOfBodyFrames
 from operators.sources.order import FrameOrder
 from tests.operators.applications.scripted import (
@@ -259,3 +260,12 @@ def test_faults_one_upon_the_other(watched, seed):
     everything_came(watch)
     watch.recovers_in(after)
     watch.learned_nothing_bad()
+
+
+def test_a_run_without_a_log_scores_its_pictures_all_the_same(watched):
+    script = Script()
+    script.good(15)
+    watch = watched(script, frame_log=False)
+    assert watch.outcome is not None
+    assert "frames" not in watch.outcome.outputs
+    assert watch.part(OnScreenResult).frames > 5

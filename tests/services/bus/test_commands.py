@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import asyncio
+import json
+
+import pytest
+import zmq
+
+from gsplat_core.errors import InvalidSetting
+from services.bus.commands import CommandServer, ask, ask_async, text_of
+from services.bus.errors import BadMessage, CommandRefused, NoAnswer
+from services.bus.messages import MOST_BYTES
+
+
+def refuse(arguments):
+    raise InvalidSetting("quality is 7; it must be 8")
+
+
+def fail(arguments):
+    raise RuntimeError("oh")
+
+
+@pytest.fixture
+def endpoint(runtime):
+    where = runtime.stream("a").commands("engine")
+    handlers = {
+        "echo": dict,
+        "silent": lambda _: None,
+        "refuse": refuse,
+        "fail": fail,
+        "nan": lambda _: {"x": float("nan")},
+    }
+    server = CommandServer(where, handlers)
+    yield where
+    server.close()
+
+
+def test_answers(endpoint):
+    assert ask(endpoint, "echo", x=1, y="z") == {"x": 1, "y": "z"}
+    assert ask(endpoint, "silent") == {}
+    assert asyncio.run(ask_async(endpoint, "echo", x=2)) == {"x": 2}
+
+
+@pytest.mark.parametrize(
+    ("command", "why"),
+    [("refuse", "it must be 8"), ("fail", "RuntimeError: oh"), ("nan", "JSON"), ("what", "echo, silent")],
+)
+def test_refusals_say_why_and_the_server_goes_on(endpoint, command, why):
+    with pytest.raises(CommandRefused, match=why):
+        ask(endpoint, command)
+    with pytest.raises(CommandRefused, match=why):
+        asyncio.run(ask_async(endpoint, command))
+    assert ask(endpoint, "silent") == {}
+
+
+def test_nobody_is_waited_for_without_end(runtime):
+    nobody = runtime.stream("a").commands("capture")
+    with pytest.raises(NoAnswer, match=r"'echo' within 0\.05 s"):
+        ask(nobody, "echo", timeout_s=0.05)
+    with pytest.raises(NoAnswer):
+        asyncio.run(ask_async(nobody, "echo", timeout_s=0.05))
+
+
+@pytest.mark.parametrize("data", [b"", b"nonsense", b"[]", b'{"command": 3}', b'{"command": ["echo"]}', b"\x80\x04."])
+def test_nonsense_is_refused(endpoint, data):
+    with zmq.Context() as context, context.socket(zmq.REQ) as socket:
+        socket.connect(endpoint)
+        socket.send(data)
+        assert json.loads(socket.recv())["ok"] is False
+
+
+def test_a_giant_is_not_read(endpoint):
+    with pytest.raises(BadMessage):
+        ask(endpoint, "echo", x="y" * MOST_BYTES)
+    with zmq.Context() as context, context.socket(zmq.REQ) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.connect(endpoint)
+        socket.send(b"x" * (MOST_BYTES + 1))
+        assert not socket.poll(200)
+    assert ask(endpoint, "silent") == {}
+
+
+def test_arguments_are_texts():
+    assert text_of({"folder": "x"}, "folder") == "x"
+    for wrong in ({}, {"folder": 3}, {"folder": ""}):
+        with pytest.raises(BadMessage, match="folder"):
+            text_of(wrong, "folder")

@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+import math
+import pickle
+
+import pytest
+
+from services.bus.errors import BadMessage
+from services.bus.messages import MOST_BYTES, packed_json, parsed_json
+
+
+def test_round_trip():
+    content = {"state": "live", "counts": {"frames": 3}, "nothing": None}
+    assert parsed_json(packed_json(content)) == content
+
+
+@pytest.mark.parametrize("content", [{"x": math.nan}, {"x": math.inf}, {"x": object()}, {"x": "y" * MOST_BYTES}])
+def test_what_cannot_be_sent(content):
+    with pytest.raises(BadMessage):
+        packed_json(content)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"[1]",
+        b"3",
+        b'{"x": NaN}',
+        b'{"x": Infinity}',
+        b"{" * 1000,
+        b"[" * MOST_BYTES,
+        b'{"x":' * 9000 + b"1" + b"}" * 9000,
+        b"\xff\xfe",
+        pickle.dumps({"x": 1}),
+        b'{"x": "' + b"y" * MOST_BYTES + b'"}',
+    ],
+    ids=lambda data: repr(data[:12]),
+)
+def test_what_is_not_read(data):
+    with pytest.raises(BadMessage):
+        parsed_json(data)

@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import pickle
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import zmq
+
+from operators.sources.zeromq_message import packed
+from services.bus.errors import BadMessage
+from services.bus.pictures import HIGH_WATER, PicturePublisher, picture_from, subscribe
+
+
+@pytest.fixture
+def context():
+    with zmq.Context() as context:
+        yield context
+
+
+def picture(value: int, height: int = 4, width: int = 6) -> np.ndarray:
+    return np.full((height, width, 3), value, np.uint8)
+
+
+def received(socket: zmq.Socket):
+    assert socket.poll(5000), "nothing came"
+    return picture_from(socket.recv_multipart(copy=False))
+
+
+def connected(publisher: PicturePublisher, *sockets: zmq.Socket) -> None:
+    """Publish until everybody has heard something, then let what is under way come in."""
+    for socket in sockets:
+        while not socket.poll(10):
+            publisher.publish({"seq": -1}, picture(0))
+        while socket.poll(50):
+            socket.recv_multipart()
+
+
+def test_a_shown_picture_arrives_as_it_was(runtime, context):
+    endpoint = runtime.stream("a").pictures("engine")
+    publisher = PicturePublisher(endpoint, context)
+    with subscribe(context.socket(zmq.SUB), endpoint) as socket:
+        connected(publisher, socket)
+        image = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+        publisher.publish({"seq": 7, "state": "live"}, image[:, ::-1])
+        got = received(socket)
+        assert (got.header["seq"], got.header["state"]) == (7, "live")
+        np.testing.assert_array_equal(got.image, image[:, ::-1])
+        publisher.publish_frame({"seq": 8}, packed(8, 0, {"image": image, "mask": image[..., 0]}))
+        np.testing.assert_array_equal(received(socket).image, image)
+    publisher.close()
+
+
+def test_a_reader_that_was_there_before_the_sender_hears_it(runtime, context):
+    endpoint = runtime.stream("a").pictures("engine")
+    with subscribe(context.socket(zmq.SUB), endpoint) as socket:
+        for value in (1, 2):  # the second one after the first has gone
+            publisher = PicturePublisher(endpoint, context)
+            connected(publisher, socket)
+            publisher.publish({"seq": value}, picture(value))
+            assert received(socket).header["seq"] == value
+            publisher.close()
+
+
+READER = """
+import sys, zmq
+from services.bus.pictures import subscribe
+socket = subscribe(zmq.Context.instance().socket(zmq.SUB), sys.argv[1])
+socket.recv_multipart()
+print("reads", flush=True)
+while True:
+    socket.recv_multipart()
+"""
+
+
+def test_a_stopped_reader_slows_nobody(runtime, context):
+    endpoint = runtime.stream("a").pictures("engine")
+    publisher = PicturePublisher(endpoint, context)
+    process = subprocess.Popen([sys.executable, "-c", READER, endpoint], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        image = np.zeros((512, 640, 3), np.uint8)
+        while process.poll() is None and not select_line(process):
+            publisher.publish({"seq": -1}, image)
+        process.send_signal(signal.SIGSTOP)
+        with subscribe(context.socket(zmq.SUB), endpoint) as socket:
+            connected(publisher, socket)
+            for seq in range(40):
+                publisher.publish({"seq": seq}, image)
+                assert received(socket).header["seq"] == seq
+                time.sleep(0.005)  # no camera is so fast that ZeroMQ does not come to take note of what was read
+    finally:
+        process.kill()
+        process.communicate()
+        publisher.close()
+
+
+def select_line(process: subprocess.Popen) -> bool:
+    import select
+
+    return bool(select.select([process.stdout], [], [], 0.01)[0])
+
+
+def test_a_slow_reader_gets_few_of_many(runtime, context):
+    endpoint = runtime.stream("a").pictures("engine")
+    publisher = PicturePublisher(endpoint, context)
+    with subscribe(context.socket(zmq.SUB), endpoint) as socket:
+        connected(publisher, socket)
+        image = np.zeros((256, 320, 3), np.uint8)
+        for seq in range(100):
+            publisher.publish({"seq": seq}, image)
+        time.sleep(0.2)
+        waiting = 0
+        while socket.poll(100):
+            socket.recv_multipart()
+            waiting += 1
+        assert 0 < waiting <= 2 * HIGH_WATER + 8  # what the kernel holds besides
+    publisher.close()
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [b"{}"],
+        [b"{}", b"", b""],
+        [b"{}", b"123"],
+        [pickle.dumps({}), b"123"],
+        [b'{"pixels":"rgb","width_px":1,"height_px":2}', b"123"],
+        [b'{"pixels":"rgb","width_px":-1,"height_px":-1}', b"123"],
+        [b'{"pixels":"rgb","width_px":0,"height_px":0}', b""],
+        [b'{"pixels":"rgb","width_px":true,"height_px":1}', b"123"],
+        [b'{"pixels":"rgb","width_px":1e0,"height_px":1}', b"123"],
+        [b'{"pixels":"frame"}', b"123"],
+        [b'{"pixels":"frame"}', packed(0, 0, {"image": np.zeros((2, 2, 3), np.uint8)})[:-1]],
+        [b'{"x":"' + b"y" * (1 << 17) + b'"}', b"123"],
+    ],
+    ids=lambda parts: repr(parts[0][:40]),
+)
+def test_what_is_no_picture(parts):
+    with pytest.raises(BadMessage):
+        picture_from([zmq.Frame(part) for part in parts])

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from services.bus.errors import AlreadyRunning, RuntimeFolderUnusable
+from services.bus.process_identity import ProcessIdentity
+from services.bus.runtime import RuntimeFolder, default_runtime_folder, write_json
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_folders_are_for_their_owner_alone(runtime):
+    path = runtime.path / "inside"
+    stream = RuntimeFolder(path).stream("room-1")
+    assert (mode(path), mode(stream.path)) == (0o700, 0o700)
+    write_json(stream.path / "capture.json", {})
+    assert mode(stream.path / "capture.json") == 0o600
+    assert RuntimeFolder(path).streams() == ["room-1"]
+
+
+def test_a_folder_that_others_may_look_into_is_refused(runtime):
+    runtime.path.chmod(0o750)
+    with pytest.raises(RuntimeFolderUnusable, match=r"0750.*chmod 700"):
+        RuntimeFolder(runtime.path)
+
+
+def test_a_link_to_a_folder_is_refused(runtime):
+    (runtime.path / "real").mkdir(mode=0o700)
+    (runtime.path / "link").symlink_to(runtime.path / "real")
+    with pytest.raises(RuntimeFolderUnusable, match="no folder"):
+        RuntimeFolder(runtime.path / "link")
+
+
+def test_a_file_in_its_place_is_refused(runtime):
+    (runtime.path / "file").touch()
+    with pytest.raises(RuntimeFolderUnusable, match="cannot be made"):
+        RuntimeFolder(runtime.path / "file")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")
+def test_somebody_elses_folder_is_refused(runtime):
+    other = runtime.path / "other"
+    other.mkdir(mode=0o700)
+    os.chown(other, 12345, -1)
+    with pytest.raises(RuntimeFolderUnusable, match="user 12345"):
+        RuntimeFolder(other)
+
+
+def test_a_path_too_long_for_a_socket_is_refused(runtime):
+    with pytest.raises(RuntimeFolderUnusable, match="bytes"):
+        runtime.stream("x" * 80)
+
+
+def test_the_default_folder_is_the_users_own(monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/7")
+    assert default_runtime_folder() == Path("/run/user/7/intrasplat")
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    assert str(os.geteuid()) in default_runtime_folder().name
+
+
+def test_the_record_of_a_running_process_is_kept(runtime):
+    stream = runtime.stream("a")
+    stream.write_record("engine", "abc")
+    record = stream.record("engine")
+    assert record is not None
+    assert (record.identity.pid, record.spec_digest) == (os.getpid(), "abc")
+
+
+def test_what_a_dead_process_left_is_removed_though_another_has_its_number(runtime):
+    stream = runtime.stream("a")
+    now = ProcessIdentity.of(os.getpid())
+    assert now is not None
+    earlier = ProcessIdentity(now.pid, now.started + "0")
+    write_json(stream.path / "engine.json", {"pid": earlier.pid, "started": earlier.started, "spec_digest": ""})
+    for name in ("shown", "engine.ctl", "engine.status"):
+        with socket.socket(socket.AF_UNIX) as left:
+            left.bind(str(stream.path / name))
+    stream.log("engine").touch()
+    assert stream.record("engine") is None
+    assert [path.name for path in stream.path.iterdir()] == ["engine.log"]
+
+
+def test_one_process_serves_a_part(runtime):
+    stream = runtime.stream("a")
+    held = stream.lock("capture")
+    program = (
+        "import sys; from pathlib import Path; from services.bus.runtime import StreamFolder\n"
+        "StreamFolder(Path(sys.argv[1])).lock('capture')"
+    )
+    command = [sys.executable, "-c", program, str(stream.path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert AlreadyRunning.__name__ in done.stderr
+    os.close(held)
+    assert subprocess.run(command).returncode == 0
+
+
+def test_nothing_is_left_of_a_stream_that_is_removed(runtime):
+    stream = runtime.stream("a")
+    os.close(stream.lock("capture"))
+    stream.write_record("capture", "")
+    for path in (stream.log("engine"), stream.spec("capture")):
+        path.touch()
+    stream.remove()
+    assert runtime.streams() == []

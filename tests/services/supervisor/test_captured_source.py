@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame, FrameStatus
+from operators.errors import SourceUnavailable
+from operators.sources.source import SourceDescription, SourceState
+from operators.sources.wire import description_to, frame_header, planes_of
+from operators.sources.zeromq_message import packed
+from services.bus.commands import CommandServer
+from services.bus.heartbeats import Heartbeats
+from services.bus.pictures import PicturePublisher
+from services.supervisor.captured_source import CapturedSource
+
+SOON_S = 20.0
+ABOUT = SourceDescription("made up", 6, 4, 25.0, Camera.from_focal(5.0, 6, 4), fields=frozenset({"depth", "mask"}))
+
+
+class StandIn:
+    """Speaks as a capture process does."""
+
+    def __init__(self, folder, run: int) -> None:
+        self.run, self.said = run, {"state": "live", "reason": "well"}
+        self.publisher = PicturePublisher(folder.pictures("capture"))
+        self.heartbeats = Heartbeats(folder.status("capture"), lambda: dict(self.said))
+        self.commands = CommandServer(
+            folder.commands("capture"), {"describe": lambda _: {"description": description_to(ABOUT)}}
+        )
+
+    def send(self, seq: int, **changes) -> None:
+        frame = Frame(
+            seq, seq * 40_000_000, np.full((4, 6, 3), seq, np.uint8), arrived_ns=time.monotonic_ns(), **changes
+        )
+        header = {**frame_header(frame), "run": self.run}
+        self.publisher.publish_frame(header, packed(frame.seq, frame.pts_ns, planes_of(frame)))
+
+    def close(self) -> None:
+        self.publisher.close()
+        self.commands.close()
+        self.heartbeats.close()
+
+
+@pytest.fixture
+def folder(runtime):
+    return runtime.stream("a")
+
+
+def first(source: CapturedSource, capture: StandIn, seq: int = 0, **changes) -> Frame:
+    """Send frames until one is read."""
+    until_s = time.monotonic() + SOON_S
+    while time.monotonic() < until_s:
+        capture.send(seq, **changes)
+        frame = source.read(0.02)
+        if frame is not None:
+            return frame
+        seq += 1
+    raise AssertionError("no frame came")
+
+
+def until(what) -> None:
+    until_s = time.monotonic() + SOON_S
+    while not what():
+        assert time.monotonic() < until_s, "it did not come about"
+        time.sleep(0.01)
+
+
+def test_frames_come_with_all_that_they_have(folder):
+    capture = StandIn(folder, run=1)
+    source = CapturedSource(folder)
+    assert (source.description.camera, source.description.fields) == (ABOUT.camera, ABOUT.fields)
+    source.open()
+    mask, depth = np.ones((4, 6), np.uint8), np.full((4, 6), 7, np.float32)
+    frame = first(source, capture, mask=mask, depth=depth, status=FrameStatus.DAMAGED, damage="torn")
+    assert (frame.status, frame.damage) == (FrameStatus.DAMAGED, "torn")
+    assert frame.mask is not None and frame.depth is not None
+    np.testing.assert_array_equal(frame.depth, depth)
+    assert frame.arrived_ns is not None and frame.arrived_ns < time.monotonic_ns()
+    source.close()
+    capture.close()
+
+
+def test_numbers_and_times_go_on_when_capture_is_there_again(folder):
+    capture = StandIn(folder, run=1)
+    source = CapturedSource(folder)
+    source.open()
+    last = first(source, capture, seq=100)
+    capture.close()
+    until(lambda: source.state is SourceState.RECONNECTING)
+    assert "capture process" in source.state_sentence
+    capture = StandIn(folder, run=2)
+    following = first(source, capture, seq=0)
+    assert following.seq > last.seq
+    assert following.pts_ns > last.pts_ns
+    until(lambda: source.state is SourceState.LIVE)
+    source.close()
+    capture.close()
+
+
+@pytest.mark.parametrize(
+    ("said", "state"),
+    [("stalled", SourceState.STALLED), ("ended", SourceState.STALLED), ("opening", SourceState.RECONNECTING)],
+)
+def test_it_says_what_capture_says_of_its_source(folder, said, state):
+    capture = StandIn(folder, run=1)
+    source = CapturedSource(folder)
+    source.open()
+    first(source, capture)
+    capture.said = {"state": said, "reason": "the cable is out"}
+    while source.read(0) is not None:
+        pass
+    until(lambda: source.state is state and source.state_sentence == "the cable is out")
+    source.close()
+    capture.close()
+
+
+def test_a_message_that_is_no_frame_is_counted(folder):
+    capture = StandIn(folder, run=1)
+    source = CapturedSource(folder)
+    source.open()
+    first(source, capture)
+    capture.publisher.publish_frame({"seq": 1}, b"nonsense")
+    until(lambda: source.counts().get("bad_messages") == 1)
+    capture.publisher.publish({"seq": 1}, np.zeros((4, 6, 3), np.uint8))
+    until(lambda: source.counts().get("bad_messages") == 2)
+    source.close()
+    capture.close()
+
+
+def test_waiting_for_capture_ends_when_it_is_told_to(folder):
+    stop = threading.Event()
+    threading.Timer(0.2, stop.set).start()
+    with pytest.raises(SourceUnavailable, match="has not opened its source"):
+        CapturedSource(folder, stop.is_set)

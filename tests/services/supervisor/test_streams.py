@@ -1,0 +1,248 @@
+"""Whole streams on a small synthetic endoscope: processes are killed, stopped, orphaned and adopted."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import zmq
+
+from services.bus.pictures import split, subscribe
+from services.bus.process_identity import ProcessIdentity
+from services.bus.runtime import RuntimeFolder
+from services.supervisor.launching import ByLauncher, Direct
+from services.supervisor.process import ManagedProcess, StreamEvent
+from services.supervisor.specs import ProcessLimits, SourceSpec, StreamSpec
+from services.supervisor.stream import StreamSupervisor
+
+SMALL = SourceSpec(address="synthetic:?width=64&height=64&frames=3&fps=20")
+SOON_S = 60.0
+
+
+def spec(**limits) -> StreamSpec:
+    return StreamSpec(name="a", source=SMALL, limits=ProcessLimits(**limits))
+
+
+async def until(what) -> None:
+    async with asyncio.timeout(SOON_S):
+        while not what():
+            await asyncio.sleep(0.02)
+
+
+class Headers:
+    """What is said about each picture of a socket, in the order in which they come."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.seen: list[dict] = []
+        self._socket = subscribe(zmq.asyncio.Context.instance().socket(zmq.SUB), endpoint, waiting=64)
+        self._task = asyncio.create_task(self._listen())
+
+    async def _listen(self) -> None:
+        while True:
+            self.seen.append(split(await self._socket.recv_multipart(copy=False))[0])
+
+    async def close(self) -> None:
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+        self._socket.close()
+
+
+def without_gaps(headers: list[dict]) -> bool:
+    """Whether each frame that one capture process has read was seen."""
+    numbers = [header["seq"] for header in headers]
+    return numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+@contextlib.asynccontextmanager
+async def capturing(runtime: RuntimeFolder, events: list[StreamEvent] | None = None, **limits):
+    """A capture process that is kept running."""
+    folder = runtime.stream("a")
+    process = ManagedProcess(
+        spec(**limits), "capture", folder, Direct(), [].append if events is None else events.append
+    )
+    process.open()
+    try:
+        yield process
+    finally:
+        await process.close(stop=True, reason="over")
+
+
+def kill(pid: int | None, number: int = signal.SIGKILL) -> None:
+    assert pid is not None
+    os.kill(pid, number)
+
+
+def test_capture_is_there_again_after_it_was_killed_and_says_why(runtime):
+    async def scenario() -> None:
+        events: list[StreamEvent] = []
+        async with capturing(runtime, events) as capture:
+            headers = Headers(runtime.stream("a").pictures("capture"))
+            await until(lambda: capture.state.state == "live" and headers.seen)
+            pid, run = capture.state.pid, headers.seen[-1]["run"]
+            kill(pid)
+            await until(lambda: headers.seen[-1]["run"] != run)
+            assert capture.state.pid != pid and capture.state.restarts == 1
+            assert [event.kind for event in events] == ["started", "ended", "started"]
+            assert "SIGKILL" in events[1].reason
+            await headers.close()
+        assert events[-1].kind == "stopped"
+        assert not (runtime.path / "a" / "capture.json").exists()
+
+    asyncio.run(scenario())
+
+
+def test_a_process_that_hangs_is_replaced(runtime):
+    async def scenario() -> None:
+        events: list[StreamEvent] = []
+        async with capturing(runtime, events, heartbeat_s=1.0) as capture:
+            await until(lambda: capture.state.state == "live")
+            pid = capture.state.pid
+            kill(pid, signal.SIGSTOP)
+            await until(lambda: capture.state.pid not in (pid, None) and capture.state.state == "live")
+            assert "said nothing" in next(event.reason for event in events if event.kind == "ended")
+
+    asyncio.run(scenario())
+
+
+def test_an_address_that_cannot_work_is_said_and_tried_seldom(runtime):
+    async def scenario() -> None:
+        wrong = StreamSpec(name="a", source=SourceSpec(address="/nowhere/to/be/found.mp4"))
+        process = ManagedProcess(wrong, "capture", runtime.stream("a"), Direct(), lambda event: None)
+        process.open()
+        await until(lambda: process.state.state == "failed")
+        assert "/nowhere/to/be/found.mp4" in process.state.reason
+        await process.close(stop=True, reason="over")
+
+    asyncio.run(scenario())
+
+
+def test_a_process_that_nobody_looks_after_ends(runtime):
+    folder = runtime.stream("a")
+    path = spec(orphan_after_s=1.0).write("capture", folder)
+    command = [sys.executable, "-m", "services.supervisor.capture", "--spec", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=SOON_S)
+    assert done.returncode == 0, done.stderr
+    assert "no supervisor" in done.stderr
+    assert sorted(file.name for file in folder.path.iterdir()) == ["capture.lock", "capture.spec"]
+
+
+def test_capture_loads_no_torch(runtime):
+    program = (
+        "import sys, services.supervisor.capture, services.supervisor.captured_source, operators.sources.synthetic\n"
+        "assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+CONTROL_PLANE = """
+import asyncio, sys
+from pathlib import Path
+from services.bus.runtime import RuntimeFolder
+from services.supervisor.launching import ByLauncher
+from services.supervisor.specs import StreamSpec
+from services.supervisor.stream import StreamSupervisor
+
+async def run():
+    runtime = RuntimeFolder(Path(sys.argv[1]))
+    launcher = ByLauncher(runtime)
+    launcher.open()
+    await launcher.ready.wait()
+    await StreamSupervisor(StreamSpec.model_validate_json(sys.argv[2]), runtime, start=launcher).start()
+    await asyncio.sleep(600)
+
+assert "torch" not in sys.modules and "cv2" not in sys.modules
+asyncio.run(run())
+"""
+
+
+def test_processes_outlive_the_control_plane_and_each_other(runtime):
+    """One long story, since an engine takes seconds to start."""
+
+    async def scenario() -> None:
+        wanted = spec()
+        command = [sys.executable, "-c", CONTROL_PLANE, str(runtime.path), wanted.model_dump_json()]
+        control = subprocess.Popen(command)
+        folder = runtime.stream("a")
+        raw, shown = Headers(folder.pictures("capture")), Headers(folder.pictures("engine"))
+        events: list[StreamEvent] = []
+        launcher = ByLauncher(runtime)
+        stream = StreamSupervisor(wanted, runtime, start=launcher, on_event=events.append)
+        try:
+            await until(lambda: len(shown.seen) > 3)
+
+            # The control plane is killed: both processes go on, and the next one adopts them.
+            before = {role: folder.record(role) for role in ("capture", "engine")}
+            control.kill()
+            control.wait()
+            seen = len(shown.seen)
+            await until(lambda: len(shown.seen) > seen + 3)
+            launcher.open()
+            await stream.start()
+            await until(lambda: stream.state().engine.state == "running" and stream.state().capture.state == "live")
+            assert {event.role: event.kind for event in events} == {"capture": "adopted", "engine": "adopted"}
+            for role, record in before.items():
+                assert record is not None and getattr(stream.state(), role).pid == record.identity.pid
+            assert (await stream.command("engine", "ping"))["pid"] == stream.state().engine.pid
+            await until(launcher.ready.is_set)
+
+            # The engine is killed twice: no raw picture is missing, and it comes back.
+            raw.seen.clear()
+            for _ in range(2):
+                pid = stream.state().engine.pid
+                kill(pid)
+                at_ns = time.monotonic_ns()
+                await until(lambda at_ns=at_ns: shown.seen[-1]["arrived_ns"] > at_ns)
+                assert stream.state().engine.pid != pid
+            assert without_gaps(raw.seen)
+            assert [event.kind for event in events if event.role == "engine"][1:] == ["ended", "started"] * 2
+            assert "SIGKILL" in events[-2].reason
+
+            # Capture is killed: the engine says that the source is lost, stays, and goes on with the next one.
+            pid, run, seen = stream.state().engine.pid, raw.seen[-1]["run"], len(shown.seen)
+            kill(stream.state().capture.pid)
+            await until(lambda: any(header["state"] == "source lost" for header in shown.seen[seen:]))
+            await until(lambda: raw.seen[-1]["run"] != run and shown.seen[-1]["state"] != "source lost")
+            assert stream.state().engine.pid == pid
+            numbers = [header["seq"] for header in shown.seen[seen:] if header["new"]]
+            assert numbers == sorted(numbers)
+
+            # Everything is ended: nothing is left.
+            pids = [stream.state().engine.pid, stream.state().capture.pid]
+            await stream.stop("the test is over")
+            await launcher.close(stop=True)
+            assert all(ProcessIdentity.of(pid) is None for pid in pids if pid is not None)
+            assert [path.name for path in runtime.path.iterdir()] == ["launcher.log"]
+            assert {event.reason for event in events if event.kind == "stopped"} == {"the test is over"}
+        finally:
+            control.kill()
+            await stream.stop()
+            await launcher.close(stop=True)
+            await raw.close()
+            await shown.close()
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("what", ["said", "log"])
+def test_nothing_that_is_said_names_the_address(runtime, what):
+    secret = SourceSpec(address="rtsp://user:swordfish@127.0.0.1:1/stream")
+
+    async def scenario() -> None:
+        process = ManagedProcess(
+            StreamSpec(name="a", source=secret), "capture", runtime.stream("a"), Direct(), lambda event: None
+        )
+        process.open()
+        await until(lambda: process.state.state == "opening")
+        said = json.dumps([process.state.reason, *map(str, process.state.figures.items())])
+        log = runtime.stream("a").log("capture").read_text()
+        await process.close(stop=True, reason="over")
+        assert "swordfish" not in (said if what == "said" else log)
+
+    asyncio.run(scenario())
