@@ -96,6 +96,7 @@ WITHOUT_TORCH = [
     *(f"services.bus.{name}" for name in ("commands", "heartbeats", "pictures", "runtime")),
     *(f"services.supervisor.{name}" for name in ("launching", "process", "specs", "stream")),
     "services.display.hub",
+    "services.registry.models",
 ]
 """What the control plane's process loads."""
 

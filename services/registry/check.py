@@ -1,0 +1,166 @@
+"""The check of an unpacked model, run as a program of its own: `python -m services.registry.check FOLDER --json`.
+
+It reads the bundle by the same code as everything else (`gsplat_core.io.bundle`: header limits, allowed keys, shapes and types, finite values),
+holds it against the budgets, and renders it at its own camera. With `--json` each step is one line: `{"stage": "validated", …}`, then
+`{"stage": "ready", …}`, or `{"stage": "rejected", "reason": …}`. Exit code 0: there is a verdict. Anything else: the check itself failed.
+
+Nothing else of the registry imports this module: it loads torch, before the limits are set, which are for the model.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsplat_core.errors import BundleCorrupt, UnknownFormatVersion, UserError
+from gsplat_core.io.bundle import MANIFEST, load_bundle
+from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, parse_manifest
+from gsplat_core.io.model_files import open_model_file
+from gsplat_core.rendering.alpha import AlphaRenderer
+from gsplat_core.scene.model import Model
+
+FAINTEST = 1 / 255
+"""An opacity below it changes no pixel of a picture."""
+_MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memory", "bad_alloc")
+
+
+class Unusable(Exception):
+    """A model takes more than it may, or cannot be shown; the text is the sentence."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Check one folder and print what was found."""
+    options = _options(arguments)
+    say = _say_json if options.json else _say_words
+    _limit_resources(options)
+    try:
+        model = _read(options)
+        say({"stage": "validated", **_description(model)})
+        say({"stage": "ready", **_render(model, options.device)})
+    except (BundleCorrupt, UnknownFormatVersion, Unusable) as error:
+        say({"stage": "rejected", "reason": str(error).replace(f"{options.folder}/", "")})
+    except UserError as error:
+        # The files were whole a moment ago, so that this is about the machine: memory that others have taken, rights.
+        sys.stderr.write(f"{error}\n")
+        return 1
+    except (MemoryError, RuntimeError) as error:
+        # torch's allocators raise RuntimeError.
+        if isinstance(error, RuntimeError) and not any(words in str(error).lower() for words in _MEMORY_WORDS):
+            raise
+        most = options.memory_bytes
+        say({"stage": "rejected", "reason": f"it needs more memory than the {most} bytes that a check may take"})
+    return 0
+
+
+def _options(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m services.registry.check", description="Check an unpacked model.")
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument("--json", action="store_true", help="one line of JSON for each step")
+    parser.add_argument("--device", default="cpu", help="where the warm-up picture is rendered: cpu or cuda")
+    parser.add_argument("--gaussians", type=int, default=2_000_000, help="at most so many")
+    parser.add_argument("--model-bytes", type=int, default=4 << 30, help="at most so much of tensors")
+    parser.add_argument("--pixels", type=int, default=4096 * 4096, help="at most so many in the camera's picture")
+    parser.add_argument("--memory-bytes", type=int, default=12 << 30, help="what this may take beside torch itself")
+    parser.add_argument("--seconds", type=float, default=120.0, help="of processor time, for each processor")
+    return parser.parse_args(arguments)
+
+
+def _limit_resources(options: argparse.Namespace) -> None:
+    """No more processor time than allowed, no more memory beyond what torch itself takes, and no core file with a model in it.
+
+    On CUDA memory is not limited: it maps far more than it takes.
+    """
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if options.device == "cpu":
+        _lower(resource.RLIMIT_DATA, _taken_bytes() + options.memory_bytes)
+    _lower(resource.RLIMIT_CPU, int(options.seconds + 1) * len(os.sched_getaffinity(0)))
+
+
+def _taken_bytes() -> int:
+    """What the system counts for RLIMIT_DATA at this moment."""
+    fields = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines() if ":" in line)
+    return int(fields["VmData"].split()[0]) * 1024
+
+
+def _lower(kind: int, wanted: int) -> None:
+    _, hard = resource.getrlimit(kind)
+    allowed = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    resource.setrlimit(kind, (allowed, allowed))
+
+
+def _read(options: argparse.Namespace) -> Model:
+    """The model, once its manifest is within the budgets. Raises BundleError, Unusable."""
+    with open_model_file(options.folder / MANIFEST, options.folder) as file:
+        manifest = parse_manifest(file.read(MAX_MANIFEST_BYTES + 1), MANIFEST)
+    camera = manifest.camera
+    for found, most, what in (
+        (manifest.count, options.gaussians, "Gaussians"),
+        (manifest.tensors_bytes, options.model_bytes, "bytes of tensors"),
+        (camera.width_px * camera.height_px, options.pixels, f"pixels ({camera.width_px}x{camera.height_px})"),
+    ):
+        if found > most:
+            raise Unusable(f"the model has {found} {what}; at most {most} are allowed here")
+    if manifest.count == 0:
+        raise Unusable("the model has no Gaussians, so that there is nothing to show")
+    return load_bundle(options.folder)
+
+
+def _description(model: Model) -> dict[str, Any]:
+    return {
+        "gaussians": model.gaussians.count,
+        "parameters": model.parameter_count,
+        "field": None if model.field is None else model.field.kind,
+        "width_px": model.camera.width_px,
+        "height_px": model.camera.height_px,
+        "time_window_s": list(model.time_window_s),
+        "model_sha256": model.sha256(),
+    }
+
+
+def _render(model: Model, device: str) -> dict[str, Any]:
+    """Pictures at the beginning, the middle and the end of what the model has seen. Raises Unusable where one is not finite, or all are empty."""
+    start_s, end_s = model.time_window_s
+    renderer = AlphaRenderer(model.camera, torch.device(device))
+    covered, visible, took_s = 0.0, 0.0, 0.0
+    with torch.inference_mode():
+        renderer.prepare(model.to(device))
+        for time_s in (start_s, (start_s + end_s) / 2, end_s):
+            began = time.perf_counter()
+            picture = renderer.render(model.camera, time_s).result()
+            for name in ("image", "alpha", "depth"):
+                values = getattr(picture, name)
+                if not bool(torch.isfinite(values).all()):
+                    bad = int((~torch.isfinite(values)).sum())
+                    raise Unusable(
+                        f"the picture at {time_s:g} s has {bad} values of its {name} that are NaN or infinite"
+                    )
+            visible = max(visible, float(picture.alpha.max()))
+            covered = max(covered, float((picture.alpha > 0.5).double().mean()))
+            took_s = time.perf_counter() - began
+    if visible < FAINTEST:
+        raise Unusable(
+            "its pictures show nothing at its own camera; look at its Gaussians, its camera and its deformation"
+        )
+    return {"render_ms": round(1000 * took_s, 1), "covered": round(covered, 4)}
+
+
+def _say_json(line: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(line, allow_nan=False) + "\n")
+    sys.stdout.flush()
+
+
+def _say_words(line: dict[str, Any]) -> None:
+    stage = line.pop("stage")
+    sys.stdout.write(f"{stage}: {line.get('reason') or ', '.join(f'{name} {value}' for name, value in line.items())}\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,16 @@
+"""What Alembic runs for every migration: on the connection, and in the transaction, that `database.migrate` gives it."""
+
+from __future__ import annotations
+
+from alembic import context
+
+from services.registry.tables import METADATA
+
+context.configure(
+    connection=context.config.attributes["connection"],
+    target_metadata=METADATA,
+    render_as_batch=True,
+    transactional_ddl=True,
+)
+with context.begin_transaction():
+    context.run_migrations()

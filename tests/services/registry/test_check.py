@@ -1,0 +1,179 @@
+"""The check of a model in its own process: its verdicts, its bounds, and what it is kept away from."""
+
+import json
+import os
+import re
+import subprocess
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsplat_core.io import model_files
+from gsplat_core.io.bundle import load_bundle
+from gsplat_core.rendering.alpha import AlphaRenderer
+from services.registry import check
+from services.registry.checking import PROGRAM, run_check
+from services.registry.errors import CheckFailed
+from services.registry.limits import RegistryLimits
+from services.registry.models import ModelRegistry
+from tests.services.registry.made import packed_model, save_model
+from tests.services.registry.stub_check import ALWAYS_READY, says
+
+QUICK = RegistryLimits(check_s=1.0)
+
+
+def checked(folder, *options):
+    done = subprocess.run([*PROGRAM, folder, "--json", *options], capture_output=True, text=True, check=True)
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_a_good_model_is_described_and_rendered(tmp_path):
+    folder = save_model(tmp_path / "model")
+    seen = []
+    verdict = run_check(folder, RegistryLimits(), validated=lambda description: seen.append(dict(description)))
+    assert verdict.reason is None
+    (validated,) = seen
+    assert validated == {
+        "gaussians": 5,
+        "parameters": load_bundle(folder).parameter_count,
+        "field": "basis",
+        "width_px": 16,
+        "height_px": 12,
+        "time_window_s": [0.0, 1.0],
+        "model_sha256": load_bundle(folder).sha256(),
+    }
+    assert verdict.description.keys() - validated.keys() == {"render_ms", "covered"}
+
+
+def test_words_for_people(tmp_path):
+    folder = save_model(tmp_path / "model")
+    done = subprocess.run([*PROGRAM, folder], capture_output=True, text=True, check=True)
+    first, second = done.stdout.splitlines()
+    assert first.startswith("validated: gaussians 5, ") and second.startswith("ready: render_ms ")
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["--gaussians=4"], "the model has 5 Gaussians; at most 4 are allowed here"),
+        (["--model-bytes=100"], r"bytes of tensors; at most 100"),
+        (["--pixels=191"], r"192 pixels \(16x12\); at most 191"),
+    ],
+)
+def test_a_model_over_a_budget_is_rejected_before_it_is_read(tmp_path, options, reason):
+    (verdict,) = checked(save_model(tmp_path / "model"), *options)
+    assert verdict["stage"] == "rejected"
+    assert re.search(reason, verdict["reason"])
+
+
+def test_a_model_without_gaussians_is_rejected(tmp_path):
+    (verdict,) = checked(save_model(tmp_path / "model", count=0))
+    assert verdict["stage"] == "rejected" and "no Gaussians" in verdict["reason"]
+
+
+def test_a_check_without_enough_memory_is_a_verdict(tmp_path):
+    folder = save_model(tmp_path / "model", count=40_000)
+    verdict = run_check(folder, RegistryLimits(check_memory_bytes=50 << 20))
+    assert verdict.reason is not None and "memory" in verdict.reason
+
+
+def test_a_machine_without_memory_says_nothing_about_the_model(tmp_path, monkeypatch, capsys):
+    """Through the same program in this process: the reader finds too little memory left."""
+    folder = save_model(tmp_path / "model")
+    monkeypatch.setattr(check, "_limit_resources", lambda options: None)
+    monkeypatch.setattr(model_files, "available_bytes", lambda: 100)
+    assert check.main([str(folder), "--json"]) == 1
+    said = capsys.readouterr()
+    assert said.out == "" and "of memory to load" in said.err
+
+
+def test_the_reason_names_no_folder_of_the_machine(tmp_path):
+    folder = save_model(tmp_path / "model")
+    (folder / "model.safetensors").write_bytes(b"short")
+    (verdict,) = checked(folder)
+    assert verdict["stage"] == "rejected" and verdict["reason"].startswith("model.safetensors has")
+
+
+def test_a_check_that_takes_too_long_is_ended_with_what_it_started(tmp_path):
+    pid_file = tmp_path / "pid"
+    program = says(
+        f"import subprocess, sys, time; child = subprocess.Popen(['sleep', '60']); open({str(pid_file)!r}, 'w').write(str(child.pid)); time.sleep(60)"
+    )
+    assert run_check(tmp_path, QUICK, program=program).reason == "its check took longer than 1 s"
+    child = int(pid_file.read_text())
+    for _ in range(100):
+        if not os.path.exists(f"/proc/{child}") or "Z" in Path(f"/proc/{child}/stat").read_text().split():
+            break
+        threading.Event().wait(0.05)
+    else:
+        pytest.fail("what the check started still runs")
+
+
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGSEGV", "SIGXCPU"])
+def test_a_model_that_brings_its_check_down_is_rejected(tmp_path, name):
+    program = says(f"import os, signal; os.kill(os.getpid(), signal.{name})")
+    assert f"was ended by {name}" in run_check(tmp_path, QUICK, program=program).reason
+
+
+@pytest.mark.parametrize(
+    ("program", "said"),
+    [
+        (says("import sys; sys.exit('the core is missing')"), "code 1 and without a verdict: the core is missing"),
+        (says("print('hello')"), "code 0 and without a verdict: it said nothing"),
+        (says("import os, signal; os.kill(os.getpid(), signal.SIGTERM)"), "code -15"),
+        (says("""print('{"stage": "ready"}'); raise SystemExit(3)"""), "code 3"),
+        (("/nowhere/python",), "cannot be started: No such file"),
+    ],
+)
+def test_a_check_that_cannot_be_run_says_nothing_about_the_model(tmp_path, program, said):
+    with pytest.raises(CheckFailed, match=said):
+        run_check(tmp_path, QUICK, program=program)
+
+
+def test_a_check_that_failed_can_be_made_again(tmp_path, files):
+    with ModelRegistry(tmp_path, check_program=says("raise SystemExit(1)")) as registry:
+        registry.upload("liver", packed_model(files), None, "surgeon")
+        with pytest.raises(CheckFailed):
+            registry.check("liver", 1)
+        assert registry.version("liver", 1).state == "uploaded"
+    with ModelRegistry(tmp_path, check_program=ALWAYS_READY) as registry:
+        assert registry.recover().unchecked == (("liver", 1),)
+        assert registry.check("liver", 1).state == "ready"
+
+
+def test_credentials_do_not_reach_the_check(tmp_path, monkeypatch):
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
+    program = says("import json, os; print(json.dumps({'stage': 'rejected', 'reason': ' '.join(os.environ)}))")
+    names = run_check(tmp_path, QUICK, program=program).reason.split()
+    assert "PATH" in names and not any("AWS" in name or "INTRASPLAT_" in name for name in names)
+
+
+def test_a_flood_of_words_is_not_collected(tmp_path):
+    program = says(
+        "import sys\nfor _ in range(100_000): sys.stdout.write('x' * 100)\nprint('\\n{\"stage\": \"ready\"}')"
+    )
+    assert run_check(tmp_path, RegistryLimits(check_s=20), program=program).reason is None
+
+
+def test_a_picture_that_is_not_finite_is_rejected(tmp_path, monkeypatch, capsys):
+    """Through the same program in this process, with a renderer that is broken."""
+    folder = save_model(tmp_path / "model")
+    monkeypatch.setattr(check, "_limit_resources", lambda options: None)
+    render = AlphaRenderer.render
+
+    def broken(self, camera, time_s, *arguments):
+        frame = render(self, camera, time_s, *arguments)
+        output = frame.result()
+        if time_s == 0.5:
+            output.image[3, 4, 1] = torch.nan
+        return frame
+
+    monkeypatch.setattr(AlphaRenderer, "render", broken)
+    assert check.main([str(folder), "--json"]) == 0
+    last = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert last == {
+        "stage": "rejected",
+        "reason": "the picture at 0.5 s has 1 values of its image that are NaN or infinite",
+    }

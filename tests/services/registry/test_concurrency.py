@@ -1,0 +1,110 @@
+"""Several threads and processes at one registry: one wins, the others are told, and numbers are given once."""
+
+import multiprocessing
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from services.registry.errors import Conflict
+from services.registry.models import ModelRegistry
+from tests.services.registry.made import add_ready, assert_whole, packed_model
+from tests.services.registry.stub_check import ALWAYS_READY
+
+ROUNDS = 5
+
+
+def activate_together(folder, database_url, version, gate, results):
+    """In a process of its own: in each round try to be the one that replaces version 1."""
+    with ModelRegistry(folder, database_url=database_url, check_program=ALWAYS_READY) as registry:
+        for _ in range(ROUNDS):
+            gate.wait()
+            try:
+                registry.activate("liver", version, 1, f"process {version}")
+                results.put(version)
+            except Conflict as error:
+                results.put(str(error))
+            gate.wait()
+
+
+def test_of_two_processes_that_activate_at_once_one_wins(new_registry, files, database_url, tmp_path):
+    registry = new_registry()
+    for seed in range(3):
+        add_ready(registry, files, seed)
+    registry.activate("liver", 1, None, "admin")
+    context = multiprocessing.get_context("spawn")
+    gate, results = context.Barrier(3), context.Queue()
+    processes = [
+        context.Process(target=activate_together, args=(tmp_path / "registry", database_url, version, gate, results))
+        for version in (2, 3)
+    ]
+    for process in processes:
+        process.start()
+    try:
+        for _ in range(ROUNDS):
+            gate.wait(60)
+            said = [results.get(timeout=60), results.get(timeout=60)]
+            (won,) = [each for each in said if isinstance(each, int)]
+            (lost,) = [each for each in said if isinstance(each, str)]
+            assert (
+                lost == f"model 'liver' has version {won} active, not version 1 as expected; look again and decide anew"
+            )
+            assert registry.active("liver").version == won
+            assert_whole(registry)
+            registry.rollback("liver", "admin", expected_current=won)
+            gate.wait(60)
+    finally:
+        for process in processes:
+            process.join(60)
+            process.close()
+        results.close()
+        results.join_thread()
+
+
+def test_uploads_at_once_get_different_numbers(registry, files):
+    file = packed_model(files)
+    with ThreadPoolExecutor(4) as pool:
+        records = list(pool.map(lambda _: registry.upload("liver", file, None, "surgeon"), range(12)))
+    assert sorted(record.version for record in records) == list(range(1, 13))
+    assert_whole(registry)
+
+
+def test_two_checks_of_one_version_agree(registry, files):
+    version = registry.upload("liver", packed_model(files), None, "surgeon").version
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(lambda _: registry.check("liver", version), range(2))
+    assert first == second and first.state == "ready"
+
+
+def test_readers_always_see_one_active_version(registry, files):
+    """Activations and rollbacks go on beside them."""
+    for seed in range(2):
+        add_ready(registry, files, seed)
+    registry.activate("liver", 1, None, "admin")
+    over = threading.Event()
+
+    def swap():
+        for _ in range(20):
+            registry.activate("liver", 2, 1, "admin")
+            registry.rollback("liver", "admin")
+        over.set()
+
+    with ThreadPoolExecutor(1) as pool:
+        swapping = pool.submit(swap)
+        seen = set()
+        while not over.is_set() and not swapping.done():
+            seen.add(registry.active("liver").version)
+        swapping.result()
+    assert seen <= {1, 2} and seen
+    assert_whole(registry)
+
+
+def test_a_version_that_is_deleted_while_it_is_checked_is_gone(new_registry, files):
+    from services.registry.errors import NotFound
+
+    registry = new_registry()
+    version = registry.upload("liver", packed_model(files), None, "surgeon").version
+    registry._reached = lambda step: registry.delete("liver", version, "admin") if step == "check ended" else None
+    with pytest.raises(NotFound, match="'liver' has no version 1"):
+        registry.check("liver", version)
+    assert registry.versions("liver") == []

@@ -1,0 +1,126 @@
+"""The database: migrated at start, one writer at a time, refused when a later version wrote it, and errors with a sentence."""
+
+import threading
+
+import pytest
+import sqlalchemy as sa
+from alembic.autogenerate import compare_metadata
+from alembic.runtime.migration import MigrationContext
+
+from services.registry.database import Database
+from services.registry.errors import SchemaTooNew, StoreUnavailable
+from services.registry.models import ModelRegistry
+from services.registry.tables import METADATA, MODELS
+
+
+@pytest.fixture
+def database(database_url, tmp_path):
+    opened = Database(database_url or f"sqlite:///{tmp_path / 'registry.sqlite'}")
+    yield opened
+    opened.close()
+
+
+def test_the_migrations_make_the_tables_that_the_program_uses(database):
+    database.migrate()
+    with database.reading() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), METADATA) == []
+
+
+def test_migrating_twice_changes_nothing(database):
+    database.migrate()
+    with database.writing() as connection:
+        connection.execute(sa.insert(MODELS).values(name="liver", created_at="now", last_version=0))
+    database.migrate()
+    with database.reading() as connection:
+        assert connection.execute(sa.select(MODELS.c.name)).scalars().all() == ["liver"]
+
+
+def test_several_programs_that_start_at_once_migrate_once(database):
+    errors = []
+
+    def migrate():
+        try:
+            database.migrate()
+        except StoreUnavailable as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=migrate) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+
+
+def test_a_database_of_a_later_version_is_refused_and_left_alone(database):
+    database.migrate()
+    with database.writing() as connection:
+        connection.execute(sa.text("UPDATE alembic_version SET version_num = '0999'"))
+    with pytest.raises(
+        SchemaTooNew, match=r"has schema 0999, which this version .* \(it knows up to 0001\); start the version"
+    ):
+        database.migrate()
+    with database.reading() as connection:
+        assert connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar() == "0999"
+
+
+def test_what_failed_is_undone(database):
+    database.migrate()
+    with pytest.raises(ZeroDivisionError), database.writing() as connection:
+        connection.execute(sa.insert(MODELS).values(name="liver", created_at="now", last_version=0))
+        raise ZeroDivisionError
+    with database.reading() as connection:
+        assert connection.execute(sa.select(MODELS)).all() == []
+
+
+def test_a_second_writer_waits_for_the_first(database):
+    database.migrate()
+    order = []
+    started = threading.Event()
+
+    def second():
+        started.set()
+        with database.writing():
+            order.append("second")
+
+    with database.writing():
+        thread = threading.Thread(target=second)
+        thread.start()
+        assert started.wait(5)
+        thread.join(0.3)
+        order.append("first")
+    thread.join()
+    assert order == ["first", "second"]
+
+
+def test_sqlite_keeps_what_was_committed_and_lets_readers_go_on(tmp_path):
+    database = Database(f"sqlite:///{tmp_path / 'a.sqlite'}")
+    with database.reading() as connection:
+        asked = [
+            connection.exec_driver_sql(f"PRAGMA {name}").scalar()
+            for name in ("journal_mode", "synchronous", "foreign_keys")
+        ]
+    assert asked == ["wal", 2, 1]
+    database.migrate()
+    with database.writing(), database.reading() as connection:
+        assert connection.execute(sa.select(MODELS)).all() == []
+    database.close()
+
+
+def test_a_file_that_is_no_database_is_named(tmp_path):
+    (tmp_path / "registry.sqlite").write_bytes(b"something else entirely" * 100)
+    with pytest.raises(StoreUnavailable, match=r"registry\.sqlite does not answer: file is not a database"):
+        ModelRegistry(tmp_path)
+
+
+def test_a_server_that_does_not_answer_is_named_without_its_password():
+    database = Database("postgresql://somebody:secret@127.0.0.1:1/registry")
+    with pytest.raises(StoreUnavailable, match=r"somebody:\*\*\*@127\.0\.0\.1.*does not answer") as raised:
+        database.migrate()
+    assert "secret" not in str(raised.value)
+
+
+@pytest.mark.parametrize("url", ["", "nonsense", "mysql://host/x", "oracle://host/x", "nothing://x"])
+def test_other_databases_are_refused(url):
+    with pytest.raises(StoreUnavailable, match="cannot be opened"):
+        Database(url)

@@ -1,0 +1,108 @@
+"""The blob store on a server that speaks S3."""
+
+import secrets
+
+import pytest
+
+from gsplat_core.io.bundle import load_bundle
+from services.registry.blobs import RemoteBlobs
+from services.registry.errors import BlobDamaged, StoreUnavailable
+from services.registry.models import ModelRegistry
+from tests.services.registry.made import add_ready, assert_whole, packed_model, sha256
+from tests.services.registry.stub_check import ALWAYS_READY
+
+
+@pytest.fixture
+def credentials(monkeypatch):
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "tester")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+
+
+@pytest.fixture
+def bucket(s3, credentials):
+    """A new bucket: its file system and its name."""
+    import s3fs
+
+    files = s3fs.S3FileSystem(**s3, skip_instance_cache=True)
+    name = f"models-{secrets.token_hex(4)}"
+    files.mkdir(name)
+    return files, name
+
+
+@pytest.fixture
+def registry(bucket, s3, tmp_path):
+    with ModelRegistry(
+        tmp_path / "registry", blobs_url=f"s3://{bucket[1]}/isplat", blob_options=s3, check_program=ALWAYS_READY
+    ) as opened:
+        yield opened
+
+
+def objects(bucket):
+    files, name = bucket
+    files.invalidate_cache()
+    return [path.rsplit("/", 1)[-1] for path in files.find(name)]
+
+
+def test_files_lie_in_the_bucket_under_their_digest(registry, bucket, files, tmp_path):
+    assert registry.recover().removed == ()
+    version = add_ready(registry, files)
+    registry.activate("liver", version, None, "admin")
+    (key,) = objects(bucket)
+    assert key.startswith(f"{sha256(packed_model(files))}-") and key.endswith(".isplat")
+    assert not list((tmp_path / "registry" / "incoming").iterdir())
+    assert load_bundle(registry.folder_of("liver", version)).sha256() == load_bundle(files / "model-0").sha256()
+    add_ready(registry, files, 1)
+    assert_whole(registry)
+    registry.delete("liver", 2, "admin")
+    assert objects(bucket) == [key]
+
+
+def test_an_object_that_is_gone_or_changed_is_noticed(registry, bucket, files, tmp_path):
+    store, name = bucket
+    versions = [registry.upload("liver", packed_model(files, seed), None, "surgeon").version for seed in (0, 1)]
+    for key in objects(bucket):
+        if key.startswith(sha256(packed_model(files, 0))):
+            store.rm(f"{name}/isplat/{key}")
+        else:
+            store.pipe(f"{name}/isplat/{key}", packed_model(files, 1).read_bytes().replace(b"basis", b"basil"))
+    with pytest.raises(StoreUnavailable, match="has no"):
+        registry.folder_of("liver", versions[0])
+    with pytest.raises(BlobDamaged, match="is not what was uploaded"):
+        registry.folder_of("liver", versions[1])
+    assert [each[:2] for each in registry.recover().damaged] == [("liver", 1)]
+    assert not list((tmp_path / "registry" / "incoming").iterdir())
+
+
+def test_uploads_that_no_version_names_are_removed_once_they_are_old(bucket, s3):
+    store, name = bucket
+    orphan = f"{64 * 'a'}-{16 * 'b'}.isplat"
+    store.pipe(f"{name}/isplat/{orphan}", b"x")
+    young = RemoteBlobs(f"s3://{name}/isplat", s3)
+    assert [(blob.key, blob.size, blob.abandoned) for blob in young.stored()] == [(orphan, 1, False)]
+    old = RemoteBlobs(f"s3://{name}/isplat", s3, others_upload_s=-60)
+    assert [blob.abandoned for blob in old.stored()] == [True]
+    old.remove(orphan)
+    old.remove(orphan)
+    assert old.stored() == []
+
+
+def test_an_upload_that_the_store_does_not_take_leaves_nothing(s3, credentials, files, tmp_path):
+    with ModelRegistry(tmp_path, blobs_url="s3://no-such-bucket/x", blob_options=s3) as registry:
+        with pytest.raises(StoreUnavailable, match="no-such-bucket"):
+            registry.upload("liver", packed_model(files), None, "surgeon")
+        assert registry.models() == [] and not list((tmp_path / "incoming").iterdir())
+
+
+def test_a_store_that_does_not_answer_is_named(credentials, files, tmp_path):
+    options = {"endpoint_url": "http://127.0.0.1:1", "config_kwargs": {"retries": {"max_attempts": 0}}}
+    with (
+        ModelRegistry(tmp_path, blobs_url="s3://models/x", blob_options=options) as registry,
+        pytest.raises(StoreUnavailable, match="s3://models/x"),
+    ):
+        registry.upload("liver", packed_model(files), None, "surgeon")
+
+
+def test_an_unknown_kind_of_store_is_refused(tmp_path):
+    with pytest.raises(StoreUnavailable, match="cannot be used: Protocol not known"):
+        ModelRegistry(tmp_path, blobs_url="nowhere://models")
