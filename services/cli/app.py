@@ -18,6 +18,7 @@ from services.cli.options import (
     LiveOutOption,
     ModelArgument,
     OutOption,
+    PackedFileArgument,
     RecordingArgument,
     RecordKeepOption,
     RendererOption,
@@ -215,6 +216,19 @@ def synthesize(
     from services.cli.synthesize import synthesize_command
 
     return synthesize_command(out, frames, width, height, fps, seed, moving_camera, as_json=json)
+
+
+@app.command()
+def pack(
+    model: ModelArgument,
+    file: PackedFileArgument,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Pack a model into one file, for an upload to the service."""
+    from services.cli.pack import pack_command
+
+    return pack_command(model, file, overwrite=overwrite, as_json=json)
 
 
 @app.command()

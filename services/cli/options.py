@@ -41,6 +41,7 @@ SourceArgument = Annotated[
     ),
 ]
 ModelArgument = Annotated[Path, _path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
+PackedFileArgument = Annotated[Path, _path_argument("FILE", "The packed file, which ends in .isplat.")]
 OutOption = Annotated[Path, _path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
 LiveOutOption = Annotated[
     Path | None, _path_option("--out", "Folder for the report and the model; without it nothing is kept.")
