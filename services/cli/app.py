@@ -29,6 +29,7 @@ from services.cli.options import (
     SourceArgument,
     takes_run_options,
 )
+from services.cli.service import add_to
 from services.cli.streams import printable
 
 # Wrong options and their like. Where the class lives has changed between releases of typer; what derives from it has not.
@@ -245,3 +246,6 @@ def doctor(json: JsonOption = False) -> int:
     from services.cli.doctor import doctor_command
 
     return doctor_command(as_json=json)
+
+
+add_to(app)

@@ -25,7 +25,7 @@ def _path_argument(name: str, help_text: str) -> Any:
     return typer.Argument(parser=_path, metavar=name, help=help_text, show_default=False)
 
 
-def _path_option(name: str, help_text: str) -> Any:
+def path_option(name: str, help_text: str) -> Any:
     return typer.Option(name, parser=_path, metavar="<path>", help=help_text, show_default=False)
 
 
@@ -42,14 +42,14 @@ SourceArgument = Annotated[
 ]
 ModelArgument = Annotated[Path, _path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
 PackedFileArgument = Annotated[Path, _path_argument("FILE", "The packed file, which ends in .isplat.")]
-OutOption = Annotated[Path, _path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
+OutOption = Annotated[Path, path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
 LiveOutOption = Annotated[
-    Path | None, _path_option("--out", "Folder for the report and the model; without it nothing is kept.")
+    Path | None, path_option("--out", "Folder for the report and the model; without it nothing is kept.")
 ]
 EvaluatedArgument = Annotated[Path, _path_argument("MODEL|RUN", "A model folder, or the output folder of a run.")]
 EvaluationOutOption = Annotated[
     Path | None,
-    _path_option("--out", "Folder for evaluation.json and evaluation.html: new, empty, or left by an earlier run."),
+    path_option("--out", "Folder for evaluation.json and evaluation.html: new, empty, or left by an earlier run."),
 ]
 PlaceOption = Annotated[
     list[str] | None,
@@ -69,7 +69,7 @@ RecordKeepOption = Annotated[
         show_default="everything",
     ),
 ]
-RenderOutOption = Annotated[Path, _path_option("--out", "A video (name.mp4) or a folder of images.")]
+RenderOutOption = Annotated[Path, path_option("--out", "A video (name.mp4) or a folder of images.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
 RendererOption = Annotated[str, typer.Option(help="How Gaussians become a picture: alpha.")]
 FieldOption = Annotated[str, typer.Option(help="Deformation field: auto, basis or hexplane.")]

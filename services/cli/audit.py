@@ -1,0 +1,33 @@
+"""`intrasplat audit verify`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import typer
+
+from services.audit import verify
+from services.cli.exit_codes import BAD_INPUT, OK
+from services.control.app import AUDIT_FILE
+from services.settings import SettingsInvalid, load_settings
+
+
+def audit_verify_command(file: Path | None, config: Path | None, head: str | None, *, as_json: bool) -> int:
+    """Say whether an audit log is as it was written; 2 when it is not."""
+    path = file or load_settings(config).data_dir / AUDIT_FILE
+    try:
+        verdict = verify(path, head)
+    except OSError as error:
+        raise SettingsInvalid(f"{path}: {error.strerror}; give the audit log's path") from error
+    if as_json:
+        typer.echo(json.dumps({"intact": verdict.intact, **asdict(verdict)}, indent=2))
+        return OK if verdict.intact else BAD_INPUT
+    for finding in verdict.findings:
+        typer.echo(f"line {finding.line}: {finding.what}")
+    if verdict.cut_by_a_crash:
+        typer.echo("the last line has no end: the service stopped while it wrote; its next start takes the line off")
+    kept = "intact" if verdict.intact else "NOT as it was written"
+    typer.echo(f"{verdict.entries} entries, {kept}; the newest has the digest {verdict.head.digest}")
+    return OK if verdict.intact else BAD_INPUT

@@ -1,0 +1,66 @@
+"""`intrasplat keys`: API keys of a server's folder, whether the server runs or not."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import typer
+
+from gsplat_core.errors import UserError
+from services.cli.exit_codes import OK
+from services.control.app import KEYS_FILE
+from services.control.auth.keys import KeyConflict, KeyStore
+from services.control.auth.roles import Role
+from services.settings import load_settings
+from services.settings.sections import NAME_PATTERN
+
+
+class KeyRefused(UserError):
+    """A key cannot be made or revoked; says why."""
+
+
+def keys_list_command(config: Path | None, data: Path | None, *, as_json: bool) -> int:
+    """Print every key."""
+    keys = _store(config, data).all()
+    if as_json:
+        shown = [{name: value for name, value in asdict(key).items() if name != "sha256"} for key in keys]
+        typer.echo(json.dumps(shown, indent=2))
+        return OK
+    for key in keys:
+        typer.echo(f"{key.id}  {key.role:8}  {key.created_at}  {key.name}")
+    return OK
+
+
+def keys_add_command(config: Path | None, data: Path | None, name: str, role: str) -> int:
+    """Make a key and print it, once, to standard output."""
+    import re
+
+    if not re.match(NAME_PATTERN, name):
+        raise KeyRefused(f"{name!r:.60} is no name of a key; use a-z, 0-9 and -, at most 40 of them")
+    if role not in (Role.VIEWER, Role.OPERATOR, Role.ADMIN):
+        raise KeyRefused(f"the role is {role!r:.60}; choose viewer, operator or admin")
+    try:
+        _, token = _store(config, data).create(name, Role(role))
+    except KeyConflict as error:
+        raise KeyRefused(str(error)) from error
+    typer.echo(token)
+    return OK
+
+
+def keys_revoke_command(config: Path | None, data: Path | None, key_id: str) -> int:
+    """End a key."""
+    try:
+        key = _store(config, data).revoke(key_id)
+    except KeyError as error:
+        raise KeyRefused(f"there is no key {key_id!r:.60}; `intrasplat keys list` shows them") from error
+    except KeyConflict as error:
+        raise KeyRefused(str(error)) from error
+    typer.echo(f"revoked {key.id} of {key.name}")
+    return OK
+
+
+def _store(config: Path | None, data: Path | None) -> KeyStore:
+    settings = load_settings(config, {} if data is None else {"paths.data": json.dumps(str(data))})
+    return KeyStore(settings.data_dir / KEYS_FILE)

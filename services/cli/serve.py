@@ -1,0 +1,57 @@
+"""`intrasplat serve` and `intrasplat schema`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+
+from services.cli.exit_codes import OK
+from services.control.app import new_app
+from services.control.logs import log_to_stderr
+from services.control.parts import Parts
+from services.control.server import bind, serve
+from services.settings import ServiceSettings, SettingsInvalid, load_settings
+
+
+def serve_command(
+    config: Path | None, host: str | None, port: int | None, data: Path | None, setting: Sequence[str]
+) -> int:
+    """Serve until the process is asked to end."""
+    named = {"server.host": host, "server.port": port, "paths.data": data}
+    flags = {name: json.dumps(str(value)) for name, value in named.items() if value is not None}
+    settings = load_settings(config, {**_assigned(setting), **flags})
+    log_to_stderr(settings.log)
+    listener = bind(settings)  # before anything is made or started
+    app = new_app(settings, assembled(settings))
+    serve(app, settings, listener, lambda address: _say(address, settings))
+    return OK
+
+
+def assembled(settings: ServiceSettings) -> Parts:
+    """The parts of this server."""
+    return Parts()
+
+
+def schema_command() -> int:
+    """Print the JSON schema of the settings file."""
+    typer.echo(json.dumps(ServiceSettings.model_json_schema(), indent=2))
+    return OK
+
+
+def _assigned(setting: Sequence[str]) -> dict[str, str]:
+    flags = {}
+    for each in setting:
+        name, equals, value = each.partition("=")
+        if not equals or not name:
+            raise SettingsInvalid(f"--set {each!r:.80} has no value; write --set section.key=value")
+        flags[name] = value
+    return flags
+
+
+def _say(address: str, settings: ServiceSettings) -> None:
+    lines = [f"IntraSplat is on {address}/docs", f"the administrator's key is in {settings.admin_key_file}"]
+    print("\n".join(lines), file=sys.stderr, flush=True)  # noqa: T201

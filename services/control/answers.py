@@ -1,0 +1,97 @@
+"""Every error of the application as problem+json: the one place where errors become statuses."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+
+from fastapi import FastAPI
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import JSONResponse, Response
+from starlette.types import Scope
+from starlette.websockets import WebSocket
+
+from services.audit import AuditUnwritable
+from services.control.problems import OF_STATUS, PROBLEM_JSON, Problem, Unavailable, Unprocessable
+
+log = logging.getLogger(__name__)
+
+KNOWN: dict[type[Exception], type[Problem]] = {AuditUnwritable: Unavailable}
+"""Errors of other packages, and what they are here. `Parts.errors` adds those of the parts."""
+
+PHRASES = {
+    404: "there is nothing at this path; /docs lists what there is",
+    405: "this path does not take this method; the header Allow lists those that it takes",
+}
+"""What the framework's own errors say, in a sentence."""
+
+
+class ProblemResponse(JSONResponse):
+    """A problem as an answer."""
+
+    media_type = PROBLEM_JSON
+
+
+def response_of(problem: Problem, scope: Scope) -> Response:
+    """The answer; closes the connection where a body was announced that nobody will read."""
+    headers = dict(problem.headers)
+    if _has_unread_body(scope):
+        headers["Connection"] = "close"
+    document = problem.document(scope.get("state", {}).get("request_id", ""))
+    return ProblemResponse(document, problem.status, headers)
+
+
+def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Problem]]) -> None:
+    """Install the handlers of an application."""
+
+    async def on_problem(connection: HTTPConnection, error: Exception) -> Response | None:
+        assert isinstance(error, Problem)
+        return await _answer(connection, error)
+
+    async def on_http(connection: HTTPConnection, error: Exception) -> Response | None:
+        assert isinstance(error, HTTPException)
+        kind = OF_STATUS.get(error.status_code, OF_STATUS[500 if error.status_code >= 500 else 400])
+        detail = PHRASES.get(error.status_code, str(error.detail))
+        return await _answer(connection, kind(detail, headers=error.headers))
+
+    async def on_invalid(connection: HTTPConnection, error: Exception) -> Response | None:
+        assert isinstance(error, RequestValidationError)
+        return await _answer(connection, _of_validation(error))
+
+    async def on_known(connection: HTTPConnection, error: Exception) -> Response | None:
+        kind = next(known[each] for each in type(error).__mro__ if each in known)
+        if kind.status >= 500:
+            log.error("%s", error)
+        return await _answer(connection, kind(str(error)))
+
+    known: dict[type, type[Problem]] = {**KNOWN, **errors}
+    for each in known:
+        app.add_exception_handler(each, on_known)  # type: ignore[arg-type]
+    app.add_exception_handler(Problem, on_problem)  # type: ignore[arg-type]
+    app.add_exception_handler(HTTPException, on_http)  # type: ignore[arg-type]
+    app.add_exception_handler(RequestValidationError, on_invalid)  # type: ignore[arg-type]
+
+
+def _of_validation(error: RequestValidationError) -> Problem:
+    """Where and what, without the values: they may be secrets, and the caller has them."""
+    errors = [{"at": ".".join(str(part) for part in each["loc"]), "what": each["msg"]} for each in error.errors()]
+    said = "; ".join(f"{each['at']}: {each['what']}" for each in errors[:3])
+    return Unprocessable(f"{said}; /docs describes what is expected", errors=errors[:20])
+
+
+async def _answer(connection: HTTPConnection, problem: Problem) -> Response | None:
+    response = response_of(problem, connection.scope)
+    if isinstance(connection, Request):
+        return response
+    assert isinstance(connection, WebSocket)
+    await connection.send_denial_response(response)
+    return None
+
+
+def _has_unread_body(scope: Scope) -> bool:
+    if scope["type"] != "http" or scope.get("state", {}).get("body_read"):
+        return False
+    headers = dict(scope["headers"])
+    return b"transfer-encoding" in headers or headers.get(b"content-length", b"0") != b"0"

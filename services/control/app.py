@@ -1,0 +1,124 @@
+"""The application: routes, guards and limits around the parts that it is given."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+
+from fastapi import FastAPI
+from fastapi.routing import APIRoute
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
+
+from services.audit import AuditLog
+from services.control.answers import answer_with_problems
+from services.control.auth.keys import KeyStore, first_admin_key
+from services.control.auth.tickets import Tickets
+from services.control.documents import ABOUT, describe
+from services.control.headers import SecurityHeaders
+from services.control.limits import AddressRate, TokenBuckets
+from services.control.measures import Measures
+from services.control.observed import Observed
+from services.control.parts import Parts
+from services.control.routes import ROUTERS
+from services.control.state import ControlState
+from services.control.viewer_count import ViewerCount
+from services.settings import ServiceSettings
+from services.version import product_version
+
+log = logging.getLogger(__name__)
+KEYS_FILE = "keys.json"
+AUDIT_FILE = "audit.jsonl"
+
+
+def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:
+    """The control plane as an ASGI application; its stores lie in `settings.data_dir`, which is made.
+
+    Raises AuditError where another server uses the same folder. At the first start the administrator's key is put into
+    `settings.admin_key_file`.
+    """
+    parts = parts or Parts()
+    control = _new_state(settings, parts)
+    app = FastAPI(
+        title="IntraSplat",
+        version=product_version(),
+        summary="Live, deforming 3D reconstruction from endoscopic video.",
+        description=ABOUT,
+        openapi_url=None, docs_url=None, redoc_url=None,  # ours are in documents.py, and load nothing from elsewhere
+        redirect_slashes=False,
+        generate_unique_id_function=_operation_id,
+        lifespan=_lifespan,
+    )  # fmt: skip
+    app.state.control = control
+    for router in (*ROUTERS, *parts.routers):
+        app.include_router(router)
+    answer_with_problems(app, parts.errors)
+    describe(app)
+    limits = settings.limits
+    by_address = TokenBuckets(limits.address_requests_per_s, limits.address_requests_per_s * limits.burst_s)
+    # Each is put around those before it.
+    app.add_middleware(AddressRate, buckets=by_address, measures=control.measures)
+    app.add_middleware(Observed, measures=control.measures)
+    app.add_middleware(SecurityHeaders)
+    if settings.server.trusted_proxies:
+        app.add_middleware(ProxyHeadersMiddleware, trusted_hosts=list(settings.server.trusted_proxies))
+    return app
+
+
+def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
+    data = settings.data_dir
+    uploads = data / "uploads"
+    for folder in (data, uploads):
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    audit = AuditLog(data / AUDIT_FILE)  # first: its lock says that no other server uses these folders
+    _remove_unfinished(uploads)
+    keys = KeyStore(data / KEYS_FILE)
+    made = first_admin_key(keys, settings.admin_key_file)
+    if made:
+        audit.append("key.create", actor="system", subject="admin", detail={"role": "admin", "first": True})
+        log.warning("the administrator's key was made: it is in %s", settings.admin_key_file)
+    limits = settings.limits
+    return ControlState(
+        settings=settings,
+        parts=parts,
+        keys=keys,
+        tickets=Tickets(settings.auth.ticket_s),
+        audit=audit,
+        measures=Measures(parts.collectors),
+        key_rate=TokenBuckets(limits.requests_per_s, limits.requests_per_s * limits.burst_s),
+        uploads_dir=uploads,
+        uploads=asyncio.Semaphore(limits.uploads),
+        viewers=ViewerCount(limits.viewers),
+    )
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    control: ControlState = app.state.control
+    async with AsyncExitStack() as running:
+        for enter in control.parts.background:
+            await running.enter_async_context(enter())
+        audit = control.audit
+        await asyncio.to_thread(audit.append, "service.start", actor="system", detail={"version": product_version()})
+        try:
+            yield
+        finally:
+            control.draining.set()
+            if control.tasks:
+                await asyncio.wait(control.tasks, timeout=control.settings.server.drain_s)
+            await asyncio.to_thread(audit.append, "service.stop", actor="system")
+    control.audit.close()
+
+
+def _remove_unfinished(uploads: Path) -> None:
+    """What a server that was killed had taken in."""
+    for name in os.listdir(uploads):
+        if name.startswith("upload-"):
+            (uploads / name).unlink()
+
+
+def _operation_id(route: APIRoute) -> str:
+    return route.name

@@ -1,0 +1,152 @@
+"""The guard: every route declares the role that it needs, and nothing of a request's body is read before that was looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, TypeVar
+
+from fastapi import APIRouter, Depends
+from fastapi.routing import APIRoute
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import Response
+
+from services.control.auth.roles import ANYBODY, Caller, Role
+from services.control.bodies import BoundedBody, refuse_by_length
+from services.control.problems import Forbidden, TooManyRequests, Unauthenticated, WrongContent
+from services.control.state import ControlState, control_of
+
+JSON = "application/json"
+MOST_TOKEN_LENGTH = 256
+Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a route asks for."""
+
+    role: Role
+    ticket: bool = False
+    """A ticket in the address is taken in place of a key."""
+    takes: str | None = None
+    """Content type of the body; JSON where the route declares a body."""
+    most: Literal["body_bytes", "model_bytes"] = "body_bytes"
+    """Which limit of the settings bounds the body."""
+
+
+def requires(
+    role: str,
+    *,
+    ticket: bool = False,
+    takes: str | None = None,
+    most: Literal["body_bytes", "model_bytes"] = "body_bytes",
+) -> Callable[[Endpoint], Endpoint]:
+    """Declare what a route asks for. It stands between the route's decorator and its function."""
+    rule = Rule(Role(role), ticket, takes, most)
+
+    def declare(endpoint: Endpoint) -> Endpoint:
+        endpoint.__rule__ = rule  # type: ignore[attr-defined]
+        return endpoint
+
+    return declare
+
+
+def rule_of(endpoint: Callable[..., Any]) -> Rule:
+    """What a route's function declared; raises TypeError where it did not."""
+    rule = getattr(endpoint, "__rule__", None)
+    if not isinstance(rule, Rule):
+        raise TypeError(
+            f"the route {getattr(endpoint, '__name__', endpoint)} declares no role; put @requires(…) below it"
+        )
+    return rule
+
+
+class GuardedRoute(APIRoute):
+    """A route whose rule is enforced before its body is read, which FastAPI does before it looks at dependencies."""
+
+    def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
+        rule = rule_of(endpoint)
+        extra: dict[str, Any] = {
+            "x-role": rule.role.value,
+            "security": [{"key": []}] if rule.role is not Role.PUBLIC else [],
+        }
+        options["openapi_extra"] = (options.get("openapi_extra") or {}) | extra
+        super().__init__(path, endpoint, **options)
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handle = super().get_route_handler()
+        rule = rule_of(self.endpoint)
+        takes = rule.takes or (JSON if self.body_field is not None else None)
+
+        async def guarded(request: Request) -> Response:
+            control = control_of(request)
+            request.scope["state"]["caller"] = _admit(request, rule, control)
+            limits = control.settings.limits
+            most_bytes: int = getattr(limits, rule.most)
+            refuse_by_length(request, most_bytes)
+            if takes is not None:
+                _check_content_type(request, takes)
+            return await handle(Request(request.scope, BoundedBody(request.scope, request.receive, most_bytes, limits)))
+
+        return guarded
+
+
+def new_router(tag: str, prefix: str = "/v1") -> APIRouter:
+    """A router whose routes are guarded."""
+    return APIRouter(prefix=prefix, tags=[tag], route_class=GuardedRoute)
+
+
+def _caller_of(connection: HTTPConnection) -> Caller:
+    """Who makes this request. A WebSocket is guarded here: it has no body, and its route no handler to wrap."""
+    if connection.scope["type"] == "websocket":
+        return _admit(connection, rule_of(connection.scope["endpoint"]), control_of(connection))
+    caller: Caller = connection.scope["state"]["caller"]
+    return caller
+
+
+CallerOf = Annotated[Caller, Depends(_caller_of)]
+
+
+def _admit(connection: HTTPConnection, rule: Rule, control: ControlState) -> Caller:
+    if rule.role is Role.PUBLIC:
+        return ANYBODY
+    try:
+        caller = _authenticated(connection, rule, control)
+    except Unauthenticated:
+        control.measures.refused.labels("not authenticated").inc()
+        raise
+    wait_s = control.key_rate.wait_s(caller.key_id)
+    if wait_s > 0:
+        control.measures.refused.labels("key rate").inc()
+        raise TooManyRequests(f"too many requests with this key; wait {wait_s:.1f} s", wait_s)
+    if not caller.role.may(rule.role):
+        control.measures.refused.labels("role").inc()
+        raise Forbidden(f"this needs the role {rule.role}; the key {caller.name} has the role {caller.role}")
+    return caller
+
+
+def _authenticated(connection: HTTPConnection, rule: Rule, control: ControlState) -> Caller:
+    given = connection.headers.getlist("authorization")
+    tickets = connection.query_params.getlist("ticket") if rule.ticket else []
+    if len(given) + len(tickets) > 1:
+        raise Unauthenticated("more than one key or ticket was sent; send one")
+    if tickets:
+        caller = control.tickets.use(tickets[0][:MOST_TOKEN_LENGTH], connection.url.path)
+        if caller is None or control.keys.is_revoked(caller.key_id):
+            raise Unauthenticated(
+                "the ticket is unknown, used, too old or for another path; get one from POST /v1/tickets"
+            )
+        return caller
+    scheme, _, token = (given[0] if given else "").partition(" ")
+    if scheme.lower() != "bearer" or not token:
+        raise Unauthenticated("send an API key as `Authorization: Bearer KEY`")
+    key = control.keys.find(token.strip()) if len(token) <= MOST_TOKEN_LENGTH else None
+    if key is None:
+        raise Unauthenticated("the API key is not known here; it may have been revoked")
+    return Caller(key.name, key.id, key.role)
+
+
+def _check_content_type(request: Request, takes: str) -> None:
+    given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if given != takes:
+        raise WrongContent(f"the body's Content-Type is {given!r:.80}; send {takes}")

@@ -1,0 +1,35 @@
+"""Roles, each of which may do what those before it may."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Role(StrEnum):
+    """`public` is anybody, without a key; no key has it."""
+
+    PUBLIC = "public"
+    VIEWER = "viewer"
+    OPERATOR = "operator"
+    ADMIN = "admin"
+
+    def may(self, needed: Role) -> bool:
+        """Whether this role suffices where `needed` is asked for."""
+        order = list(Role)
+        return order.index(self) >= order.index(needed)
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who makes a request: the name and number of a key, and its role."""
+
+    name: str
+    key_id: str
+    role: Role
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.key_id})" if self.key_id else self.name
+
+
+ANYBODY = Caller("anybody", "", Role.PUBLIC)

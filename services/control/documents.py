@@ -1,0 +1,117 @@
+"""The OpenAPI document and Swagger UI, which comes from this package: no page loads anything from elsewhere."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI
+from starlette.requests import Request
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
+
+from services.control.auth.guard import new_router, requires
+from services.control.problems import Missing
+
+SWAGGER_UI = Path(__file__).parent / "swagger"
+FILES = {
+    "swagger-ui-bundle.js": "text/javascript",
+    "swagger-ui.css": "text/css",
+    "page.css": "text/css",
+    "start.js": "text/javascript",
+    "favicon-32x32.png": "image/png",
+    "LICENSE": "text/plain",
+    "NOTICE": "text/plain",
+}
+PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<title>IntraSplat API</title>
+<meta name="viewport" content="width=device-width">
+<link rel="icon" href="/docs/favicon-32x32.png">
+<link rel="stylesheet" href="/docs/swagger-ui.css">
+<link rel="stylesheet" href="/docs/page.css">
+</head>
+<body>
+<div id="api"></div>
+<script src="/docs/swagger-ui-bundle.js"></script>
+<script src="/docs/start.js"></script>
+</body>
+</html>
+"""
+
+ABOUT = """Research use only, not a medical device. Keys have roles (viewer, operator, admin); `x-role` of an operation says which it needs."""
+
+router = new_router("documents", prefix="")
+
+
+@router.get("/openapi.json", include_in_schema=False)
+@requires("public")
+async def openapi_document(request: Request) -> Response:
+    """The API's description."""
+    return JSONResponse(request.app.openapi())
+
+
+@router.get("/docs", include_in_schema=False)
+@requires("public")
+async def swagger_ui() -> Response:
+    """The API's page, to read and to try."""
+    return HTMLResponse(PAGE)
+
+
+@router.get("/docs/{file}", include_in_schema=False)
+@requires("public")
+async def swagger_ui_file(file: str) -> Response:
+    """A file of that page."""
+    if file not in FILES:
+        raise Missing("there is no such file of the API's page")
+    return FileResponse(SWAGGER_UI / file, media_type=FILES[file], headers={"Cache-Control": "public, max-age=3600"})
+
+
+PROBLEM_SCHEMA: dict[str, Any] = {
+    "title": "Problem",
+    "description": "RFC 9457: what happened, the value, what to do.",
+    "type": "object",
+    "required": ["type", "title", "status"],
+    "properties": {
+        "type": {"type": "string", "examples": ["urn:intrasplat:problem:not-found"]},
+        "title": {"type": "string", "examples": ["Not found"]},
+        "status": {"type": "integer", "examples": [404]},
+        "detail": {"type": "string", "examples": ["there is no model liver; PUT a version of it first"]},
+        "instance": {"type": "string", "examples": ["urn:intrasplat:request:1f0c9a3b5d7e8f20"]},
+        "errors": {"type": "array", "items": {"type": "object"}},
+    },
+}
+PROBLEMS = {"4XX": "Refused; the body says why.", "5XX": "Not done; the body says why."}
+"""Answers that every operation may give."""
+
+
+def describe(app: FastAPI) -> None:
+    """Give the application's document its keys' scheme and its problems."""
+    framework = app.openapi
+
+    def described() -> dict[str, Any]:
+        fresh = app.openapi_schema is None
+        document = framework()
+        if fresh:
+            _add_common(document)
+        return document
+
+    app.openapi = partial(described)  # type: ignore[method-assign]
+
+
+def _add_common(document: dict[str, Any]) -> None:
+    components = document.setdefault("components", {})
+    components["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer", "description": "An API key."}}
+    schemas = components.setdefault("schemas", {})
+    for unused in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(unused, None)
+    schemas["Problem"] = PROBLEM_SCHEMA
+    content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    for operations in document["paths"].values():
+        for operation in operations.values():
+            responses = operation["responses"]
+            responses.pop("422", None)  # as FastAPI would answer
+            for status, description in PROBLEMS.items():
+                responses[status] = {"description": description, "content": content}

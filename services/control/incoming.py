@@ -1,0 +1,90 @@
+"""An upload on its way in: a file without a name that anybody could ask for, and the digest of what was written."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from starlette.requests import Request
+
+from services.control.problems import NoSpace, TooManyRequests, Unprocessable
+from services.control.state import ControlState
+
+PART_BYTES = 1 << 20
+SPARE_BYTES = 256 * 2**20
+"""Left free on the disk: for the audit log and the database, which must always be able to write."""
+
+
+@dataclass(frozen=True)
+class IncomingFile:
+    """A whole upload; removed when the block that received it ends, unless it was moved away."""
+
+    path: Path
+    size_bytes: int
+    sha256: str
+
+
+@asynccontextmanager
+async def incoming_file(request: Request, control: ControlState, expected_sha256: bytes) -> AsyncIterator[IncomingFile]:
+    """Write the body to a file as it comes. Raises TooManyRequests, NoSpace, and Unprocessable for another digest or an empty body."""
+    if control.uploads.locked():
+        raise TooManyRequests("as many uploads as may are running; wait for one to end", 5.0)
+    async with control.uploads:
+        folder = control.uploads_dir
+        _check_space(folder, int(request.headers.get("content-length", 0)))
+        descriptor, name = tempfile.mkstemp(prefix="upload-", dir=folder)
+        path = Path(name)
+        try:
+            size, digest = await _write(request, descriptor, control)
+            if digest != expected_sha256:
+                raise Unprocessable(
+                    f"the body's SHA-256 is {digest.hex()}, Content-Digest says {expected_sha256.hex()}; send it again"
+                )
+            if size == 0:
+                raise Unprocessable("the body is empty; send the file")
+            yield IncomingFile(path, size, digest.hex())
+        finally:
+            with suppress(FileNotFoundError):
+                path.unlink()
+
+
+async def _write(request: Request, descriptor: int, control: ControlState) -> tuple[int, bytes]:
+    running = hashlib.sha256()
+    size = 0
+
+    def put(part: bytes) -> None:
+        running.update(part)
+        file.write(part)
+
+    with os.fdopen(descriptor, "wb") as file:
+        try:
+            waiting = bytearray()
+            async for chunk in request.stream():
+                waiting += chunk
+                size += len(chunk)
+                if len(waiting) >= PART_BYTES:
+                    _check_space(control.uploads_dir, 0)
+                    await asyncio.to_thread(put, bytes(waiting))
+                    waiting.clear()
+            await asyncio.to_thread(put, bytes(waiting))
+            await asyncio.to_thread(file.flush)
+            await asyncio.to_thread(os.fsync, file.fileno())
+        except OSError as error:
+            raise NoSpace(f"the upload cannot be kept: {error.strerror}; free space on that disk") from error
+    control.measures.upload_bytes.inc(size)
+    return size, running.digest()
+
+
+def _check_space(folder: Path, wanted_bytes: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if free < wanted_bytes + SPARE_BYTES:
+        raise NoSpace(
+            f"{free // 2**20} MiB are free and {SPARE_BYTES // 2**20} MiB must stay so; delete versions that are not needed"
+        )

@@ -1,0 +1,71 @@
+"""Rates: token buckets, and the middleware that holds each address to one before anything else is looked at."""
+
+from __future__ import annotations
+
+import ipaddress
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from services.control.answers import response_of
+from services.control.measures import Measures
+from services.control.problems import TooManyRequests
+
+MOST_BUCKETS = 20_000
+
+
+class TokenBuckets:
+    """A bucket for each caller: `rate_per_s` tokens come in, at most `burst` stay, each request takes one."""
+
+    def __init__(self, rate_per_s: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._rate = rate_per_s
+        self._burst = max(1.0, burst)
+        self._clock = clock
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def wait_s(self, caller: str, tokens: float = 1.0) -> float:
+        """Take tokens; 0 when there were enough, else how long it takes until there are, and nothing is taken."""
+        now_s = self._clock()
+        left, at_s = self._buckets.pop(caller, (self._burst, now_s))
+        left = min(self._burst, left + (now_s - at_s) * self._rate)
+        enough = left >= tokens
+        self._buckets[caller] = (left - tokens if enough else left, now_s)
+        if len(self._buckets) > MOST_BUCKETS:
+            self._buckets.popitem(
+                last=False
+            )  # of whom nothing was heard for longest: its bucket is full again, or nearly
+        return 0.0 if enough else (tokens - left) / self._rate
+
+
+class AddressRate:
+    """Middleware that answers 429 to an address that asks too often."""
+
+    def __init__(self, app: ASGIApp, buckets: TokenBuckets, measures: Measures) -> None:
+        self._app = app
+        self._buckets = buckets
+        self._measures = measures
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            return await self._app(scope, receive, send)
+        wait_s = self._buckets.wait_s(network_of(scope))
+        if wait_s == 0:
+            return await self._app(scope, receive, send)
+        self._measures.refused.labels("address rate").inc()
+        problem = TooManyRequests(f"too many requests from this address; wait {wait_s:.1f} s", wait_s)
+        if scope["type"] == "websocket":
+            await receive()  # websocket.connect
+            return await send({"type": "websocket.close", "code": 1013})  # before it is accepted: 403 to the client
+        await response_of(problem, scope)(scope, receive, send)
+
+
+def network_of(scope: Scope) -> str:
+    """Who a caller's address stands for: of IPv6 its /64, which one host can fill with addresses."""
+    host = (scope.get("client") or ("unknown", 0))[0]
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return host
+    return str(ipaddress.ip_network((address, 64), strict=False)) if address.version == 6 else host

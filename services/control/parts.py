@@ -1,0 +1,168 @@
+"""What the control plane is put together from: protocols, so that each part can be built, tested and left out by itself."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from fastapi import APIRouter
+from prometheus_client.registry import Collector
+
+from services.control.problems import Problem
+
+PictureKind = Literal["raw", "shown"]
+
+
+class VersionRecord(Protocol):
+    """A version of a model, as the registry has it."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def version(self) -> int: ...
+    @property
+    def state(self) -> str: ...
+    @property
+    def reason(self) -> str | None: ...
+    @property
+    def digest(self) -> str: ...
+    @property
+    def size_bytes(self) -> int: ...
+    @property
+    def uploaded_at(self) -> Any: ...
+    @property
+    def uploaded_by(self) -> str: ...
+
+
+class ModelRecord(Protocol):
+    """A model: a name and which of its versions is active."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def active(self) -> int | None: ...
+
+
+class Models(Protocol):
+    """The registry of models. Synchronous and safe for threads: the API calls it in one. Its errors are named in `Parts.errors`."""
+
+    def upload(self, name: str, file: Path, digest: str, by: str) -> VersionRecord:
+        """Keep a file as a new version; `digest` is its SHA-256 in hex."""
+
+    def check(self, name: str, version: int) -> VersionRecord:
+        """Validate a version: afterwards it is ready, or rejected with a reason."""
+
+    def models(self) -> Sequence[ModelRecord]: ...
+    def versions(self, name: str) -> Sequence[VersionRecord]: ...
+    def version(self, name: str, number: int) -> VersionRecord: ...
+    def activate(self, name: str, version: int, expected_current: int | None, by: str) -> VersionRecord: ...
+    def rollback(self, name: str, by: str) -> VersionRecord: ...
+    def delete(self, name: str, version: int, by: str) -> None: ...
+
+
+class StreamState(Protocol):
+    """What a stream is and does."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def source(self) -> str: ...
+    @property
+    def show(self) -> str: ...
+    @property
+    def device(self) -> str: ...
+    @property
+    def options(self) -> Mapping[str, Any]: ...
+    @property
+    def state(self) -> str:
+        """`stopped`, `starting`, `live`, `stale`, `frozen`, `source lost` or `failed`."""
+
+    @property
+    def reason(self) -> str | None: ...
+    @property
+    def processes(self) -> Mapping[str, Mapping[str, Any]]:
+        """Of capture and engine: state, pid, restarts, figures."""
+
+
+@dataclass(frozen=True)
+class NewStream:
+    """What a caller asks for; its source was checked against the rules."""
+
+    name: str
+    source: str
+    show: str
+    device: str
+    options: Mapping[str, Any]
+
+
+class Streams(Protocol):
+    """The streams and their processes."""
+
+    async def all(self) -> Sequence[StreamState]: ...
+    async def get(self, name: str) -> StreamState: ...
+    async def create(self, stream: NewStream) -> StreamState: ...
+    async def start(self, name: str) -> StreamState: ...
+    async def stop(self, name: str) -> StreamState: ...
+    async def set_options(self, name: str, options: Mapping[str, Any]) -> StreamState: ...
+    async def delete(self, name: str) -> None: ...
+
+
+class EncodedPicture(Protocol):
+    """A picture as viewers get it."""
+
+    @property
+    def header(self) -> Mapping[str, Any]: ...
+    @property
+    def jpeg(self) -> bytes: ...
+
+
+class Display(Protocol):
+    """Pictures of the streams, newest wins: who reads slowly misses some."""
+
+    def subscribe(self, stream: str, kind: PictureKind, quality: int) -> AsyncIterator[EncodedPicture]:
+        """Pictures until the iterator is closed (`aclose`) or the stream is gone."""
+
+
+class Jobs(Protocol):
+    """Replays that run by themselves."""
+
+    async def all(self) -> Sequence[Mapping[str, Any]]: ...
+
+
+class Recordings(Protocol):
+    """Recordings that were uploaded."""
+
+    async def all(self) -> Sequence[Mapping[str, Any]]: ...
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """How a part is. A service whose needed parts are well is ready; another one that is not makes it degraded."""
+
+    ok: bool
+    detail: str = ""
+    needed: bool = True
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The parts of a server; requests for an absent one are answered with 503."""
+
+    streams: Streams | None = None
+    models: Models | None = None
+    display: Display | None = None
+    jobs: Jobs | None = None
+    recordings: Recordings | None = None
+    routers: Sequence[APIRouter] = ()
+    """Further routes, made by `new_router`."""
+    background: Sequence[Callable[[], AbstractAsyncContextManager[Any]]] = ()
+    """Entered in order when the server starts, left in reverse when it has drained."""
+    checks: Mapping[str, Callable[[], Awaitable[CheckResult]]] = field(default_factory=dict)
+    """For /readyz, by name."""
+    collectors: Sequence[Collector] = ()
+    """For /metrics."""
+    errors: Mapping[type[Exception], type[Problem]] = field(default_factory=dict)
+    """What the parts' errors mean to a caller; their text is shown."""

@@ -1,0 +1,157 @@
+"""Errors of the API, each with its HTTP status; every answer that is no success is one of them (RFC 9457, application/problem+json).
+
+Problem
+├── BadRequest            400  the request makes no sense
+├── Unauthenticated       401  no key, or none that is known
+├── Forbidden             403  the key's role does not allow it
+├── Missing               404  there is no such thing
+├── WrongMethod           405  not with this method
+├── TooSlow               408  the body does not come
+├── Conflicting           409  it is not in the state that this needs
+├── TooLarge              413  the body is longer than it may be
+├── WrongContent          415  the body is of another type
+├── Unprocessable         422  understood, and refused for what it says
+├── TooManyRequests       429  later
+├── Internal              500  a bug of ours: the log has it, the answer has not
+├── Unavailable           503  not now
+│   └── NotBuiltIn        503  this server was put together without that part
+└── NoSpace               507  the disk is full
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+PROBLEM_JSON = "application/problem+json"
+
+
+class Problem(Exception):
+    """An answer that is no success. `detail` says what happened, the value, what to do; it goes to the caller."""
+
+    status = 500
+    title = "Internal error"
+
+    def __init__(
+        self, detail: str = "", *, headers: Mapping[str, str] | None = None, errors: Sequence[Mapping[str, Any]] = ()
+    ) -> None:
+        super().__init__(detail)
+        self.detail = detail
+        self.headers = dict(headers or {})
+        self.errors = tuple(errors)
+
+    def document(self, request_id: str = "") -> dict[str, Any]:
+        """The answer's body."""
+        kind = self.title.lower().replace(" ", "-")
+        body: dict[str, Any] = {"type": f"urn:intrasplat:problem:{kind}", "title": self.title, "status": self.status}
+        if self.detail:
+            body["detail"] = self.detail
+        if request_id:
+            body["instance"] = f"urn:intrasplat:request:{request_id}"
+        if self.errors:
+            body["errors"] = list(self.errors)
+        return body
+
+
+class BadRequest(Problem):
+    """The request makes no sense."""
+
+    status, title = 400, "Bad request"
+
+
+class Unauthenticated(Problem):
+    """No key, or none that is known."""
+
+    status, title = 401, "Not authenticated"
+
+    def __init__(self, detail: str) -> None:
+        super().__init__(detail, headers={"WWW-Authenticate": 'Bearer realm="intrasplat"'})
+
+
+class Forbidden(Problem):
+    """The key's role does not allow it."""
+
+    status, title = 403, "Forbidden"
+
+
+class Missing(Problem):
+    """There is no such thing."""
+
+    status, title = 404, "Not found"
+
+
+class WrongMethod(Problem):
+    """Not with this method."""
+
+    status, title = 405, "Method not allowed"
+
+
+class TooSlow(Problem):
+    """The body does not come."""
+
+    status, title = 408, "Request timeout"
+
+
+class Conflicting(Problem):
+    """It is not in the state that this needs."""
+
+    status, title = 409, "Conflict"
+
+
+class TooLarge(Problem):
+    """The body is longer than it may be."""
+
+    status, title = 413, "Content too large"
+
+
+class WrongContent(Problem):
+    """The body is of another type."""
+
+    status, title = 415, "Unsupported media type"
+
+
+class Unprocessable(Problem):
+    """Understood, and refused for what it says."""
+
+    status, title = 422, "Unprocessable content"
+
+
+class TooManyRequests(Problem):
+    """Later."""
+
+    status, title = 429, "Too many requests"
+
+    def __init__(self, detail: str, after_s: float) -> None:
+        super().__init__(detail, headers={"Retry-After": str(max(1, round(after_s + 0.5)))})
+
+
+class Internal(Problem):
+    """A bug of ours: the log has it, the answer has not."""
+
+
+class Unavailable(Problem):
+    """Not now."""
+
+    status, title = 503, "Service unavailable"
+
+
+class NotBuiltIn(Unavailable):
+    """This server was put together without that part."""
+
+    title = "Not built into this server"
+
+
+class NoSpace(Problem):
+    """The disk is full."""
+
+    status, title = 507, "Insufficient storage"
+
+
+OF_STATUS: dict[int, type[Problem]] = {
+    kind.status: kind
+    for kind in (
+        BadRequest, Forbidden, Missing, WrongMethod, TooSlow, Conflicting, TooLarge, WrongContent, Unprocessable,
+        Internal, Unavailable, NoSpace,
+    )
+}  # fmt: skip
+"""Problems by status, for the framework's own errors."""

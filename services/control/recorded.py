@@ -1,0 +1,54 @@
+"""What changes something is in the audit log, with its outcome, before the caller hears of it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from starlette.requests import Request
+
+from services.audit.entries import Detail, Outcome
+from services.control.auth.roles import Caller
+from services.control.problems import Problem
+from services.control.state import control_of
+
+
+@asynccontextmanager
+async def recorded(
+    request: Request, caller: Caller, event: str, subject: str, detail: Detail | None = None
+) -> AsyncIterator[Detail]:
+    """Write an entry when the block ends: done, or refused or failed by what it raised, which goes on. What is put into the dictionary that
+    is given becomes part of it. Raises AuditUnwritable where it cannot be written: the caller is told, though the change may be made."""
+    said: Detail = dict(detail or {})
+    outcome: Outcome = "failed"
+    try:
+        yield said
+        outcome = "done"
+    except Exception as error:
+        outcome = "failed" if _status_of(request, error) >= 500 else "refused"
+        said["error"] = type(error).__name__
+        raise
+    finally:
+        await _write(request, caller, event, subject, outcome, said)
+
+
+async def _write(request: Request, caller: Caller, event: str, subject: str, outcome: Outcome, detail: Detail) -> None:
+    control = control_of(request)
+
+    def append() -> None:
+        control.audit.append(
+            event, actor=str(caller), role=caller.role, subject=subject, outcome=outcome,
+            request_id=request.state.request_id, detail=detail,
+        )  # fmt: skip
+
+    # A caller who leaves now does not take the entry along.
+    await asyncio.shield(asyncio.to_thread(append))
+    control.measures.audit_entries.inc()
+
+
+def _status_of(request: Request, error: Exception) -> int:
+    if isinstance(error, Problem):
+        return error.status
+    known = control_of(request).parts.errors
+    return next((known[each].status for each in type(error).__mro__ if each in known), 500)

@@ -1,0 +1,28 @@
+"""The routes, one module for each resource."""
+
+from fastapi import APIRouter
+
+from services.control import documents
+from services.control.routes import (
+    audit,
+    config,
+    display,
+    health,
+    jobs,
+    keys,
+    metrics,
+    models,
+    recordings,
+    streams,
+    tickets,
+    uploads,
+    version,
+)
+
+ROUTERS: tuple[APIRouter, ...] = tuple(
+    module.router
+    for module in (
+        health, version, config, streams, display, models, uploads, jobs, recordings, keys, tickets, audit, metrics,
+        documents,
+    )
+)  # fmt: skip

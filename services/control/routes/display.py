@@ -1,0 +1,106 @@
+"""What a stream shows, as it comes: by WebSocket, with what is known of each picture, or as MJPEG for anything that shows pictures."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack
+from typing import Annotated
+
+from fastapi import Path, Query
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketState
+
+from services.control.auth.guard import CallerOf, new_router, requires
+from services.control.parts import EncodedPicture, PictureKind
+from services.control.viewers import in_time, until_ended, viewing
+from services.settings import ResourceName
+
+router = new_router("display")
+Kind = Annotated[PictureKind, Query(description="The camera's picture, or what is shown in its place.")]
+Quality = Annotated[int, Query(ge=10, le=95, description="Of the JPEG.")]
+BOUNDARY = "picture"
+GOING_AWAY = 1001
+
+
+def message_of(picture: EncodedPicture) -> bytes:
+    """A picture as one message: the length of the header in four bytes, big end first, the header in JSON, the JPEG."""
+    header = json.dumps(dict(picture.header), separators=(",", ":")).encode()
+    return struct.pack(">I", len(header)) + header + picture.jpeg
+
+
+def part_of(picture: EncodedPicture) -> bytes:
+    """A picture as a part of a multipart answer."""
+    head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture.jpeg)}\r\n\r\n"
+    return head.encode() + picture.jpeg + b"\r\n"
+
+
+@router.websocket("/streams/{name}/display")
+@requires("viewer", ticket=True)
+async def display(
+    socket: WebSocket,
+    caller: CallerOf,
+    name: Annotated[ResourceName, Path()],
+    kind: Kind = "shown",
+    quality: Quality = 75,
+) -> None:
+    """Binary messages, one for each picture that this viewer is in time for."""
+    async with viewing(socket, "websocket", name, kind, quality) as pictures:
+        await socket.accept()
+        send = in_time(socket.send_bytes, socket)
+        async with until_ended(socket, _left(socket)):
+            async for picture in pictures:
+                await send(message_of(picture))
+        if socket.client_state is WebSocketState.CONNECTED and socket.application_state is WebSocketState.CONNECTED:
+            await socket.close(GOING_AWAY, "the stream or the server has ended")
+
+
+async def _left(socket: WebSocket) -> None:
+    """Viewers have nothing to say; what they send is read and forgotten, so that their leaving is heard."""
+    while (await socket.receive())["type"] != "websocket.disconnect":
+        pass
+
+
+@router.get(
+    "/streams/{name}/mjpeg",
+    response_class=Response,
+    responses={200: {"content": {f"multipart/x-mixed-replace; boundary={BOUNDARY}": {}}}},
+)
+@requires("viewer", ticket=True)
+async def mjpeg(
+    request: Request, caller: CallerOf, name: ResourceName, kind: Kind = "shown", quality: Quality = 75
+) -> Response:
+    """Pictures as `multipart/x-mixed-replace`, which an `<img>` shows."""
+    opened = AsyncExitStack()
+    pictures = await opened.enter_async_context(viewing(request, "mjpeg", name, kind, quality))
+    return MjpegResponse(request, pictures, opened)
+
+
+class MjpegResponse(Response):
+    """An answer that ends when the viewer leaves, when it takes nothing for too long, or when the server does; then its pictures are closed."""
+
+    media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+
+    def __init__(self, request: Request, pictures: AsyncIterator[EncodedPicture], opened: AsyncExitStack) -> None:
+        super().__init__()
+        del self.headers["content-length"]
+        self._request = request
+        self._pictures = pictures
+        self._opened = opened
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async with self._opened:
+            await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
+            send_part = in_time(send, self._request)
+            async with until_ended(self._request, _hung_up(receive)):
+                async for picture in self._pictures:
+                    await send_part({"type": "http.response.body", "body": part_of(picture), "more_body": True})
+            await send({"type": "http.response.body", "body": b"", "more_body": False})
+
+
+async def _hung_up(receive: Receive) -> None:
+    while (await receive())["type"] != "http.disconnect":
+        pass

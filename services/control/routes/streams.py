@@ -1,0 +1,142 @@
+"""Streams: made, started, stopped, looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+from starlette.requests import Request
+
+from services.control.auth.guard import CallerOf, new_router, requires
+from services.control.parts import NewStream, Streams, StreamState
+from services.control.recorded import recorded
+from services.control.sources import check_source
+from services.control.state import control_of, part
+from services.settings import ResourceName, StreamSettings
+from services.settings.addresses import masked_address
+
+router = new_router("streams")
+MOST_OPTIONS = 50
+Option = str | int | float | bool | None
+
+
+class StreamOptions(BaseModel):
+    """Options of the source and of the reconstruction, by name; null takes one back to its default."""
+
+    model_config = ConfigDict(extra="forbid")
+    options: dict[str, Option] = Field(max_length=MOST_OPTIONS, examples=[{"tool_mask": "builtin"}])
+
+
+class StreamWanted(StreamSettings):
+    """A new stream."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: ResourceName
+    start: bool = Field(True, description="Start it at once.")
+    options: dict[str, Any] = Field({}, max_length=MOST_OPTIONS)
+
+    @field_validator("options")
+    @classmethod
+    def _plain(cls, options: dict[str, Any]) -> dict[str, Any]:
+        return StreamOptions(options=options).options
+
+
+class StreamView(BaseModel):
+    """A stream. `state`: stopped, starting, live, stale, frozen, source lost or failed; `reason` says why."""
+
+    model_config = ConfigDict(from_attributes=True)
+    name: str = Field(examples=["endoscope"])
+    source: str = Field(examples=["rtsp://10.0.0.5/stream"])
+    show: str = Field(examples=["live"])
+    device: str = Field(examples=["cuda:0"])
+    options: dict[str, Any]
+    state: str = Field(examples=["live"])
+    reason: str | None = None
+    processes: dict[str, dict[str, Any]] = Field({}, description="Capture and engine.")
+
+    @field_validator("source")
+    @classmethod
+    def _without_credentials(cls, source: str) -> str:
+        return masked_address(source)
+
+    @field_validator("options", "processes", mode="before")
+    @classmethod
+    def _as_dict(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        return dict(values)
+
+
+def streams_of(request: Request) -> Streams:
+    """The streams of this server."""
+    return part(request, lambda parts: parts.streams, "streams")
+
+
+@router.get("/streams")
+@requires("viewer")
+async def streams(request: Request) -> list[StreamView]:
+    """Every stream."""
+    return [_view(stream) for stream in await streams_of(request).all()]
+
+
+@router.post("/streams", status_code=201)
+@requires("operator")
+async def create_stream(request: Request, caller: CallerOf, wanted: StreamWanted) -> StreamView:
+    """Make a stream. Its source must be one that the settings allow (`sources`)."""
+    found = streams_of(request)
+    detail = {"scheme": wanted.source.partition(":")[0][:20] if wanted.source.isascii() else "", "show": wanted.show}
+    async with recorded(request, caller, "stream.create", wanted.name, {**detail}):
+        check_source(wanted.source, control_of(request).settings.sources)
+        new = NewStream(wanted.name, wanted.source, wanted.show, wanted.device, wanted.options)
+        state = await found.create(new)
+        if wanted.start:
+            state = await found.start(wanted.name)
+    return _view(state)
+
+
+@router.get("/streams/{name}")
+@requires("viewer")
+async def stream(request: Request, name: ResourceName) -> StreamView:
+    """One stream, with its state and its processes."""
+    return _view(await streams_of(request).get(name))
+
+
+@router.post("/streams/{name}/start")
+@requires("operator")
+async def start_stream(request: Request, caller: CallerOf, name: ResourceName) -> StreamView:
+    """Start a stream; one that runs goes on."""
+    found = streams_of(request)
+    async with recorded(request, caller, "stream.start", name):
+        return _view(await found.start(name))
+
+
+@router.post("/streams/{name}/stop")
+@requires("operator")
+async def stop_stream(request: Request, caller: CallerOf, name: ResourceName) -> StreamView:
+    """Stop a stream, its raw picture too."""
+    found = streams_of(request)
+    async with recorded(request, caller, "stream.stop", name):
+        return _view(await found.stop(name))
+
+
+@router.patch("/streams/{name}/options")
+@requires("operator")
+async def set_stream_options(
+    request: Request, caller: CallerOf, name: ResourceName, wanted: StreamOptions
+) -> StreamView:
+    """Change options; those that are not named stay."""
+    found = streams_of(request)
+    async with recorded(request, caller, "stream.options", name, {"options": len(wanted.options)}):
+        return _view(await found.set_options(name, wanted.options))
+
+
+@router.delete("/streams/{name}", status_code=204)
+@requires("admin")
+async def delete_stream(request: Request, caller: CallerOf, name: ResourceName) -> None:
+    """Stop a stream and forget it."""
+    found = streams_of(request)
+    async with recorded(request, caller, "stream.delete", name):
+        await found.delete(name)
+
+
+def _view(state: StreamState) -> StreamView:
+    return StreamView.model_validate(state)

@@ -1,0 +1,67 @@
+"""Uploading a model: the file is the body, its digest a header. It is checked in a process of its own after the answer."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+from fastapi import Header, Response
+from starlette.requests import Request
+
+from services.control.auth.guard import CallerOf, new_router, requires
+from services.control.digests import stated_sha256
+from services.control.incoming import incoming_file
+from services.control.parts import Models
+from services.control.recorded import recorded
+from services.control.routes.models import VersionView, registry_of
+from services.control.state import control_of
+from services.settings import ResourceName
+
+log = logging.getLogger(__name__)
+router = new_router("models")
+OCTETS = "application/octet-stream"
+BODY = {
+    "requestBody": {
+        "required": True,
+        "description": "A model packed by `intrasplat pack`, not longer than limits.model_bytes.",
+        "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+
+@router.put("/models/{name}/versions", status_code=201, openapi_extra=BODY)
+@requires("operator", takes=OCTETS, most="model_bytes")
+async def upload_model(
+    request: Request,
+    response: Response,
+    caller: CallerOf,
+    name: ResourceName,
+    content_digest: str | None = Header(
+        None, max_length=1000, description="`sha-256=:BASE64:` of the file (RFC 9530).",
+        examples=["sha-256=:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=:"],
+    ),
+) -> VersionView:  # fmt: skip
+    """Upload a model's next version. It is `uploaded` at first; a check makes it `ready`, or `rejected` with a reason."""
+    control = control_of(request)
+    registry = registry_of(request)
+    expected = stated_sha256(content_digest)
+    async with recorded(request, caller, "model.upload", name, {"sha256": expected.hex()}) as said:
+        async with incoming_file(request, control, expected) as file:
+            record = await asyncio.to_thread(registry.upload, name, file.path, file.sha256, str(caller))
+        said["version"] = record.version
+        said["size_bytes"] = file.size_bytes
+    checking = asyncio.create_task(_check(registry, name, record.version))
+    control.tasks.add(checking)
+    checking.add_done_callback(control.tasks.discard)
+    response.headers["Location"] = f"/v1/models/{name}/versions/{record.version}"
+    return VersionView.model_validate(record)
+
+
+async def _check(registry: Models, name: str, version: int) -> None:
+    """What a check finds is the version's state. One that fails by a bug leaves it as it was, which the next start takes up again."""
+    try:
+        record = await asyncio.to_thread(registry.check, name, version)
+    except Exception:
+        log.exception("the check of %s/%d failed", name, version)
+    else:
+        log.info("%s/%d was checked: %s", name, version, record.state)

@@ -1,0 +1,36 @@
+"""Which version this is."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version as version_of
+
+from pydantic import BaseModel, Field
+from starlette.requests import Request
+
+from services.control.auth.guard import new_router, requires
+from services.control.state import control_of
+from services.version import product_version
+
+router = new_router("service")
+
+
+class Version(BaseModel):
+    """Versions, and which parts this server has."""
+
+    version: str = Field(examples=["0.1.0"])
+    api: str = "v1"
+    python: str
+    fastapi: str
+    parts: list[str] = Field(examples=[["models", "streams"]])
+
+
+@router.get("/version")
+@requires("viewer")
+async def version(request: Request) -> Version:
+    """Version of the server and of what it stands on."""
+    parts = control_of(request).parts
+    here = [name for name in ("streams", "models", "display", "jobs", "recordings") if getattr(parts, name) is not None]
+    return Version(
+        version=product_version(), python=platform.python_version(), fastapi=version_of("fastapi"), parts=here
+    )

@@ -1,0 +1,161 @@
+"""The process around the application: uvicorn on a socket of ours, with a bound on slow heads, and an end that drains."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import signal
+import socket
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
+
+import h11
+import uvicorn
+from fastapi import FastAPI
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from gsplat_core.errors import UserError
+from services.control.state import ControlState
+from services.settings import ServiceSettings
+
+MOST_HEAD_BYTES = 32 * 1024
+MOST_MESSAGE_BYTES = 4096
+"""Of what a viewer sends by WebSocket: nothing that anybody reads."""
+
+
+class CannotServe(UserError):
+    """The server cannot listen where, or as, the settings say."""
+
+
+def serve(app: FastAPI, settings: ServiceSettings, listener: socket.socket, listening: Callable[[str], None]) -> None:
+    """Serve until SIGTERM or SIGINT, then drain. `listening` is called with the server's address once it can be connected to.
+
+    Raises CannotServe for a certificate that cannot be read, and where the application does not start.
+    """
+    config = uvicorn.Config(
+        app,
+        http=with_head_timeout(settings.limits.head_s),
+        ws="websockets-sansio",
+        ws_max_size=MOST_MESSAGE_BYTES,
+        ws_per_message_deflate=False,  # the pictures are compressed
+        log_config=None,
+        access_log=False,
+        proxy_headers=False,  # the application has its own list of proxies
+        server_header=False,
+        limit_concurrency=settings.limits.connections,
+        timeout_graceful_shutdown=max(1, round(settings.server.drain_s)),
+        h11_max_incomplete_event_size=MOST_HEAD_BYTES,
+        ssl_certfile=settings.server.certfile,
+        ssl_keyfile=settings.server.keyfile,
+    )
+    try:
+        config.load()
+    except OSError as error:  # ssl.SSLError is one
+        raise CannotServe(f"TLS: {error}; check server.certfile and server.keyfile") from error
+    # uvicorn raises the signal that ended it again, for whoever handled it before: a server that has drained has done what it was asked to.
+    signal.signal(signal.SIGTERM, _done)
+    signal.signal(signal.SIGINT, _done)
+    with listener:
+        server = DrainingServer(config, app.state.control, lambda: listening(_address(listener, settings)))
+        server.run(sockets=[listener])
+    if not server.started:
+        raise CannotServe("the server could not start; its log says why")
+
+
+class DrainingServer(uvicorn.Server):
+    """A server that tells the application at once that it is to end, so that displays without an end do so."""
+
+    def __init__(self, config: uvicorn.Config, control: ControlState, listening: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._control = control
+        self._listening = listening
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to take requests."""
+        self._loop = asyncio.get_running_loop()
+        await super().startup(sockets)
+        if self.started:
+            self._listening()
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """The first signal drains; a second SIGINT ends at once."""
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._control.draining.set)
+        super().handle_exit(sig, frame)
+
+
+def with_head_timeout(head_s: float) -> type[H11Protocol]:
+    """uvicorn's protocol, which closes a connection whose request has no whole head within `head_s`: uvicorn itself would wait for ever."""
+
+    class HeadTimeout(H11Protocol):
+        _timer: asyncio.TimerHandle | None = None
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self._watch()
+
+        def data_received(self, data: bytes) -> None:
+            super().data_received(data)
+            self._watch()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            self._stop_watching()
+            super().connection_lost(exc)
+
+        def _watch(self) -> None:
+            if self.conn.their_state is not h11.IDLE:
+                self._stop_watching()
+            elif self._timer is None:
+                self._timer = self.loop.call_later(head_s, self._close)
+
+        def _stop_watching(self) -> None:
+            if self._timer is not None:
+                self._timer.cancel()
+                self._timer = None
+
+        def _close(self) -> None:
+            if self.conn.their_state is h11.IDLE and not self.transport.is_closing():
+                self.transport.close()
+
+    return HeadTimeout
+
+
+def bind(settings: ServiceSettings) -> socket.socket:
+    """A socket that listens where the settings say. Raises CannotServe for a port that is taken, and for a network without TLS."""
+    server = settings.server
+    _refuse_plaintext(settings)
+    family = socket.AF_INET6 if ":" in server.host else socket.AF_INET
+    try:
+        return socket.create_server((server.host, server.port), family=family, backlog=256)
+    except OSError as error:
+        raise CannotServe(
+            f"cannot listen on {server.host} port {server.port}: {error.strerror}; give another server.host or server.port"
+        ) from error
+
+
+def _refuse_plaintext(settings: ServiceSettings) -> None:
+    server = settings.server
+    if server.certfile is None and not server.plaintext and not _is_loopback(server.host):
+        raise CannotServe(
+            f"server.host is {server.host}, which others reach, without TLS: keys would travel in the clear; give server.certfile and"
+            " server.keyfile, or server.plaintext: true where something before this server does TLS"
+        )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _address(listener: socket.socket, settings: ServiceSettings) -> str:
+    host, port = listener.getsockname()[:2]
+    scheme = "http" if settings.server.certfile is None else "https"
+    return f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
+
+
+def _done(number: int, frame: FrameType | None) -> None:
+    """The signal was seen to."""

@@ -1,0 +1,90 @@
+"""Which sources a caller may name. A stream makes this machine open what an address says, so only what the settings list is let through."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from services.control.problems import Unprocessable
+from services.settings import SourceRules
+
+OF_NETWORKS = frozenset(
+    {"rtsp", "rtsps", "rtp", "udp", "tcp", "srt", "rtmp", "rtmps", "http", "https", "zmq+tcp"}
+)  # fmt: skip
+OF_FOLDERS = frozenset({"recording", "realtime", "folder", "pipe", "zmq+ipc"})
+OF_DEVICES = frozenset({"v4l2"})
+OF_NOTHING = frozenset({"synthetic"})
+_ADDRESS = re.compile(r"(?P<scheme>[a-z][a-z0-9+.-]+):(?P<slashes>/{0,2})(?P<rest>.*)")
+_PRINTABLE = re.compile(r"[\x21-\x7e]+")
+_HOST = re.compile(r"([A-Za-z0-9.-]+|\[[0-9A-Fa-f:.]+\])(:\d{1,5})?")
+MOST_LENGTH = 1000
+_STEREO = "stereo:"
+
+
+def check_source(address: str, rules: SourceRules) -> None:
+    """Raise Unprocessable for an address that the rules do not allow. No name is resolved: one that is not listed is refused."""
+    if len(address) > MOST_LENGTH or not _PRINTABLE.fullmatch(address) or "\\" in address:
+        raise Unprocessable(
+            "the source's address has spaces, backslashes or letters beyond ASCII, or is too long; encode them as %20"
+        )
+    eyes = address.removeprefix(_STEREO).split("|") if address.startswith(_STEREO) else [address]
+    for eye in eyes:
+        _check_one(eye, rules)
+
+
+def _check_one(address: str, rules: SourceRules) -> None:
+    match = _ADDRESS.fullmatch(address)
+    if match is None:
+        raise Unprocessable("the source has no scheme; give an address such as rtsp://10.0.0.5/stream or synthetic:")
+    scheme = match["scheme"]
+    if scheme not in rules.schemes:
+        raise Unprocessable(
+            f"sources with the scheme {scheme} are not allowed here; the settings allow {', '.join(rules.schemes)}"
+        )
+    if scheme in OF_NETWORKS:
+        _check_host(address, rules)
+    elif scheme in OF_FOLDERS:
+        _check_path(match, rules.folders, "sources.folders")
+    elif scheme in OF_DEVICES:
+        _check_path(match, rules.devices, "sources.devices")
+    elif scheme not in OF_NOTHING:
+        raise Unprocessable(
+            f"it is not known what a source with the scheme {scheme} opens; name it in the settings' streams"
+        )
+
+
+def _check_host(address: str, rules: SourceRules) -> None:
+    try:
+        parts = urlsplit(address)
+        host, _ = parts.hostname, parts.port
+    except ValueError as error:
+        raise Unprocessable(f"the source's address cannot be read: {error}") from error
+    # What another reader could take for the host must be what was looked at here: user info ends at the last @ for some, at the first for others.
+    authority = parts.netloc.rpartition("@")
+    if host is None or parts.netloc.count("@") > 1 or not _HOST.fullmatch(authority[2]):
+        raise Unprocessable("the source's address has no plain host in it; write scheme://host:port/path")
+    if host in rules.hosts:
+        return
+    try:
+        ip = ipaddress.ip_address(host)
+    except ValueError:
+        raise Unprocessable(
+            f"the host {host:.80} is not in sources.hosts of the settings; add it, or give an address of sources.networks"
+        ) from None
+    ip = getattr(ip, "ipv4_mapped", None) or ip
+    if not any(ip in network for network in map(ipaddress.ip_network, rules.networks) if network.version == ip.version):
+        raise Unprocessable(f"{ip} is in none of sources.networks of the settings; add its network there")
+
+
+def _check_path(match: re.Match[str], allowed: tuple[Path, ...], setting: str) -> None:
+    # One slash begins an absolute path, as the sources read it. Some take `?` for the beginning of options, some for a letter: both must fit.
+    whole = ("/" if match["slashes"] == "/" else "") + match["rest"]
+    for path in (whole, whole.partition("?")[0]):
+        real = Path(path).resolve()
+        inside = any(real.is_relative_to(folder.resolve()) for folder in allowed)
+        if not path.startswith("/") or ".." in path or "%" in path or not inside:
+            raise Unprocessable(
+                f"the source's path is in none of {setting} of the settings; give an absolute path in one of them"
+            )

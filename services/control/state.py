@@ -1,0 +1,57 @@
+"""What the routes of one application share."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from starlette.requests import HTTPConnection
+
+from services.audit import AuditLog
+from services.control.auth.keys import KeyStore
+from services.control.auth.tickets import Tickets
+from services.control.limits import TokenBuckets
+from services.control.measures import Measures
+from services.control.parts import Parts
+from services.control.problems import NotBuiltIn
+from services.control.viewer_count import ViewerCount
+from services.settings import ServiceSettings
+
+Part = TypeVar("Part")
+
+
+@dataclass(frozen=True)
+class ControlState:
+    """One application's parts, stores and limits; `control_of` finds it."""
+
+    settings: ServiceSettings
+    parts: Parts
+    keys: KeyStore
+    tickets: Tickets
+    audit: AuditLog
+    measures: Measures
+    key_rate: TokenBuckets
+    uploads_dir: Path
+    uploads: asyncio.Semaphore
+    viewers: ViewerCount
+    draining: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set when the server is asked to end: what has no end of its own then ends."""
+    tasks: set[asyncio.Task[None]] = field(default_factory=set)
+    """What goes on after its request was answered."""
+
+
+def control_of(connection: HTTPConnection) -> ControlState:
+    """The state of the application that serves a connection."""
+    state: ControlState = connection.app.state.control
+    return state
+
+
+def part(connection: HTTPConnection, choose: Callable[[Parts], Part | None], name: str) -> Part:
+    """A part of this server; raises NotBuiltIn where it is absent."""
+    found = choose(control_of(connection).parts)
+    if found is None:
+        raise NotBuiltIn(f"this server was started without {name}")
+    return found

@@ -1,0 +1,80 @@
+"""Viewers of a stream: a bounded number, each with a subscription that ends when the viewer, the stream or the server does."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from contextlib import asynccontextmanager
+from typing import Any
+
+import anyio
+from starlette.requests import HTTPConnection
+from starlette.websockets import WebSocketDisconnect
+
+from services.control.parts import EncodedPicture, PictureKind
+from services.control.problems import Missing, Unavailable
+from services.control.state import control_of, part
+
+log = logging.getLogger(__name__)
+
+
+class ViewerStalled(Exception):
+    """A viewer takes no pictures any more."""
+
+
+@asynccontextmanager
+async def viewing(
+    connection: HTTPConnection, transport: str, stream: str, kind: PictureKind, quality: int
+) -> AsyncIterator[AsyncIterator[EncodedPicture]]:
+    """The pictures for one viewer. Raises Unavailable when there are as many viewers as may be, Missing for a stream that is not there."""
+    control = control_of(connection)
+    display = part(connection, lambda parts: parts.display, "a display")
+    streams = part(connection, lambda parts: parts.streams, "streams")
+    if all(each.name != stream for each in await streams.all()):
+        raise Missing("there is no stream with this name; GET /v1/streams lists them")
+    gauge = control.measures.viewers.labels(transport)
+    if control.viewers.full:
+        raise Unavailable(f"{control.settings.limits.viewers} displays are open, which is as many as may be; close one")
+    with control.viewers.one_more(), gauge.track_inprogress():
+        pictures = display.subscribe(stream, kind, quality)
+        try:
+            yield pictures
+        finally:
+            close: Any = getattr(pictures, "aclose", None)
+            if close is not None:
+                with anyio.CancelScope(shield=True):
+                    await close()
+
+
+def in_time(send: Callable[[Any], Awaitable[None]], connection: HTTPConnection) -> Callable[[Any], Awaitable[None]]:
+    """`send`, which raises ViewerStalled when the viewer takes nothing for too long."""
+    control = control_of(connection)
+    stall_s = control.settings.limits.viewer_stall_s
+
+    async def send_in_time(message: Any) -> None:
+        with anyio.move_on_after(stall_s) as waiting:
+            await send(message)
+        if waiting.cancelled_caught:
+            control.measures.viewers_dropped.labels("stalled").inc()
+            raise ViewerStalled(f"a viewer took nothing for {stall_s:g} s")
+
+    return send_in_time
+
+
+@asynccontextmanager
+async def until_ended(connection: HTTPConnection, left: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+    """A block that is left when the server drains, when `left` returns, and when the viewer stalls or its connection breaks."""
+    draining = control_of(connection).draining
+    async with anyio.create_task_group() as group:
+
+        async def end_after(over: Coroutine[Any, Any, Any]) -> None:
+            await over
+            group.cancel_scope.cancel()
+
+        group.start_soon(end_after, draining.wait())
+        group.start_soon(end_after, left)
+        try:
+            yield
+        except (ViewerStalled, WebSocketDisconnect, OSError) as error:
+            log.info("a viewer was dropped: %s", error or type(error).__name__)
+        group.cancel_scope.cancel()

@@ -1,0 +1,16 @@
+"""The settings of the service: what they are, and how they are read from a file, the environment and the command line."""
+
+from services.settings.errors import SettingsInvalid
+from services.settings.load import ENVIRONMENT_PREFIX, load_settings
+from services.settings.sections import ResourceName, SourceRules, StreamSettings
+from services.settings.service import ServiceSettings
+
+__all__ = [
+    "ENVIRONMENT_PREFIX",
+    "ResourceName",
+    "ServiceSettings",
+    "SettingsInvalid",
+    "SourceRules",
+    "StreamSettings",
+    "load_settings",
+]

@@ -1,0 +1,14 @@
+"""Addresses of sources as they may be shown."""
+
+from __future__ import annotations
+
+import re
+
+_CREDENTIALS = re.compile(r"(?<=://)[^/?#|]*@")
+_SECRET_OPTION = re.compile(r"(?i)(?<=[?&#])([^=&#|]*(?:pass|secret|token|key|auth|sig)[^=&#|]*)=[^&#|]*")
+MASK = "**********"
+
+
+def masked_address(address: str) -> str:
+    """The address without the user, password and tokens in it."""
+    return _SECRET_OPTION.sub(rf"\1={MASK}", _CREDENTIALS.sub(f"{MASK}@", address))

@@ -1,0 +1,127 @@
+"""Settings from a YAML file, the environment and flags. What cannot be used is refused by its place, with the nearest key that there is."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+from pydantic import BaseModel, ValidationError
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    InitSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsError,
+)
+
+from services.settings.errors import SettingsInvalid
+from services.settings.service import ServiceSettings
+from services.settings.yaml_file import YamlFile
+
+ENVIRONMENT_PREFIX = "INTRASPLAT_"
+Location = tuple[int | str, ...]
+
+
+def load_settings(file: Path | None = None, flags: Mapping[str, str] | None = None) -> ServiceSettings:
+    """Defaults, overridden by `file`, by variables like INTRASPLAT_SERVER__PORT, and by flags like {"server.port": "8080"}.
+
+    Raises SettingsInvalid: a key that is not known, a value out of its range, a file that cannot be read.
+    """
+    document = YamlFile.read(file) if file is not None else YamlFile({}, {}, "")
+    given = _nested(flags or {})
+    _refuse_unknown_variables()
+
+    class Settings(ServiceSettings):
+        @classmethod
+        def settings_customise_sources(
+            cls, settings_cls: type[BaseSettings], *_: Any, **__: Any
+        ) -> tuple[PydanticBaseSettingsSource, ...]:
+            return (
+                InitSettingsSource(settings_cls, given),
+                EnvSettingsSource(settings_cls),
+                InitSettingsSource(settings_cls, document.values),
+            )
+
+    try:
+        return ServiceSettings.model_construct(**dict(Settings()))
+    except SettingsError as error:
+        raise SettingsInvalid(f"the environment: {error}; give lists and tables as JSON") from error
+    except ValidationError as error:
+        said = [_sentence(one["loc"], one, document, flags or {}) for one in error.errors(include_input=False)]
+        raise SettingsInvalid("\n".join(said)) from None
+
+
+def _nested(flags: Mapping[str, str]) -> dict[str, Any]:
+    """`{"server.port": "1"}` as `{"server": {"port": "1"}}`; values are read as YAML, as in the file."""
+    values: dict[str, Any] = {}
+    for name, text in flags.items():
+        *sections, key = name.split(".")
+        place = values
+        for section in sections:
+            place = place.setdefault(section, {})
+            if not isinstance(place, dict):
+                raise SettingsInvalid(f"--set {name}: {section} is given as a value, too; give one of them")
+        try:
+            place[key] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise SettingsInvalid(f"--set {name}={text!r:.80} is not YAML; quote it") from error
+    return values
+
+
+def _refuse_unknown_variables() -> None:
+    """pydantic-settings passes over variables of sections that it does not know; a misspelt one must not be lost."""
+    for variable in sorted(os.environ):
+        section = variable.removeprefix(ENVIRONMENT_PREFIX).partition("__")
+        if variable.startswith(ENVIRONMENT_PREFIX) and section[1] and section[0].lower() not in _keys(()):
+            raise SettingsInvalid(f"{variable}: {_unknown((section[0].lower(),))}")
+
+
+def _sentence(location: Location, error: Any, document: YamlFile, flags: Mapping[str, str]) -> str:
+    what = _unknown(location) if error["type"] == "extra_forbidden" else f"{_dotted(location)}: {error['msg']}"
+    return f"{_place(location, document, flags)}{what}"
+
+
+def _place(location: Location, document: YamlFile, flags: Mapping[str, str]) -> str:
+    """Where a value came from, the winning one first."""
+    dotted = _dotted(location)
+    for name in flags:
+        if dotted == name or dotted.startswith(f"{name}.") or name.startswith(f"{dotted}."):
+            return f"--set {name}: "
+    for length in range(len(location), 1, -1):
+        variable = ENVIRONMENT_PREFIX + "__".join(str(part) for part in location[:length]).upper()
+        if variable in {name.upper() for name in os.environ}:
+            return f"{variable}: "
+    line = document.line_of(location)
+    return "" if line is None else f"{document.name}, line {line}: "
+
+
+def _unknown(location: Location) -> str:
+    keys = _keys(location[:-1])
+    wrong = str(location[-1])
+    near = difflib.get_close_matches(wrong, keys, n=1, cutoff=0.0)
+    inside = f" in {_dotted(location[:-1])}" if len(location) > 1 else ""
+    return (
+        f"there is no key {wrong!r:.60}{inside}; the nearest is {near[0]!r}"
+        if near
+        else f"there is no key {wrong!r:.60}{inside}"
+    )
+
+
+def _keys(location: Location) -> list[str]:
+    """The keys of the section at a location."""
+    kind: Any = ServiceSettings
+    for part in location:
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            field = kind.model_fields.get(str(part))
+            kind = None if field is None else field.annotation
+        else:
+            kind = (get_args(kind) or (None,))[-1]
+    return sorted(kind.model_fields) if isinstance(kind, type) and issubclass(kind, BaseModel) else []
+
+
+def _dotted(location: Location) -> str:
+    return ".".join(str(part) for part in location)

@@ -1,0 +1,145 @@
+"""The sections of the settings, one class each. Times in seconds, sizes in bytes."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, SecretStr, model_validator
+
+NAME_PATTERN = r"^[a-z0-9][a-z0-9-]{0,39}$"
+ResourceName = Annotated[str, Field(pattern=NAME_PATTERN, examples=["theatre-1"])]
+"""What streams, models and keys are called: short, and safe in an address, a file name and a metric's label."""
+MIB = 2**20
+
+
+def _network(text: str) -> str:
+    try:
+        return str(ipaddress.ip_network(text))
+    except ValueError as error:
+        raise ValueError(f"{text!r} is no network or address, such as 10.0.0.0/8 or 192.168.1.5") from error
+
+
+Network = Annotated[str, AfterValidator(_network), Field(examples=["10.0.0.0/8"])]
+
+
+class Section(BaseModel):
+    """Values that do not change, without keys that are not known, and with errors that do not repeat a secret."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
+
+
+class ServerSettings(Section):
+    """Where the API listens, and who stands before it."""
+
+    host: str = Field(default="127.0.0.1", description="Address to listen on.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes any that is free.")
+    certfile: Path | None = Field(default=None, description="TLS certificate chain (PEM).")
+    keyfile: Path | None = Field(default=None, description="TLS private key (PEM).")
+    plaintext: bool = Field(
+        default=False, description="Listen beyond this machine without TLS: keys then travel in the clear."
+    )
+    trusted_proxies: tuple[Network, ...] = Field(
+        default=(), description="Whose X-Forwarded-For and X-Forwarded-Proto are believed; nobody's by default."
+    )
+    drain_s: float = Field(default=10.0, ge=0, le=600, description="How long requests may take to end after SIGTERM.")
+
+    @model_validator(mode="after")
+    def _whole_pair(self) -> ServerSettings:
+        if (self.certfile is None) != (self.keyfile is None):
+            raise ValueError("certfile and keyfile belong together; give both or neither")
+        return self
+
+
+class PathSettings(Section):
+    """Folders of the service; made where they are missing, for their owner alone."""
+
+    data: Path | None = Field(default=None, description="What is kept. Default: $XDG_DATA_HOME/intrasplat.")
+    runtime: Path | None = Field(
+        default=None, description="Sockets of running processes. Default: $XDG_RUNTIME_DIR/intrasplat."
+    )
+
+
+class AuthSettings(Section):
+    """API keys and tickets."""
+
+    admin_key_file: Path | None = Field(
+        default=None,
+        description="Holds the first administrator's key: read if it is there, else made at the first start. Default: admin.key in paths.data.",
+    )
+    ticket_s: float = Field(default=30.0, gt=0, le=300, description="How long a ticket may wait for its one use.")
+
+
+class LimitSettings(Section):
+    """What one caller may take."""
+
+    body_bytes: int = Field(default=MIB, ge=1024, description="Longest body of a request that is not an upload.")
+    model_bytes: int = Field(default=2048 * MIB, ge=MIB, description="Longest uploaded model.")
+    uploads: int = Field(default=2, ge=1, le=64, description="Uploads at one time.")
+    stall_s: float = Field(default=10.0, gt=0, description="Longest wait for the next part of a body.")
+    slowest_bytes_per_s: int = Field(
+        default=4096, ge=0, description="A body that comes slower than this, after the first seconds, is refused."
+    )
+    head_s: float = Field(default=10.0, gt=0, description="Longest wait for the head of a request.")
+    requests_per_s: float = Field(default=100.0, gt=0, description="Requests of one key, on average.")
+    address_requests_per_s: float = Field(default=300.0, gt=0, description="Requests of one address, on average.")
+    burst_s: float = Field(
+        default=2.0, ge=0.1, le=60, description="How many seconds' worth of requests may come at once."
+    )
+    connections: int = Field(default=512, ge=8, description="Open connections; more are refused.")
+    viewers: int = Field(default=100, ge=1, description="Open displays.")
+    viewer_stall_s: float = Field(
+        default=15.0, gt=0, description="A viewer that takes no picture for so long is dropped."
+    )
+
+
+class SourceRules(Section):
+    """Which sources a caller of the API may name: a stream makes this machine open what its address says."""
+
+    schemes: tuple[str, ...] = Field(
+        default=("synthetic", "rtsp", "rtsps", "v4l2"), description="Schemes of addresses that may be used."
+    )
+    networks: tuple[Network, ...] = Field(default=(), description="Networks whose addresses may be connected to.")
+    hosts: tuple[str, ...] = Field(
+        default=(), description="Names of hosts that may be connected to, whatever they resolve to."
+    )
+    folders: tuple[Path, ...] = Field(default=(), description="Folders whose recordings may be read.")
+    devices: tuple[Path, ...] = Field(default=(), description="Video devices that may be opened, such as /dev/video0.")
+
+
+class RegistrySettings(Section):
+    """Where models are kept."""
+
+    database: SecretStr | None = Field(
+        default=None, description="SQLAlchemy URL. Default: an SQLite file in paths.data."
+    )
+    blobs: str | None = Field(
+        default=None, description="fsspec URL of the models' files. Default: a folder in paths.data."
+    )
+    blob_options: dict[str, SecretStr] = Field(
+        default={}, description="Options of that file system, credentials among them."
+    )
+
+
+class LogSettings(Section):
+    """What is written to standard error."""
+
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    format: Literal["json", "text"] = "json"
+
+
+class StreamSettings(Section):
+    """A stream that is there from the start."""
+
+    source: str = Field(
+        max_length=1000, description="Address of the source (docs/sources.md).", examples=["synthetic:?moving=1"]
+    )
+    show: str = Field(
+        default="live",
+        pattern=r"^(live|model [a-z0-9][a-z0-9-]{0,39})$",
+        description="`live`, or `model NAME` of the registry.",
+    )
+    device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="auto, cpu, cuda or cuda:1.")
+    start: bool = Field(default=True, description="Start it with the service.")
+    options: dict[str, Any] = Field(default={}, description="Options of the source and of the reconstruction.")

@@ -1,0 +1,76 @@
+"""All settings of the service."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from services.settings.addresses import masked_address
+from services.settings.sections import (
+    AuthSettings,
+    LimitSettings,
+    LogSettings,
+    PathSettings,
+    RegistrySettings,
+    ResourceName,
+    ServerSettings,
+    SourceRules,
+    StreamSettings,
+)
+
+
+class ServiceSettings(BaseSettings):
+    """Settings of `intrasplat serve`: defaults, then the file, then the environment, then flags, the later ones winning."""
+
+    model_config = SettingsConfigDict(
+        env_prefix="INTRASPLAT_", env_nested_delimiter="__", extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+    version: Literal[1] = Field(default=1, description="Version of this format.")
+    server: ServerSettings = ServerSettings()
+    paths: PathSettings = PathSettings()
+    auth: AuthSettings = AuthSettings()
+    limits: LimitSettings = LimitSettings()
+    sources: SourceRules = SourceRules()
+    registry: RegistrySettings = RegistrySettings()
+    log: LogSettings = LogSettings()
+    streams: dict[ResourceName, StreamSettings] = Field(
+        default={"endoscope": StreamSettings(source="synthetic:?moving=1")},
+        description="Streams that are there from the start.",
+    )
+
+    @cached_property
+    def data_dir(self) -> Path:
+        """Where everything that is kept lies."""
+        return self.paths.data or _base("XDG_DATA_HOME", Path.home() / ".local" / "share") / "intrasplat"
+
+    @cached_property
+    def runtime_dir(self) -> Path:
+        """Where the sockets of running processes lie: a short path."""
+        if self.paths.runtime is not None:
+            return self.paths.runtime
+        if os.environ.get("XDG_RUNTIME_DIR"):
+            return Path(os.environ["XDG_RUNTIME_DIR"]) / "intrasplat"
+        return Path(tempfile.gettempdir()) / f"intrasplat-{os.getuid()}"
+
+    @property
+    def admin_key_file(self) -> Path:
+        """Where the first administrator's key is found, or put."""
+        return self.auth.admin_key_file or self.data_dir / "admin.key"
+
+    def shown(self) -> dict[str, Any]:
+        """The settings as JSON, secrets and the passwords in addresses of sources masked."""
+        values = self.model_dump(mode="json")
+        for stream in values["streams"].values():
+            stream["source"] = masked_address(stream["source"])
+        return values
+
+
+def _base(variable: str, default: Path) -> Path:
+    return Path(os.environ[variable]) if os.environ.get(variable) else default

@@ -1,0 +1,56 @@
+"""Streams over the API."""
+
+from __future__ import annotations
+
+import pytest
+
+ENDOSCOPE = {"name": "endoscope", "source": "synthetic:?moving=1"}
+
+
+def test_the_life_of_a_stream(plane):
+    made = plane.ask("POST", "/v1/streams", "operator", json=ENDOSCOPE)
+    assert (made.status_code, made.json()["state"]) == (201, "live")
+    assert plane.ask("POST", "/v1/streams", "operator", json=ENDOSCOPE).status_code == 409
+    assert [stream["name"] for stream in plane.ask("GET", "/v1/streams", "viewer").json()] == ["endoscope"]
+    assert plane.ask("POST", "/v1/streams/endoscope/stop", "operator").json()["state"] == "stopped"
+    assert plane.ask("POST", "/v1/streams/endoscope/start", "operator").json()["state"] == "live"
+    changed = plane.ask("PATCH", "/v1/streams/endoscope/options", "operator", json={"options": {"tool_mask": "none"}})
+    assert changed.json()["options"] == {"tool_mask": "none"}
+    refused = plane.ask("PATCH", "/v1/streams/endoscope/options", "operator", json={"options": {"unknown": 1}})
+    assert refused.status_code == 422 and "nearest" in refused.json()["detail"]
+    assert plane.ask("DELETE", "/v1/streams/endoscope", "operator").status_code == 403
+    assert plane.ask("DELETE", "/v1/streams/endoscope").status_code == 204
+    assert plane.ask("GET", "/v1/streams/endoscope").status_code == 404
+    assert [event[0] for event in plane.events()][-7:] == [
+        "stream.create", "stream.create", "stream.stop", "stream.start", "stream.options", "stream.options", "stream.delete",
+    ]  # fmt: skip
+
+
+def test_passwords_of_sources_are_shown_to_nobody(new_plane):
+    address = "rtsp://user:pa55@10.0.0.5/stream?token=s3cret&fps=30"
+    plane = new_plane(
+        sources={"networks": ["10.0.0.0/8"]},
+        streams={"camera": {"source": address}},
+        registry={"database": "postgresql://u:dbpass@db/x", "blob_options": {"secret": "s3key"}},
+    )
+    made = plane.ask("POST", "/v1/streams", json={"name": "camera", "source": address})
+    assert made.status_code == 201
+    assert plane.parts.streams.kept["camera"].source == address
+    for answer in (made, plane.ask("GET", "/v1/streams/camera"), plane.ask("GET", "/v1/config")):
+        assert not any(secret in answer.text for secret in ("pa55", "s3cret", "dbpass", "s3key"))
+        assert "10.0.0.5" in answer.text
+    log = plane.control.audit.path.read_text()
+    assert not any(secret in log for secret in ("pa55", "s3cret", "10.0.0.5"))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"name": "Endoscope"}, {"name": "../x"}, {"source": None}, {"show": "model ../x"}, {"device": "tpu"}, {"more": 1},
+        {"options": {"a": [1]}}, {"options": {str(n): n for n in range(51)}}, {"start": "perhaps"},
+    ],
+)  # fmt: skip
+def test_refused_streams(plane, change):
+    answer = plane.ask("POST", "/v1/streams", json={**ENDOSCOPE, **change})
+    assert answer.status_code == 422 and answer.json()["errors"]
+    assert plane.parts.streams.kept == {}
