@@ -97,6 +97,9 @@ WITHOUT_TORCH = [
     *(f"services.supervisor.{name}" for name in ("launching", "process", "specs", "stream")),
     "services.display.hub",
     "services.registry.models",
+    *(f"services.server.{name}" for name in ("displays", "page", "parts", "streams")),
+    "services.client",
+    *(f"services.{name}" for name in ("audit", "control", "control.server", "settings")),
 ]
 """What the control plane's process loads."""
 

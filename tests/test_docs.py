@@ -73,12 +73,13 @@ def test_relative_links_resolve(document):
 
 
 def commands() -> dict[str, set[str]]:
-    """The options of each command; those of the program itself under the empty name."""
+    """The options of each command, those of a group's commands under its name; those of the program itself under the empty name."""
     group = typer.main.get_command(app)
     options = {name: {"--help"} for name in ["", *group.commands]}
     for name, command in [("", group), *group.commands.items()]:
-        for parameter in command.params:
-            options[name] |= {*parameter.opts, *parameter.secondary_opts}
+        for each in [command, *getattr(command, "commands", {}).values()] if name else [command]:
+            for parameter in each.params:
+                options[name] |= {*parameter.opts, *parameter.secondary_opts}
     return options
 
 

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from services.audit.entries import MOST_LINE_BYTES, Detail, Entry, Outcome, digest_of_entry, parse_line
-from services.audit.errors import AuditError, AuditUnwritable
+from services.audit.errors import AuditInUse, AuditUnwritable
 from services.audit.head import Head, head_path, read_head, write_head
 
 BLOCK_BYTES = 1 << 16
@@ -92,7 +92,7 @@ class AuditLog:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             os.close(descriptor)
-            raise AuditError(f"{self.path} is being written by another process; end that service first") from error
+            raise AuditInUse(f"{self.path} is being written by another process; end that service first") from error
         return descriptor
 
     def _write(self, line: bytes) -> None:

@@ -42,7 +42,10 @@ def verify(path: Path, expected_head: str | None = None) -> Verdict:
     """Check every line's digest, number and predecessor, and the end against the head beside the log, and against `expected_head`, a digest
     that was noted elsewhere: it must be some entry's. Raises OSError for a file that cannot be read."""
     findings: list[Finding] = []
-    kept = _kept_head(path, findings)  # first: the service may be writing
+    try:
+        kept = read_head(path)  # first: the service may be writing
+    except ValueError as error:
+        return Verdict(0, Head(), (Finding(0, f"the head beside the log cannot be read: {error}"),), False)
     before, digests, count, unfinished = Head(), {}, 0, False
     for number, line in enumerate(_lines(path), start=1):
         if not line.endswith(b"\n") and len(line) <= MOST_LINE_BYTES:
@@ -72,14 +75,6 @@ def _misfits(entry: Entry, stated: str, before: Head) -> Iterator[str]:
         yield f"entry {entry.seq} stands after entry {before.seq}: it was inserted, repeated or moved"
     elif entry.previous != before.digest:
         yield f"entry {entry.seq} does not follow what stands before it: one of the two was changed or inserted"
-
-
-def _kept_head(path: Path, findings: list[Finding]) -> Head | None:
-    try:
-        return read_head(path)
-    except ValueError as error:
-        findings.append(Finding(0, f"the head beside the log cannot be read: {error}"))
-        return Head()
 
 
 def _misfits_at_the_end(

@@ -52,6 +52,8 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
 
     async def on_http(connection: HTTPConnection, error: Exception) -> Response | None:
         assert isinstance(error, HTTPException)
+        if isinstance(error.__cause__, Problem):  # raised while FastAPI read the body, and wrapped by it
+            return await _answer(connection, error.__cause__)
         kind = OF_STATUS.get(error.status_code, OF_STATUS[500 if error.status_code >= 500 else 400])
         detail = PHRASES.get(error.status_code, str(error.detail))
         return await _answer(connection, kind(detail, headers=error.headers))

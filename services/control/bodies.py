@@ -16,8 +16,11 @@ GRACE_S = 5.0
 
 
 def refuse_by_length(request: Request, most_bytes: int) -> None:
-    """Raise TooLarge for a body whose header says that it is too long, before a byte of it is read."""
+    """Raise TooLarge for a body whose header says that it is too long, before a byte of it is read, and BadRequest where two headers say two
+    things: a proxy before this server may have believed the other one."""
     stated = request.headers.get("content-length")
+    if stated is not None and "transfer-encoding" in request.headers:
+        raise BadRequest("Content-Length and Transfer-Encoding were both sent; send one")
     if stated is None:
         return
     if not stated.isascii() or not stated.isdigit():

@@ -43,12 +43,17 @@ def _check_one(address: str, rules: SourceRules) -> None:
         raise Unprocessable(
             f"sources with the scheme {scheme} are not allowed here; the settings allow {', '.join(rules.schemes)}"
         )
+    place = ("/" if match["slashes"] == "/" else "") + match[
+        "rest"
+    ]  # as the sources read it: one slash begins an absolute path
     if scheme in OF_NETWORKS:
         _check_host(address, rules)
     elif scheme in OF_FOLDERS:
-        _check_path(match, rules.folders, "sources.folders")
+        # Some of them take `?` for the beginning of options, some for a letter: both must fit.
+        for path in (place, place.partition("?")[0]):
+            _check_path(path, rules.folders, "sources.folders")
     elif scheme in OF_DEVICES:
-        _check_path(match, rules.devices, "sources.devices")
+        _check_path(place.partition("?")[0], rules.devices, "sources.devices")
     elif scheme not in OF_NOTHING:
         raise Unprocessable(
             f"it is not known what a source with the scheme {scheme} opens; name it in the settings' streams"
@@ -78,13 +83,10 @@ def _check_host(address: str, rules: SourceRules) -> None:
         raise Unprocessable(f"{ip} is in none of sources.networks of the settings; add its network there")
 
 
-def _check_path(match: re.Match[str], allowed: tuple[Path, ...], setting: str) -> None:
-    # One slash begins an absolute path, as the sources read it. Some take `?` for the beginning of options, some for a letter: both must fit.
-    whole = ("/" if match["slashes"] == "/" else "") + match["rest"]
-    for path in (whole, whole.partition("?")[0]):
-        real = Path(path).resolve()
-        inside = any(real.is_relative_to(folder.resolve()) for folder in allowed)
-        if not path.startswith("/") or ".." in path or "%" in path or not inside:
-            raise Unprocessable(
-                f"the source's path is in none of {setting} of the settings; give an absolute path in one of them"
-            )
+def _check_path(path: str, allowed: tuple[Path, ...], setting: str) -> None:
+    real = Path(path).resolve()
+    inside = any(real.is_relative_to(each.resolve()) for each in allowed)
+    if not path.startswith("/") or ".." in path or "%" in path or not inside:
+        raise Unprocessable(
+            f"the source's path is in none of {setting} of the settings; give an absolute path in one of them"
+        )

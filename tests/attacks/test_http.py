@@ -1,0 +1,135 @@
+"""What a stranger may try over HTTP: headers of a proxy, forged log lines, keys in odd places, odd paths and methods."""
+
+from __future__ import annotations
+
+import json
+import logging
+
+import pytest
+from starlette.testclient import TestClient
+
+from services.control import new_app
+from services.control.logs import JsonFormatter, facts
+from services.control.problems import PROBLEM_JSON
+from services.settings import ServiceSettings
+
+
+@pytest.fixture
+def served(tmp_path):
+    def make(client=("10.0.0.9", 1234), **settings):
+        folder = tmp_path / "data"
+        app = new_app(ServiceSettings(paths={"data": folder}, **settings))
+        app.state.key = (folder / "admin.key").read_text().strip()
+        return TestClient(app, client=client, raise_server_exceptions=False)
+
+    made = []
+
+    def remembered(**options):
+        made.append(make(**options))
+        return made[-1]
+
+    yield remembered
+    for each in made:
+        each.app.state.control.audit.close()
+
+
+def asked_from(client: TestClient, headers, caplog) -> str:
+    """The address that the log has for a request."""
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "intrasplat.requests"):
+        client.get("/v1/version", headers=headers)
+    return caplog.records[-1].facts["address"]
+
+
+def test_a_stranger_cannot_say_where_it_comes_from(served, caplog):
+    client = served()
+    for headers in ({"X-Forwarded-For": "1.2.3.4"}, {"Forwarded": "for=1.2.3.4"}, {"X-Real-IP": "1.2.3.4"}):
+        assert asked_from(client, headers, caplog) == "10.0.0.9"
+    assert "strict-transport-security" not in client.get("/livez", headers={"X-Forwarded-Proto": "https"}).headers
+
+
+def test_behind_a_proxy_the_last_stranger_counts(served, caplog):
+    client = served(server={"trusted_proxies": ["10.0.0.9", "10.1.0.0/16"]})
+    for value, address in (
+        ("1.2.3.4", "1.2.3.4"),
+        ("6.6.6.6, 1.2.3.4", "1.2.3.4"),  # the client sent the first one
+        ("6.6.6.6, 1.2.3.4, 10.1.2.3", "1.2.3.4"),  # a chain of two proxies
+    ):
+        assert asked_from(client, {"X-Forwarded-For": value}, caplog) == address
+    two = [("X-Forwarded-For", "6.6.6.6"), ("X-Forwarded-For", "1.2.3.4")]
+    assert asked_from(client, two, caplog) == "1.2.3.4"
+    assert client.get("/livez", headers={"X-Forwarded-Proto": "https"}).headers["strict-transport-security"]
+
+
+def test_a_rate_is_not_escaped_by_forged_addresses(served):
+    client = served(limits={"address_requests_per_s": 1, "burst_s": 2})
+    answers = [client.get("/livez", headers={"X-Forwarded-For": f"1.2.3.{n}"}).status_code for n in range(5)]
+    assert answers[-1] == 429
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Authorization": "Bearer"}, {"Authorization": "Bearer "}, {"Authorization": "Basic KEY"}, {"Authorization": "KEY"},
+        {"X-API-Key": "KEY"}, {"Cookie": "key=KEY"}, {"Authorization": "Bearer KEY KEY"}, {"Authorization": "Bearer " + 5000 * "a"},
+        {"Authorization": "Bearer intrasplat__"}, {"Authorization": "Bearer KEYx"}, {"X-Remote-User": "admin"},
+        {"X-Original-URL": "/livez"}, {"X-HTTP-Method-Override": "GET"}, {"Authorization": "Bearer \xff"},
+    ],
+)  # fmt: skip
+def test_no_other_way_in(served, headers):
+    client = served()
+    given = {name: value.replace("KEY", client.app.state.key).encode("latin1") for name, value in headers.items()}
+    answer = client.get("/v1/version", headers=given)
+    assert (answer.status_code, answer.headers["content-type"]) == (401, PROBLEM_JSON)
+    assert client.get(f"/v1/version?ticket={client.app.state.key}&key={client.app.state.key}").status_code == 401
+
+
+def test_two_keys_are_none(served):
+    client = served()
+    right = f"Bearer {client.app.state.key}"
+    assert client.get("/v1/version", headers={"Authorization": right}).status_code == 200
+    for both in ([right, right], [right, "Bearer x"], ["Bearer x", right]):
+        assert client.get("/v1/version", headers=[("Authorization", each) for each in both]).status_code == 401
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/v1/version/", "//v1/version", "/v1//version", "/V1/version", "/v1/version%00", "/v1/%2e%2e/livez",
+        "/v1/models/..%2f..%2fetc/versions", "/v1/streams/%2e%2e", "/docs/%2e%2e%2fapp.py", "/.git/config",
+        "/v1/version;x", "/metrics/", "/readyz/x", "/v1/models/liver/versions/1e3", "/v1/models/liver/versions/-1",
+    ],
+)  # fmt: skip
+def test_odd_paths_give_a_problem_and_no_file(served, path):
+    client = served()
+    answer = client.get(path, headers={"Authorization": f"Bearer {client.app.state.key}"})
+    assert answer.status_code in (404, 422, 503), answer.text
+    assert answer.headers["content-type"] == PROBLEM_JSON
+
+
+@pytest.mark.parametrize("method", ["TRACE", "CONNECT", "OPTIONS", "PROPFIND", "X" * 1000])
+def test_odd_methods_are_405_and_no_label(served, method):
+    client = served()
+    answer = client.request(method, "/v1/version", headers={"Origin": "https://evil.example"})
+    assert answer.status_code == 405 and answer.headers["content-type"] == PROBLEM_JSON
+    assert not any(name.startswith("access-control") for name in answer.headers)
+    metrics = client.get("/metrics", headers={"Authorization": f"Bearer {client.app.state.key}"}).text
+    assert 1000 * "X" not in metrics and "PROPFIND" not in metrics
+
+
+def test_paths_are_no_labels(served):
+    client = served()
+    for number in range(20):
+        client.get(f"/v1/models/patient-{number}/versions")
+        client.get(f"/patient-{number}")
+    metrics = client.get("/metrics", headers={"Authorization": f"Bearer {client.app.state.key}"}).text
+    assert "patient" not in metrics and 'route="unmatched"' in metrics
+
+
+def test_a_line_of_the_log_cannot_be_forged():
+    message = 'x\n{"level": "info", "message": "forged"}\r\n\x1b[31m rtsp://u:pa55@h/'
+    record = logging.LogRecord("x", logging.INFO, "", 0, "%s", (message,), None)
+    record.__dict__.update(facts(address="a\nb"))
+    line = JsonFormatter().format(record)
+    assert "\n" not in line and "\x1b" not in line and "pa55" not in line
+    assert json.loads(line)["address"] == "a\nb"

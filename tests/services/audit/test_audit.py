@@ -1,0 +1,246 @@
+"""The audit log: what was done to it is found, and a crash is told apart from it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from services.audit import AuditError, AuditLog, AuditUnwritable, verify
+from services.audit.entries import Entry, digest_of_entry, parse_line
+from services.audit.head import head_path
+
+ENTRIES = 12
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    log = AuditLog(tmp_path / "audit.jsonl")
+    for number in range(ENTRIES):
+        log.append("model.activate", actor="console (1f0c)", role="operator", subject=f"liver/{number}", request_id="r")
+    log.close()
+    return log.path
+
+
+def lines(path: Path) -> list[bytes]:
+    return path.read_bytes().splitlines(keepends=True)
+
+
+def test_an_untouched_log_is_intact(path):
+    verdict = verify(path)
+    assert verdict.intact and not verdict.cut_by_a_crash and verdict.entries == ENTRIES
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert verify(path, verdict.head.digest).intact
+    assert verify(path, parse_line(lines(path)[3])[1]).intact, "an older digest that was noted"
+    assert not verify(path, 64 * "a").intact
+
+
+@pytest.mark.parametrize("line", [0, 5, ENTRIES - 1])
+@pytest.mark.parametrize("key", ["actor", "outcome", "subject", "at", "seq", "event", "role"])
+def test_a_changed_line_is_found(path, line, key):
+    all_lines = lines(path)
+    values = json.loads(all_lines[line])
+    values[key] = {"outcome": "refused", "seq": 77}.get(key, "other")
+    all_lines[line] = (json.dumps(values, sort_keys=True, separators=(",", ":")) + "\n").encode()
+    path.write_bytes(b"".join(all_lines))
+    assert any(finding.line == line + 1 for finding in verify(path).findings)
+
+
+@pytest.mark.parametrize("line", [0, 5, ENTRIES - 2])
+def test_a_changed_line_with_a_new_digest_is_found(path, line):
+    all_lines = lines(path)
+    entry, _ = parse_line(all_lines[line])
+    all_lines[line] = replace(entry, actor="somebody else").line()
+    path.write_bytes(b"".join(all_lines))
+    assert any("does not follow" in finding.what for finding in verify(path).findings)
+
+
+def test_the_last_line_with_a_new_digest_is_found_by_the_head(path):
+    all_lines = lines(path)
+    entry, _ = parse_line(all_lines[-1])
+    path.write_bytes(b"".join(all_lines[:-1]) + replace(entry, actor="somebody else").line())
+    assert "is not the one that was written" in verify(path).findings[0].what
+
+
+@pytest.mark.parametrize("line", range(ENTRIES))
+def test_a_removed_line_is_found(path, line):
+    all_lines = lines(path)
+    del all_lines[line]
+    path.write_bytes(b"".join(all_lines))
+    assert not verify(path).intact
+
+
+@pytest.mark.parametrize("count", [1, 3, ENTRIES])
+def test_lines_cut_off_the_end_are_found(path, count):
+    path.write_bytes(b"".join(lines(path)[:-count]))
+    assert f"{count} entries were cut off" in verify(path).findings[0].what
+
+
+@pytest.mark.parametrize("place", [0, 4, ENTRIES])
+@pytest.mark.parametrize("kind", ["a copy", "forged", "no entry", "an empty line"])
+def test_an_inserted_line_is_found(path, place, kind):
+    all_lines = lines(path)
+    before, _ = parse_line(all_lines[max(0, place - 1)])
+    forged = replace(before, seq=before.seq, previous=digest_of_entry(before)).line()
+    inserted = {"a copy": all_lines[3], "forged": forged, "no entry": b"{}\n", "an empty line": b"\n"}[kind]
+    path.write_bytes(b"".join([*all_lines[:place], inserted, *all_lines[place:]]))
+    assert not verify(path).intact
+
+
+def test_entries_that_something_else_added_are_found(path):
+    with path.open("ab") as file:
+        for _ in range(2):
+            entry, _ = parse_line(lines(path)[-1])
+            file.write(replace(entry, seq=entry.seq + 1, previous=digest_of_entry(entry)).line())
+            file.flush()
+    assert "added by something else" in verify(path).findings[0].what
+
+
+def test_two_lines_in_another_order_are_found(path):
+    all_lines = lines(path)
+    all_lines[4], all_lines[5] = all_lines[5], all_lines[4]
+    path.write_bytes(b"".join(all_lines))
+    assert not verify(path).intact
+
+
+def test_a_line_that_a_crash_cut_is_told_apart_and_taken_off(path):
+    whole = path.read_bytes()
+    path.write_bytes(whole + b'{"actor":"console')
+    verdict = verify(path)
+    assert verdict.intact and verdict.cut_by_a_crash and verdict.entries == ENTRIES
+    log = AuditLog(path)
+    assert log.newest(1)[0].event == "audit.recovered"
+    log.close()
+    assert verify(path).intact and path.read_bytes().startswith(whole)
+
+
+def test_a_finished_line_that_was_cut_is_no_crash(path):
+    path.write_bytes(path.read_bytes()[:-20])
+    verdict = verify(path)
+    assert not verdict.intact and not verdict.cut_by_a_crash
+
+
+def test_a_crash_between_the_line_and_its_head(path):
+    head = head_path(path).read_bytes()
+    log = AuditLog(path)
+    log.append("model.rollback", actor="console")
+    log.close()
+    head_path(path).write_bytes(head)
+    assert verify(path).intact
+    log = AuditLog(path)
+    log.append("model.rollback", actor="console")
+    log.close()
+    assert verify(path).intact and verify(path).entries == ENTRIES + 2
+
+
+def test_a_lost_head_is_found(path):
+    head_path(path).unlink()
+    assert "head beside the log is missing" in verify(path).findings[0].what
+    head_path(path).write_text("[]")
+    assert "cannot be read" in verify(path).findings[0].what
+
+
+def test_a_broken_log_is_put_aside_and_the_service_goes_on(path):
+    path.write_bytes(b"".join(lines(path)[:-2]))
+    log = AuditLog(path)
+    entry = log.newest(1)[0]
+    log.close()
+    aside = path.with_name(str(entry.detail["put_aside"]))
+    assert (entry.event, entry.seq) == ("audit.broken", 0)
+    assert len(lines(aside)) == ENTRIES - 2 and not verify(aside).intact
+    assert verify(path).intact
+
+
+def test_one_writer_at_a_time(path):
+    log = AuditLog(path)
+    with pytest.raises(AuditError, match="another process"):
+        AuditLog(path)
+    log.close()
+
+
+def test_many_threads_make_one_chain(tmp_path):
+    log = AuditLog(tmp_path / "audit.jsonl")
+    threads = [
+        threading.Thread(target=lambda: [log.append("x", actor="a", subject=str(n)) for n in range(10)]) for _ in range(8)
+    ]  # fmt: skip
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    log.close()
+    assert verify(log.path).intact and verify(log.path).entries == 80
+
+
+def test_a_full_disk_is_an_error_and_leaves_whole_lines(path, monkeypatch):
+    log = AuditLog(path)
+    whole = path.read_bytes()
+    real = os.write
+    monkeypatch.setattr(os, "write", lambda fd, data: real(fd, data[:10]))
+    with pytest.raises(AuditUnwritable, match="free space"):
+        log.append("model.delete", actor="console")
+    monkeypatch.undo()
+    assert path.read_bytes() == whole
+    log.append("model.delete", actor="console")
+    log.close()
+    assert verify(path).intact
+
+
+@pytest.mark.parametrize(
+    "values", [{"actor": "a\nb"}, {"subject": 'x"y'}, {"detail": {"a": "\x1b[0m"}}, {"subject": 500 * "a"}, {"event": "é"}]
+)  # fmt: skip
+def test_only_short_plain_texts_get_in(path, values):
+    log = AuditLog(path)
+    with pytest.raises(ValueError, match="audit"):
+        log.append(**{"event": "x", "actor": "a", **values})
+    log.close()
+    assert verify(path).entries == ENTRIES
+
+
+def test_pages_are_read_from_the_end(tmp_path):
+    log = AuditLog(tmp_path / "audit.jsonl")
+    for number in range(400):
+        log.append("x", actor="a", detail={"padding": 300 * "p", "number": number})
+    assert [entry.seq for entry in log.newest(3)] == [399, 398, 397]
+    assert [entry.seq for entry in log.newest(500, before=200)] == list(range(199, -1, -1))
+    log.close()
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from services.audit import AuditLog
+log = AuditLog(Path(sys.argv[1]))
+print("open", flush=True)
+while True:
+    print(log.append("x", actor="a").seq, flush=True)
+"""
+
+
+def test_kill_at_any_moment_loses_no_entry_that_was_confirmed(tmp_path):
+    path = tmp_path / "audit.jsonl"
+    for round_ in range(5):
+        process = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        confirmed = [process.stdout.readline() for _ in range(8 + round_)]
+        process.send_signal(signal.SIGKILL)
+        confirmed += process.stdout.read().splitlines()
+        process.wait()
+        process.stdout.close()
+        verdict = verify(path)
+        assert verdict.intact, verdict.findings
+        assert verdict.head.seq >= int(confirmed[-1])
+
+
+def test_entries_are_what_their_line_says():
+    entry = Entry(
+        0, "2026-01-01T00:00:00.000+00:00", "x", "a", "", "", "done", detail={"n": 1, "b": True, "s": "t", "z": None}
+    )
+    assert parse_line(entry.line())[0] == entry

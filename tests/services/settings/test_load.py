@@ -1,0 +1,137 @@
+"""Settings from a file, the environment and flags, and what is said of wrong ones."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+
+from services.settings import ServiceSettings, SettingsInvalid, load_settings
+from services.settings.addresses import masked_address
+
+
+@pytest.fixture(autouse=True)
+def clean_environment(monkeypatch):
+    for name in [name for name in os.environ if name.startswith("INTRASPLAT_")]:
+        monkeypatch.delenv(name)
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(text: str):
+        path = tmp_path / "service.yaml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_flags_win_over_the_environment_over_the_file_over_defaults(file, monkeypatch):
+    path = file("server: {port: 1, host: 127.0.0.2, drain_s: 3}\nlog: {level: debug}\n")
+    monkeypatch.setenv("INTRASPLAT_SERVER__PORT", "2")
+    monkeypatch.setenv("INTRASPLAT_SERVER__HOST", "127.0.0.3")
+    monkeypatch.setenv("INTRASPLAT_ISA", "avx2")  # not a setting of the service
+    settings = load_settings(path, {"server.port": "3"})
+    server = settings.server
+    assert (server.port, server.host, server.drain_s) == (3, "127.0.0.3", 3.0)
+    assert (settings.log.level, settings.limits.uploads) == ("debug", 2)
+    assert type(settings) is ServiceSettings
+    assert "endoscope" in settings.streams
+
+
+def test_without_anything_it_listens_on_loopback_and_shows_the_synthetic_endoscope():
+    settings = load_settings()
+    assert (settings.server.host, settings.server.port) == ("127.0.0.1", 8000)
+    assert settings.streams["endoscope"].source.startswith("synthetic:")
+    assert settings.sources.networks == () and settings.server.trusted_proxies == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("server:\n  prt: 5", "service.yaml, line 2: there is no key 'prt' in server; the nearest is 'port'"),
+        ("servr: {}", "service.yaml, line 1: there is no key 'servr'; the nearest is 'server'"),
+        ("\nserver:\n  port: 70000", "service.yaml, line 3: server.port: Input should be less than or equal to 65535"),
+        ("streams:\n  a:\n    sorce: x\n    source: y", "line 3: there is no key 'sorce' in streams.a; the nearest is 'source'"),
+        ("streams:\n  A b: {source: x}", "line 2: streams.A b.[key]: String should match"),
+        ("server:\n  port: 1\n  port: 2", "line 3: server.port is there twice, first in line 2"),
+        ("server: {certfile: a.pem}", "certfile and keyfile belong together"),
+        ("server: {trusted_proxies: [everybody]}", "'everybody' is no network"),
+        ("version: 2", "version: Input should be 1"),
+        ("[1, 2]", "holds a list"),
+        ("a: [", "is not YAML"),
+        ("a: !!python/object/apply:os.system [id]", "is not YAML"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_a_file(file, text, said):
+    with pytest.raises(SettingsInvalid) as refused:
+        load_settings(file(text))
+    assert said in str(refused.value)
+
+
+def test_every_mistake_is_said_at_once(file):
+    with pytest.raises(SettingsInvalid) as refused:
+        load_settings(file("server: {prt: 1}\nlimits: {uploads: 0}\n"))
+    assert len(str(refused.value).splitlines()) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("INTRASPLAT_SERVER__PRT", "1", "INTRASPLAT_SERVER__PRT: there is no key 'prt' in server; the nearest is 'port'"),
+        ("INTRASPLAT_SERVR__PORT", "1", "INTRASPLAT_SERVR__PORT: there is no key 'servr'; the nearest is 'server'"),
+        ("INTRASPLAT_SERVER__PORT", "many", "INTRASPLAT_SERVER__PORT: server.port: Input should be a valid integer"),
+        ("INTRASPLAT_SERVER__TRUSTED_PROXIES", "10.0.0.1", "give lists and tables as JSON"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_the_environment(monkeypatch, name, value, said):
+    monkeypatch.setenv(name, value)
+    with pytest.raises(SettingsInvalid) as refused:
+        load_settings()
+    assert said in str(refused.value)
+
+
+def test_what_is_wrong_in_flags(tmp_path):
+    for flags, said in (
+        ({"server.prt": "1"}, "--set server.prt: there is no key 'prt' in server"),
+        ({"server": "1", "server.port": "2"}, "--set server.port: server is given as a value, too"),
+        ({"log.level": "["}, "is not YAML"),
+    ):
+        with pytest.raises(SettingsInvalid) as refused:
+            load_settings(None, flags)
+        assert said in str(refused.value)
+    with pytest.raises(SettingsInvalid, match="No such file"):
+        load_settings(tmp_path / "none.yaml")
+
+
+def test_a_secret_is_not_repeated(file):
+    with pytest.raises(SettingsInvalid) as refused:
+        load_settings(file("registry: {database: [pa55word]}"))
+    assert "pa55word" not in str(refused.value)
+    settings = load_settings(file("registry: {database: 'postgresql://u:pa55word@db/x'}"))
+    assert "pa55word" not in json.dumps(settings.shown()) + repr(settings)
+    assert settings.registry.database is not None
+    assert settings.registry.database.get_secret_value().endswith("@db/x")
+
+
+@pytest.mark.parametrize(
+    ("address", "shown"),
+    [
+        ("rtsp://user:pass@10.0.0.5/s", "rtsp://**********@10.0.0.5/s"),
+        ("rtsp://10.0.0.5/s?user=a&password=b#transport=udp", "rtsp://10.0.0.5/s?user=a&password=**********#transport=udp"),
+        ("stereo:rtsp://a:b@h/x|rtsp://c:d@h/y", "stereo:rtsp://**********@h/x|rtsp://**********@h/y"),
+        ("synthetic:?moving=1", "synthetic:?moving=1"),
+    ],
+)  # fmt: skip
+def test_addresses_are_shown_without_credentials(address, shown):
+    assert masked_address(address) == shown
+
+
+def test_the_schema_names_every_key():
+    schema = ServiceSettings.model_json_schema()
+    assert set(schema["properties"]) == set(ServiceSettings.model_fields)
+    assert schema["$defs"]["ServerSettings"]["additionalProperties"] is False
+    for section in schema["$defs"].values():
+        for key, value in section["properties"].items():
+            assert "description" in value or section["title"] in ("LogSettings",), key
