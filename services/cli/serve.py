@@ -12,8 +12,8 @@ import typer
 from services.cli.exit_codes import OK
 from services.control.app import new_app
 from services.control.logs import log_to_stderr
-from services.control.parts import Parts
 from services.control.server import bind, serve
+from services.server.parts import assembled
 from services.settings import ServiceSettings, SettingsInvalid, load_settings
 
 
@@ -29,11 +29,6 @@ def serve_command(
     app = new_app(settings, assembled(settings))
     serve(app, settings, listener, lambda address: _say(address, settings))
     return OK
-
-
-def assembled(settings: ServiceSettings) -> Parts:
-    """The parts of this server."""
-    return Parts()
 
 
 def schema_command() -> int:
@@ -53,5 +48,5 @@ def _assigned(setting: Sequence[str]) -> dict[str, str]:
 
 
 def _say(address: str, settings: ServiceSettings) -> None:
-    lines = [f"IntraSplat is on {address}/docs", f"the administrator's key is in {settings.admin_key_file}"]
+    lines = [f"IntraSplat is on {address}/", f"the administrator's key is in {settings.admin_key_file}"]
     print("\n".join(lines), file=sys.stderr, flush=True)  # noqa: T201

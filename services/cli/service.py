@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from services.cli.ctl import ctl
 from services.cli.options import JsonOption, path_option
 
 ConfigOption = Annotated[Path | None, path_option("--config", "Settings file (YAML); without one: the defaults.")]
@@ -22,6 +23,7 @@ def add_to(app: typer.Typer) -> None:
     app.command()(schema)
     app.add_typer(keys, name="keys")
     app.add_typer(audit, name="audit")
+    app.add_typer(ctl, name="ctl")
 
 
 def serve(

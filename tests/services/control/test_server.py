@@ -35,7 +35,7 @@ def serving(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen, int
         lines = []
         for line in process.stderr:
             lines.append(line)
-            found = re.search(r"IntraSplat is on https?://\S+?:(\d+)/docs", line)
+            found = re.search(r"IntraSplat is on https?://\S+?:(\d+)/", line)
             if found:
                 break
         else:

@@ -1,0 +1,61 @@
+"""A stream's pictures over a WebSocket."""
+
+from __future__ import annotations
+
+import json
+import ssl
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode, urlsplit
+
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.sync.client import connect
+
+from services.client.errors import Unreachable
+
+MOST_BYTES = 64 << 20
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture as a viewer gets it."""
+
+    header: dict[str, Any]
+    """Its number, times, age and state (docs/processes.md)."""
+    jpeg: bytes
+
+
+def pictures(url: str, path: str, ticket: str, kind: str, quality: int, verify: bool | str) -> Iterator[Picture]:
+    """Pictures until the other side ends. Raises Unreachable."""
+    parts = urlsplit(url)
+    query = urlencode({"kind": kind, "quality": quality, "ticket": ticket})
+    scheme = "wss" if parts.scheme == "https" else "ws"
+    try:
+        with connect(
+            f"{scheme}://{parts.netloc}{path}?{query}",
+            max_size=MOST_BYTES,
+            ssl=_tls(verify) if scheme == "wss" else None,
+        ) as socket:
+            for message in socket:
+                if isinstance(message, bytes):
+                    yield picture_of(message)
+    except ConnectionClosed:
+        return
+    except (OSError, InvalidHandshake, TimeoutError) as error:
+        raise Unreachable(f"{url} shows no pictures of this stream: {error}") from error
+
+
+def picture_of(message: bytes) -> Picture:
+    """From one message: the length of the header in four bytes, big end first, the header in JSON, the JPEG."""
+    (length,) = struct.unpack_from(">I", message)
+    return Picture(json.loads(message[4 : 4 + length]), message[4 + length :])
+
+
+def _tls(verify: bool | str) -> ssl.SSLContext:
+    context = ssl.create_default_context(cafile=verify if isinstance(verify, str) else None)
+    if verify is False:
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
+    return context

@@ -1,0 +1,16 @@
+"""The web page of the service: what is in `page/`, as it is. No build, and nothing loaded from elsewhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+PAGE = Path(__file__).parent / "page"
+FILES = {
+    "style.css": "text/css",
+    "icon.svg": "image/svg+xml",
+    **{
+        f"{name}.js": "text/javascript"
+        for name in ("main", "api", "viewer", "plot", "table", "models", "streams", "audit")
+    },
+}
+"""What may be asked for, and its type."""

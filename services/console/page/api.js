@@ -1,0 +1,65 @@
+// Requests to the API with the key of this tab. A key that is refused asks for another one.
+
+const STORED = "intrasplat-key";
+let key = sessionStorage.getItem(STORED) ?? "";
+let askForKey = async () => { throw new Error("nobody asks for a key yet"); };
+let asked = null;
+
+/** An answer that is no success, with what the server says about it. */
+export class Problem extends Error {
+  constructor(status, document) {
+    super(document?.detail || document?.title || `the server answered ${status}`);
+    this.status = status;
+  }
+}
+
+/** Who asks for a key: an async function that resolves to one. It is called once for all requests that wait. */
+export function setKeyDialog(ask) {
+  askForKey = ask;
+}
+
+/** The key of this tab from now on; kept until the tab is closed. */
+export function useKey(given) {
+  key = given.trim();
+  sessionStorage.setItem(STORED, key);
+}
+
+async function newKey(reason) {
+  asked ??= askForKey(reason).then(useKey).finally(() => { asked = null; });
+  await asked;
+}
+
+/** Call the API; returns the JSON of the answer, or null where it has none. Throws Problem, and TypeError without a connection. */
+export async function call(method, path, body) {
+  for (;;) {
+    if (!key) await newKey("");
+    const used = key;
+    const answer = await fetch(path, {
+      method,
+      headers: { Authorization: `Bearer ${used}`, ...(body === undefined ? {} : { "Content-Type": "application/json" }) },
+      body: body === undefined ? undefined : JSON.stringify(body),
+    });
+    const document = answer.headers.get("content-type")?.includes("json") ? await answer.json() : null;
+    if (answer.ok) return document;
+    if (answer.status !== 401) throw new Problem(answer.status, document);
+    if (used === key) await newKey(document?.detail ?? "The key was refused.");
+  }
+}
+
+/** Put a file, with its SHA-256 and a call of `progress(share)` now and then. Throws Problem. */
+export async function upload(path, file, progress) {
+  const digest = new Uint8Array(await crypto.subtle.digest("SHA-256", await file.arrayBuffer()));
+  const base64 = btoa(String.fromCharCode(...digest));
+  return new Promise((resolve, reject) => {
+    const request = new XMLHttpRequest(); // fetch does not say how much was sent
+    request.open("PUT", path);
+    request.setRequestHeader("Authorization", `Bearer ${key}`);
+    request.setRequestHeader("Content-Type", "application/octet-stream");
+    request.setRequestHeader("Content-Digest", `sha-256=:${base64}:`);
+    request.responseType = "json";
+    request.upload.onprogress = (event) => { if (event.lengthComputable) progress(event.loaded / event.total); };
+    request.onload = () => (request.status < 300 ? resolve(request.response) : reject(new Problem(request.status, request.response)));
+    request.onerror = () => reject(new Error("the connection broke off while the file was sent; try again"));
+    request.send(file);
+  });
+}

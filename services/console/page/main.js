@@ -1,0 +1,135 @@
+// The console: which page is open, which stream is looked at, and what its picture says of itself.
+
+import { setKeyDialog, useKey } from "./api.js";
+import { auditPage } from "./audit.js";
+import { modelsPage } from "./models.js";
+import { Plot } from "./plot.js";
+import { streamsPage } from "./streams.js";
+import { Viewer } from "./viewer.js";
+
+const at = (id) => document.getElementById(id);
+const SILENT_MS = 1500;
+const RENEW_MS = 2000;
+
+const plots = { age: new Plot(at("age")), psnr: new Plot(at("psnr"), { from_zero: false }) };
+let viewers = [];
+let watched = "";
+let heard_ms = 0;
+
+/** Run something that was asked for, and show what goes wrong until the next thing is asked for. */
+async function report(act) {
+  at("problem").hidden = true;
+  await quietly(act);
+}
+
+/** Run something that nobody has asked for: what went wrong before stays readable. */
+async function quietly(act) {
+  try {
+    await act();
+  } catch (error) {
+    at("problem").textContent = error.message;
+    at("problem").hidden = false;
+  }
+}
+
+function say(state, age_ms) {
+  const place = at("state");
+  const age = Number.isFinite(age_ms) ? (age_ms < 1000 ? ` ${Math.round(age_ms)} ms` : ` ${(age_ms / 1000).toFixed(1)} s`) : "";
+  if (place.dataset.state !== state) place.dataset.state = state;
+  place.firstElementChild.textContent = state;
+  place.lastElementChild.textContent = age;
+}
+
+function watch(stream) {
+  if (stream === watched) return;
+  watched = stream;
+  viewers.forEach((viewer) => viewer.close());
+  viewers = [];
+  plots.age.clear();
+  plots.psnr.clear();
+  say("no picture");
+  if (!stream) return;
+  const lost = () => { say("no connection"); };
+  viewers = [
+    new Viewer(stream, "raw", at("raw"), { onPicture: (header) => { at("raw-facts").value = `frame ${header.seq}`; }, onLost: () => {} }),
+    new Viewer(stream, "shown", at("shown"), { onPicture: shown, onLost: lost }),
+  ];
+}
+
+function shown(header) {
+  heard_ms = performance.now();
+  say(header.state, header.age_ms);
+  at("shown-facts").value = `frame ${header.seq}, model ${header.model_version ?? "–"}, ${header.steps ?? "–"} steps`;
+  if (header.new === false) return;
+  plots.age.add(header.age_ms);
+  plots.psnr.add(header.psnr_db ?? null);
+  at("age-now").value = header.age_ms.toFixed(0);
+  at("psnr-now").value = Number.isFinite(header.psnr_db) ? header.psnr_db.toFixed(1) : "";
+}
+
+/** What is not said any more must not look as if it were: without pictures the state goes. */
+setInterval(() => {
+  if (watched && heard_ms && performance.now() - heard_ms > SILENT_MS && at("state").dataset.state !== "no connection") {
+    say("no picture", performance.now() - heard_ms);
+  }
+}, 250);
+
+function chooseAmong(streams) {
+  const choice = at("stream");
+  const names = streams.map((stream) => stream.name);
+  if ([...choice.options].map((option) => option.value).join() !== names.join()) {
+    const chosen = choice.value;
+    choice.replaceChildren(...names.map((name) => new Option(name, name)));
+    if (names.includes(chosen)) choice.value = chosen;
+  }
+  watch(choice.value);
+}
+
+const pages = {
+  live: async () => {},
+  models: modelsPage(report),
+  streams: streamsPage(report, chooseAmong),
+  audit: auditPage(report),
+};
+
+function open(page) {
+  for (const name of Object.keys(pages)) {
+    const chosen = name === page;
+    at(name).hidden = !chosen;
+    at(`tab-${name}`).setAttribute("aria-selected", String(chosen));
+    at(`tab-${name}`).tabIndex = chosen ? 0 : -1;
+  }
+  report(pages[page]);
+}
+
+const tabs = [...document.querySelectorAll("[role=tab]")];
+tabs.forEach((tab, index) => {
+  tab.addEventListener("click", () => open(tab.getAttribute("aria-controls")));
+  tab.addEventListener("keydown", (event) => {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (!step) return;
+    const next = tabs[(index + step + tabs.length) % tabs.length];
+    next.focus();
+    next.click();
+  });
+});
+
+setKeyDialog((reason) => new Promise((resolve) => {
+  const dialog = at("sign-in");
+  if (reason) at("sign-in-reason").textContent = reason;
+  dialog.addEventListener("close", () => { resolve(at("key").value); at("key").value = ""; }, { once: true });
+  dialog.addEventListener("cancel", (event) => event.preventDefault());
+  if (!dialog.open) dialog.showModal();
+}));
+
+// A key behind # is not sent to any server; it goes from the address at once.
+if (location.hash.startsWith("#key=")) {
+  useKey(decodeURIComponent(location.hash.slice(5)));
+  history.replaceState(null, "", location.pathname);
+}
+
+at("stream").addEventListener("change", (event) => watch(event.target.value));
+await report(pages.streams);
+setInterval(() => {
+  if (!at("sign-in").open) quietly(pages.streams);
+}, RENEW_MS);

@@ -1,0 +1,63 @@
+// The page of models: upload, activate, roll back, delete.
+
+import { call, upload } from "./api.js";
+import { button, replaceRows, row, size } from "./table.js";
+
+const at = (id) => document.getElementById(id);
+
+/** Returns what renews the page. `report(act)` runs an async function and shows what goes wrong. */
+export function modelsPage(report) {
+  async function renew() {
+    const models = await call("GET", "/v1/models");
+    const rows = [];
+    for (const model of models) {
+      const versions = await call("GET", `/v1/models/${model.name}/versions`);
+      for (const version of versions.sort((a, b) => b.version - a.version)) rows.push(line(model, version));
+    }
+    replaceRows(at("versions"), rows);
+  }
+
+  function line(model, version) {
+    const path = `/v1/models/${model.name}`;
+    const then = (act) => async () => { await act(); await renew(); };
+    const actions = [];
+    if (version.state === "ready" || version.state === "retired") {
+      const body = { version: version.version, expected_current: model.active };
+      actions.push(button("Activate", then(() => call("POST", `${path}/activate`, body)), report));
+    }
+    if (version.state === "active") actions.push(button("Roll back", then(() => call("POST", `${path}/rollback`)), report));
+    else actions.push(button("Delete", then(() => call("DELETE", `${path}/versions/${version.version}`)), report));
+    const state = version.reason ? `${version.state}: ${version.reason}` : version.state;
+    const when = new Date(version.uploaded_at).toLocaleString();
+    return row(model.name, version.version, state, size(version.size_bytes), `${when}, ${version.uploaded_by}`, actions);
+  }
+
+  at("upload").addEventListener("submit", (event) => {
+    event.preventDefault();
+    report(async () => {
+      const bar = at("uploaded"), file = at("model-file").files[0];
+      bar.value = 0;
+      bar.hidden = false;
+      try {
+        const made = await upload(`/v1/models/${at("model-name").value}/versions`, file, (share) => { bar.value = share; });
+        await checked(made);
+      } finally {
+        bar.hidden = true;
+        await renew();
+      }
+    });
+  });
+
+  /** Wait until the server has looked at a version; it says itself what it found. */
+  async function checked({ name, version }) {
+    for (let wait_ms = 200; ; wait_ms = Math.min(2 * wait_ms, 2000)) {
+      await renew();
+      const now = await call("GET", `/v1/models/${name}/versions/${version}`);
+      if (now.state === "rejected") throw new Error(`${name}/${version} was rejected: ${now.reason}`);
+      if (now.state !== "uploaded" && now.state !== "validated") return;
+      await new Promise((resolve) => setTimeout(resolve, wait_ms));
+    }
+  }
+
+  return renew;
+}

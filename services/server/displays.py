@@ -1,0 +1,26 @@
+"""The pictures of all streams of a server."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+from services.control.parts import PictureKind
+from services.control.problems import Conflicting
+from services.display.encoder import EncodedPicture
+from services.server.streams import SupervisedStreams
+
+
+class StreamDisplays:
+    """See `services.control.parts.Display`."""
+
+    def __init__(self, streams: SupervisedStreams) -> None:
+        self._streams = streams
+
+    async def subscribe(self, stream: str, kind: PictureKind, quality: int) -> AsyncIterator[EncodedPicture]:
+        """See `Display`. Raises Conflicting for a stream that does not run."""
+        hub = self._streams.hub(stream)
+        if hub is None:
+            raise Conflicting(f"the stream {stream} is stopped; start it first")
+        async with hub.subscribe(kind, quality) as viewer:
+            async for picture in viewer:
+                yield picture

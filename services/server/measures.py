@@ -1,0 +1,66 @@
+"""What Prometheus is told of the streams, at the moment when it asks. Labels: the stream's name, nothing of a patient."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from prometheus_client import Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.registry import Collector
+
+from services.supervisor.process import StreamEvent
+
+if TYPE_CHECKING:
+    from services.server.streams import SupervisedStreams
+
+STATES = ("stopped", "starting", "live", "stale", "frozen", "source lost", "failed")
+
+
+class StreamMeasures(Collector):
+    """Collects from the streams; `count` is told what happens to their processes."""
+
+    streams: SupervisedStreams | None = None
+
+    def __init__(self) -> None:
+        self._events: Counter[tuple[str, str, str]] = Counter()
+
+    def count(self, event: StreamEvent) -> None:
+        """Something happened to a process."""
+        self._events[event.stream, event.role, event.kind] += 1
+
+    def collect(self) -> Iterable[Metric]:
+        """See `Collector`."""
+        state = GaugeMetricFamily(
+            "intrasplat_stream_state", "1 for the state that a stream is in.", labels=["stream", "state"]
+        )
+        restarts = CounterMetricFamily(
+            "intrasplat_process_restarts", "Times that a process was started again.", labels=["stream", "role"]
+        )
+        events = CounterMetricFamily(
+            "intrasplat_process_events", "What happened to processes.", labels=["stream", "role", "kind"]
+        )
+        encoded = CounterMetricFamily("intrasplat_pictures_encoded", "Pictures encoded.", labels=["stream", "picture"])
+        dropped = CounterMetricFamily(
+            "intrasplat_pictures_dropped", "Pictures that viewers missed.", labels=["stream", "picture", "reason"]
+        )
+        viewers = GaugeMetricFamily("intrasplat_stream_viewers", "Open displays.", labels=["stream", "picture"])
+        for facts in [] if self.streams is None else self.streams.now():
+            for each in STATES:
+                state.add_metric([facts.name, each], float(facts.state == each))
+            for role, process in facts.processes.items():
+                restarts.add_metric([facts.name, role], process["restarts"])
+            hub = self.streams.hub(facts.name) if self.streams is not None else None
+            if hub is None:
+                continue
+            for kind in ("raw", "shown"):
+                viewers.add_metric([facts.name, kind], hub.viewers(kind))
+                for reason, count in hub.counts(kind).items():
+                    if reason == "encoded":
+                        encoded.add_metric([facts.name, kind], count)
+                    else:
+                        dropped.add_metric([facts.name, kind, reason], count)
+        for (stream, role, what), count in self._events.items():
+            events.add_metric([stream, role, what], count)
+        return [state, restarts, events, encoded, dropped, viewers]

@@ -1,0 +1,52 @@
+"""From a stream of the API to what its processes are asked for."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from gsplat_core.errors import InvalidSetting
+from services.control.parts import NewStream
+from services.supervisor.specs import EngineSpec, SourceSpec, StreamSpec
+
+OF_SOURCE = frozenset(SourceSpec.model_fields) - {"address"}
+OF_ENGINE = frozenset(EngineSpec.model_fields) - {"device", "gpu"}
+NVIDIA = Path("/proc/driver/nvidia/gpus")
+
+
+def spec_of(stream: NewStream) -> StreamSpec:
+    """The specification of a stream. Raises InvalidSetting for an option that there is not, or a value out of its range."""
+    options = {name: value for name, value in stream.options.items() if value is not None}
+    for name in sorted(set(options) - OF_SOURCE - OF_ENGINE):
+        near = difflib.get_close_matches(name, OF_SOURCE | OF_ENGINE, n=1, cutoff=0.0)[0]
+        raise InvalidSetting(f"a stream has no option {name!r:.60}; the nearest is {near!r}")
+    device, gpu = _device(stream.device)
+    try:
+        return StreamSpec(
+            name=stream.name,
+            source=SourceSpec(address=stream.source, **_of(options, OF_SOURCE)),
+            engine=EngineSpec(device=device, gpu=gpu, **_of(options, OF_ENGINE)),
+        )
+    except ValidationError as error:
+        first = error.errors(include_input=False)[0]
+        raise InvalidSetting(f"{first['loc'][-1]}: {first['msg']}") from None
+
+
+def gpus() -> int:
+    """How many NVIDIA GPUs the driver shows, without loading anything of theirs."""
+    return len(list(NVIDIA.iterdir())) if NVIDIA.is_dir() else 0
+
+
+def _device(wanted: str) -> tuple[Any, int | None]:
+    if wanted == "auto":
+        return ("cuda" if gpus() else "cpu"), None
+    kind, _, number = wanted.partition(":")
+    return kind, int(number) if number else None
+
+
+def _of(options: Mapping[str, Any], names: frozenset[str]) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if name in names}

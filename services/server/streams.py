@@ -1,0 +1,180 @@
+"""The streams of a server, each kept running by a supervisor of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from gsplat_core.errors import InvalidSetting
+from services.bus.runtime import RuntimeFolder
+from services.control.parts import NewStream
+from services.control.problems import Conflicting, Missing, Unprocessable
+from services.display.hub import DisplayHub
+from services.server.stream_specs import gpus, spec_of
+from services.supervisor.launching import ByLauncher
+from services.supervisor.process import ProcessState, StreamEvent
+from services.supervisor.specs import StreamSpec, assigned
+from services.supervisor.stream import StreamSupervisor
+
+log = logging.getLogger(__name__)
+MOST_STREAMS = 16
+
+
+@dataclass(frozen=True)
+class StreamFacts:
+    """See `services.control.parts.StreamState`."""
+
+    name: str
+    source: str
+    show: str
+    device: str
+    options: Mapping[str, Any]
+    state: str
+    reason: str | None
+    processes: Mapping[str, Mapping[str, Any]]
+
+
+class Stream:
+    """A stream that was asked for: its supervisor and its viewers, while it runs."""
+
+    def __init__(self, wanted: NewStream, spec: StreamSpec) -> None:
+        self.wanted, self.spec = wanted, spec
+        self.supervisor: StreamSupervisor | None = None
+        self.hub: DisplayHub | None = None
+        self.changing = asyncio.Lock()
+        """Held while it is started, stopped or changed: one after another."""
+
+    def facts(self) -> StreamFacts:
+        """What it is and does now."""
+        wanted = self.wanted
+        engine = self.spec.engine
+        device = engine.device if engine.gpu is None else f"{engine.device}:{engine.gpu}"
+        about = (wanted.name, wanted.source, wanted.show, device, wanted.options)
+        if self.supervisor is None:
+            return StreamFacts(*about, "stopped", None, {})
+        now = self.supervisor.state()
+        state, reason = overall(now.capture, now.engine)
+        return StreamFacts(*about, state, reason, {"capture": asdict(now.capture), "engine": asdict(now.engine)})
+
+
+def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | None]:
+    """What a stream with such processes is, and why it is not live."""
+    for process in (capture, engine):
+        if process.state == "failed":
+            return "failed", process.reason
+    if capture.state in ("stalled", "reconnecting", "lost", "ended"):
+        return "source lost", capture.reason
+    if capture.state != "live":
+        return "starting", capture.reason
+    if engine.state != "running":
+        return "starting", f"the camera's picture is live; the engine is {engine.state}: {engine.reason}"
+    shown = (engine.figures.get("picture") or {}).get("state")
+    if shown in ("live", "stale", "frozen", "source lost"):
+        return str(shown), None
+    return "starting", "the first picture is being made"
+
+
+class SupervisedStreams:
+    """See `services.control.parts.Streams`; `running` is entered with the server."""
+
+    def __init__(self, runtime: RuntimeFolder, on_event: Callable[[StreamEvent], None]) -> None:
+        self._runtime, self._on_event = runtime, on_event
+        self._launcher = ByLauncher(runtime)
+        self._streams: dict[str, Stream] = {}
+
+    @asynccontextmanager
+    async def running(self, at_start: Sequence[NewStream], started: Sequence[str]) -> AsyncIterator[None]:
+        """Make the streams `at_start`, start those named in `started`; when the server ends, they end with it."""
+        self._launcher.open()
+        for stream in at_start:
+            await self.create(stream)
+        for name in started:
+            await self.start(name)
+        try:
+            yield
+        finally:
+            await asyncio.gather(*(self._stop(stream, "the server ends") for stream in self._streams.values()))
+            await self._launcher.close(stop=True)
+
+    def hub(self, name: str) -> DisplayHub | None:
+        """The viewers of a stream; None while it does not run."""
+        stream = self._streams.get(name)
+        return None if stream is None else stream.hub
+
+    def now(self) -> Sequence[StreamFacts]:
+        """Every stream."""
+        return [stream.facts() for stream in self._streams.values()]
+
+    async def all(self) -> Sequence[StreamFacts]:
+        """See `Streams`."""
+        return self.now()
+
+    async def get(self, name: str) -> StreamFacts:
+        """See `Streams`. Raises Missing."""
+        return self._stream(name).facts()
+
+    async def create(self, stream: NewStream) -> StreamFacts:
+        """See `Streams`. Raises Conflicting for a name that is taken, Unprocessable for what cannot be a stream."""
+        if stream.name in self._streams:
+            raise Conflicting(f"there is a stream {stream.name}; delete it first, or choose another name")
+        if len(self._streams) >= MOST_STREAMS:
+            raise Conflicting(f"there are {MOST_STREAMS} streams, which is as many as may be; delete one")
+        made = self._streams[stream.name] = Stream(stream, self._spec(stream))
+        return made.facts()
+
+    async def start(self, name: str) -> StreamFacts:
+        """See `Streams`. Raises Missing."""
+        stream = self._stream(name)
+        async with stream.changing:
+            if stream.supervisor is None:
+                supervisor = StreamSupervisor(stream.spec, self._runtime, start=self._launcher, on_event=self._on_event)
+                await supervisor.start()
+                stream.supervisor, stream.hub = supervisor, DisplayHub(supervisor.folder)
+        return stream.facts()
+
+    async def stop(self, name: str) -> StreamFacts:
+        """See `Streams`. Raises Missing."""
+        stream = self._stream(name)
+        await self._stop(stream, "it was asked for")
+        return stream.facts()
+
+    async def set_options(self, name: str, options: Mapping[str, Any]) -> StreamFacts:
+        """See `Streams`: a stream that runs is started again with them. Raises Missing and Unprocessable."""
+        stream = self._stream(name)
+        wanted = replace(stream.wanted, options={**stream.wanted.options, **options})
+        spec = self._spec(wanted)
+        runs = stream.supervisor is not None
+        await self._stop(stream, "its options change")
+        stream.wanted, stream.spec = wanted, spec
+        return await self.start(name) if runs else stream.facts()
+
+    async def delete(self, name: str) -> None:
+        """See `Streams`. Raises Missing."""
+        await self._stop(self._stream(name), "it is deleted")
+        self._streams.pop(name, None)
+
+    async def _stop(self, stream: Stream, reason: str) -> None:
+        async with stream.changing:
+            supervisor, hub = stream.supervisor, stream.hub
+            stream.supervisor = stream.hub = None
+            if hub is not None:
+                await hub.close()
+            if supervisor is not None:
+                await supervisor.stop(reason)
+
+    def _stream(self, name: str) -> Stream:
+        if name not in self._streams:
+            raise Missing("there is no stream with this name; GET /v1/streams lists them")
+        return self._streams[name]
+
+    def _spec(self, wanted: NewStream) -> StreamSpec:
+        try:
+            spec = spec_of(wanted)
+        except InvalidSetting as error:
+            raise Unprocessable(str(error)) from error
+        others = [stream.spec for name, stream in self._streams.items() if name != wanted.name]
+        return assigned([*others, spec], gpus())[-1]

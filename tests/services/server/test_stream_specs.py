@@ -1,0 +1,66 @@
+"""From a stream of the API to the specification of its processes, and from its processes to its state."""
+
+from __future__ import annotations
+
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from services.control.parts import NewStream
+from services.server import stream_specs
+from services.server.stream_specs import spec_of
+from services.server.streams import overall
+from services.supervisor.process import ProcessState
+
+
+def wanted(device="cpu", **options):
+    return NewStream("theatre-1", "synthetic:?width=64", "live", device, options)
+
+
+def test_each_option_goes_to_the_process_that_it_is_for():
+    spec = spec_of(wanted(scale=0.5, tool_mask="none", seed=None))
+    assert (spec.name, spec.source.address, spec.source.scale) == ("theatre-1", "synthetic:?width=64", 0.5)
+    assert (spec.engine.device, spec.engine.gpu, spec.engine.tool_mask, spec.engine.seed) == ("cpu", None, "none", 0)
+
+
+@pytest.mark.parametrize(
+    ("device", "found", "expected"),
+    [("cpu", 2, ("cpu", None)), ("cuda", 2, ("cuda", None)), ("cuda:1", 2, ("cuda", 1)), ("auto", 0, ("cpu", None)), ("auto", 1, ("cuda", None))],
+)  # fmt: skip
+def test_devices(monkeypatch, device, found, expected):
+    monkeypatch.setattr(stream_specs, "gpus", lambda: found)
+    engine = spec_of(wanted(device)).engine
+    assert (engine.device, engine.gpu) == expected
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"scael": 1}, "no option 'scael'; the nearest is 'scale'"),
+        ({"gpu": 1}, "no option 'gpu'"),
+        ({"scale": 9}, "scale: "),
+        ({"budget_ms": "soon"}, "budget_ms: "),
+    ],
+)
+def test_options_that_cannot_be_are_refused_with_what_is_wrong(options, said):
+    with pytest.raises(InvalidSetting, match=said):
+        spec_of(wanted(**options))
+
+
+def process(state, reason="", **figures):
+    return ProcessState(state, reason, 1, 0, figures, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("capture", "engine", "expected"),
+    [
+        (process("live"), process("running", picture={"state": "live"}), ("live", None)),
+        (process("live"), process("running", picture={"state": "stale"}), ("stale", None)),
+        (process("live"), process("running"), ("starting", "the first picture is being made")),
+        (process("starting", "opens it"), process("running"), ("starting", "opens it")),
+        (process("stalled", "no frame for 2 s"), process("running"), ("source lost", "no frame for 2 s")),
+        (process("failed", "no such file"), process("starting"), ("failed", "no such file")),
+        (process("live"), process("down", "killed by SIGKILL"), ("starting", "the camera's picture is live; the engine is down: killed by SIGKILL")),
+    ],
+)  # fmt: skip
+def test_a_stream_is_what_its_processes_are(capture, engine, expected):
+    assert overall(capture, engine) == expected

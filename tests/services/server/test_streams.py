@@ -1,0 +1,66 @@
+"""The streams of a server, without their processes: what is refused, what is kept."""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from services.bus.runtime import RuntimeFolder
+from services.control.parts import NewStream
+from services.control.problems import Conflicting, Missing, Unprocessable
+from services.server.displays import StreamDisplays
+from services.server.streams import MOST_STREAMS, SupervisedStreams
+
+
+@pytest.fixture
+def streams():
+    with tempfile.TemporaryDirectory(prefix="isp-") as folder:
+        yield SupervisedStreams(RuntimeFolder(Path(folder)), lambda event: None)
+
+
+def stream(name="theatre-1", **options):
+    return NewStream(name, "synthetic:?width=64", "live", "cpu", options)
+
+
+def test_a_stream_is_stopped_until_it_is_started_and_gone_when_it_is_deleted(streams):
+    async def run():
+        made = await streams.create(stream(scale=0.5))
+        assert (made.name, made.state, made.device, dict(made.options)) == (
+            "theatre-1",
+            "stopped",
+            "cpu",
+            {"scale": 0.5},
+        )
+        changed = await streams.set_options("theatre-1", {"loop": False})
+        assert dict(changed.options) == {"scale": 0.5, "loop": False}
+        assert (await streams.stop("theatre-1")).state == "stopped"
+        await streams.delete("theatre-1")
+        assert list(await streams.all()) == []
+
+    asyncio.run(run())
+
+
+def test_what_cannot_be_is_refused_and_changes_nothing(streams):
+    async def run():
+        await streams.create(stream())
+        with pytest.raises(Conflicting, match="there is a stream theatre-1"):
+            await streams.create(stream())
+        with pytest.raises(Unprocessable, match="no option 'x'"):
+            await streams.create(stream("theatre-2", x=1))
+        with pytest.raises(Unprocessable, match="scale"):
+            await streams.set_options("theatre-1", {"scale": -1})
+        assert dict((await streams.get("theatre-1")).options) == {}
+        for refused in (streams.get, streams.start, streams.stop, streams.delete):
+            with pytest.raises(Missing):
+                await refused("nobody")
+        with pytest.raises(Conflicting, match="stopped"):
+            await anext(StreamDisplays(streams).subscribe("theatre-1", "raw", 80))
+        for number in range(MOST_STREAMS - 1):
+            await streams.create(stream(f"more-{number}"))
+        with pytest.raises(Conflicting, match="as many as may be"):
+            await streams.create(stream("too-many"))
+
+    asyncio.run(run())

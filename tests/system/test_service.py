@@ -1,0 +1,174 @@
+"""`intrasplat serve` as a hospital's engineer meets it: a process, its page in a browser, its API, and engines that die."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from services.client import Client, Refused
+
+SOURCE = "synthetic:?width=160&height=128&frames=12&fps=15"
+CHROMIUM = Path("/usr/bin/chromium")
+WITHIN_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def served():
+    """A service with one small stream, and a client with its administrator's key."""
+    with tempfile.TemporaryDirectory(prefix="isp-") as folder:
+        data, log = Path(folder) / "data", Path(folder) / "log"
+        config = Path(folder) / "service.yaml"
+        config.write_text(
+            f"server: {{port: 0}}\npaths: {{data: {data}, runtime: {folder}/r}}\nlog: {{format: text}}\n"
+            f'streams: {{theatre: {{source: "{SOURCE}", device: cpu}}}}\n'
+        )
+        with log.open("w") as output:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "services.cli", "serve", "--config", config], stdout=output, stderr=output
+            )
+        try:
+            url = until(lambda: re.search(r"IntraSplat is on (http://\S+?)(?:/\S*)?\n", log.read_text()), log)[1]
+            with Client(url, (data / "admin.key").read_text()) as client:
+                until(lambda: client.stream("theatre").state == "live", log)
+                yield client, url, log
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(30) == 0, log.read_text()
+            assert not [each for each in Path(folder, "r").rglob("*.json")], "a process or its socket was left"
+        finally:
+            process.kill()
+            process.wait()
+
+
+def until(found, log, within_s=WITHIN_S):
+    """What `found` returns once that is true."""
+    end_s = time.monotonic() + within_s
+    while time.monotonic() < end_s:
+        result = found()
+        if result:
+            return result
+        time.sleep(0.05)
+    raise AssertionError(f"it did not come about within {within_s} s:\n{log.read_text()[-4000:]}")
+
+
+def test_what_it_serves_is_what_it_says(served):
+    client, _, _ = served
+    assert {"streams", "models", "display"} <= set(client.about()["parts"])
+    stream = client.stream("theatre")
+    assert (stream.source, stream.show, stream.device) == (SOURCE, "live", "cpu")
+    assert stream.processes["engine"]["state"] == "running" and stream.processes["capture"]["state"] == "live"
+
+
+@pytest.mark.parametrize("kind", ["raw", "shown"])
+def test_a_viewer_gets_pictures_with_their_age(served, kind):
+    client, _, _ = served
+    shown = client.pictures("theatre", kind)
+    headers = [next(shown).header for _ in range(5)]
+    shown.close()
+    assert [header["seq"] for header in headers] == sorted(header["seq"] for header in headers)
+    assert all(header["state"] in ("live", "stale") and 0 <= header["age_ms"] < 5000 for header in headers)
+    assert all((header["width_px"], header["height_px"]) == (160, 128) for header in headers)
+
+
+def test_the_cameras_picture_goes_on_while_a_killed_engine_comes_back(served):
+    client, _, log = served
+    before = client.stream("theatre").processes["engine"]
+    raw = client.pictures("theatre", "raw")
+    next(raw)
+    os.kill(before["pid"], signal.SIGKILL)
+    longest_s, last_s, began_s = 0.0, time.monotonic(), time.monotonic()
+    while time.monotonic() < began_s + 2:
+        next(raw)
+        now_s = time.monotonic()
+        longest_s, last_s = max(longest_s, now_s - last_s), now_s
+    raw.close()
+    assert longest_s < 1.0  # a picture every 67 ms, on a machine that may be busy
+    after = until(lambda: (found := client.stream("theatre")).state == "live" and found, log).processes["engine"]
+    assert after["pid"] != before["pid"] and after["restarts"] == before["restarts"] + 1
+
+
+def test_what_is_not_there_is_refused_with_a_sentence(served):
+    client, url, _ = served
+    with pytest.raises(Refused, match="no stream with this name") as refused:
+        client.stream("nobody")
+    assert refused.value.status == 404
+    with pytest.raises(Refused) as unknown, Client(url, "intrasplat_00000000_x") as stranger:
+        stranger.streams()
+    assert unknown.value.status == 401
+    with pytest.raises(Refused, match=r"file|scheme|not allowed"):
+        client.create_stream("spy", "file:///etc/passwd")
+
+
+@pytest.fixture(scope="module")
+def page(served):
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright comes with the development packages")
+    if not CHROMIUM.exists():
+        pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
+    client, url, _ = served
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(
+            executable_path=str(CHROMIUM), args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+        )
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.set_default_timeout(1000 * WITHIN_S)
+        said: list[str] = []
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on(
+            "request",
+            lambda request: said.append(request.url) if not request.url.startswith((url, "data:", "blob:")) else None,
+        )
+        page.goto(f"{url}/")
+        page.fill("#key", client._key)
+        page.keyboard.press("Enter")
+        page.wait_for_selector("#state[data-state=live]")
+        yield page
+        assert said == [], "the page failed, or asked for something from elsewhere"
+        browser.close()
+
+
+def brightness(page, canvas):
+    """Mean of a canvas's values, 0 to 255."""
+    return page.evaluate(
+        """(id) => { const canvas = document.getElementById(id);
+        const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+        return data.reduce((sum, value, index) => index % 4 < 3 ? sum + value : sum, 0) / (0.75 * data.length); }""",
+        canvas,
+    )
+
+
+def test_the_page_shows_camera_and_reconstruction(page):
+    assert page.evaluate("[raw.width, raw.height, shown.width, shown.height].join()") == "160,128,160,128"
+    assert 30 < brightness(page, "raw") < 225 and abs(brightness(page, "raw") - brightness(page, "shown")) < 25
+
+
+def test_a_stream_is_stopped_and_started_from_the_page(page):
+    page.click("#tab-streams")
+    page.click("#stream-rows >> text=Stop")
+    page.wait_for_selector("#stream-rows >> text=stopped")
+    page.wait_for_selector("#state:not([data-state=live])")
+    page.click("#stream-rows >> text=Start")
+    page.wait_for_selector("#state[data-state=live]")
+
+
+def test_pages_are_reached_by_the_keyboard(page):
+    page.focus("#tab-streams")
+    page.keyboard.press("ArrowRight")
+    page.wait_for_selector("#entries >> text=stream.start")
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("document.activeElement.id") == "tab-live" and page.is_visible("#raw")
+
+
+def test_what_the_server_refuses_is_said_on_the_page(page):
+    page.click("#tab-streams")
+    page.fill("#stream-name", "spy")
+    page.fill("#stream-source", "file:///etc/passwd")
+    page.click("text=Start a stream")
+    page.wait_for_selector("#problem:not([hidden])")
+    assert "file" in page.inner_text("#problem") or "scheme" in page.inner_text("#problem")
