@@ -16,6 +16,7 @@ measure replay_cpu replay_sinus "$recordings/sinus" --fields basis --engines emb
 measure graph_overhead graph --holoscan
 measure frame_path_cpu frame_path "$recordings/cutting" "synthetic:?width=1280&height=1024&frames=12"
 measure losses_cpu losses
+measure registry_cpu registry
 measure deformation_cpu deformation
 measure training_cpu training
 measure splat_cpu splat

@@ -29,6 +29,8 @@ from gsplat_core.scene.model import Model
 
 FAINTEST = 1 / 255
 """An opacity below it changes no pixel of a picture."""
+NICENESS = 10
+"""Streams that run on this machine go before a check."""
 _MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memory", "bad_alloc")
 
 
@@ -50,6 +52,9 @@ def main(arguments: list[str] | None = None) -> int:
     except UserError as error:
         # The files were whole a moment ago, so that this is about the machine: memory that others have taken, rights.
         sys.stderr.write(f"{error}\n")
+        return 1
+    except torch.OutOfMemoryError as error:  # of a GPU, which others use too
+        sys.stderr.write(f"{str(error).splitlines()[0]}\n")
         return 1
     except (MemoryError, RuntimeError) as error:
         # torch's allocators raise RuntimeError.
@@ -78,6 +83,7 @@ def _limit_resources(options: argparse.Namespace) -> None:
 
     On CUDA memory is not limited: it maps far more than it takes.
     """
+    os.nice(NICENESS)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if options.device == "cpu":
         _lower(resource.RLIMIT_DATA, _taken_bytes() + options.memory_bytes)

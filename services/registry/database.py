@@ -40,7 +40,7 @@ class Database:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[sa.Connection]:
-        """A connection that sees one state of the database for every statement. Raises StoreUnavailable."""
+        """A connection of which every statement sees what is committed at that moment. Raises StoreUnavailable."""
         with self._errors(), self._engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             yield connection
 

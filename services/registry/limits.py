@@ -23,6 +23,9 @@ class RegistryLimits:
     check_s: float = 120.0
     """How long the check may take, the start of its process included."""
 
+    checks_at_once: int = 1
+    """Further checks wait for their turn."""
+
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not value > 0:

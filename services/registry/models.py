@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,7 @@ class ModelRegistry:
             raise StoreUnavailable(
                 f"the registry cannot use {folder}: {error.strerror or error}; give a folder that can be written"
             ) from error
+        self._checks = threading.BoundedSemaphore(limits.checks_at_once)
         self._lock = FolderLock(folder / "lock")
         self._database = Database(database_url or f"sqlite:///{folder.absolute() / 'registry.sqlite'}")
         self._database.migrate()
@@ -117,21 +119,22 @@ class ModelRegistry:
     def check(self, name: str, version: int) -> VersionRecord:
         """Check an uploaded version in a process of its own; blocks until it is `ready`, or `rejected` with a reason.
 
-        A version that was checked before is answered as it is. Raises NotFound, BlobDamaged, and CheckFailed where the check could not be run:
+        Checks wait for each other, `RegistryLimits.checks_at_once` run. A version that was checked before is answered as it is. Raises NotFound, BlobDamaged, and CheckFailed where the check could not be run:
         the version then waits for another one.
         """
-        with self._database.reading() as connection:
-            row = version_row(connection, name, version)
-        if State(row["state"]) not in UNCHECKED:
-            return version_record(row)
-        with self._lock.shared():
-            folder = self._unpacked.folder_of(row)
 
         def validated(description: dict[str, Any]) -> None:
             self._after_check(name, version, State.VALIDATED, Verdict(None, description))
             self._reached("version validated")
 
-        verdict = run_check(folder, self._limits, self._device, validated, self._check_program)
+        with self._checks:
+            with self._database.reading() as connection:
+                row = version_row(connection, name, version)
+            if State(row["state"]) not in UNCHECKED:
+                return version_record(row)
+            with self._lock.shared():
+                folder = self._unpacked.folder_of(row)
+            verdict = run_check(folder, self._limits, self._device, validated, self._check_program)
         self._reached("check ended")
         state = State.READY if verdict.reason is None else State.REJECTED
         return self._after_check(name, version, state, verdict)

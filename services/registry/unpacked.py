@@ -24,7 +24,8 @@ class UnpackedModels:
 
     def __init__(self, folder: Path, incoming: Path, blobs: BlobStore, reached: Callable[[str], None]) -> None:
         self._folder, self._incoming, self._blobs, self._reached = folder, incoming, blobs, reached
-        self._making = threading.Lock()
+        self._locks: dict[str, threading.Lock] = {}
+        """For each folder, so that none is made twice at once and nobody waits for another one."""
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def folder_of(self, row: Mapping[Any, Any]) -> Path:
@@ -33,7 +34,7 @@ class UnpackedModels:
         Raises BlobDamaged where the stored file is gone or changed, StoreUnavailable where it cannot be read or unpacked.
         """
         target = self._folder / folder_name(row)
-        with self._making:
+        with self._locks.setdefault(target.name, threading.Lock()):
             try:
                 if not _is_intact(target, row):
                     if target.exists():

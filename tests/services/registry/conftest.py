@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from services.registry.models import ModelRegistry
+from tests.services.registry.servers import new_database
 from tests.services.registry.stub_check import ALWAYS_READY
 
 SERVER_STARTS_S = 30.0
@@ -97,16 +98,6 @@ def sqlite_registry(tmp_path: Path) -> Iterator[ModelRegistry]:
     """An empty registry where the database does not matter."""
     with ModelRegistry(tmp_path / "registry", check_program=ALWAYS_READY) as registry:
         yield registry
-
-
-def new_database(socket_folder: str) -> str:
-    """The URL of a new, empty database."""
-    import psycopg
-
-    with psycopg.connect(f"host={socket_folder} user=tester dbname=postgres", autocommit=True) as connection:
-        name = f"test_{time.monotonic_ns()}"
-        connection.execute(f"CREATE DATABASE {name}")
-    return f"postgresql://tester@/{name}?host={socket_folder}"
 
 
 def _answers_postgresql(folder: Path) -> bool:

@@ -1,6 +1,6 @@
-"""A process that changes a registry and dies by SIGKILL at a step: `python dying.py FOLDER UPLOAD ACTION [STEP]`.
+"""A process that changes a registry and dies by SIGKILL at a step: `python dying.py FOLDER DATABASE_URL UPLOAD ACTION [STEP]`.
 
-Without a step it does the same again and again until somebody ends it.
+DATABASE_URL may be empty: SQLite in the folder. Without a step it does the same again and again until somebody ends it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from services.registry.models import ModelRegistry
 from tests.services.registry.stub_check import ALWAYS_READY
@@ -32,12 +33,13 @@ def swap_for_ever(registry: ModelRegistry) -> None:
         os.write(1, b".")
 
 
-def main(folder: str, upload: str, action: str, step: str | None = None) -> None:
+def main(folder: str, database_url: str, upload: str, action: str, step: str | None = None) -> None:
     def die_there(reached: str) -> None:
         if reached == step:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    with ModelRegistry(Path(folder), check_program=ALWAYS_READY, reached=die_there) as registry:
+    given: Any = {"database_url": database_url or None, "check_program": ALWAYS_READY, "reached": die_there}
+    with ModelRegistry(Path(folder), **given) as registry:
         if action == "swap":
             swap_for_ever(registry)
         ACTIONS[action](registry, Path(upload))

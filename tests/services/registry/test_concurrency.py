@@ -6,10 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from services.registry.errors import Conflict
+from services.registry.errors import Conflict, NotFound
+from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from tests.services.registry.made import add_ready, assert_whole, packed_model
-from tests.services.registry.stub_check import ALWAYS_READY
+from tests.services.registry.stub_check import ALWAYS_READY, says
 
 ROUNDS = 5
 
@@ -76,6 +77,22 @@ def test_two_checks_of_one_version_agree(registry, files):
     assert first == second and first.state == "ready"
 
 
+def test_checks_wait_for_each_other(tmp_path, files):
+    """Each check takes a file for itself, and fails where it is taken."""
+    taken = str(tmp_path / "taken")
+    program = says(
+        f'import os, time; os.mkdir({taken!r}); time.sleep(0.2); os.rmdir({taken!r}); print(\'{{"stage": "ready"}}\')'
+    )
+    limits = RegistryLimits(checks_at_once=1)
+    with ModelRegistry(tmp_path / "registry", check_program=program, limits=limits) as registry:
+        for _ in range(3):
+            registry.upload("liver", packed_model(files), None, "surgeon")
+        with ThreadPoolExecutor(3) as pool:
+            assert {
+                record.state for record in pool.map(lambda version: registry.check("liver", version), (1, 2, 3))
+            } == {"ready"}
+
+
 def test_readers_always_see_one_active_version(registry, files):
     """Activations and rollbacks go on beside them."""
     for seed in range(2):
@@ -100,8 +117,6 @@ def test_readers_always_see_one_active_version(registry, files):
 
 
 def test_a_version_that_is_deleted_while_it_is_checked_is_gone(new_registry, files):
-    from services.registry.errors import NotFound
-
     registry = new_registry()
     version = registry.upload("liver", packed_model(files), None, "surgeon").version
     registry._reached = lambda step: registry.delete("liver", version, "admin") if step == "check ended" else None

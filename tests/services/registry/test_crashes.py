@@ -36,9 +36,9 @@ STEPS = {
 }  # fmt: skip
 
 
-def prepare(folder, files, action):
+def prepare(folder, files, action, database_url=None):
     """Versions 1 and 2 are ready, and one is active (2 after 1 where it is rolled back); 3 waits for its check, or for being deleted."""
-    with ModelRegistry(folder, check_program=ALWAYS_READY) as registry:
+    with ModelRegistry(folder, database_url=database_url, check_program=ALWAYS_READY) as registry:
         for seed in (0, 1):
             add_ready(registry, files, seed)
         registry.activate("liver", 1, None, "admin")
@@ -70,13 +70,13 @@ def test_every_step_is_known(action, tmp_path, files):
 
 
 @pytest.mark.parametrize(("action", "step"), [(action, step) for action, steps in STEPS.items() for step in steps])
-def test_a_kill_at_a_step_leaves_the_old_or_the_new(action, step, tmp_path, files):
-    prepare(tmp_path, files, action)
-    died = run_dying(tmp_path, packed_model(files, 2), action, step)
+def test_a_kill_at_a_step_leaves_the_old_or_the_new(action, step, tmp_path, files, database_url):
+    prepare(tmp_path, files, action, database_url)
+    died = run_dying(tmp_path, database_url or "", packed_model(files, 2), action, step)
     assert died.returncode == -9, died.stderr
     happened = action in COMMITTED and STEPS[action].index(step) >= STEPS[action].index(COMMITTED[action])
 
-    with ModelRegistry(tmp_path, check_program=ALWAYS_READY) as registry:
+    with ModelRegistry(tmp_path, database_url=database_url, check_program=ALWAYS_READY) as registry:
         recovery = registry.recover()
         assert recovery.damaged == () and recovery.skipped is None
         assert_whole(registry)
@@ -102,7 +102,7 @@ def test_kills_at_random_while_versions_are_swapped(tmp_path, files):
         for _ in range(6):
             before = activations(reader)
             swapping = subprocess.Popen(
-                [sys.executable, dying.__file__, tmp_path, "-", "swap"],
+                [sys.executable, dying.__file__, tmp_path, "", "-", "swap"],
                 env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
             )  # fmt: skip
             with swapping:

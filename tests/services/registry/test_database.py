@@ -11,6 +11,7 @@ from services.registry.database import Database
 from services.registry.errors import SchemaTooNew, StoreUnavailable
 from services.registry.models import ModelRegistry
 from services.registry.tables import METADATA, MODELS
+from tests.services.registry.servers import new_database
 
 
 @pytest.fixture
@@ -124,3 +125,18 @@ def test_a_server_that_does_not_answer_is_named_without_its_password():
 def test_other_databases_are_refused(url):
     with pytest.raises(StoreUnavailable, match="cannot be opened"):
         Database(url)
+
+
+def test_connections_that_the_server_ended_are_opened_again(postgresql):
+    url = new_database(postgresql)
+    database, other = Database(url), Database(url)
+    database.migrate()
+    with other.writing() as connection:
+        mine = sa.text(
+            "SELECT count(pg_terminate_backend(pid)) FROM pg_stat_activity WHERE pid <> pg_backend_pid() AND datname = current_database()"
+        )
+        assert connection.execute(mine).scalar() == 1
+    with database.reading() as connection:
+        assert connection.execute(sa.select(MODELS)).all() == []
+    database.close()
+    other.close()

@@ -1,11 +1,14 @@
 """The life of versions: uploaded, checked, activated, rolled back, deleted; on SQLite and on PostgreSQL."""
 
+import errno
+import os
 import shutil
 
 import pytest
 
+from gsplat_core.io import atomic_files
 from gsplat_core.io.bundle import load_bundle
-from services.registry.errors import BlobDamaged, Conflict, NotFound, Rejected, StillActive
+from services.registry.errors import BlobDamaged, Conflict, NotFound, Rejected, StillActive, StoreUnavailable
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from tests.services.registry.made import add_ready, assert_whole, packed_model, sha256
@@ -234,10 +237,19 @@ def test_a_version_that_was_damaged_is_not_rolled_back_to(sqlite_registry, files
 
 
 def test_a_file_that_is_not_there_is_named(sqlite_registry, tmp_path):
-    from services.registry.errors import StoreUnavailable
-
     with pytest.raises(StoreUnavailable, match=r"nothing\.isplat is missing"):
         sqlite_registry.upload("liver", tmp_path / "nothing.isplat", None, "surgeon")
+
+
+def test_a_full_disk_is_said_and_nothing_is_kept(sqlite_registry, files, tmp_path, monkeypatch):
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(atomic_files.os, "fsync", full)
+    with pytest.raises(StoreUnavailable, match="the upload cannot be kept: No space left on device; free space"):
+        sqlite_registry.upload("liver", packed_model(files), None, "surgeon")
+    monkeypatch.undo()
+    assert sqlite_registry.models() == [] and not list((tmp_path / "registry" / "incoming").iterdir())
 
 
 def test_leftovers_are_removed_and_what_is_not_ours_stays(tmp_path, files):

@@ -87,6 +87,22 @@ def test_uploads_that_no_version_names_are_removed_once_they_are_old(bucket, s3)
     assert old.stored() == []
 
 
+def test_an_upload_that_ended_before_its_row_is_removed_once_it_is_old(bucket, s3, files, tmp_path, monkeypatch):
+    def stop(step):
+        if step == "blob stored":
+            raise KeyboardInterrupt
+
+    options = {"blobs_url": f"s3://{bucket[1]}/isplat", "blob_options": s3}
+    with ModelRegistry(tmp_path, reached=stop, **options) as registry, pytest.raises(KeyboardInterrupt):
+        registry.upload("liver", packed_model(files), None, "surgeon")
+    (key,) = objects(bucket)
+    with ModelRegistry(tmp_path, **options) as registry:
+        assert registry.models() == [] and registry.recover().removed == ()
+        monkeypatch.setattr(registry._blobs, "_others_upload_s", -60)
+        assert registry.recover().removed == (f"upload {key} that no version names",)
+    assert objects(bucket) == []
+
+
 def test_an_upload_that_the_store_does_not_take_leaves_nothing(s3, credentials, files, tmp_path):
     with ModelRegistry(tmp_path, blobs_url="s3://no-such-bucket/x", blob_options=s3) as registry:
         with pytest.raises(StoreUnavailable, match="no-such-bucket"):
