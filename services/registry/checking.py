@@ -54,21 +54,52 @@ class Verdict:
     description: dict[str, Any] = field(default_factory=dict)
 
 
+class RunningChecks:
+    """The processes of the checks that run now. Any thread may use it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._processes: set[subprocess.Popen[bytes]] = set()
+        self.ended = False
+
+    @contextlib.contextmanager
+    def counted(self, process: subprocess.Popen[bytes]) -> Iterator[None]:
+        """While entered, `end` ends this process. One that comes after `end` is ended at once."""
+        with self._lock:
+            self._processes.add(process)
+            if self.ended:
+                _kill(process)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._processes.discard(process)
+
+    def end(self) -> None:
+        """End every check that runs, and every one that is begun from now on; each raises CheckFailed."""
+        with self._lock:
+            self.ended = True
+            for process in self._processes:
+                _kill(process)
+
+
 def run_check(
     folder: Path,
     limits: RegistryLimits,
     device: str = "cpu",
     validated: Callable[[dict[str, Any]], None] = lambda description: None,
     program: tuple[str, ...] = PROGRAM,
+    running: RunningChecks | None = None,
 ) -> Verdict:
     """Check the model in `folder`; blocks until there is a verdict.
 
     A check that takes too long or too much memory, or that a model brings down, is a verdict too. validated: called once the contents are in order.
-    Raises CheckFailed where the check could not be run at all.
+    running: where the process is counted while it runs. Raises CheckFailed where the check could not be run at all, or was ended with the others.
     """
+    running = running or RunningChecks()
     command = [*program, str(folder), "--json", "--device", device, *_budgets(limits)]
     verdict, description = None, dict[str, Any]()
-    with tempfile.TemporaryFile() as said, _started(command, said, device) as process:
+    with tempfile.TemporaryFile() as said, _started(command, said, device) as process, running.counted(process):
         with _time_limit(process, limits.check_s) as late:
             for line in _lines(process):
                 stage = line.pop("stage", None)
@@ -82,6 +113,8 @@ def run_check(
             code = process.wait()
         if code == 0 and verdict is not None:
             return verdict
+        if running.ended:
+            raise CheckFailed("the check was ended because the service stops; the version waits for another one")
         return _of_the_end(code, late.is_set(), limits, said)
 
 

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from services.registry import activation
 from services.registry.blobs import open_blobs
 from services.registry.bundle_file import SUFFIX
-from services.registry.checking import PROGRAM, Verdict, run_check
+from services.registry.checking import PROGRAM, RunningChecks, Verdict, run_check
 from services.registry.database import Database
 from services.registry.errors import Conflict, NotFound, StoreUnavailable
 from services.registry.folder_lock import FolderLock
@@ -87,6 +87,7 @@ class ModelRegistry:
                 f"the registry cannot use {folder}: {error.strerror or error}; give a folder that can be written"
             ) from error
         self._checks = threading.BoundedSemaphore(limits.checks_at_once)
+        self._running = RunningChecks()
         self._lock = FolderLock(folder / "lock")
         self._database = Database(database_url or f"sqlite:///{folder.absolute() / 'registry.sqlite'}")
         self._database.migrate()
@@ -134,7 +135,7 @@ class ModelRegistry:
                 return version_record(row)
             with self._lock.shared():
                 folder = self._unpacked.folder_of(row)
-            verdict = run_check(folder, self._limits, self._device, validated, self._check_program)
+            verdict = run_check(folder, self._limits, self._device, validated, self._check_program, self._running)
         self._reached("check ended")
         state = State.READY if verdict.reason is None else State.REJECTED
         return self._after_check(name, version, state, verdict)
@@ -249,7 +250,8 @@ class ModelRegistry:
         return findings(rows, stored, removed, None)
 
     def close(self) -> None:
-        """Close the connections to the database."""
+        """End the checks that run, whose versions wait for another one, and close the connections to the database."""
+        self._running.end()
         self._database.close()
 
     def __enter__(self) -> ModelRegistry:

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -141,6 +142,27 @@ def test_a_check_that_failed_can_be_made_again(tmp_path, files):
     with ModelRegistry(tmp_path, check_program=ALWAYS_READY) as registry:
         assert registry.recover().unchecked == (("liver", 1),)
         assert registry.check("liver", 1).state == "ready"
+
+
+def test_closing_the_registry_ends_its_checks(tmp_path, files):
+    """Two are under way: one runs, the other waits for it. Neither version is rejected for that."""
+    begun = tmp_path / "begun"
+    program = says(f"import time; open({str(begun)!r}, 'w').close(); time.sleep(60)")
+    registry = ModelRegistry(tmp_path / "registry", check_program=program)
+    for _ in range(2):
+        registry.upload("liver", packed_model(files), None, "surgeon")
+    with ThreadPoolExecutor(2) as pool:
+        checks = [pool.submit(registry.check, "liver", version) for version in (1, 2)]
+        while not begun.exists():
+            assert not any(check.done() for check in checks)
+            threading.Event().wait(0.01)
+        registry.close()
+        for check in checks:
+            with pytest.raises(CheckFailed, match="because the service stops"):
+                check.result(10)
+    with ModelRegistry(tmp_path / "registry", check_program=ALWAYS_READY) as again:
+        assert again.recover().unchecked == (("liver", 1), ("liver", 2))
+    registry.close()
 
 
 def test_credentials_do_not_reach_the_check(tmp_path, monkeypatch):
