@@ -122,8 +122,10 @@ class EncodedPicture(Protocol):
 class Display(Protocol):
     """Pictures of the streams, newest wins: who reads slowly misses some."""
 
-    def subscribe(self, stream: str, kind: PictureKind, quality: int) -> AsyncIterator[EncodedPicture]:
-        """Pictures until the iterator is closed (`aclose`) or the stream is gone."""
+    def subscribe(
+        self, stream: str, kind: PictureKind, quality: int
+    ) -> AbstractAsyncContextManager[AsyncIterator[EncodedPicture]]:
+        """A viewer while it is entered; its pictures end when the stream is gone."""
 
 
 class Jobs(Protocol):

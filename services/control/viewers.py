@@ -36,14 +36,8 @@ async def viewing(
     if control.viewers.full:
         raise Unavailable(f"{control.settings.limits.viewers} displays are open, which is as many as may be; close one")
     with control.viewers.one_more(), gauge.track_inprogress():
-        pictures = display.subscribe(stream, kind, quality)
-        try:
+        async with display.subscribe(stream, kind, quality) as pictures:
             yield pictures
-        finally:
-            close: Any = getattr(pictures, "aclose", None)
-            if close is not None:
-                with anyio.CancelScope(shield=True):
-                    await close()
 
 
 def in_time(send: Callable[[Any], Awaitable[None]], connection: HTTPConnection) -> Callable[[Any], Awaitable[None]]:

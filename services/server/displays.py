@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 from services.control.parts import PictureKind
 from services.control.problems import Conflicting
@@ -16,11 +17,13 @@ class StreamDisplays:
     def __init__(self, streams: SupervisedStreams) -> None:
         self._streams = streams
 
-    async def subscribe(self, stream: str, kind: PictureKind, quality: int) -> AsyncIterator[EncodedPicture]:
+    @asynccontextmanager
+    async def subscribe(
+        self, stream: str, kind: PictureKind, quality: int
+    ) -> AsyncIterator[AsyncIterator[EncodedPicture]]:
         """See `Display`. Raises Conflicting for a stream that does not run."""
         hub = self._streams.hub(stream)
         if hub is None:
             raise Conflicting(f"the stream {stream} is stopped; start it first")
         async with hub.subscribe(kind, quality) as viewer:
-            async for picture in viewer:
-                yield picture
+            yield viewer

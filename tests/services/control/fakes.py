@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -166,17 +167,21 @@ class FakeDisplay:
         self.open = 0
         self.asked: list[tuple[str, str, int]] = []
 
-    async def subscribe(self, stream: str, kind: str, quality: int) -> AsyncIterator[FakePicture]:
+    @asynccontextmanager
+    async def subscribe(self, stream: str, kind: str, quality: int) -> AsyncIterator[AsyncIterator[FakePicture]]:
         self.asked.append((stream, kind, quality))
         self.open += 1
         try:
-            seq = 0
-            while self.most is None or seq < self.most:
-                yield FakePicture({"seq": seq, "state": "live"}, self.jpeg)
-                seq += 1
-                await asyncio.sleep(0.005)
+            yield self.pictures()
         finally:
             self.open -= 1
+
+    async def pictures(self) -> AsyncIterator[FakePicture]:
+        seq = 0
+        while self.most is None or seq < self.most:
+            yield FakePicture({"seq": seq, "state": "live"}, self.jpeg)
+            seq += 1
+            await asyncio.sleep(0.005)
 
 
 def fake_parts(**other: Any) -> Parts:

@@ -57,7 +57,7 @@ def test_what_cannot_be_is_refused_and_changes_nothing(streams):
             with pytest.raises(Missing):
                 await refused("nobody")
         with pytest.raises(Conflicting, match="stopped"):
-            await anext(StreamDisplays(streams).subscribe("theatre-1", "raw", 80))
+            await StreamDisplays(streams).subscribe("theatre-1", "raw", 80).__aenter__()
         for number in range(MOST_STREAMS - 1):
             await streams.create(stream(f"more-{number}"))
         with pytest.raises(Conflicting, match="as many as may be"):
