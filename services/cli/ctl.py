@@ -6,15 +6,17 @@ import json as json_format
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from pydantic import BaseModel
 
 from gsplat_core.errors import InvalidSetting
 from services.cli.exit_codes import OK
 from services.cli.options import JsonOption
 from services.cli.streams import printable
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 ctl = typer.Typer(help="Speak to a running service (`intrasplat serve`).", no_args_is_help=True)
 URL, KEY = "INTRASPLAT_URL", "INTRASPLAT_KEY"
