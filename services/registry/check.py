@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import resource
 import sys
@@ -74,12 +75,12 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--model-bytes", type=int, default=4 << 30, help="at most so much of tensors")
     parser.add_argument("--pixels", type=int, default=4096 * 4096, help="at most so many in the camera's picture")
     parser.add_argument("--memory-bytes", type=int, default=12 << 30, help="what this may take beside torch itself")
-    parser.add_argument("--seconds", type=float, default=120.0, help="of processor time, for each processor")
+    parser.add_argument("--seconds", type=float, default=120.0, help="of processor time beside the start of torch")
     return parser.parse_args(arguments)
 
 
 def _limit_resources(options: argparse.Namespace) -> None:
-    """No more processor time than allowed, no more memory beyond what torch itself takes, and no core file with a model in it.
+    """No more processor time and memory than allowed beyond what torch itself has taken, and no core file with a model in it.
 
     On CUDA memory is not limited: it maps far more than it takes.
     """
@@ -87,7 +88,7 @@ def _limit_resources(options: argparse.Namespace) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if options.device == "cpu":
         _lower(resource.RLIMIT_DATA, _taken_bytes() + options.memory_bytes)
-    _lower(resource.RLIMIT_CPU, int(options.seconds + 1) * len(os.sched_getaffinity(0)))
+    _lower(resource.RLIMIT_CPU, math.ceil(time.process_time() + options.seconds), spare=5)
 
 
 def _taken_bytes() -> int:
@@ -96,10 +97,13 @@ def _taken_bytes() -> int:
     return int(fields["VmData"].split()[0]) * 1024
 
 
-def _lower(kind: int, wanted: int) -> None:
+def _lower(kind: int, wanted: int, spare: int = 0) -> None:
+    """Set a limit, unless there is a lower one. spare: between the warning (of processor time: SIGXCPU) and the end."""
     _, hard = resource.getrlimit(kind)
-    allowed = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
-    resource.setrlimit(kind, (allowed, allowed))
+    allowed = [wanted, wanted + spare]
+    if hard != resource.RLIM_INFINITY:
+        allowed = [min(each, hard) for each in allowed]
+    resource.setrlimit(kind, (allowed[0], allowed[1]))
 
 
 def _read(options: argparse.Namespace) -> Model:

@@ -93,14 +93,14 @@ def run_check(
 ) -> Verdict:
     """Check the model in `folder`; blocks until there is a verdict.
 
-    A check that takes too long or too much memory, or that a model brings down, is a verdict too. validated: called once the contents are in order.
+    A check that takes too much processor time or memory, or that a model brings down, is a verdict too. validated: called once the contents are in order.
     running: where the process is counted while it runs. Raises CheckFailed where the check could not be run at all, or was ended with the others.
     """
     running = running or RunningChecks()
     command = [*program, str(folder), "--json", "--device", device, *_budgets(limits)]
     verdict, description = None, dict[str, Any]()
     with tempfile.TemporaryFile() as said, _started(command, said, device) as process, running.counted(process):
-        with _time_limit(process, limits.check_s) as late:
+        with _time_limit(process, limits.check_passed_s) as late:
             for line in _lines(process):
                 stage = line.pop("stage", None)
                 if stage == "rejected":
@@ -195,7 +195,9 @@ def _lines(process: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
 def _of_the_end(code: int, late: bool, limits: RegistryLimits, said: Any) -> Verdict:
     """The verdict on a check that ended without one. Raises CheckFailed where that says nothing about the model."""
     if late:
-        return Verdict(f"its check took longer than {limits.check_s:g} s")
+        raise CheckFailed(
+            f"the check lasted longer than {limits.check_passed_s:g} s; check again when this machine is less busy"
+        )
     if code < 0 and -code in _OF_THE_MODEL:
         return Verdict(
             f"its check was ended by {signal.Signals(-code).name}, as one is that takes too much memory or time"

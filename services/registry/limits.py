@@ -21,7 +21,9 @@ class RegistryLimits:
     check_memory_bytes: int = 12 * GIB
     """What the checking process may take beside torch itself."""
     check_s: float = 120.0
-    """How long the check may take, the start of its process included."""
+    """Processor time of the check beside the start of torch. More rejects the version."""
+    check_passed_s: float = 600.0
+    """How long a check may last, the start of its process included. More says that the machine is too busy, and nothing about the version."""
 
     checks_at_once: int = 1
     """Further checks wait for their turn."""
