@@ -4,6 +4,7 @@
       launcher, launcher.json    (`services.supervisor.launcher`)
       STREAM/                    0700
         capture.json  capture.spec  capture.log  capture.lock    engine.…  the same
+        engine.show                                 the model that is shown in place of the live reconstruction
         raw   capture.status   capture.ctl          sockets of the capture process
         shown engine.status    engine.ctl           sockets of the engine process
 
@@ -138,7 +139,7 @@ class StreamFolder:
         """Remove the folder with all that the processes of this stream left behind; they have ended."""
         for role in ROLES:
             self.clean(role)
-            for path in (self.spec(role), self.log(role), self.path / f"{role}.lock"):
+            for path in (self.spec(role), self.log(role), self.path / f"{role}.lock", self.path / f"{role}.show"):
                 path.unlink(missing_ok=True)
         self.path.rmdir()
 

@@ -113,13 +113,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run until told to stop; returns the exit code."""
     parser = argparse.ArgumentParser(description="Capture process of a stream.")
     parser.add_argument("--spec", required=True, help="file with the specification")
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
         folder, spec = stream_folder_of(parser.parse_args(arguments).spec, "capture")
         assert spec.capture is not None
         capture = Capture(spec.capture)
         with Worker(folder, spec, {"describe": capture.describe}) as worker:
-            worker.tell_figures(capture.figures)
+            worker.tell_figures("capture", capture.figures)
             publisher = PicturePublisher(folder.pictures("capture"))
             try:
                 capture.publish(worker, publisher)

@@ -20,14 +20,19 @@ from operators.applications.live_settings import LiveSettings
 from operators.applications.live_start import LiveParts, low_latency, new_parts, warm_up
 from operators.applications.session import Session
 from operators.applications.trial_run import trial_run
+from operators.errors import SourceUnavailable
 from operators.frame_clock import ClockSettings
 from operators.metrics import ScoredFrame
 from services.bus.pictures import PicturePublisher
 from services.supervisor.captured_source import CapturedSource
 from services.supervisor.exit_codes import NO_USE
+from services.supervisor.model_show import ModelShow
 from services.supervisor.screen import Screen
 from services.supervisor.specs import EngineSpec
 from services.supervisor.worker import Worker, stream_folder_of
+
+LOOK_S = 0.05
+"""How often it is asked whether the live reconstruction is to be shown again."""
 
 
 def live_settings(spec: EngineSpec, out: Path, source: str) -> LiveSettings:
@@ -55,11 +60,14 @@ def started(settings: LiveSettings, source: CapturedSource, again: bool) -> Live
 
 
 def reconstruct(worker: Worker, spec: EngineSpec, screen: Screen, *, again: bool) -> None:
-    """Reconstruct and show until the process is to end. Raises a UserError for what cannot work, RunFailed when a part failed."""
+    """Reconstruct and show until the process is to end, or a finished model is to be shown. Raises a UserError for what cannot work, RunFailed when
+    a part failed."""
+
+    def stop_requested() -> bool:
+        return worker.stop_requested() or screen.wanted != "live"
+
     worker.say("starting", "waits for the source to be opened by the capture process")
-    source = CapturedSource(worker.folder, worker.stop_requested)
-    check_device(spec.device)
-    check_renderer(spec.renderer, spec.device)
+    source = CapturedSource(worker.folder, stop_requested)
     check_picture(source.description.camera, 1.0)
     with TemporaryDirectory(prefix="intrasplat-engine-") as folder, low_latency():
         settings = live_settings(spec, Path(folder), source.description.name)
@@ -70,11 +78,34 @@ def reconstruct(worker: Worker, spec: EngineSpec, screen: Screen, *, again: bool
             screen.scored(score)
 
         graph = LiveApplication(
-            source, settings, parts, stop_requested=worker.stop_requested, on_scored=scored, on_shown=screen.show
+            source, settings, parts, stop_requested=stop_requested, on_scored=scored, on_shown=screen.show
         )
-        worker.tell_figures(lambda: {**screen.figures(), **graph_figures(graph)})
+        worker.tell_figures("graph", lambda: graph_figures(graph))
         worker.say("running", "reconstructs")
-        Session(graph, settings.stated(), command="live", stop_requested=worker.stop_requested).execute()
+        Session(graph, settings.stated(), command="live", stop_requested=stop_requested).execute()
+        worker.tell_figures("graph", dict)
+
+
+def show(worker: Worker, spec: EngineSpec, screen: Screen, again: bool) -> None:
+    """Show the live reconstruction or a finished model, as it is asked for, until the process is to end."""
+    check_device(spec.device)
+    check_renderer(spec.renderer, spec.device)
+    models = ModelShow(worker, spec, screen)
+    worker.tell_figures("screen", lambda: {**screen.figures(), **models.figures()})
+    try:
+        models.begin()
+        worker.take({"show_model": models.show, "show_live": models.show_live, "show_previous": models.show_previous})
+        while not worker.stop_requested():
+            if screen.wanted == "live":
+                reconstruct(worker, spec, screen, again=again)
+                again = True
+            else:
+                worker.say("running", "shows a finished model")
+                worker.wait(LOOK_S)
+    finally:
+        if not worker.stop_requested():
+            worker.request_stop("the engine failed")
+        models.close()
 
 
 def graph_figures(graph: LiveApplication) -> dict[str, object]:
@@ -101,16 +132,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--spec", required=True, help="file with the specification")
     parser.add_argument("--again", action="store_true", help="an engine of this stream ran before: show a picture soon")
     given = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
         folder, spec = stream_folder_of(given.spec, "engine")
         assert spec.engine is not None
-        with Worker(folder, spec, {}) as worker:
+        with Worker(folder, spec) as worker:
             publisher = PicturePublisher(folder.pictures("engine"))
             try:
-                reconstruct(worker, spec.engine, Screen(publisher), again=given.again)
+                show(worker, spec.engine, Screen(publisher), given.again)
             finally:
                 publisher.close()
+    except SourceUnavailable as error:  # nothing is a reason for not trying again
+        logging.getLogger(__name__).info("%s", error)
     except UserError as error:
         logging.getLogger(__name__).error("%s", error)
         return NO_USE

@@ -146,7 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--folder", required=True, help="runtime folder")
     parser.add_argument("--orphan-after-s", type=float, default=600.0)
     given = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     # By NVML it can be asked whether there is a GPU without using it, after which no engine could.
     os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
     try:

@@ -6,19 +6,30 @@ import math
 import threading
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from operators.messages import ShownPicture
 from operators.metrics import ScoredFrame
 from services.bus.pictures import PicturePublisher
 
+Shows = Literal["live", "model"]
+
 
 class Screen:
-    """The one place from which an engine's pictures go out, so that each is of one model as a whole."""
+    """The one place from which an engine's pictures go out, so that each is of one model as a whole.
+
+    It shows the live reconstruction or a finished model. From one to the other there is no moment without pictures: what was shown goes on
+    until the first picture of the other is there.
+    """
 
     def __init__(self, publisher: PicturePublisher) -> None:
         self._publisher = publisher
         self._lock = threading.Lock()
+        self._wanted: Shows = "live"
+        self._shown: Shows = "live"
         self.pictures = 0
         """New pictures that were shown."""
         self.published = 0
@@ -26,40 +37,51 @@ class Screen:
         self._last: dict[str, Any] = {}
         self._psnr_db: float | None = None
 
+    @property
+    def wanted(self) -> Shows:
+        """What is to be shown."""
+        return self._wanted
+
+    def want(self, shows: Shows) -> None:
+        """Show the one or the other from its next picture on."""
+        with self._lock:
+            self._wanted = shows
+
     def show(self, shown: ShownPicture) -> None:
-        """Publish a picture of the live reconstruction."""
+        """A picture of the live reconstruction."""
         rendered = shown.rendered
         content = rendered.content or rendered.frame
-        self.publish(
-            {
-                "show": "live",
-                "seq": rendered.frame.seq,
-                "pts_ns": rendered.frame.pts_ns,
-                "arrived_ns": content.arrived_ns,
-                "shown_ns": shown.shown_ns,
-                "age_ms": round(shown.age_ns * 1e-6, 3),
-                "state": shown.state.value,
-                "new": shown.new,
-                "model_version": rendered.model_version,
-                "steps": rendered.steps,
-                "psnr_db": self._psnr_db,
-            },
-            shown.image,
-        )
+        header = {
+            "seq": rendered.frame.seq,
+            "pts_ns": rendered.frame.pts_ns,
+            "arrived_ns": content.arrived_ns,
+            "shown_ns": shown.shown_ns,
+            "age_ms": round(shown.age_ns * 1e-6, 3),
+            "state": shown.state.value,
+            "new": shown.new,
+            "model_version": rendered.model_version,
+            "steps": rendered.steps,
+            "psnr_db": self._psnr_db,
+        }
+        self.publish("live", header, shown.image)
 
     def scored(self, scored: ScoredFrame) -> None:
         """What the newest scored picture's tissue PSNR was: the next ones tell it."""
         value = scored.quality.psnr_tissue_db
         self._psnr_db = round(value, 3) if math.isfinite(value) else None
 
-    def publish(self, header: Mapping[str, Any], image: Any) -> None:
-        """Publish a picture."""
+    def publish(self, shows: Shows, header: Mapping[str, Any], image: NDArray[np.uint8]) -> bool:
+        """Publish a picture; False, without effect, when the other one is shown by now."""
         with self._lock:
-            self._publisher.publish(header, image)
+            if shows != self._wanted and self._shown != shows:
+                return False
+            self._shown = shows
+            self._publisher.publish({"show": shows, **header}, image)
             self.published += 1
             self.pictures += bool(header["new"])
-            self._last = {name: header[name] for name in ("show", "state", "age_ms", "model_version", "psnr_db")}
-            self._last["shown_ns"] = time.monotonic_ns()
+            self._last = {name: header[name] for name in ("state", "age_ms", "model_version", "psnr_db")}
+            self._last |= {"show": shows, "shown_ns": time.monotonic_ns()}
+            return True
 
     def figures(self) -> dict[str, Any]:
         """For the heartbeats."""

@@ -30,16 +30,16 @@ class Worker:
     Raises AlreadyRunning where another process serves this part.
     """
 
-    def __init__(self, folder: StreamFolder, spec: ProcessSpec, handlers: Mapping[str, Handler]) -> None:
+    def __init__(self, folder: StreamFolder, spec: ProcessSpec, handlers: Mapping[str, Handler] | None = None) -> None:
         """handlers: commands beside `ping` and `stop`."""
         self.folder, self.spec, self.role = folder, spec, spec.role
-        self._own: dict[str, Handler] = {"ping": lambda _: {"pid": os.getpid()}, "stop": self._told_to_stop}
-        self._handlers = {**self._own, **handlers}
+        own: dict[str, Handler] = {"ping": lambda _: {"pid": os.getpid()}, "stop": self._told_to_stop}
+        self._handlers = {**own, **(handlers or {})}
         self._stop = threading.Event()
         self._over = threading.Event()
         self._saying = threading.Lock()
         self._said: dict[str, Any] = {"state": "starting", "reason": f"the {spec.role} process starts"}
-        self._figures: Callable[[], Mapping[str, Any]] = dict
+        self._figures: dict[str, Callable[[], Mapping[str, Any]]] = {}
         self.stop_reason = ""
 
     def __enter__(self) -> Worker:
@@ -69,6 +69,10 @@ class Worker:
         self.folder.clean(self.role)
         os.close(self._lock)
 
+    def take(self, handlers: Mapping[str, Handler]) -> None:
+        """Answer these commands, too."""
+        self._handlers.update(handlers)
+
     def say(self, state: str, reason: str) -> None:
         """What the process is doing, and why, in a sentence."""
         with self._saying:
@@ -78,9 +82,9 @@ class Worker:
             log.info("%s: %s", state, reason)
             self._heartbeats.say_now()
 
-    def tell_figures(self, figures: Callable[[], Mapping[str, Any]]) -> None:
-        """What each heartbeat tells besides; called in its thread."""
-        self._figures = figures
+    def tell_figures(self, part: str, figures: Callable[[], Mapping[str, Any]]) -> None:
+        """What each heartbeat tells of a part of the process besides; called in its thread."""
+        self._figures[part] = figures
 
     def stop_requested(self) -> bool:
         """Whether the process is to finish what it has and to end."""
@@ -105,7 +109,8 @@ class Worker:
     def _report(self) -> Mapping[str, Any]:
         with self._saying:
             said = dict(self._said)
-        return {"role": self.role, **said, "figures": dict(self._figures())}
+        figures = {name: value for part in list(self._figures.values()) for name, value in part().items()}
+        return {"role": self.role, **said, "figures": figures}
 
     def _look_after(self) -> None:
         limits = self.spec.limits

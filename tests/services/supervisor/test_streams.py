@@ -12,8 +12,13 @@ import sys
 import time
 
 import pytest
+import torch
 import zmq
 
+from gsplat_core.io.bundle import save_bundle
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.model import Model
 from services.bus.pictures import split, subscribe
 from services.bus.process_identity import ProcessIdentity
 from services.bus.runtime import RuntimeFolder
@@ -141,6 +146,16 @@ def test_capture_loads_no_torch(runtime):
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
+@pytest.fixture
+def bundle(tmp_path):
+    """A model of one Gaussian."""
+    one = Gaussians(
+        *(torch.tensor(values) for values in ([[0.0, 0, 4]], [[1.0, 0, 0, 0]], [[0.0, 0, 0]], [2.0], [[[1.0, 0, 0]]]))
+    )
+    save_bundle(Model(1, one, None, Camera.from_focal(30.0, 32, 24), (0.0, 1.0)), tmp_path / "bundle")
+    return tmp_path / "bundle"
+
+
 CONTROL_PLANE = """
 import asyncio, sys
 from pathlib import Path
@@ -162,7 +177,7 @@ asyncio.run(run())
 """
 
 
-def test_processes_outlive_the_control_plane_and_each_other(runtime):
+def test_processes_outlive_the_control_plane_and_each_other(runtime, bundle):
     """One long story, since an engine takes seconds to start."""
 
     async def scenario() -> None:
@@ -212,6 +227,18 @@ def test_processes_outlive_the_control_plane_and_each_other(runtime):
             assert stream.state().engine.pid == pid
             numbers = [header["seq"] for header in shown.seen[seen:] if header["new"]]
             assert numbers == sorted(numbers)
+
+            # A finished model takes over from the live reconstruction, outlasts the engine, and gives way again.
+            answer = await stream.command("engine", "show_model", timeout_s=30.0, folder=str(bundle), version=7)
+            assert answer["version"] == 7
+            await until(lambda: shown.seen[-1]["show"] == "model")
+            kill(stream.state().engine.pid)
+            at_ns, seen = time.monotonic_ns(), len(shown.seen)
+            await until(lambda: shown.seen[-1]["arrived_ns"] > at_ns)
+            assert {(each["show"], each["model_version"]) for each in shown.seen[seen:]} == {("model", 7)}
+            await until(lambda: stream.state().engine.state == "running")
+            await stream.command("engine", "show_live")
+            await until(lambda: shown.seen[-1]["show"] == "live")
 
             # Everything is ended: nothing is left.
             pids = [stream.state().engine.pid, stream.state().capture.pid]

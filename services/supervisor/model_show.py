@@ -1,0 +1,213 @@
+"""Finished models in place of the live reconstruction: commands `show_model` and `show_live` of an engine."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsplat_core.errors import UserError
+from gsplat_core.scene.frames import Frame
+from operators.messages import PictureState
+from operators.sources.source import SourceState
+from services.bus.commands import text_of
+from services.bus.errors import BadMessage, BusError, CommandRefused
+from services.bus.runtime import read_json, write_json
+from services.supervisor.captured_source import CapturedSource
+from services.supervisor.finished_model import FinishedModel, NotFinite
+from services.supervisor.screen import Screen
+from services.supervisor.specs import EngineSpec
+from services.supervisor.worker import Worker
+
+log = logging.getLogger(__name__)
+LOOK_S = 0.1
+REPEAT_NS = 200_000_000
+LATE_IN_A_ROW = 5
+"""So many pictures in a row that take longer than they may are a missed bound; one may be the machine's."""
+
+
+@dataclass(frozen=True)
+class Showing:
+    """A model and what was asked of it."""
+
+    model: FinishedModel
+    asked: Mapping[str, Any]
+    """The command's arguments."""
+    most_ms: float | None
+
+    def __str__(self) -> str:
+        return f"{self.model.name or 'the model'} {self.model.version}"
+
+
+class ModelShow:
+    """Shows one finished model, at the time of each frame that comes, and keeps the one before for going back.
+
+    Another model takes over between two pictures. One whose picture is not finite, or whose pictures take longer than `most_ms` again and
+    again, gives way to the one before it, or to the live reconstruction. What is shown outlasts the process: the next engine begins with it.
+    """
+
+    def __init__(self, worker: Worker, spec: EngineSpec, screen: Screen) -> None:
+        self._worker, self._spec, self._screen = worker, spec, screen
+        self._file = worker.folder.path / "engine.show"
+        self._lock = threading.Lock()
+        self._changing = threading.Lock()
+        self._current: Showing | None = None
+        self._previous: Showing | None = None
+        self._late = 0
+        self._gave_way: list[dict[str, Any]] = []
+        """The newest models that were taken back, each with its reason."""
+        self._thread: threading.Thread | None = None
+
+    def begin(self) -> None:
+        """Take up what the engine before has shown."""
+        try:
+            said = read_json(self._file)
+            self.show(said)
+        except FileNotFoundError:
+            return
+        except (UserError, BusError) as error:
+            log.error("the model that was shown is not shown again: %s", error)
+            self._file.unlink()
+
+    def show(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """`show_model {folder, version, name?, most_ms?}`: returns once the model is there and has drawn a picture. Raises as `FinishedModel`,
+        and BadMessage; what was shown before then goes on."""
+        folder, version = text_of(arguments, "folder"), arguments.get("version")
+        name, most_ms = arguments.get("name", ""), arguments.get("most_ms")
+        if type(version) is not int or version < 1 or not isinstance(name, str):
+            raise BadMessage(f"version is {version!r:.40} and name {name!r:.40}; give a whole number and a text")
+        if most_ms is not None and not (isinstance(most_ms, int | float) and most_ms > 0):
+            raise BadMessage(f"most_ms is {most_ms!r:.40}; give milliseconds, or leave it out")
+        with self._changing:
+            began_s = time.monotonic()
+            model = FinishedModel(Path(folder), name, version, device=self._spec.device, renderer=self._spec.renderer)
+            asked = {"folder": folder, "version": version, "name": name, "most_ms": most_ms}
+            with self._lock:
+                self._previous = self._current
+                self._put(Showing(model, asked, most_ms))
+                self._screen.want("model")
+                if self._thread is None:
+                    self._thread = threading.Thread(target=self._show_models, name="models")
+                    self._thread.start()
+            return {"version": version, "prepared_s": round(time.monotonic() - began_s, 3)}
+
+    def show_live(self, _: Mapping[str, Any]) -> None:
+        """`show_live`: the live reconstruction again, from its first picture on."""
+        with self._changing, self._lock:
+            self._to_live()
+
+    def show_previous(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        """`show_previous`: the model before, which is still there. Raises CommandRefused where there is none."""
+        with self._changing, self._lock:
+            if self._current is None or self._previous is None:
+                raise CommandRefused("no model was shown before this one")
+            before, self._previous = self._previous, self._current
+            self._put(before)
+            return {"version": before.model.version}
+
+    def figures(self) -> dict[str, Any]:
+        """For the heartbeats."""
+        with self._lock:
+            current = self._current
+            shown = None if current is None else {"name": current.model.name, "version": current.model.version}
+            return {"model": shown, "gave_way": list(self._gave_way)}
+
+    def close(self) -> None:
+        """Wait for the end of the thread, once the process is to end."""
+        thread = self._thread
+        if thread is not None:
+            thread.join()
+
+    def _show_models(self) -> None:
+        """Draw at the time of each frame, until the live reconstruction has taken over or the process is to end."""
+        stop = self._worker.stop_requested
+        try:
+            source = CapturedSource(self._worker.folder, stop)
+        except UserError:
+            return  # told to stop before there was a source
+        source.open()
+        frame: Frame | None = None
+        repeated_ns = 0
+        try:
+            while not stop():
+                came = source.read(LOOK_S)
+                frame, now_ns = came or frame, time.monotonic_ns()
+                if frame is None or (came is None and now_ns - repeated_ns < REPEAT_NS):
+                    continue
+                repeated_ns = now_ns
+                if not self._draw(frame, came is not None, source.state) and self._live_has_taken_over():
+                    return
+        finally:
+            source.close()
+
+    def _live_has_taken_over(self) -> bool:
+        with self._lock:
+            if self._screen.wanted != "live":
+                return False
+            self._current = self._thread = None
+            return True
+
+    def _draw(self, frame: Frame, new: bool, source: SourceState) -> bool:
+        """One picture; False when it is not shown."""
+        with self._lock:
+            showing = self._current
+        assert showing is not None
+        began_ns = time.monotonic_ns()
+        try:
+            image = showing.model.picture(frame.time_s)
+        except NotFinite as error:
+            return self._give_way(showing, str(error))
+        now_ns = time.monotonic_ns()
+        self._check_time(showing, (now_ns - began_ns) * 1e-6)
+        age_ns = max(0, now_ns - (frame.arrived_ns or now_ns))
+        state = PictureState.LIVE if source is SourceState.LIVE else PictureState.SOURCE_LOST
+        header = {
+            "seq": frame.seq,
+            "pts_ns": frame.pts_ns,
+            "arrived_ns": frame.arrived_ns,
+            "shown_ns": now_ns,
+            "age_ms": round(age_ns * 1e-6, 3),
+            "state": state.value,
+            "new": new,
+            "model": showing.model.name,
+            "model_version": showing.model.version,
+            "steps": 0,
+            "psnr_db": None,
+        }
+        return self._screen.publish("model", header, image)
+
+    def _check_time(self, showing: Showing, took_ms: float) -> None:
+        late = showing.most_ms is not None and took_ms > showing.most_ms
+        self._late = self._late + 1 if late else 0
+        if self._late >= LATE_IN_A_ROW:
+            self._give_way(showing, f"{showing} took {took_ms:.1f} ms for a picture, {LATE_IN_A_ROW} times in a row")
+
+    def _give_way(self, showing: Showing, why: str) -> bool:
+        """Show what was shown before; False when that is the live reconstruction."""
+        log.error("%s; what was shown before is shown again", why)
+        with self._lock:
+            taken_back = {"name": showing.model.name, "version": showing.model.version, "reason": why}
+            self._gave_way = [*self._gave_way[-7:], taken_back]
+            if self._current is not showing:
+                return True  # another one has taken over meanwhile
+            before, self._previous = self._previous, None
+            if before is not None:
+                self._put(before)
+                return True
+            self._to_live()
+            return False
+
+    def _put(self, showing: Showing) -> None:
+        """What the next picture shows; under the lock."""
+        self._current, self._late = showing, 0
+        write_json(self._file, showing.asked)
+
+    def _to_live(self) -> None:
+        # The model goes on until the first live picture is there; then publishing it is refused, and its thread ends.
+        self._screen.want("live")
+        self._previous = None
+        self._file.unlink(missing_ok=True)
