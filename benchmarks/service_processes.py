@@ -23,7 +23,7 @@ from service_watchers import Watch, quantiles
 
 from services.bus.runtime import Role, RuntimeFolder
 from services.supervisor.launching import ByLauncher
-from services.supervisor.specs import SourceSpec, StreamSpec
+from services.supervisor.specs import EngineSpec, SourceSpec, StreamSpec
 from services.supervisor.stream import StreamSupervisor
 
 SOURCE = "synthetic:?width=160&height=128&frames=12&fps=30"
@@ -48,7 +48,11 @@ async def killed(options: argparse.Namespace, role: Role) -> dict[str, object]:
         launcher = ByLauncher(runtime)
         launcher.open()
         stream = StreamSupervisor(
-            StreamSpec(name="bench", source=SourceSpec(address=options.source)), runtime, start=launcher
+            StreamSpec(
+                name="bench", source=SourceSpec(address=options.source), engine=EngineSpec(device=options.device)
+            ),
+            runtime,
+            start=launcher,
         )
         await stream.start()
         raw = [Watch(stream.folder.pictures("capture")) for _ in range(2)]
@@ -92,6 +96,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--source", default=SOURCE)
+    parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     print(json.dumps(asyncio.run(killed(options, options.what)), indent=2))
 

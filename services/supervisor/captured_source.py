@@ -71,6 +71,7 @@ class CapturedSource(LiveSource):
         for socket in (pictures, status, ended):
             poller.register(socket, zmq.POLLIN)
         run: Any = None
+        self._heard_s = time.monotonic()  # before, nobody has listened
         try:
             while not self.wait(0):
                 found = dict(poller.poll(LOOK_MS))

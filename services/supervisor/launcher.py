@@ -1,13 +1,13 @@
-"""The launcher, `python -m services.supervisor.launcher --folder RUNTIME`: has loaded everything that an engine needs, and forks engines.
+"""The launcher, `python -m services.supervisor.launcher --folder RUNTIME`: has loaded everything that the processes of a stream need, and forks them.
 
-Loading torch takes seconds, forking milliseconds: an engine that has died is there again before anybody has looked twice. The launcher computes
-nothing, has one thread, and touches no GPU, so that what it forks begins as if newly started; its memory is shared with the engines.
+Loading torch takes seconds, forking milliseconds: a process that has died is there again before anybody has looked twice. The launcher computes
+nothing, has one thread, and touches no GPU, so that what it forks begins as if newly started; its memory is shared with what it forks.
 
 It takes one JSON object for each connection to its socket, and answers with one:
 
 | request | answer |
 |---|---|
-| `{"command": "start", "arguments": [...], "log": PATH, "environment": {...}}` | `{"ok": true, "pid": N}` |
+| `{"command": "start", "module": NAME, "arguments": [...], "log": PATH, "environment": {...}}` | `{"ok": true, "pid": N}` |
 | `{"command": "status", "pid": N}` | `{"ok": true, "status": "signal 9"}`, null while it runs or when it is not known |
 | `{"command": "ping"}`, `{"command": "stop"}` | `{"ok": true}` |
 """
@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
+import importlib
 import logging
 import os
 import select
@@ -33,15 +35,22 @@ from services.bus.errors import AlreadyRunning, BadMessage
 from services.bus.messages import MOST_BYTES, packed_json, parsed_json
 from services.bus.process_identity import ProcessIdentity
 from services.bus.runtime import RuntimeFolder, check_path, write_json
-from services.supervisor.launching import RECORD, SOCKET, recorded_launcher
+from services.supervisor.launching import FORKED, RECORD, SOCKET, recorded_launcher
 from services.supervisor.process_end import ended_how
 
 log = logging.getLogger(__name__)
+LOADED = (
+    "operators.sources.process",
+    "operators.sources.realtime",
+    "operators.sources.synthetic",
+    "operators.sources.zeromq",
+)
+"""Sources that capture processes are likely to load."""
 LOOK_S = 0.2
 REQUEST_S = 1.0
 """A request takes no longer to be read."""
 MOST_REMEMBERED = 256
-"""Ends of engines that nobody has asked for."""
+"""Ends of processes that nobody has asked for."""
 
 
 class Launcher:
@@ -93,6 +102,9 @@ class Launcher:
 
     def _start(self, told: Mapping[str, Any], connection: socket.socket) -> int:
         arguments = [str(argument) for argument in told["arguments"]]
+        module = str(told["module"])
+        if module not in FORKED:
+            raise ValueError(f"{module[:60]!r} is not forked, only {', '.join(FORKED)}")
         environment = {str(name): str(value) for name, value in dict(told["environment"]).items()}
         output = os.open(str(told["log"]), os.O_CREAT | os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC, 0o600)
         try:
@@ -100,13 +112,13 @@ class Launcher:
             if pid == 0:
                 self._listener.close()
                 connection.close()
-                _become_engine(arguments, environment, output)
+                _become(module, arguments, environment, output)
             return pid
         finally:
             os.close(output)
 
     def _reap(self) -> None:
-        """Take note of engines that have ended."""
+        """Take note of processes that have ended."""
         while True:
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG)
@@ -119,7 +131,7 @@ class Launcher:
                 del self._ends[next(iter(self._ends))]
 
 
-def _become_engine(arguments: Sequence[str], environment: Mapping[str, str], output: int) -> NoReturn:
+def _become(module: str, arguments: Sequence[str], environment: Mapping[str, str], output: int) -> NoReturn:
     """The rest of the life of a forked process."""
     code = 1
     try:
@@ -129,9 +141,7 @@ def _become_engine(arguments: Sequence[str], environment: Mapping[str, str], out
         os.dup2(output, 1)
         os.dup2(output, 2)
         os.environ.update(environment)
-        from services.supervisor.engine import main as engine
-
-        code = engine(arguments)
+        code = importlib.import_module(module).main(arguments)
     except BaseException:  # noqa: BLE001 - nothing of this process may go on as the launcher
         traceback.print_exc()
     finally:
@@ -142,7 +152,7 @@ def _become_engine(arguments: Sequence[str], environment: Mapping[str, str], out
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until told to stop; returns the exit code."""
-    parser = argparse.ArgumentParser(description="Forks engine processes.")
+    parser = argparse.ArgumentParser(description="Forks the processes of streams.")
     parser.add_argument("--folder", required=True, help="runtime folder")
     parser.add_argument("--orphan-after-s", type=float, default=600.0)
     given = parser.parse_args(arguments)
@@ -157,7 +167,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         log.error("%s", error)
         return 2
-    import services.supervisor.engine  # noqa: F401 - what it loads is what the launcher is for
+    for module in (*FORKED, *LOADED):
+        importlib.import_module(module)
+    gc.collect()
+    gc.freeze()  # nobody searches what it was born with for garbage, and so it stays in shared memory
 
     identity = ProcessIdentity.of(os.getpid())
     assert identity is not None

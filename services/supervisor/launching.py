@@ -19,6 +19,8 @@ from services.supervisor.process_end import status_of_child
 
 log = logging.getLogger(__name__)
 SOCKET, RECORD = "launcher", "launcher.json"
+FORKED = ("services.supervisor.capture", "services.supervisor.engine")
+"""What the launcher forks."""
 ANSWER_S = 5.0
 LOOK_S = 0.05
 PING_S = 1.0
@@ -27,8 +29,16 @@ PING_S = 1.0
 class Start(Protocol):
     """Starts a module of ours as a process."""
 
-    async def start(self, module: str, arguments: Sequence[str], output: Path, environment: Mapping[str, str]) -> int:
-        """Its number. Raises OSError and NoAnswer."""
+    async def start(
+        self,
+        module: str,
+        arguments: Sequence[str],
+        output: Path,
+        environment: Mapping[str, str],
+        *,
+        fresh: bool = False,
+    ) -> int:
+        """Its number. fresh: by a new interpreter, whatever is at hand. Raises OSError."""
         ...
 
     async def how_ended(self, pid: int) -> str | None:
@@ -39,7 +49,15 @@ class Start(Protocol):
 class Direct:
     """Starts a new interpreter, in a session of its own: it outlives this process."""
 
-    async def start(self, module: str, arguments: Sequence[str], output: Path, environment: Mapping[str, str]) -> int:
+    async def start(
+        self,
+        module: str,
+        arguments: Sequence[str],
+        output: Path,
+        environment: Mapping[str, str],
+        *,
+        fresh: bool = False,
+    ) -> int:
         """See `Start`."""
         flags = os.O_CREAT | os.O_WRONLY | os.O_APPEND
         return os.posix_spawn(
@@ -61,10 +79,8 @@ class Direct:
 
 
 class ByLauncher:
-    """Has engines forked by the launcher, which it starts, and starts again when it has died; what else is asked for, and an engine while there is
-    no launcher, is started directly. One for each runtime folder; streams share it."""
-
-    FORKED = "services.supervisor.engine"
+    """Has processes forked by the launcher, which it starts, and starts again when it has died; what is asked for while there is none is started
+    directly. One for each runtime folder; streams share it."""
 
     def __init__(self, folder: RuntimeFolder, orphan_after_s: float = 600.0) -> None:
         self._folder, self._orphan_after_s = folder, orphan_after_s
@@ -99,17 +115,29 @@ class ByLauncher:
         if stop:
             self._clean()
 
-    async def start(self, module: str, arguments: Sequence[str], output: Path, environment: Mapping[str, str]) -> int:
+    async def start(
+        self,
+        module: str,
+        arguments: Sequence[str],
+        output: Path,
+        environment: Mapping[str, str],
+        *,
+        fresh: bool = False,
+    ) -> int:
         """See `Start`."""
-        if module != self.FORKED or not self.ready.is_set():
+        if fresh or module not in FORKED or not self.ready.is_set():
             return await self._direct.start(module, arguments, output, environment)
         try:
             answer = await self._ask(
-                "start", arguments=list(arguments), log=os.fspath(output), environment=dict(environment)
+                "start",
+                module=module,
+                arguments=list(arguments),
+                log=os.fspath(output),
+                environment=dict(environment),
             )
             return int(answer["pid"])
         except (NoAnswer, BadMessage, OSError) as error:
-            log.warning("the launcher did not start an engine (%s); it is started directly", error)
+            log.warning("the launcher did not start %s (%s); it is started directly", module, error)
             return await self._direct.start(module, arguments, output, environment)
 
     async def how_ended(self, pid: int) -> str | None:

@@ -30,6 +30,8 @@ PING_S = 1.0
 PAUSED_S = 1.0
 """When so much more time has passed between two looks, it is the supervisor that stood still."""
 MOST_LOG_BYTES = 1 << 20
+FRESH_AFTER = 3
+"""After so many ends in a row a process is started by a new interpreter: what it was forked from may be what is wrong."""
 WELL = ("live", "running")
 
 Kind = Literal["started", "adopted", "replaced", "ended", "stopped", "left"]
@@ -177,7 +179,8 @@ class ManagedProcess:
         if self._role == "engine" and self._restarts.total:
             arguments.append("--again")
         try:
-            pid = await self._start.start(f"services.supervisor.{self._role}", arguments, output, self._environment())
+            module, fresh = f"services.supervisor.{self._role}", self._restarts.in_a_row >= FRESH_AFTER
+            pid = await self._start.start(module, arguments, output, self._environment(), fresh=fresh)
         except OSError as error:
             self._down = "down", f"it cannot be started: {error}"
             return None

@@ -76,7 +76,7 @@ class Worker:
     def say(self, state: str, reason: str) -> None:
         """What the process is doing, and why, in a sentence."""
         with self._saying:
-            changed = self._said["state"] != state
+            changed = self._said["state"] != state or (state == "starting" and self._said["reason"] != reason)
             self._said = {"state": state, "reason": reason[:2000]}
         if changed:
             log.info("%s: %s", state, reason)

@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import socket
+import threading
+
+import pytest
+
+from services.bus.process_identity import ProcessIdentity
+from services.supervisor.launcher import Launcher
+from services.supervisor.launching import SOCKET, ByLauncher, Direct, recorded_launcher
+from services.supervisor.process_end import is_of_no_use, last_words
+
+
+@pytest.fixture
+def launcher(runtime):
+    launcher = Launcher(runtime.path / SOCKET, orphan_after_s=600.0)
+    serving = threading.Thread(target=launcher.serve)
+    serving.start()
+    yield runtime.path / SOCKET
+    launcher.stop()
+    serving.join()
+    assert not (runtime.path / SOCKET).exists()
+
+
+def asked(path, data: bytes) -> dict:
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.connect(os.fspath(path))
+        connection.sendall(data)
+        return json.loads(connection.recv(1 << 16))
+
+
+def test_the_launcher_answers(launcher):
+    assert asked(launcher, b'{"command": "ping"}') == {"ok": True}
+    assert asked(launcher, b'{"command": "status", "pid": 1}') == {"ok": True, "status": None}
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"nonsense",
+        b"[]",
+        b'{"command": "status"}',
+        b'{"command": "status", "pid": "x"}',
+        b'{"command": "start"}',
+        b'{"command": "start", "module": "os", "arguments": [], "environment": {}, "log": "/dev/null"}',
+        b'{"command": "start", "module": "services.supervisor.engine", "arguments": 3, "environment": {}, "log": "/dev/null"}',
+        b'{"command": "what"}',
+    ],
+    ids=repr,
+)
+def test_the_launcher_refuses_and_goes_on(launcher, data):
+    assert asked(launcher, data)["ok"] is False
+    assert asked(launcher, b'{"command": "ping"}') == {"ok": True}
+
+
+def test_a_launcher_that_nobody_asks_ends(runtime):
+    Launcher(runtime.path / SOCKET, orphan_after_s=0.1).serve()
+    assert not (runtime.path / SOCKET).exists()
+
+
+def test_a_direct_start_is_a_session_of_its_own_and_says_how_it_ended(runtime):
+    output = runtime.path / "log"
+
+    async def run() -> str | None:
+        start = Direct()
+        pid = await start.start("this", [], output, {"PYTHONPATH": "", "X": "1"})
+        identity = ProcessIdentity.of(pid)
+        if identity is not None:
+            assert os.getsid(pid) == pid != os.getsid(0)
+            await identity.ended()
+        return await start.how_ended(pid)
+
+    how = asyncio.run(run())
+    assert how == "exit code 0"
+    assert "Zen" in output.read_text()
+    assert last_words(output).startswith("Namespaces")
+    assert not is_of_no_use(how) and is_of_no_use("exit code 2")
+
+
+def test_without_a_launcher_processes_are_started_directly(runtime):
+    async def run() -> str | None:
+        start = ByLauncher(runtime)
+        pid = await start.start("services.supervisor.capture", ["--spec", "/none"], runtime.path / "log", {})
+        identity = ProcessIdentity.of(pid)
+        if identity is not None:
+            await identity.ended()
+        return await start.how_ended(pid)
+
+    assert asyncio.run(run()) == "exit code 2"
+    assert "/none cannot be read" in last_words(runtime.path / "log")
+    assert recorded_launcher(runtime) is None
