@@ -1,0 +1,136 @@
+"""The chart: helm renders it, Kubernetes' schemas take what it renders, and what cannot work is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+CHART = ROOT / "deploy" / "helm"
+OF_AN_OPERATOR = {"ServiceMonitor", "PrometheusRule"}
+FULL = [
+    "tls.secretName=room-1-tls", "adminKey.secretName=room-1-key", "serviceMonitor.enabled=true",
+    "serviceMonitor.keySecretName=room-1-metrics", "serviceMonitor.caSecretName=ca", "prometheusRule.enabled=true",
+    "dashboard.enabled=true", "gpu.runtimeClassName=nvidia", "image.pullSecrets[0].name=registry",
+    "nodeSelector.room=one", "podAnnotations.note=one", "persistence.storageClass=fast", "extraEnv[0].name=TZ",
+    "extraEnv[0].value=UTC", "networkPolicy.egress[0].to[0].ipBlock.cidr=10.20.0.0/16",
+]  # fmt: skip
+WITHOUT_A_GPU = ["plaintext=true", "gpu.count=0", "image.tag=cpu", "persistence.existingClaim=mine"]
+
+
+@pytest.fixture
+def render(tool):
+    """What helm makes of the chart with values, by kind."""
+
+    def rendered(values: list[str], release: str = "room-1") -> dict[str, dict]:
+        given = [argument for value in values for argument in ("--set", value)]
+        done = tool("helm", "template", release, CHART, "--namespace", "theatres", *given)
+        assert done.returncode == 0, done.stderr
+        documents = [document for document in yaml.safe_load_all(done.stdout) if document]
+        return {f"{document['kind']} {document['metadata']['name']}": document for document in documents}
+
+    return rendered
+
+
+def container(resources: dict[str, dict]) -> dict:
+    (deployment,) = [each for each in resources.values() if each["kind"] == "Deployment"]
+    (only,) = deployment["spec"]["template"]["spec"]["containers"]
+    return only
+
+
+@pytest.mark.parametrize("values", [FULL, WITHOUT_A_GPU], ids=["full", "without a GPU"])
+def test_kubernetes_takes_what_is_rendered(render, kubernetes_takes, values):
+    for resource in render(values).values():
+        if resource["kind"] not in OF_AN_OPERATOR:
+            kubernetes_takes(resource)
+
+
+def test_pods_are_restricted(render):
+    resources = render(FULL)
+    pod = resources["Deployment room-1-intrasplat"]["spec"]["template"]["spec"]
+    assert pod["securityContext"]["runAsNonRoot"] is True
+    assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+    assert pod["automountServiceAccountToken"] is False
+    assert container(resources)["securityContext"] == {
+        "allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]},
+    }  # fmt: skip
+    assert not any("hostPath" in volume for volume in pod["volumes"])
+
+
+def test_one_pod_with_the_gpu(render):
+    resources = render(FULL)
+    deployment = resources["Deployment room-1-intrasplat"]["spec"]
+    assert (deployment["replicas"], deployment["strategy"]) == (1, {"type": "Recreate"})
+    assert container(resources)["resources"]["limits"]["nvidia.com/gpu"] == 1
+    assert "nvidia.com/gpu" not in container(render(WITHOUT_A_GPU))["resources"]["limits"]
+
+
+def test_probes_speak_tls_where_the_server_does(render):
+    for values, scheme in ((FULL, "HTTPS"), (WITHOUT_A_GPU, "HTTP")):
+        probed = container(render(values))
+        paths = {name: probed[f"{name}Probe"]["httpGet"] for name in ("startup", "liveness", "readiness")}
+        assert {each["scheme"] for each in paths.values()} == {scheme}
+        assert paths["readiness"]["path"] == "/readyz" and paths["liveness"]["path"] == "/livez"
+
+
+def test_a_room_shares_nothing_with_another(render):
+    one, two = render(FULL, "room-1"), render(FULL, "room-2")
+    assert not set(one) & set(two)
+    selectors = [
+        rooms[f"Service {name}-intrasplat"]["spec"]["selector"]["app.kubernetes.io/instance"]
+        for rooms, name in ((one, "room-1"), (two, "room-2"))
+    ]
+    assert selectors == ["room-1", "room-2"]
+
+
+def test_rules_and_dashboard_are_those_of_the_compose_file(render):
+    resources = render(FULL)
+    rules = yaml.safe_load((ROOT / "deploy" / "prometheus" / "rules.yaml").read_text())
+    assert resources["PrometheusRule room-1-intrasplat"]["spec"] == rules
+    shown = json.loads(resources["ConfigMap room-1-intrasplat-dashboard"]["data"]["intrasplat.json"])
+    assert shown == json.loads((ROOT / "deploy" / "grafana" / "dashboards" / "intrasplat.json").read_text())
+
+
+def test_prometheus_is_let_in_with_its_key(render):
+    resources = render(FULL)
+    (endpoint,) = resources["ServiceMonitor room-1-intrasplat"]["spec"]["endpoints"]
+    assert endpoint["authorization"]["credentials"] == {"name": "room-1-metrics", "key": "metrics.key"}
+    assert {"targetLabel": "job", "replacement": "intrasplat"} in endpoint["relabelings"]
+    (ingress,) = resources["NetworkPolicy room-1-intrasplat"]["spec"]["ingress"]
+    assert len(ingress["from"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ([], "tls.secretName"),
+        (["plaintext=true", "gpu.cout=2"], "cout"),
+        (["plaintext=true", "gpu.count=-1"], "minimum"),
+        (["plaintext=true", "settings.server.port=9"], "settings"),
+        (["plaintext=true", "serviceMonitor.enabled=true"], "keySecretName"),
+        (["plaintext=true", "image.digest=latest"], "digest"),
+        (["plaintext=true", "terminationGracePeriodSeconds=5"], "minimum"),
+    ],
+)
+def test_what_cannot_work_is_refused(tool, values, why):
+    given = [argument for value in values for argument in ("--set", value)]
+    done = tool("helm", "template", "room-1", CHART, *given)
+    assert done.returncode != 0
+    assert why in done.stderr
+
+
+def test_helm_finds_nothing_to_say(tool):
+    done = tool("helm", "lint", "--strict", CHART, "--set", "plaintext=true")
+    assert done.returncode == 0, done.stdout
+
+
+def test_values_and_their_schema_name_the_same_keys():
+    values = yaml.safe_load((CHART / "values.yaml").read_text())
+    schema = json.loads((CHART / "values.schema.json").read_text())
+    assert set(schema["properties"]) - {"global"} == set(values)
+    for name, each in schema["properties"].items():
+        if "properties" in each:
+            assert set(each["properties"]) == set(values[name]), name

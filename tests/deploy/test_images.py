@@ -1,0 +1,113 @@
+"""The Dockerfile: what it copies is there and reaches the build, and what it makes has neither compiler nor root."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path, PurePosixPath
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCKERFILE = ROOT / "docker" / "Dockerfile"
+
+
+def instructions() -> list[tuple[str, str]]:
+    """Each instruction and what follows it, continued lines joined."""
+    lines = [line for line in DOCKERFILE.read_text().splitlines() if not line.startswith("#")]
+    text = re.sub(r"\\\n\s*", " ", "\n".join(lines))
+    return [(name, rest.strip()) for name, _, rest in (line.partition(" ") for line in text.splitlines()) if name]
+
+
+def stages() -> dict[str, tuple[str, list[tuple[str, str]]]]:
+    """What each stage begins with, and its instructions."""
+    found: dict[str, tuple[str, list[tuple[str, str]]]] = {}
+    current: list[tuple[str, str]] = []
+    for name, rest in instructions():
+        if name == "FROM":
+            base, stage = re.fullmatch(r"(\S+) AS (\S+)", rest).groups()  # type: ignore[union-attr]
+            current = []
+            found[stage] = base, current
+        else:
+            current.append((name, rest))
+    return found
+
+
+def lineage(stage: str) -> list[tuple[str, str]]:
+    """The instructions of a stage and of those that it begins with."""
+    base, own = stages()[stage]
+    return [*(lineage(base) if base in stages() else []), *own]
+
+
+def let_through(path: str) -> bool:
+    """Whether .dockerignore lets a file or folder reach the build: the last line that fits decides."""
+    passes = True
+    for line in (ROOT / ".dockerignore").read_text().splitlines():
+        if not line or line.startswith("#"):
+            continue
+        pattern = line.removeprefix("!")
+        parents = [path, *map(str, PurePosixPath(path).parents)]
+        if any(PurePosixPath("/", each).match(f"/{pattern}") for each in parents if each != "."):
+            passes = line.startswith("!")
+    return passes
+
+
+def copied_from_the_repository() -> list[str]:
+    return [
+        source
+        for name, rest in instructions()
+        if name == "COPY" and not rest.startswith("--from=")
+        for source in rest.split()[:-1]
+    ]
+
+
+def test_what_is_copied_is_there_and_reaches_the_build():
+    sources = copied_from_the_repository()
+    assert {"services", "requirements.lock", "docker/healthcheck.py"} <= set(sources)
+    for source in sources:
+        assert (ROOT / source).exists(), source
+        assert let_through(source), source
+
+
+@pytest.mark.parametrize("path", ["deploy/secrets/admin.key", ".git", "tests", "out", "shared", "key.pem", ".venv"])
+def test_nothing_else_reaches_the_build(path):
+    assert not let_through(path)
+
+
+@pytest.mark.parametrize("stage", ["cpu", "cuda"])
+def test_images_have_no_compiler_and_do_not_run_as_root(stage):
+    steps = lineage(stage)
+    installed = " ".join(rest for name, rest in steps if name == "RUN")
+    assert "tini" in installed
+    assert not re.search(r"\b(g\+\+|gcc|clang|build-essential|nvcc|cmake|requirements-cuda)\b", installed)
+    assert [rest for name, rest in steps if name == "USER"][-1] == "10001:10001"
+    assert [name for name, _ in steps if name == "HEALTHCHECK"] == ["HEALTHCHECK"]
+    copied = [rest for name, rest in steps if name == "COPY" and "/opt/intrasplat " in rest]
+    assert copied == ["--from=trimmed /opt/intrasplat /opt/intrasplat"]
+
+
+def test_build_tools_are_taken_out_again():
+    import tomllib
+
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]["build"]
+    (removed,) = [rest for _, rest in stages()["trimmed"][1]]
+    assert set(re.sub(r"pip uninstall --yes", "", removed).split()) == {re.split(r"[<>=]", tool)[0] for tool in tools}
+
+
+def test_stages_that_are_copied_from_exist():
+    named = re.findall(r"(?:--from=|from=)([\w-]+)", DOCKERFILE.read_text())
+    assert set(named) == {"trimmed", "wheel-cpu", "wheel-cuda"}
+    assert set(named) <= set(stages())
+
+
+def test_the_cuda_wheel_is_built_as_make_cuda_does():
+    (built,) = [rest for name, rest in stages()["wheel-cuda"][1] if name == "RUN"]
+    makefile = (ROOT / "Makefile").read_text()
+    for option in ("--require-hashes --no-deps --target", "requirements-cuda.lock", "INTRASPLAT_CUDA=ON"):
+        assert option in built and option in makefile
+    assert "build/cuda-toolkit" in built and "CUDA_TOOLKIT := build/cuda-toolkit" in makefile
+    assert ("ARG", "CUDA_ARCHITECTURES=portable") in stages()["wheel-cuda"][1]
+
+
+def test_hadolint_finds_nothing(tool):
+    done = tool("hadolint", DOCKERFILE)
+    assert done.returncode == 0 and not done.stdout, done.stdout

@@ -1,0 +1,32 @@
+"""Prometheus takes its files, and each alert comes when it should."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import yaml
+
+HERE = Path(__file__).parent
+PROMETHEUS = HERE.parents[1] / "deploy" / "prometheus"
+
+
+def test_prometheus_takes_its_settings_and_rules(tool):
+    checked = tool("promtool", "check", "config", "--syntax-only", PROMETHEUS / "prometheus.yaml")
+    assert checked.returncode == 0, checked.stderr
+    checked = tool("promtool", "check", "rules", "--lint-fatal", PROMETHEUS / "rules.yaml")
+    assert checked.returncode == 0, checked.stderr + checked.stdout
+
+
+def test_alerts_come_and_stay_away(tool, tmp_path):
+    for file in (PROMETHEUS / "rules.yaml", HERE / "rules_test.yaml"):
+        shutil.copy(file, tmp_path)
+    tested = tool("promtool", "test", "rules", "rules_test.yaml", cwd=tmp_path)
+    assert tested.returncode == 0, tested.stdout + tested.stderr
+
+
+def test_each_alert_has_an_example_that_raises_it():
+    examples = yaml.safe_load((HERE / "rules_test.yaml").read_text())["tests"]
+    raised = {each["alertname"] for test in examples for each in test["alert_rule_test"] if each["exp_alerts"]}
+    groups = yaml.safe_load((PROMETHEUS / "rules.yaml").read_text())["groups"]
+    assert raised == {rule["alert"] for group in groups for rule in group["rules"]}

@@ -1,0 +1,44 @@
+"""systemd takes the units."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+UNITS = sorted((ROOT / "deploy" / "systemd").iterdir())
+
+
+@pytest.fixture
+def units(tmp_path) -> list[Path]:
+    """The units with programs that are there: systemd asks for each."""
+    for unit in UNITS:
+        (tmp_path / unit.name).write_text(re.sub(r"/opt/intrasplat/bin/\w+", "/bin/true", unit.read_text()))
+    return sorted(tmp_path.iterdir())
+
+
+def test_systemd_takes_the_units(tool, units):
+    checked = tool("systemd-analyze", "verify", "--man=no", *units)
+    assert (checked.returncode, checked.stderr) == (0, "")
+
+
+def test_a_mistake_would_be_seen(tool, tmp_path):
+    wrong = tmp_path / "wrong.service"
+    wrong.write_text("[Service]\nType=exec\nExecStart=/bin/true\nProtectSistem=strict\n")
+    assert "ProtectSistem" in tool("systemd-analyze", "verify", "--man=no", wrong).stderr
+
+
+def test_the_unit_is_closed(tool, units):
+    (service,) = [unit for unit in units if unit.name == "intrasplat.service"]
+    done = tool("systemd-analyze", "security", "--offline=true", "--threshold=25", service)
+    assert done.returncode == 0, done.stdout[-200:]
+
+
+def test_the_unit_asks_for_no_watchdog_that_nothing_feeds():
+    """`sd_notify` and the two lines of the unit come together or not at all."""
+    speaks = any("NOTIFY_SOCKET" in path.read_text() for path in (ROOT / "services").rglob("*.py"))
+    text = (ROOT / "deploy" / "systemd" / "intrasplat.service").read_text()
+    assert bool(re.search(r"^WatchdogSec=", text, re.MULTILINE)) is speaks
+    assert ("\nType=notify\n" in text) is speaks
