@@ -17,6 +17,7 @@ from services.registry.models import ModelRegistry
 from services.server import page
 from services.server.displays import StreamDisplays
 from services.server.measures import StreamMeasures
+from services.server.shown_models import ShownModels
 from services.server.streams import SupervisedStreams
 from services.settings import ServiceSettings
 
@@ -59,7 +60,11 @@ def assembled(settings: ServiceSettings) -> Parts:
         models=models,
         display=StreamDisplays(streams),
         routers=[page.router],
-        background=[lambda: recovered(models), lambda: streams.running(at_start, started)],
+        background=[
+            lambda: recovered(models),
+            lambda: streams.running(at_start, started),
+            ShownModels(streams, models).following,
+        ],
         checks={"streams": streams_are_well, "models": models_are_there},
         collectors=[measures],
         errors=ERRORS,

@@ -109,6 +109,10 @@ class SupervisedStreams:
         """Every stream."""
         return [stream.facts() for stream in self._streams.values()]
 
+    def running_streams(self) -> Sequence[Stream]:
+        """Those that run."""
+        return [stream for stream in self._streams.values() if stream.supervisor is not None]
+
     async def all(self) -> Sequence[StreamFacts]:
         """See `Streams`."""
         return self.now()

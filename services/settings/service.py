@@ -41,7 +41,7 @@ class ServiceSettings(BaseSettings):
     registry: RegistrySettings = RegistrySettings()
     log: LogSettings = LogSettings()
     streams: dict[ResourceName, StreamSettings] = Field(
-        default={"endoscope": StreamSettings(source="synthetic:?moving=1")},
+        default={"endoscope": StreamSettings(source="synthetic:?width=320&height=256&frames=24&moving=1")},
         description="Streams that are there from the start.",
     )
 

@@ -11,9 +11,17 @@ import tempfile
 import time
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+import torch
 
+from gsplat_core.io.bundle import save_bundle
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.model import Model
 from services.client import Client, Refused
+from services.registry.bundle_file import pack
 
 SOURCE = "synthetic:?width=160&height=128&frames=12&fps=15"
 CHROMIUM = Path("/usr/bin/chromium")
@@ -94,6 +102,69 @@ def test_the_cameras_picture_goes_on_while_a_killed_engine_comes_back(served):
     assert after["pid"] != before["pid"] and after["restarts"] == before["restarts"] + 1
 
 
+def wall(colour) -> Model:
+    """A wall of one colour in front of the camera."""
+    x, y = torch.meshgrid(torch.linspace(-2, 2, 12), torch.linspace(-2, 2, 12), indexing="xy")
+    count = x.numel()
+    means = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((count,), 4.0)], 1)
+    sh = ((torch.tensor(colour) - 0.5) / 0.28209479177387814).expand(count, 1, 3).clone()
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
+    gaussians = Gaussians(means, quats, torch.full((count, 3), -1.0), torch.full((count,), 6.0), sh)
+    return Model(1, gaussians, None, Camera.from_focal(40.0, 64, 48), (1.0, 3.0))
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory):
+    """Packed models of a red and of a green wall."""
+    folder = tmp_path_factory.mktemp("walls")
+    for name, colour in (("red", (0.9, 0.1, 0.1)), ("green", (0.1, 0.9, 0.1))):
+        save_bundle(wall(colour), folder / name)
+        pack(folder / name, folder / f"{name}.isplat")
+    return folder
+
+
+def colour_shown(client, stream):
+    """Red, green or blue: what the middle of the newest picture has most of; and which version it says that it is."""
+    shown = client.pictures(stream)
+    picture = next(shown)
+    shown.close()
+    image = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
+    middle = image[image.shape[0] // 2, image.shape[1] // 2]
+    return ("red", "green", "blue")[int(middle.argmax())], picture.header["model_version"]
+
+
+def test_a_model_is_uploaded_checked_activated_and_rolled_back(served, walls):
+    client, _, log = served
+    versions = []
+    for name in ("red", "green"):
+        made = client.upload("wall", walls / f"{name}.isplat")
+        assert client.checked("wall", made.version).state == "ready"
+        versions.append(made.version)
+    with pytest.raises(Refused, match="active"):
+        client.activate("wall", versions[0], expected_current=7)
+    client.activate("wall", versions[0], expected_current=None)
+    client.create_stream("playback", SOURCE, show="model wall", device="cpu")
+    until(lambda: client.stream("playback").state == "live", log)
+    until(lambda: colour_shown(client, "playback") == ("red", versions[0]), log)
+    client.activate("wall", versions[1], expected_current=versions[0])
+    until(lambda: colour_shown(client, "playback") == ("green", versions[1]), log)
+    client.rollback("wall")
+    until(lambda: colour_shown(client, "playback") == ("red", versions[0]), log)
+    with pytest.raises(Refused, match="active"):
+        client.delete_version("wall", versions[0])
+    client.delete_stream("playback")
+    with pytest.raises(Refused, match="no stream"):
+        client.stream("playback")
+
+
+def test_what_is_no_model_is_refused_before_it_is_kept(served, tmp_path):
+    client, _, _ = served
+    (tmp_path / "x.isplat").write_bytes(b"\x80\x04" + bytes(3000))
+    with pytest.raises(Refused) as refused:
+        client.upload("wall", tmp_path / "x.isplat")
+    assert refused.value.status == 422
+
+
 def test_what_is_not_there_is_refused_with_a_sentence(served):
     client, url, _ = served
     with pytest.raises(Refused, match="no stream with this name") as refused:
@@ -163,6 +234,16 @@ def test_pages_are_reached_by_the_keyboard(page):
     page.wait_for_selector("#entries >> text=stream.start")
     page.keyboard.press("ArrowRight")
     assert page.evaluate("document.activeElement.id") == "tab-live" and page.is_visible("#raw")
+
+
+def test_a_model_is_uploaded_and_activated_from_the_page(page, walls):
+    page.click("#tab-models")
+    page.fill("#model-name", "from-the-page")
+    page.set_input_files("#model-file", walls / "green.isplat")
+    page.click("text=Upload")
+    mine = page.locator("#versions tr", has_text="from-the-page")
+    mine.get_by_text("Activate").click()
+    mine.get_by_text("active").wait_for()
 
 
 def test_what_the_server_refuses_is_said_on_the_page(page):
