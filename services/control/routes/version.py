@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import platform
-from importlib.metadata import version as version_of
 
+import fastapi
 from pydantic import BaseModel, Field
 from starlette.requests import Request
 
 from services.control.auth.guard import new_router, requires
 from services.control.state import control_of
-from services.version import product_version
 
 router = new_router("service")
+FASTAPI = fastapi.__version__
 
 
 class Version(BaseModel):
@@ -31,6 +31,4 @@ async def version(request: Request) -> Version:
     """Version of the server and of what it stands on."""
     parts = control_of(request).parts
     here = [name for name in ("streams", "models", "display", "jobs", "recordings") if getattr(parts, name) is not None]
-    return Version(
-        version=product_version(), python=platform.python_version(), fastapi=version_of("fastapi"), parts=here
-    )
+    return Version(version=request.app.version, python=platform.python_version(), fastapi=FASTAPI, parts=here)

@@ -1,0 +1,76 @@
+"""`intrasplat schema`, `keys` and `audit verify`."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+
+from services.audit import AuditLog
+from services.cli.app import run
+from services.cli.exit_codes import BAD_INPUT, OK
+from services.control.auth.keys import KeyStore
+
+
+@pytest.fixture(autouse=True)
+def clean_environment(monkeypatch):
+    for name in [name for name in os.environ if name.startswith("INTRASPLAT_")]:
+        monkeypatch.delenv(name)
+
+
+def test_the_schema_is_json(capsys):
+    assert run(["schema"]) == OK
+    assert "streams" in json.loads(capsys.readouterr().out)["properties"]
+
+
+def test_a_key_is_made_listed_and_revoked(tmp_path, capsys):
+    data = ["--data", str(tmp_path)]
+    assert run(["keys", "add", "console", "--role", "admin", *data]) == OK
+    token = capsys.readouterr().out.strip()
+    assert KeyStore(tmp_path / "keys.json").find(token) is not None
+    assert run(["keys", "add", "wall", *data]) == OK
+    capsys.readouterr()
+    assert run(["keys", "list", "--json", *data]) == OK
+    out = capsys.readouterr().out
+    assert token not in out and "sha256" not in out
+    listed = {key["name"]: key for key in json.loads(out)}
+    assert {name: key["role"] for name, key in listed.items()} == {"console": "admin", "wall": "viewer"}
+    assert run(["keys", "list", *data]) == OK
+    assert "wall" in capsys.readouterr().out
+    assert run(["keys", "revoke", listed["wall"]["id"], *data]) == OK
+    assert run(["keys", "revoke", listed["wall"]["id"], *data]) == BAD_INPUT
+    assert run(["keys", "revoke", listed["console"]["id"], *data]) == BAD_INPUT
+    assert "only administrator" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [(["Console"], "is no name of a key"), (["a/b"], "is no name of a key"), (["console", "--role", "public"], "choose viewer")],
+)  # fmt: skip
+def test_refused_keys(tmp_path, capsys, arguments, said):
+    assert run(["keys", "add", *arguments, "--data", str(tmp_path)]) == BAD_INPUT
+    assert said in capsys.readouterr().err
+
+
+def test_the_audit_log_is_verified(tmp_path, capsys):
+    log = AuditLog(tmp_path / "audit.jsonl")
+    for number in range(3):
+        log.append("model.activate", actor="console", subject=str(number))
+    log.close()
+    path = str(log.path)
+    assert run(["audit", "verify", path]) == OK
+    said = capsys.readouterr().out
+    assert "3 entries, intact" in said
+    digest = said.split()[-1]
+    assert run(["audit", "verify", path, "--head", digest]) == OK
+    assert run(["audit", "verify", path, "--head", 64 * "0"]) == BAD_INPUT
+    capsys.readouterr()
+    lines = log.path.read_bytes().splitlines(keepends=True)
+    log.path.write_bytes(lines[0] + lines[2])
+    assert run(["audit", "verify", path]) == BAD_INPUT
+    assert "line 2: 1 entries are missing" in capsys.readouterr().out
+    assert run(["audit", "verify", path, "--json"]) == BAD_INPUT
+    assert json.loads(capsys.readouterr().out)["intact"] is False
+    assert run(["audit", "verify", str(tmp_path / "none")]) == BAD_INPUT
+    assert "No such file" in capsys.readouterr().err
