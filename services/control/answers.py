@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
+from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import JSONResponse, Response
@@ -55,8 +56,10 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
         if isinstance(error.__cause__, Problem):  # raised while FastAPI read the body, and wrapped by it
             return await _answer(connection, error.__cause__)
         kind = OF_STATUS.get(error.status_code, OF_STATUS[500 if error.status_code >= 500 else 400])
-        detail = PHRASES.get(error.status_code, str(error.detail))
-        return await _answer(connection, kind(detail, headers=error.headers))
+        headers = dict(error.headers or {})
+        if error.status_code == 405:
+            headers["Allow"] = _methods_of(app, connection)
+        return await _answer(connection, kind(PHRASES.get(error.status_code, str(error.detail)), headers=headers))
 
     async def on_invalid(connection: HTTPConnection, error: Exception) -> Response | None:
         assert isinstance(error, RequestValidationError)
@@ -74,6 +77,13 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
     app.add_exception_handler(Problem, on_problem)  # type: ignore[arg-type]
     app.add_exception_handler(HTTPException, on_http)  # type: ignore[arg-type]
     app.add_exception_handler(RequestValidationError, on_invalid)  # type: ignore[arg-type]
+
+
+def _methods_of(app: FastAPI, connection: HTTPConnection) -> str:
+    """All methods of a path: the framework names only those of the first route that has it."""
+    path = connection.scope["route"].path
+    routes = [each for each in iter_route_contexts(app.routes) if getattr(each, "path", None) == path]
+    return ", ".join(sorted({method for each in routes for method in getattr(each, "methods", None) or ()}))
 
 
 def _of_validation(error: RequestValidationError) -> Problem:

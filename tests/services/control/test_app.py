@@ -66,6 +66,12 @@ def test_a_route_without_a_role_cannot_be_made():
         new_router("x").get("/open")(open_to_all)
 
 
+def test_a_wrong_method_says_which_are_right(plane):
+    for path, methods in (("/v1/streams", "GET, POST"), ("/v1/models/a/versions", "GET, PUT"), ("/livez", "GET")):
+        answer = plane.ask("TRACE", path)
+        assert (answer.status_code, answer.headers["allow"], answer.json()["status"]) == (405, methods, 405)
+
+
 def test_absent_parts_answer_503(new_plane):
     plane = new_plane(Parts())
     for path in ("/v1/streams", "/v1/models", "/v1/replays", "/v1/recordings"):
