@@ -33,7 +33,24 @@ def serve(app: FastAPI, settings: ServiceSettings, listener: socket.socket, list
 
     Raises CannotServe for a certificate that cannot be read, and where the application does not start.
     """
-    config = uvicorn.Config(
+    config = config_of(app, settings)
+    try:
+        config.load()
+    except OSError as error:  # ssl.SSLError is one
+        raise CannotServe(f"TLS: {error}; check server.certfile and server.keyfile") from error
+    # uvicorn raises the signal that ended it again, for whoever handled it before: a server that has drained has done what it was asked to.
+    signal.signal(signal.SIGTERM, _done)
+    signal.signal(signal.SIGINT, _done)
+    with listener:
+        server = DrainingServer(config, app.state.control, lambda: listening(_address(listener, settings)))
+        server.run(sockets=[listener])
+    if not server.started:
+        raise CannotServe("the server could not start; its log says why")
+
+
+def config_of(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
+    """How uvicorn is run."""
+    return uvicorn.Config(
         app,
         http=with_head_timeout(settings.limits.head_s),
         ws="websockets-sansio",
@@ -49,18 +66,6 @@ def serve(app: FastAPI, settings: ServiceSettings, listener: socket.socket, list
         ssl_certfile=settings.server.certfile,
         ssl_keyfile=settings.server.keyfile,
     )
-    try:
-        config.load()
-    except OSError as error:  # ssl.SSLError is one
-        raise CannotServe(f"TLS: {error}; check server.certfile and server.keyfile") from error
-    # uvicorn raises the signal that ended it again, for whoever handled it before: a server that has drained has done what it was asked to.
-    signal.signal(signal.SIGTERM, _done)
-    signal.signal(signal.SIGINT, _done)
-    with listener:
-        server = DrainingServer(config, app.state.control, lambda: listening(_address(listener, settings)))
-        server.run(sockets=[listener])
-    if not server.started:
-        raise CannotServe("the server could not start; its log says why")
 
 
 class DrainingServer(uvicorn.Server):
@@ -128,11 +133,14 @@ def bind(settings: ServiceSettings) -> socket.socket:
     _refuse_plaintext(settings)
     family = socket.AF_INET6 if ":" in server.host else socket.AF_INET
     try:
-        return socket.create_server((server.host, server.port), family=family, backlog=256)
+        listener = socket.create_server((server.host, server.port), family=family, backlog=256)
     except OSError as error:
         raise CannotServe(
             f"cannot listen on {server.host} port {server.port}: {error.strerror}; give another server.host or server.port"
         ) from error
+    # Connections inherit it: one whose peer takes nothing for so long is cut off by the system, whatever still waits to be sent.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(settings.limits.viewer_stall_s * 1000))
+    return listener
 
 
 def _refuse_plaintext(settings: ServiceSettings) -> None:

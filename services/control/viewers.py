@@ -57,8 +57,10 @@ def in_time(send: Callable[[Any], Awaitable[None]], connection: HTTPConnection) 
 
 @asynccontextmanager
 async def until_ended(connection: HTTPConnection, left: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
-    """A block that is left when the server drains, when `left` returns, and when the viewer stalls or its connection breaks."""
+    """A block that is left when the server drains, when `left` returns, and when the viewer's connection breaks. Raises ViewerStalled where
+    nothing more can be sent: whoever waited for that would wait for ever."""
     draining = control_of(connection).draining
+    stalled: ViewerStalled | None = None
     async with anyio.create_task_group() as group:
 
         async def end_after(over: Coroutine[Any, Any, Any]) -> None:
@@ -69,6 +71,11 @@ async def until_ended(connection: HTTPConnection, left: Coroutine[Any, Any, None
         group.start_soon(end_after, left)
         try:
             yield
-        except (ViewerStalled, WebSocketDisconnect, OSError) as error:
-            log.info("a viewer was dropped: %s", error or type(error).__name__)
+        except ViewerStalled as error:
+            stalled = error
+        except (WebSocketDisconnect, OSError) as error:
+            log.info("a viewer's connection broke: %s", error or type(error).__name__)
         group.cancel_scope.cancel()
+    if stalled is not None:
+        log.info("a viewer was dropped: %s", stalled)
+        raise stalled

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from typing import Annotated
 
+import anyio
 from fastapi import Path, Query
 from starlette.requests import Request
 from starlette.responses import Response
@@ -16,7 +17,7 @@ from starlette.websockets import WebSocket, WebSocketState
 
 from services.control.auth.guard import CallerOf, new_router, requires
 from services.control.parts import EncodedPicture, PictureKind
-from services.control.viewers import in_time, until_ended, viewing
+from services.control.viewers import ViewerStalled, in_time, until_ended, viewing
 from services.settings import ResourceName
 
 router = new_router("display")
@@ -24,6 +25,8 @@ Kind = Annotated[PictureKind, Query(description="The camera's picture, or what i
 Quality = Annotated[int, Query(ge=10, le=95, description="Of the JPEG.")]
 BOUNDARY = "picture"
 GOING_AWAY = 1001
+CLOSE_S = 1.0
+"""How long a viewer may take to hear that it is over."""
 
 
 def message_of(picture: EncodedPicture) -> bytes:
@@ -51,11 +54,13 @@ async def display(
     async with viewing(socket, "websocket", name, kind, quality) as pictures:
         await socket.accept()
         send = in_time(socket.send_bytes, socket)
-        async with until_ended(socket, _left(socket)):
-            async for picture in pictures:
-                await send(message_of(picture))
-        if socket.client_state is WebSocketState.CONNECTED and socket.application_state is WebSocketState.CONNECTED:
-            await socket.close(GOING_AWAY, "the stream or the server has ended")
+        with suppress(ViewerStalled):  # the server closes the connection, and the system cuts it off
+            async with until_ended(socket, _left(socket)):
+                async for picture in pictures:
+                    await send(message_of(picture))
+            if socket.client_state is WebSocketState.CONNECTED and socket.application_state is WebSocketState.CONNECTED:
+                with anyio.move_on_after(CLOSE_S):
+                    await socket.close(GOING_AWAY, "the stream or the server has ended")
 
 
 async def _left(socket: WebSocket) -> None:
@@ -95,10 +100,12 @@ class MjpegResponse(Response):
         async with self._opened:
             await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
             send_part = in_time(send, self._request)
-            async with until_ended(self._request, _hung_up(receive)):
-                async for picture in self._pictures:
-                    await send_part({"type": "http.response.body", "body": part_of(picture), "more_body": True})
-            await send({"type": "http.response.body", "body": b"", "more_body": False})
+            with suppress(ViewerStalled):
+                async with until_ended(self._request, _hung_up(receive)):
+                    async for picture in self._pictures:
+                        await send_part({"type": "http.response.body", "body": part_of(picture), "more_body": True})
+                with anyio.move_on_after(CLOSE_S):
+                    await send({"type": "http.response.body", "body": b"", "more_body": False})
 
 
 async def _hung_up(receive: Receive) -> None:
