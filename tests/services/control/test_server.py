@@ -19,6 +19,9 @@ from pathlib import Path
 
 import pytest
 
+from services.control.server import bind
+from services.settings import ServiceSettings
+
 ROOT = Path(__file__).resolve().parents[3]
 SERVE = [sys.executable, "-m", "services.cli", "serve", "--port", "0"]
 
@@ -86,6 +89,15 @@ def test_it_answers_and_says_nothing_about_itself(served):
     assert answer.status == 200 and json.loads(body)["api"] == "v1"
     assert answer.headers["server"] is None
     assert ask(port, "/v1/version")[0].status == 401
+
+
+def test_answers_do_not_wait_to_be_acknowledged():
+    with bind(ServiceSettings(server={"port": 0})) as listener:
+        client = socket.create_connection(listener.getsockname())
+        connection, _ = listener.accept()
+        assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
+        client.close()
+        connection.close()
 
 
 def test_the_key_is_printed_nowhere(served):
