@@ -23,7 +23,7 @@ from services.control.server import bind
 from services.settings import ServiceSettings
 
 ROOT = Path(__file__).resolve().parents[3]
-SERVE = [sys.executable, "-m", "services.cli", "serve", "--port", "0"]
+SERVE = [sys.executable, "-m", "services.cli", "serve", "--port", "0", "--set", "streams={}"]
 
 
 @contextmanager
@@ -31,7 +31,11 @@ def serving(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen, int
     """A server's process, its port, and the administrator's key."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("INTRASPLAT_")}
     process = subprocess.Popen(
-        [*SERVE, "--data", str(folder), *options], stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment
+        [*SERVE, "--data", str(folder), "--set", f"paths.runtime={folder / 'r'}", *options],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env=environment,
     )
     assert process.stderr is not None
     try:
