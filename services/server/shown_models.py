@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from services.bus.errors import BusError
@@ -23,6 +24,18 @@ AGAIN_S = 5.0
 """After a refusal an engine is asked again so much later."""
 
 
+GivenUp = tuple[tuple[str, int, str], ...]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What an engine was asked to show, and which models it had taken back by then."""
+
+    name: str
+    version: int
+    given_up_before: GivenUp
+
+
 class ShownModels:
     """Looks four times a second whether each stream shows what it is to show. An engine that is started again is told again."""
 
@@ -30,6 +43,8 @@ class ShownModels:
         self._streams, self._registry = streams, registry
         self._refused: dict[tuple[str, str, int], float] = {}
         """When an engine refused a version, by stream, model and version."""
+        self._asked: dict[str, Asked] = {}
+        """What each stream's engine was asked for last."""
 
     @asynccontextmanager
     async def following(self) -> AsyncIterator[None]:
@@ -59,9 +74,8 @@ class ShownModels:
         engine = supervisor.state().engine
         if engine.state != "running":
             return
+        await self._roll_back_if_given_up(stream.wanted.name, engine.figures)
         active = await asyncio.to_thread(self._registry.active, name)
-        if active is not None and await self._was_given_up(name, active.version, engine.figures):
-            return
         shown = engine.figures.get("model") or {}
         if active is None or (shown.get("name"), shown.get("version")) == (name, active.version):
             return
@@ -75,18 +89,24 @@ class ShownModels:
         except BusError:
             self._refused[which] = now_s
             raise
+        self._asked[stream.wanted.name] = Asked(name, active.version, _given_up(engine.figures))
         log.info("%s shows %s/%d", stream.wanted.name, name, active.version)
 
-    async def _was_given_up(self, name: str, version: int, figures: Any) -> bool:
-        """Whether an engine found that the active version cannot be shown; then the registry serves the one before."""
-        shown = figures.get("model") or {}
-        if (shown.get("name"), shown.get("version")) == (name, version):
-            return False  # it was activated again since
-        for gave_up in figures.get("gave_way") or ():
-            if (gave_up["name"], gave_up["version"]) == (name, version):
-                change = await asyncio.to_thread(
-                    self._registry.rollback, name, "engine", expected_current=version, reason=gave_up["reason"]
-                )
-                log.error("%s/%d was rolled back to %d: %s", name, version, change.version, gave_up["reason"])
-                return True
-        return False
+    async def _roll_back_if_given_up(self, stream: str, figures: Mapping[str, Any]) -> None:
+        """Have the registry serve the version before, where the engine found that the one it was asked for cannot be shown."""
+        asked, given_up = self._asked.get(stream), _given_up(figures)
+        if asked is None or given_up == asked.given_up_before:
+            return
+        name, version, reason = given_up[-1]
+        if (name, version) != (asked.name, asked.version):
+            return
+        del self._asked[stream]
+        change = await asyncio.to_thread(
+            self._registry.rollback, name, "engine", expected_current=version, reason=reason
+        )
+        log.error("%s/%d was rolled back to %d: %s", name, version, change.version, reason)
+
+
+def _given_up(figures: Mapping[str, Any]) -> GivenUp:
+    """The newest models that an engine took back, the newest last."""
+    return tuple((each["name"], each["version"], each["reason"]) for each in figures.get("gave_way") or ())

@@ -1,0 +1,134 @@
+"""Streams that show a model follow the registry, and the registry follows an engine that cannot show one."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+
+import pytest
+
+from services.bus.errors import CommandRefused
+from services.registry.errors import Conflict
+from services.server.shown_models import ShownModels
+
+
+class Registry:
+    """One model with versions 1 and 2."""
+
+    def __init__(self) -> None:
+        self.current: int | None = 1
+        self.rolled_back: list[tuple] = []
+
+    def active(self, name):
+        return None if self.current is None else SimpleNamespace(version=self.current)
+
+    def folder_of(self, name, version):
+        return f"/models/{name}/{version}"
+
+    def rollback(self, name, by, *, expected_current, reason):
+        if expected_current != 2:
+            raise Conflict("nothing was active before")
+        self.rolled_back.append((name, by, expected_current, reason))
+        self.current = 1
+        return SimpleNamespace(version=1)
+
+
+class Supervisor:
+    """An engine that shows what it is asked for."""
+
+    def __init__(self) -> None:
+        self.figures: dict = {"model": None, "gave_way": []}
+        self.engine_state, self.asked, self.refuses = "running", [], False
+
+    def state(self):
+        return SimpleNamespace(engine=SimpleNamespace(state=self.engine_state, figures=self.figures))
+
+    async def command(self, role, command, *, timeout_s, **arguments):
+        self.asked.append((role, command, arguments["folder"]))
+        if self.refuses:
+            raise CommandRefused("no room")
+        self.figures = {**self.figures, "model": {"name": arguments["name"], "version": arguments["version"]}}
+
+    def gives_up(self, version, reason, instead):
+        taken_back = {"name": "wall", "version": version, "reason": reason}
+        shown = None if instead is None else {"name": "wall", "version": instead}
+        self.figures = {"model": shown, "gave_way": [*self.figures["gave_way"], taken_back]}
+
+
+@pytest.fixture
+def parts():
+    registry, supervisor = Registry(), Supervisor()
+    stream = SimpleNamespace(wanted=SimpleNamespace(name="theatre", show="model wall"), supervisor=supervisor)
+    return SimpleNamespace(
+        registry=registry, engine=supervisor, stream=stream, models=ShownModels(SimpleNamespace(), registry)
+    )
+
+
+def looks(parts, times=1):
+    async def look():
+        for _ in range(times):
+            await parts.models.look_at(parts.stream)
+
+    asyncio.run(look())
+
+
+def test_the_active_version_is_asked_for_once_and_again_when_it_changes_or_the_engine_is_new(parts):
+    looks(parts, 3)
+    assert parts.engine.asked == [("engine", "show_model", "/models/wall/1")]
+    parts.registry.current = 2
+    looks(parts, 2)
+    assert parts.engine.asked[1:] == [("engine", "show_model", "/models/wall/2")]
+    parts.engine.figures = {"model": None, "gave_way": []}
+    looks(parts, 2)
+    assert len(parts.engine.asked) == 3
+
+
+@pytest.mark.parametrize("why", ["live", "stopped", "starting", "none active"])
+def test_nothing_is_asked_for_where_nothing_is_to_be_shown(parts, why):
+    if why == "live":
+        parts.stream.wanted.show = "live"
+    elif why == "stopped":
+        parts.stream.supervisor = None
+    elif why == "starting":
+        parts.engine.engine_state = "starting"
+    else:
+        parts.registry.current = None
+    looks(parts)
+    assert parts.engine.asked == []
+
+
+def test_a_version_that_an_engine_gives_up_is_rolled_back_once_and_can_be_activated_again(parts):
+    parts.registry.current = 2
+    looks(parts)
+    parts.engine.gives_up(2, "its picture is not finite", instead=1)
+    looks(parts, 3)
+    assert parts.registry.rolled_back == [("wall", "engine", 2, "its picture is not finite")]
+    assert parts.registry.current == 1 and len(parts.engine.asked) == 1
+    parts.registry.current = 2
+    looks(parts, 3)
+    assert len(parts.registry.rolled_back) == 1 and parts.engine.asked[-1][2] == "/models/wall/2"
+    parts.engine.gives_up(2, "it took 300.0 ms", instead=1)
+    looks(parts)
+    assert len(parts.registry.rolled_back) == 2
+
+
+def test_a_first_version_that_is_given_up_has_nothing_before_it(parts):
+    looks(parts)
+    parts.engine.gives_up(1, "its picture is not finite", instead=None)
+    with pytest.raises(Conflict):
+        looks(parts)
+
+
+def test_an_engine_that_refuses_is_not_asked_all_the_time(parts):
+    parts.engine.refuses = True
+    with pytest.raises(CommandRefused):
+        looks(parts)
+
+    async def look_twice():
+        with pytest.raises(CommandRefused):
+            await parts.models.look_at(parts.stream)
+        await parts.models.look_at(parts.stream)
+
+    parts.models._refused.clear()
+    asyncio.run(look_twice())
+    assert len(parts.engine.asked) == 2
