@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,7 +31,7 @@ class StageCounts:
         return type(self).__name__.removesuffix("Counts").lower()
 
 
-class Stage:
+class Stage(ABC):
     """Adds fields to one frame after another; keeps no more state than it needs for that.
 
     A subclass sets `counts_type`, makes its state in `reset` and works in `annotate`. It never raises for what a picture shows. What it adds to every
@@ -44,12 +45,12 @@ class Stage:
         self.found: Counter[str] = Counter()
         self.reset()
 
-    def reset(self) -> None:
+    def reset(self) -> None:  # noqa: B027 - not every stage keeps something
         """Forget the stream."""
 
+    @abstractmethod
     def annotate(self, frame: Frame) -> Frame:
         """The frame with what was found on it."""
-        raise NotImplementedError(f"{type(self).__name__} has no annotate method")
 
     def carried(self, frame: Frame) -> Frame:
         """The frame with what holds on from the last one that was looked at, without a look at this one."""

@@ -47,7 +47,7 @@ class Observed:
         started_s = time.monotonic()
         try:
             await self._app(scope, receive, send_numbered)
-        except Exception:
+        except Exception:  # the outermost place: a bug becomes an answer without a traceback, which the log has
             log.exception("a request failed by a bug in this program")
             if status == 0 and scope["type"] == "http":
                 problem = Internal(f"a bug in this server; its log has the cause under request {request_id}")

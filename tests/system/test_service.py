@@ -14,14 +14,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from gsplat_core.io.bundle import save_bundle
-from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.model import Model
 from services.client import Client, Refused
 from services.registry.bundle_file import pack
+from tests.services.supervisor.test_model_show import uniform
 
 SOURCE = "synthetic:?width=160&height=128&frames=12&fps=15"
 CHROMIUM = Path("/usr/bin/chromium")
@@ -102,23 +99,12 @@ def test_the_cameras_picture_goes_on_while_a_killed_engine_comes_back(served):
     assert after["pid"] != before["pid"] and after["restarts"] == before["restarts"] + 1
 
 
-def wall(colour) -> Model:
-    """A wall of one colour in front of the camera."""
-    x, y = torch.meshgrid(torch.linspace(-2, 2, 12), torch.linspace(-2, 2, 12), indexing="xy")
-    count = x.numel()
-    means = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((count,), 4.0)], 1)
-    sh = ((torch.tensor(colour) - 0.5) / 0.28209479177387814).expand(count, 1, 3).clone()
-    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
-    gaussians = Gaussians(means, quats, torch.full((count, 3), -1.0), torch.full((count,), 6.0), sh)
-    return Model(1, gaussians, None, Camera.from_focal(40.0, 64, 48), (1.0, 3.0))
-
-
 @pytest.fixture(scope="module")
 def walls(tmp_path_factory):
     """Packed models of a red and of a green wall."""
     folder = tmp_path_factory.mktemp("walls")
     for name, colour in (("red", (0.9, 0.1, 0.1)), ("green", (0.1, 0.9, 0.1))):
-        save_bundle(wall(colour), folder / name)
+        save_bundle(uniform(colour), folder / name)
         pack(folder / name, folder / f"{name}.isplat")
     return folder
 

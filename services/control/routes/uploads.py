@@ -61,7 +61,7 @@ async def _check(registry: Models, name: str, version: int) -> None:
     """What a check finds is the version's state. One that fails by a bug leaves it as it was, which the next start takes up again."""
     try:
         record = await asyncio.to_thread(registry.check, name, version)
-    except Exception:
+    except Exception:  # nobody waits for this task: what it raised would be seen by no one
         log.exception("the check of %s/%d failed", name, version)
     else:
         log.info("%s/%d was checked: %s", name, version, record.state)

@@ -1,0 +1,27 @@
+"""What is done once before a stream, so that no frame of it waits."""
+
+from __future__ import annotations
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.upkeep import Upkeep
+from operators.applications.warm_reconstructor import warm_reconstructor
+
+
+def test_upkeep_is_done_once_in_each_scene_and_nothing_of_it_stays(monkeypatch):
+    done = []
+    once = Upkeep.once
+
+    def noted(self, step, observation, last_seen=None):
+        before = step.gaussians.means.clone()
+        once(self, step, observation, last_seen)
+        done.append(len(before) != step.gaussians.count or not bool((before == step.gaussians.means).all()))
+
+    monkeypatch.setattr(Upkeep, "once", noted)
+    config = ReconstructorConfig(gaussians=120, max_gaussians=240, history_s=1.0, preallocate=True)
+    reconstructor = LiveReconstructor(config, Camera.from_focal(50.0, 48, 40))
+    drawn = []
+    warm_reconstructor(reconstructor, lambda frame, model: drawn.append(model))
+    assert done == [True, True] and len(drawn) == 5
+    assert reconstructor.gaussians == 0
