@@ -1,4 +1,4 @@
-"""The service's log: a line of JSON for each event on standard error, with the number of the request that it belongs to."""
+"""The service's log: a line for each event on standard error, JSON for machines and text for a terminal, with the number of the request that it belongs to."""
 
 from __future__ import annotations
 
@@ -32,16 +32,26 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(entry, ensure_ascii=True, default=str)
 
 
+class TextFormatter(logging.Formatter):
+    """A record as a line for people; passwords in addresses are masked and line breaks of a message are escaped as in JSON."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        time = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
+        line = f"{time} {record.levelname.lower():7} {masked_address(record.getMessage())}"
+        line += "".join(f" {name}={value}" for name, value in getattr(record, _FACTS, {}).items())
+        line = line.replace("\r", "\\r").replace("\n", "\\n")
+        return f"{line}\n{masked_address(self.formatException(record.exc_info))}" if record.exc_info else line
+
+
 def log_to_stderr(settings: LogSettings) -> None:
     """Send every logger of this process to standard error."""
     handler = logging.StreamHandler()
-    if settings.format == "json":
-        handler.setFormatter(JsonFormatter())
-    else:
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    text = settings.format == "text" or (settings.format == "auto" and handler.stream.isatty())
+    handler.setFormatter(TextFormatter() if text else JsonFormatter())
     logging.basicConfig(level=settings.level.upper(), handlers=[handler], force=True)
     logging.getLogger("uvicorn.access").disabled = True  # it writes addresses with tickets in them
-    logging.getLogger("websockets").setLevel(logging.WARNING)
+    for chatty in ("websockets", "alembic"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
 
 
 def facts(**values: object) -> dict[str, dict[str, object]]:

@@ -126,7 +126,9 @@ class LogSettings(Section):
     """What is written to standard error."""
 
     level: Literal["debug", "info", "warning", "error"] = "info"
-    format: Literal["json", "text"] = "json"
+    format: Literal["auto", "json", "text"] = Field(
+        default="auto", description="`auto` writes text to a terminal and JSON to anything else."
+    )
 
 
 class StreamSettings(Section):
