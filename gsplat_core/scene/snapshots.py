@@ -164,6 +164,17 @@ class Snapshot:
                 gaussians = slot.field(gaussians, self.clamp_time(time_s))
             return gaussians.map(lambda tensor: tensor[: self.gaussian_count].clone())
 
+    def unseen_s(self) -> Tensor | None:
+        """How long each Gaussian had not been seen (`Model.unseen_s`), in memory of its own."""
+        if self._unseen_s is None:
+            return None
+        with self.reading():
+            seen = self._unseen_s.clone()
+            if seen.is_cuda:
+                # It lies in no slot: whoever published it may let go of it before this stream has read it.
+                self._unseen_s.record_stream(torch.cuda.current_stream(self.device))
+            return seen
+
     def as_model(self) -> Model:
         """An immutable copy in memory of its own, made when it is first asked for."""
         with self._lock:
@@ -171,10 +182,7 @@ class Snapshot:
                 with self.reading() as slot, torch.no_grad():
                     gaussians = slot.gaussians.map(lambda tensor: tensor[: self.gaussian_count].clone())
                     field = None if slot._field is None else slot._field.exact_copy()
-                    seen = None if self._unseen_s is None else self._unseen_s.clone()
-                    if self._unseen_s is not None and self._unseen_s.is_cuda:
-                        # It lies in no slot: whoever published it may let go of it before this stream has read it.
-                        self._unseen_s.record_stream(torch.cuda.current_stream(self.device))
+                    seen = self.unseen_s()
                 self._model = Model(
                     self.version, gaussians, field, self.camera, self.time_window_s, self.training_digest, seen
                 )

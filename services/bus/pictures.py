@@ -36,8 +36,10 @@ class Picture:
 class PicturePublisher:
     """Publishes pictures at an endpoint. One thread at a time uses it."""
 
+    kind = zmq.PUB
+
     def __init__(self, endpoint: str, context: zmq.Context | None = None) -> None:
-        self._socket = (context or zmq.Context.instance()).socket(zmq.PUB)
+        self._socket = (context or zmq.Context.instance()).socket(self.kind)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
         self._socket.bind(endpoint)

@@ -7,6 +7,7 @@
         engine.show                                 the model that is shown in place of the live reconstruction
         raw   capture.status   capture.ctl          sockets of the capture process
         shown engine.status    engine.ctl           sockets of the engine process
+        depth confidence orbit                      further pictures of the engine process
 
 A file of a process that has ended is recognised by the process's number *and* its start, and removed.
 """
@@ -29,6 +30,9 @@ Role = Literal["capture", "engine"]
 ROLES: tuple[Role, ...] = get_args(Role)
 PICTURES: Mapping[Role, str] = {"capture": "raw", "engine": "shown"}
 """The socket at which each process publishes pictures."""
+Layer = Literal["depth", "confidence", "orbit"]
+LAYERS: tuple[Layer, ...] = get_args(Layer)
+"""Further pictures of the engine, at a socket each, made only while somebody reads them."""
 MOST_PATH_BYTES = 100
 """A socket's path may not be longer (`man 7 unix`: 108, and libzmq needs some)."""
 _LONGEST_NAME = "capture.status"
@@ -132,7 +136,8 @@ class StreamFolder:
 
     def clean(self, role: Role) -> None:
         """Remove the sockets and the record of a process that has ended."""
-        for name in (PICTURES[role], f"{role}.status", f"{role}.ctl", f"{role}.json"):
+        layers = LAYERS if role == "engine" else ()
+        for name in (PICTURES[role], *layers, f"{role}.status", f"{role}.ctl", f"{role}.json"):
             (self.path / name).unlink(missing_ok=True)
 
     def remove(self) -> None:

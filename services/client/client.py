@@ -70,6 +70,11 @@ class Client:
         """Stop a stream and forget it."""
         self._ask("DELETE", f"/v1/streams/{name}")
 
+    def turn_camera(self, stream: str, azimuth_deg: float = 0, elevation_deg: float = 0, zoom: float = 1) -> None:
+        """Turn a stream's virtual camera, whose view is the picture `orbit`."""
+        wanted = {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg, "zoom": zoom}
+        self._ask("PUT", f"/v1/streams/{stream}/camera", json=wanted)
+
     def pictures(self, stream: str, kind: str = "shown", quality: int = 75) -> Iterator[Picture]:
         """What a stream shows, as it comes, until the stream or the server ends. Close the iterator to leave."""
         path = f"/v1/streams/{stream}/display"

@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 PAGE = Path(__file__).parent / "page"
+MODULES = "main api viewer plot table models streams audit badge layers legend orbit"
 FILES = {
     "style.css": "text/css",
     "icon.svg": "image/svg+xml",
-    **{
-        f"{name}.js": "text/javascript"
-        for name in ("main", "api", "viewer", "plot", "table", "models", "streams", "audit")
-    },
+    **{f"{name}.js": "text/javascript" for name in MODULES.split()},
 }
 """What may be asked for, and its type."""

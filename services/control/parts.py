@@ -13,7 +13,7 @@ from prometheus_client.registry import Collector
 
 from services.control.problems import Problem
 
-PictureKind = Literal["raw", "shown"]
+PictureKind = Literal["raw", "shown", "depth", "confidence", "orbit"]
 
 
 class VersionRecord(Protocol):
@@ -108,6 +108,8 @@ class Streams(Protocol):
     async def stop(self, name: str) -> StreamState: ...
     async def set_options(self, name: str, options: Mapping[str, Any]) -> StreamState: ...
     async def delete(self, name: str) -> None: ...
+    async def set_camera(self, name: str, camera: Mapping[str, float]) -> Mapping[str, float]:
+        """Turn the stream's virtual camera; returns where it is."""
 
 
 class EncodedPicture(Protocol):

@@ -14,13 +14,14 @@ import zmq.asyncio
 
 from services.bus.errors import BadMessage
 from services.bus.pictures import Picture, picture_from, subscribe
-from services.bus.runtime import Role, StreamFolder
+from services.bus.runtime import LAYERS, Layer, StreamFolder
 from services.display.encoder import EncodedPicture, check_quality, dimmed, encoded
 from services.display.viewer import Viewer
 
 log = logging.getLogger(__name__)
-Pictures = Literal["raw", "shown"]
-PUBLISHERS: dict[Pictures, Role] = {"raw": "capture", "shown": "engine"}
+Pictures = Literal["raw", "shown", Layer]
+KINDS: tuple[Pictures, ...] = ("raw", "shown", *LAYERS)
+"""Each has a socket of its name."""
 QUALITY = 80
 STALE_S, FROZEN_S = 0.5, 1.0
 """When no picture has come for so long, its process has died: the last one is shown once more, dimmed, and then again and again with its age."""
@@ -40,7 +41,7 @@ class DisplayHub:
         check_quality(quality)
         channel = self._channels.get(kind)
         if channel is None:
-            channel = self._channels[kind] = _Channel(self._folder.pictures(PUBLISHERS[kind]), kind, self._encoders)
+            channel = self._channels[kind] = _Channel(self._folder.endpoint(kind), kind, self._encoders)
         return channel.add(quality)
 
     def viewers(self, kind: Pictures) -> int:
@@ -61,7 +62,7 @@ class DisplayHub:
 
 
 class _Channel:
-    """The viewers of one of a stream's two kinds of picture. It listens only while there are any."""
+    """The viewers of one of a stream's kinds of picture. It listens only while there are any."""
 
     def __init__(self, endpoint: str, kind: Pictures, encoders: ThreadPoolExecutor) -> None:
         self._endpoint, self._kind, self._encoders = endpoint, kind, encoders

@@ -10,6 +10,7 @@ from prometheus_client import Metric
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
+from services.display.hub import KINDS
 from services.supervisor.process import StreamEvent
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ class StreamMeasures(Collector):
             hub = self.streams.hub(facts.name) if self.streams is not None else None
             if hub is None:
                 continue
-            for kind in ("raw", "shown"):
+            for kind in KINDS:
                 viewers.add_metric([facts.name, kind], hub.viewers(kind))
                 for reason, count in hub.counts(kind).items():
                     if reason == "encoded":

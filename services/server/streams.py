@@ -161,6 +161,17 @@ class SupervisedStreams:
         await self._stop(self._stream(name), "it is deleted")
         self._streams.pop(name, None)
 
+    async def set_camera(self, name: str, camera: Mapping[str, float]) -> Mapping[str, float]:
+        """See `Streams`. Raises Missing, Conflicting for a stream that does not run, BusError."""
+        return await self.supervisor(name).command("engine", "camera", **camera)
+
+    def supervisor(self, name: str) -> StreamSupervisor:
+        """Of a stream that runs. Raises Missing, Conflicting."""
+        supervisor = self._stream(name).supervisor
+        if supervisor is None:
+            raise Conflicting(f"the stream {name} is stopped; start it first")
+        return supervisor
+
     async def _stop(self, stream: Stream, reason: str) -> None:
         async with stream.changing:
             supervisor, hub = stream.supervisor, stream.hub

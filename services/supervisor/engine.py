@@ -22,10 +22,13 @@ from operators.applications.session import Session
 from operators.applications.trial_run import trial_run
 from operators.errors import SourceUnavailable
 from operators.frame_clock import ClockSettings
+from operators.messages import ShownPicture
 from operators.metrics import ScoredFrame
 from services.bus.pictures import PicturePublisher
 from services.supervisor.captured_source import CapturedSource
 from services.supervisor.exit_codes import NO_USE
+from services.supervisor.layers import Layers
+from services.supervisor.live_scene import scene_of
 from services.supervisor.model_show import ModelShow
 from services.supervisor.screen import Screen
 from services.supervisor.specs import EngineSpec
@@ -59,7 +62,7 @@ def started(settings: LiveSettings, source: CapturedSource, again: bool) -> Live
     return warm_up(settings, source)
 
 
-def reconstruct(worker: Worker, spec: EngineSpec, screen: Screen, *, again: bool) -> None:
+def reconstruct(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, *, again: bool) -> None:
     """Reconstruct and show until the process is to end, or a finished model is to be shown. Raises a UserError for what cannot work, RunFailed when
     a part failed."""
 
@@ -77,27 +80,31 @@ def reconstruct(worker: Worker, spec: EngineSpec, screen: Screen, *, again: bool
         def scored(graph: LiveApplication, score: ScoredFrame) -> None:
             screen.scored(score)
 
-        graph = LiveApplication(
-            source, settings, parts, stop_requested=stop_requested, on_scored=scored, on_shown=screen.show
-        )
+        def show(shown: ShownPicture) -> None:
+            if screen.show(shown):
+                layers.offer(lambda: scene_of(shown, graph.reconstruct.newest))
+
+        graph = LiveApplication(source, settings, parts, stop_requested=stop_requested, on_scored=scored, on_shown=show)
         worker.tell_figures("graph", lambda: graph_figures(graph))
         worker.say("running", "reconstructs")
         Session(graph, settings.stated(), command="live", stop_requested=stop_requested).execute()
         worker.tell_figures("graph", dict)
 
 
-def show(worker: Worker, spec: EngineSpec, screen: Screen, again: bool) -> None:
+def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again: bool) -> None:
     """Show the live reconstruction or a finished model, as it is asked for, until the process is to end."""
     check_device(spec.device)
     check_renderer(spec.renderer, spec.device)
-    models = ModelShow(worker, spec, screen)
-    worker.tell_figures("screen", lambda: {**screen.figures(), **models.figures()})
+    models = ModelShow(worker, spec, screen, layers)
+    worker.tell_figures("screen", lambda: {**screen.figures(), **models.figures(), **layers.figures()})
+    worker.take({"camera": layers.camera})
+    layers.open()
     try:
         models.begin()
         worker.take({"show_model": models.show, "show_live": models.show_live, "show_previous": models.show_previous})
         while not worker.stop_requested():
             if screen.wanted == "live":
-                reconstruct(worker, spec, screen, again=again)
+                reconstruct(worker, spec, screen, layers, again=again)
                 again = True
             else:
                 worker.say("running", "shows a finished model")
@@ -106,6 +113,7 @@ def show(worker: Worker, spec: EngineSpec, screen: Screen, again: bool) -> None:
         if not worker.stop_requested():
             worker.request_stop("the engine failed")
         models.close()
+        layers.close()
 
 
 def graph_figures(graph: LiveApplication) -> dict[str, object]:
@@ -139,7 +147,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with Worker(folder, spec) as worker:
             publisher = PicturePublisher(folder.pictures("engine"))
             try:
-                show(worker, spec.engine, Screen(publisher), given.again)
+                layers = Layers(folder, spec.engine.device)
+                show(worker, spec.engine, Screen(publisher), layers, given.again)
             finally:
                 publisher.close()
     except SourceUnavailable as error:  # nothing is a reason for not trying again

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from gsplat_core.rendering.registry import new_renderer
 from operators.applications.limits import check_picture
 from operators.rasterize import displayed
 from services.bus.errors import CommandRefused
+from services.supervisor.layer_drawing import LayerScene
 
 
 class NotFinite(InvalidInput):
@@ -43,6 +46,10 @@ class FinishedModel:
         """The model's time at a time of the stream: its window over and over."""
         start_s, end_s = self._model.time_window_s
         return start_s + math.fmod(max(0.0, stream_s), end_s - start_s) if end_s > start_s else start_s
+
+    def scene(self, stream_s: float, header: Mapping[str, Any]) -> LayerScene:
+        """What the picture of that time shows, for drawing more of it. A bundle does not say what its unit is."""
+        return LayerScene(self._model, self._camera, self.at(stream_s), header)
 
     def picture(self, stream_s: float) -> NDArray[np.uint8]:
         """RGB uint8 [H, W, 3] by the model's camera. Raises NotFinite."""

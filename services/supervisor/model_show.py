@@ -19,6 +19,7 @@ from services.bus.errors import BadMessage, BusError, CommandRefused
 from services.bus.runtime import read_json, write_json
 from services.supervisor.captured_source import CapturedSource
 from services.supervisor.finished_model import FinishedModel, NotFinite
+from services.supervisor.layers import Layers
 from services.supervisor.screen import Screen
 from services.supervisor.specs import EngineSpec
 from services.supervisor.worker import Worker
@@ -50,8 +51,8 @@ class ModelShow:
     again, gives way to the one before it, or to the live reconstruction. What is shown outlasts the process: the next engine begins with it.
     """
 
-    def __init__(self, worker: Worker, spec: EngineSpec, screen: Screen) -> None:
-        self._worker, self._spec, self._screen = worker, spec, screen
+    def __init__(self, worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers | None = None) -> None:
+        self._worker, self._spec, self._screen, self._layers = worker, spec, screen, layers
         self._file = worker.folder.path / "engine.show"
         self._lock = threading.Lock()
         self._changing = threading.Lock()
@@ -178,7 +179,10 @@ class ModelShow:
             "steps": 0,
             "psnr_db": None,
         }
-        return self._screen.publish("model", header, image)
+        shown = self._screen.publish("model", header, image)
+        if shown and self._layers is not None:
+            self._layers.offer(lambda: showing.model.scene(frame.time_s, {**header, "show": "model"}))
+        return shown
 
     def _check_time(self, showing: Showing, took_ms: float) -> None:
         late = showing.most_ms is not None and took_ms > showing.most_ms

@@ -47,23 +47,9 @@ class Screen:
         with self._lock:
             self._wanted = shows
 
-    def show(self, shown: ShownPicture) -> None:
-        """A picture of the live reconstruction."""
-        rendered = shown.rendered
-        content = rendered.content or rendered.frame
-        header = {
-            "seq": rendered.frame.seq,
-            "pts_ns": rendered.frame.pts_ns,
-            "arrived_ns": content.arrived_ns,
-            "shown_ns": shown.shown_ns,
-            "age_ms": round(shown.age_ns * 1e-6, 3),
-            "state": shown.state.value,
-            "new": shown.new,
-            "model_version": rendered.model_version,
-            "steps": rendered.steps,
-            "psnr_db": self._psnr_db,
-        }
-        self.publish("live", header, shown.image)
+    def show(self, shown: ShownPicture) -> bool:
+        """A picture of the live reconstruction; False when it is not shown."""
+        return self.publish("live", {**header_of(shown), "psnr_db": self._psnr_db}, shown.image)
 
     def scored(self, scored: ScoredFrame) -> None:
         """What the newest scored picture's tissue PSNR was: the next ones tell it."""
@@ -87,3 +73,20 @@ class Screen:
         """For the heartbeats."""
         with self._lock:
             return {"pictures": self.pictures, "published": self.published, "picture": dict(self._last)}
+
+
+def header_of(shown: ShownPicture) -> dict[str, Any]:
+    """What is said of a picture of the live reconstruction (docs/processes.md)."""
+    rendered = shown.rendered
+    content = rendered.content or rendered.frame
+    return {
+        "seq": rendered.frame.seq,
+        "pts_ns": rendered.frame.pts_ns,
+        "arrived_ns": content.arrived_ns,
+        "shown_ns": shown.shown_ns,
+        "age_ms": round(shown.age_ns * 1e-6, 3),
+        "state": shown.state.value,
+        "new": shown.new,
+        "model_version": rendered.model_version,
+        "steps": rendered.steps,
+    }

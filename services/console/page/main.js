@@ -2,6 +2,8 @@
 
 import { setKeyDialog, useKey } from "./api.js";
 import { auditPage } from "./audit.js";
+import { Badge } from "./badge.js";
+import { layersOf } from "./layers.js";
 import { modelsPage } from "./models.js";
 import { Plot } from "./plot.js";
 import { streamsPage } from "./streams.js";
@@ -12,6 +14,8 @@ const SILENT_MS = 1500;
 const RENEW_MS = 2000;
 
 const plots = { age: new Plot(at("age")), psnr: new Plot(at("psnr"), { from_zero: false }) };
+const badges = { raw: new Badge(at("raw-state")), shown: new Badge(at("shown-state")) };
+const watchLayers = layersOf(at("layers"), at("pictures"), report);
 let viewers = [];
 let watched = "";
 let heard_ms = 0;
@@ -48,18 +52,25 @@ function watch(stream) {
   plots.age.clear();
   plots.psnr.clear();
   say("no picture");
+  watchLayers(stream);
   if (!stream) return;
-  const lost = () => { say("no connection"); };
+  const lost = () => { say("no connection"); badges.shown.lost(); };
   viewers = [
-    new Viewer(stream, "raw", at("raw"), { onPicture: (header) => { at("raw-facts").value = `frame ${header.seq}`; }, onLost: () => {} }),
+    new Viewer(stream, "raw", at("raw"), { onPicture: raw, onLost: () => badges.raw.lost() }),
     new Viewer(stream, "shown", at("shown"), { onPicture: shown, onLost: lost }),
   ];
 }
 
+function raw(header) {
+  badges.raw.say(header);
+  at("raw-facts").value = `frame ${header.seq}`;
+}
+
 function shown(header) {
   heard_ms = performance.now();
+  badges.shown.say(header);
   say(header.state, header.age_ms);
-  at("shown-facts").value = `frame ${header.seq}, model ${header.model_version ?? "–"}, ${header.steps ?? "–"} steps`;
+  at("shown-facts").value = `frame ${header.seq}, model ${header.model_version ?? "–"}`;
   if (header.new === false) return;
   plots.age.add(header.age_ms);
   plots.psnr.add(header.psnr_db ?? null);

@@ -17,12 +17,13 @@ from services.control.routes import (
     tickets,
     uploads,
     version,
+    virtual_camera,
 )
 
 ROUTERS: tuple[APIRouter, ...] = tuple(
     module.router
     for module in (
-        health, version, config, streams, display, models, uploads, jobs, recordings, keys, tickets, audit, metrics,
+        health, version, config, streams, virtual_camera, display, models, uploads, jobs, recordings, keys, tickets, audit, metrics,
         documents,
     )
 )  # fmt: skip

@@ -21,7 +21,13 @@ from services.control.viewers import ViewerStalled, in_time, until_ended, viewin
 from services.settings import ResourceName
 
 router = new_router("display")
-Kind = Annotated[PictureKind, Query(description="The camera's picture, or what is shown in its place.")]
+Kind = Annotated[
+    PictureKind,
+    Query(
+        description="The camera's picture (`raw`), what is shown in its place (`shown`), or of that the depth, the confidence, and the view of the"
+        " stream's virtual camera (`orbit`), which are drawn while somebody watches them."
+    ),
+]
 Quality = Annotated[int, Query(ge=10, le=95, description="Of the JPEG.")]
 BOUNDARY = "picture"
 GOING_AWAY = 1001

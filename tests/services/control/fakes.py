@@ -147,6 +147,11 @@ class FakeStreams:
         await self.get(name)
         del self.kept[name]
 
+    async def set_camera(self, name: str, camera: Mapping[str, float]) -> Mapping[str, float]:
+        await self.get(name)
+        self.camera = dict(camera)
+        return camera
+
     async def _in_state(self, name: str, state: str) -> FakeStream:
         self.kept[name] = replace(await self.get(name), state=state)
         return self.kept[name]

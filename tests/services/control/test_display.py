@@ -96,7 +96,7 @@ def test_a_stream_that_is_not_there(watched):
     ):
         pass
     assert refused.value.status_code == 404
-    assert watched.ask("GET", f"{MJPEG}?kind=depth").status_code == 422
+    assert watched.ask("GET", f"{MJPEG}?kind=thermal").status_code == 422
     assert watched.ask("GET", f"{MJPEG}?quality=100").status_code == 422
 
 

@@ -54,3 +54,14 @@ def test_refused_streams(plane, change):
     answer = plane.ask("POST", "/v1/streams", json={**ENDOSCOPE, **change})
     assert answer.status_code == 422 and answer.json()["errors"]
     assert plane.parts.streams.kept == {}
+
+
+def test_the_virtual_camera_is_turned_by_whoever_watches(plane):
+    plane.ask("POST", "/v1/streams", json={"name": "endoscope", "source": "synthetic:"})
+    path = "/v1/streams/endoscope/camera"
+    answer = plane.ask("PUT", path, "viewer", json={"azimuth_deg": 20})
+    assert (answer.status_code, answer.json()) == (200, {"azimuth_deg": 20, "elevation_deg": 0, "zoom": 1})
+    assert plane.parts.streams.camera == answer.json()
+    for wrong in ({"azimuth_deg": 80}, {"zoom": 0}, {"roll_deg": 3}, {"zoom": "near"}):
+        assert plane.ask("PUT", path, json=wrong).status_code == 422
+    assert plane.ask("PUT", "/v1/streams/nobody/camera", json={}).status_code == 404

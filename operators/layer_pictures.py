@@ -1,0 +1,133 @@
+"""Depth and confidence as pictures in false colours, each with its legend, and the marks of what was never observed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.remembered import COVERED
+
+STOPS = 9
+"""Colours that a legend names, evenly spaced."""
+RANGE_QUANTILES = (0.02, 0.98)
+RANGE_FOLLOWS = 0.15
+"""How fast the range of depths follows the pictures: colours must not flicker."""
+HATCH_PX = 12
+UNOBSERVED, UNOBSERVED_LINE = (24, 18, 32), (150, 60, 170)
+"""Colours of what was never observed: no colour map has them."""
+VIRTUAL = (190, 110, 255)
+"""The frame around a picture that no camera has taken."""
+
+Unit = Literal["mm", "relative", "confidence"]
+
+
+@dataclass(frozen=True)
+class Legend:
+    """What the colours of a picture mean."""
+
+    unit: Unit
+    """`mm`; `relative`: a depth over the picture's median depth, where the recording has no scale; `confidence`: 0 to 1."""
+    low: float
+    high: float
+    stops: tuple[str, ...]
+    """Colours from `low` to `high`, evenly spaced."""
+
+    def said(self) -> dict[str, Any]:
+        """For a picture's header."""
+        low, high = (float(f"{value:.4g}") for value in (self.low, self.high))
+        return {"unit": self.unit, "low": low, "high": high, "stops": list(self.stops), "unobserved": _hex(UNOBSERVED)}
+
+
+class DepthColours:
+    """Depth in false colours, near ones warm. Its range follows the pictures slowly. For one thread at a time."""
+
+    def __init__(self) -> None:
+        self._range: tuple[float, float] | None = None
+        self.median: float | None = None
+        """Median depth of what is covered, in the scene's unit; None before anything was."""
+
+    def look_at(self, depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> None:
+        """Learn the range of depths from a picture's planes [H, W]."""
+        values = depth[(alpha >= 0.5) & np.isfinite(depth) & (depth > 0)]
+        if values.size == 0:
+            return
+        low, middle, high = (
+            float(value) for value in np.quantile(values[:: 1 + values.size // 20_000], (0.02, 0.5, 0.98))
+        )
+        if self._range is None or self.median is None or not 0.5 < middle / self.median < 2:
+            self._range, self.median = (low, high), middle
+            return
+        before = self._range
+        self._range = tuple(old + RANGE_FOLLOWS * (new - old) for old, new in zip(before, (low, high), strict=True))  # type: ignore[assignment]
+        self.median += RANGE_FOLLOWS * (middle - self.median)
+
+    def picture(
+        self, depth: NDArray[np.float32], alpha: NDArray[np.float32], metric: bool
+    ) -> tuple[NDArray[np.uint8], Legend]:
+        """RGB uint8 [H, W, 3] with what was never observed marked, and its legend. metric: the scene's unit is the millimetre."""
+        self.look_at(depth, alpha)
+        low, high = self._range or (0.0, 1.0)
+        # Nearly flat tissue must not look like mountains.
+        spread = max(high - low, 0.05 * (self.median or 1.0))
+        middle = (low + high) / 2
+        low, high = middle - spread / 2, middle + spread / 2
+        share = np.clip((high - np.nan_to_num(depth)) / (high - low), 0, 1)
+        image = _coloured(share, cv2.COLORMAP_TURBO)
+        mark_unobserved(image, alpha)
+        unit = 1.0 if metric else (self.median or 1.0)
+        stops = tuple(reversed(_stops(cv2.COLORMAP_TURBO)))
+        return image, Legend("mm" if metric else "relative", low / unit, high / unit, stops)
+
+
+def confidence_picture(confidence: NDArray[np.float32], alpha: NDArray[np.float32]) -> tuple[NDArray[np.uint8], Legend]:
+    """Confidence [H, W], 0 to 1, as RGB uint8 [H, W, 3] with what was never observed marked, and its legend."""
+    image = _coloured(np.clip(np.nan_to_num(confidence), 0, 1), cv2.COLORMAP_VIRIDIS)
+    mark_unobserved(image, alpha)
+    return image, Legend("confidence", 0.0, 1.0, _stops(cv2.COLORMAP_VIRIDIS))
+
+
+def mark_unobserved(image: NDArray[np.uint8], alpha: NDArray[np.float32]) -> float:
+    """Hatch, in place, where a model shows nothing: no camera has seen anything there. Returns the share of such pixels."""
+    empty = ~(alpha >= COVERED)
+    share = float(empty.mean())
+    if share:
+        height, width = alpha.shape
+        rows, columns = np.ogrid[:height, :width]
+        line = (rows + columns) % HATCH_PX < 2
+        image[empty] = UNOBSERVED
+        image[empty & line] = UNOBSERVED_LINE
+    return share
+
+
+def mark_virtual(image: NDArray[np.uint8], text: str) -> None:
+    """Frame a picture that no camera has taken, in place, and say so at its lower edge."""
+    height, width = image.shape[:2]
+    edge = max(2, height // 80)
+    cv2.rectangle(image, (0, 0), (width - 1, height - 1), VIRTUAL, edge)
+    scale = max(0.35, height / 1000)
+    thickness = max(1, round(scale * 2))
+    (wide, high), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
+    pad = max(2, high // 2)
+    top = max(0, height - high - below - 2 * pad)
+    cv2.rectangle(image, (0, top), (min(width - 1, wide + 2 * pad), height - 1), (0, 0, 0), cv2.FILLED)
+    cv2.putText(
+        image, text, (pad, height - below - pad), cv2.FONT_HERSHEY_SIMPLEX, scale, VIRTUAL, thickness, cv2.LINE_AA
+    )
+
+
+def _coloured(share: NDArray[np.floating], colours: int) -> NDArray[np.uint8]:
+    grey = (share * 255).astype(np.uint8)
+    return np.ascontiguousarray(cv2.applyColorMap(grey, colours)[..., ::-1])
+
+
+def _stops(colours: int) -> tuple[str, ...]:
+    levels = np.linspace(0, 255, STOPS).round().astype(np.uint8)[None]
+    return tuple(_hex(colour) for colour in cv2.applyColorMap(levels, colours)[0, :, ::-1])
+
+
+def _hex(colour: Any) -> str:
+    return "#" + "".join(f"{int(value):02x}" for value in colour)

@@ -1,0 +1,31 @@
+"""The virtual camera of a stream, whose view is the picture `orbit`."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.requests import Request
+
+from services.control.auth.guard import new_router, requires
+from services.control.routes.streams import streams_of
+from services.settings import ResourceName
+
+router = new_router("streams")
+
+
+class VirtualCamera(BaseModel):
+    """Where the virtual camera is, beside the endoscope's: round the point in the middle of its picture."""
+
+    model_config = ConfigDict(
+        extra="forbid", json_schema_extra={"examples": [{"azimuth_deg": 20, "elevation_deg": 10}]}
+    )
+    azimuth_deg: float = Field(0.0, ge=-75, le=75, description="To the right.")
+    elevation_deg: float = Field(0.0, ge=-75, le=75, description="Upwards.")
+    zoom: float = Field(1.0, ge=0.25, le=4, description="How many times closer.")
+
+
+@router.put("/streams/{name}/camera")
+@requires("viewer")
+async def turn_virtual_camera(request: Request, name: ResourceName, wanted: VirtualCamera) -> VirtualCamera:
+    """Turn the stream's virtual camera. There is one for all who watch, and the last one to turn it wins. It changes nothing else, and is not
+    in the audit log."""
+    return VirtualCamera.model_validate(await streams_of(request).set_camera(name, wanted.model_dump()))

@@ -1,0 +1,45 @@
+"""A publisher that knows whether anybody reads."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import zmq
+
+from services.bus.pictures import picture_from, subscribe
+from services.bus.watched_pictures import WatchedPublisher, wait_for_readers
+
+IMAGE = np.zeros((2, 3, 3), np.uint8)
+
+
+def becomes(publisher: WatchedPublisher, watched: bool) -> None:
+    until_s = time.monotonic() + 10
+    while publisher.watched is not watched:
+        assert time.monotonic() < until_s, f"watched did not become {watched}"
+        wait_for_readers([publisher], 0.05)
+
+
+def test_it_hears_of_the_first_reader_and_of_the_last_one_that_leaves(runtime):
+    endpoint = runtime.stream("a").endpoint("depth")
+    with zmq.Context() as context:
+        publisher = WatchedPublisher(endpoint, context)
+        assert not publisher.watched
+        with subscribe(context.socket(zmq.SUB), endpoint) as one:
+            becomes(publisher, True)
+            with subscribe(context.socket(zmq.SUB), endpoint) as other:
+                while not other.poll(20):
+                    publisher.publish({"seq": 1}, IMAGE)
+                assert picture_from(other.recv_multipart(copy=False)).header["seq"] == 1
+            assert one.poll(1000)
+            assert publisher.watched
+        becomes(publisher, False)
+        publisher.close()
+
+
+def test_a_reader_that_waits_is_heard_as_soon_as_there_is_a_publisher(runtime):
+    endpoint = runtime.stream("a").endpoint("orbit")
+    with zmq.Context() as context, subscribe(context.socket(zmq.SUB), endpoint):
+        publisher = WatchedPublisher(endpoint, context)
+        becomes(publisher, True)
+        publisher.close()

@@ -1,0 +1,97 @@
+"""What depth, confidence and the virtual view show of a known scene: a red wall far away, a green post in front of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.orbit import Orbit
+from operators.layer_pictures import UNOBSERVED, UNOBSERVED_LINE, DepthColours
+from operators.messages import PictureState
+from operators.rasterize import displayed
+from operators.remembered import COVERED
+from services.supervisor.layer_drawing import LayerDrawing, LayerScene, label
+from tests.services.supervisor.test_model_show import uniform
+
+RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.9, 0.1)
+
+
+def wall_and_post(unseen: bool = False) -> Model:
+    """The post covers the left half of the wall, at half its distance."""
+    wall, post = uniform(RED), uniform(GREEN).gaussians
+    left = post.select(post.means[:, 0] < -0.3)
+    near = replace(left, means=left.means * 0.5, log_scales=left.log_scales - 0.7)
+    both = wall.gaussians.append(near)
+    unseen_s = torch.zeros(both.count, dtype=torch.float64)
+    unseen_s[wall.gaussians.count :] = 20.0
+    return Model(3, both, None, wall.camera.scaled(5), wall.time_window_s, unseen_s=unseen_s if unseen else None)
+
+
+def drawn(layer, model, orbit=Orbit(), **options):
+    drawing = LayerDrawing("cpu")
+    drawing.orbit = orbit
+    return drawing.draw(layer, LayerScene(model, model.camera, 1.0, {"state": "live"}, **options))
+
+
+def test_near_is_warmer_and_the_legend_has_both_depths():
+    image, said = drawn("depth", wall_and_post(), metric=True)
+    left, right = image[60, 30].astype(int), image[60, 130].astype(int)
+    assert left[0] > left[2] and right[2] > right[0] - 20
+    assert said["legend"]["unit"] == "mm"
+    assert said["legend"]["low"] == pytest.approx(2, abs=0.4) and said["legend"]["high"] == pytest.approx(4, abs=0.4)
+
+
+def test_planes_that_are_there_are_not_rendered_again(monkeypatch):
+    monkeypatch.setattr("services.supervisor.layer_drawing.render", None)
+    model = wall_and_post()
+    plane = np.full((120, 160), 7.0, np.float32)
+    _, said = drawn("depth", model, planes=(plane, np.ones_like(plane)))
+    assert said["legend"]["unit"] == "relative" and said["legend"]["low"] < 1 < said["legend"]["high"]
+
+
+def test_confidence_falls_with_the_time_since_it_was_seen():
+    image, said = drawn("confidence", wall_and_post(unseen=True))
+    assert "time" in said["legend"]["counts"]
+    certain, _ = drawn("confidence", wall_and_post())
+    right, left = (60, 130), (60, 30)
+    assert np.abs(image[right].astype(int) - certain[right]).max() < 5
+    assert image[left].astype(int).sum() < certain[left].astype(int).sum() - 100
+
+
+def test_a_virtual_camera_looks_round_the_post():
+    model = wall_and_post()
+    orbit, depths = Orbit(-40, 10, 1.2), DepthColours()
+    plain = model.render(1.0)
+    depths.look_at(plain.depth.numpy(), plain.alpha.numpy())
+    expected = model.render(1.0, orbit.camera(model.camera, depths.median))
+    image, said = drawn("orbit", model, orbit)
+    assert said["virtual"] == {"azimuth_deg": -40, "elevation_deg": 10, "zoom": 1.2}
+    shown = expected.alpha.numpy() >= COVERED
+    assert said["unobserved_share"] == pytest.approx(1 - shown.mean(), abs=1e-3) and 0 < shown.mean() < 1
+    inside = np.s_[4:-20, 4:-4]
+    seen = shown[inside]
+    np.testing.assert_array_equal(image[inside][seen], displayed(expected.image)[inside][seen])
+    assert {tuple(colour) for colour in image[inside][~seen].tolist()} <= {UNOBSERVED, UNOBSERVED_LINE}
+    straight, _ = drawn("orbit", model)
+    assert np.abs(image.astype(int) - straight).mean() > 10
+
+
+def test_what_nobody_sees_now_has_no_colour_in_the_virtual_view():
+    image, _ = drawn("orbit", wall_and_post(unseen=True))
+    left, right = image[60, 30].astype(int), image[60, 130].astype(int)
+    assert np.ptp(left) <= 2 and np.ptp(right) > 100
+
+
+def test_a_virtual_view_never_says_live():
+    image = np.zeros((200, 300, 3), np.uint8)
+    label(image, "orbit", PictureState.LIVE, 10)
+    assert not image.any()
+    label(image, "orbit", PictureState.STALE, 10)
+    assert image.any()
+    depth = np.zeros((200, 300, 3), np.uint8)
+    label(depth, "depth", PictureState.LIVE, 10)
+    assert depth.any()
