@@ -7,6 +7,7 @@ CoreError
 ├── BundleError (UserError)             a model file cannot be used
 │   ├── BundleCorrupt                   wrong digest, truncated, not finite
 │   └── UnknownFormatVersion            written by a later version
+├── ExportError (UserError)             a model cannot be written in a format of other programs
 └── RecordingError (UserError)          a recording cannot be used
     ├── RecordingMissing                a file or folder is not there
     └── RecordingInvalid                counts, sizes, polarity, calibration or video data are wrong
@@ -46,6 +47,10 @@ class BundleCorrupt(BundleError):
 
 class UnknownFormatVersion(BundleError):
     """A model file was written by a later version."""
+
+
+class ExportError(CoreError, UserError):
+    """A model cannot be written in a format of other programs."""
 
 
 class RecordingError(CoreError, UserError):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,10 +18,12 @@ from gsplat_core.training.live import LiveReconstructor
 from operators.frame_clock import FrameClock
 from operators.graph import Operator, OperatorSpec
 from operators.messages import Reconstruction
+from operators.model_request import ModelRequest
 from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ModelResult
 from operators.schedule import ScheduleEvent, ScheduleListener
 
+log = logging.getLogger(__name__)
 REHEARSED_AT_ONCE = 3
 """Rehearsal steps between two looks for a new frame, on a GPU; on the CPU, where a step takes long, it is one."""
 GROWN_AT_LATEST = 10
@@ -87,6 +92,7 @@ class LiveReconstructOp(Operator):
         """The newest frame that the model has seen."""
         self._scene = 0
         """Number of the scene that the model shows."""
+        self._requests: deque[ModelRequest] = deque()
         self._since_grown = 0
         """Frames that were trained on since the scene was last looked at for tissue that it does not cover."""
         super().__init__(fragment, *args, **kwargs)
@@ -126,6 +132,8 @@ class LiveReconstructOp(Operator):
             self.model = self._reconstructor.whole_model(self.newest)
         self.newest = self.model
         self._reconstructor = self._learned = None
+        while self._requests:
+            self._requests.popleft().refuse("the reconstruction has ended")
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         frame: Frame = op_input.receive("frame")
@@ -135,6 +143,7 @@ class LiveReconstructOp(Operator):
         reconstruction = self._observe(frame, behind=bool(op_input.queued("frame")))
         if reconstruction is not None:
             op_output.emit(reconstruction, "reconstruction")
+            self._answer_requests(frame)
             if not op_input.queued("frame"):
                 self.clock.wait_until_shown()
             self._rehearse(frame, lambda: bool(op_input.queued("frame")))
@@ -218,6 +227,27 @@ class LiveReconstructOp(Operator):
     def _tell(self, event: ScheduleEvent) -> None:
         if self.listener is not None:
             self.listener(event)
+
+    def request_model(self) -> ModelRequest:
+        """Ask for the whole model, as it stands after the next frame; from any thread."""
+        request = ModelRequest()
+        self._requests.append(request)
+        return request
+
+    def _answer_requests(self, frame: Frame) -> None:
+        """The picture is on its way by now, and what is left is the time for rehearsal."""
+        while self._requests:
+            assert self._reconstructor is not None and self.newest is not None
+            began_ns = time.perf_counter_ns()
+            # A snapshot on a GPU is whole, and stays as it is while it is held: whoever asked copies it, in a thread of its own.
+            request, newest = self._requests.popleft(), self.newest
+            try:
+                model = newest if isinstance(newest, Snapshot) else self._reconstructor.whole_model(newest)
+            except Exception as error:  # who asked learns of it, and the stream goes on
+                log.exception("the whole model was not copied")
+                request.refuse(f"{type(error).__name__}: {error}")
+                continue
+            request.answer(model, frame, time.perf_counter_ns() - began_ns)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""

@@ -97,7 +97,8 @@ WITHOUT_TORCH = [
     *(f"services.supervisor.{name}" for name in ("launching", "process", "specs", "stream")),
     "services.display.hub",
     "services.registry.models",
-    *(f"services.server.{name}" for name in ("displays", "page", "parts", "streams")),
+    *(f"services.server.{name}" for name in ("displays", "page", "parts", "snapshots", "streams")),
+    *(f"services.exports.{name}" for name in ("cache", "snapshots")),
     "services.client",
     *(f"services.{name}" for name in ("audit", "control", "control.server", "settings")),
 ]

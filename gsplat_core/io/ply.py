@@ -39,6 +39,13 @@ REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGRE
 def save_ply(gaussians: Gaussians, path: str | Path) -> None:
     """Write the Gaussians; the file appears whole or not at all. OSError when it cannot be written."""
     path = Path(path)
+    draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    write_durably(draft, ply_pieces(gaussians))
+    replace_durably(draft, path)
+
+
+def ply_pieces(gaussians: Gaussians) -> list[bytes]:
+    """The content of such a file: header and body."""
     g = {name: t.detach().cpu().to(torch.float32).numpy() for name, t in gaussians.tensors().items()}
     rest = g["sh"][:, 1:].transpose(0, 2, 1).reshape(gaussians.count, 3 * (g["sh"].shape[1] - 1))
     columns = [
@@ -50,9 +57,7 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {gaussians.count}"]
     header += [*(f"property float {name}" for name in names), "end_header", ""]
     body = np.concatenate(columns, axis=1).astype("<f4")
-    draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    write_durably(draft, ["\n".join(header).encode(), body.tobytes()])
-    replace_durably(draft, path)
+    return ["\n".join(header).encode(), body.tobytes()]
 
 
 def load_ply(path: str | Path) -> Gaussians:

@@ -13,6 +13,7 @@ from services.cli.options import (
     EvaluatedArgument,
     EvaluateOptions,
     EvaluationOutOption,
+    ExportedFileArgument,
     JsonOption,
     LiveOptions,
     LiveOutOption,
@@ -230,6 +231,28 @@ def pack(
     from services.cli.pack import pack_command
 
     return pack_command(model, file, overwrite=overwrite, as_json=json)
+
+
+@app.command()
+def export(
+    model: ModelArgument,
+    file: ExportedFileArgument,
+    format: Annotated[
+        str | None, typer.Option(help="ply, splat, glb or ply-sequence.", show_default="by the file's ending")
+    ] = None,
+    time: Annotated[
+        float | None, typer.Option(help="Which time of the model, in seconds.", show_default="the end of its window")
+    ] = None,
+    times: Annotated[
+        int | None, typer.Option(help="Of a sequence: how many times of the window.", show_default="30")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Write a model as a file for other programs: .ply, .splat, .glb, or a .zip of .ply over time."""
+    from services.cli.export import export_command
+
+    return export_command(model, file, format, time, times, overwrite=overwrite, as_json=json)
 
 
 @app.command()

@@ -42,6 +42,7 @@ SourceArgument = Annotated[
 ]
 ModelArgument = Annotated[Path, _path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
 PackedFileArgument = Annotated[Path, _path_argument("FILE", "The packed file, which ends in .isplat.")]
+ExportedFileArgument = Annotated[Path, _path_argument("FILE", "The exported file.")]
 OutOption = Annotated[Path, path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
 LiveOutOption = Annotated[
     Path | None, path_option("--out", "Folder for the report and the model; without it nothing is kept.")

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from services.cli import ctl_models
 from services.cli.ctl import ctl
 from services.cli.options import JsonOption, path_option
 
@@ -23,6 +24,7 @@ def add_to(app: typer.Typer) -> None:
     app.command()(schema)
     app.add_typer(keys, name="keys")
     app.add_typer(audit, name="audit")
+    assert ctl_models.ctl is ctl  # it has added its commands
     app.add_typer(ctl, name="ctl")
 
 

@@ -14,6 +14,7 @@ from pydantic import TypeAdapter
 
 from services.client.errors import ClientError, Refused, Unreachable
 from services.client.pictures import Picture, pictures
+from services.client.snapshots import SnapshotMethods
 from services.control.routes.models import ModelView, VersionView
 from services.control.routes.streams import StreamView
 
@@ -22,7 +23,7 @@ CHUNK_BYTES = 1 << 20
 WAITING = ("uploaded", "validated")
 
 
-class Client:
+class Client(SnapshotMethods):
     """A server's API, with one key.
 
         with Client("http://127.0.0.1:8000", key) as client:

@@ -12,6 +12,7 @@ from fastapi import APIRouter
 from prometheus_client.registry import Collector
 
 from services.control.problems import Problem
+from services.control.snapshot_parts import Exports, Snapshots
 
 PictureKind = Literal["raw", "shown", "depth", "confidence", "orbit"]
 
@@ -160,6 +161,8 @@ class Parts:
     display: Display | None = None
     jobs: Jobs | None = None
     recordings: Recordings | None = None
+    snapshots: Snapshots | None = None
+    exports: Exports | None = None
     routers: Sequence[APIRouter] = ()
     """Further routes, made by `new_router`."""
     background: Sequence[Callable[[], AbstractAsyncContextManager[Any]]] = ()

@@ -17,6 +17,7 @@ from services.control.limits import TokenBuckets
 from services.control.measures import Measures
 from services.control.parts import Parts
 from services.control.problems import NotBuiltIn
+from services.control.repeated import Repeated
 from services.control.viewer_count import ViewerCount
 from services.settings import ServiceSettings
 
@@ -39,6 +40,8 @@ class ControlState:
     viewers: ViewerCount
     draining: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server is asked to end: what has no end of its own then ends."""
+    repeated: Repeated = field(default_factory=Repeated)
+    """Answers to requests that may be sent again."""
     tasks: set[asyncio.Task[None]] = field(default_factory=set)
     """What goes on after its request was answered."""
 

@@ -11,6 +11,9 @@ from services.bus.errors import BusError
 from services.bus.runtime import RuntimeFolder
 from services.control.parts import CheckResult, NewStream, Parts
 from services.control.problems import Conflicting, Missing, Problem, Unavailable, Unprocessable
+from services.exports.cache import ExportCache
+from services.exports.errors import ExportBusy, ExportFailed, ExportRefused, NoSnapshot
+from services.exports.snapshots import SnapshotStore
 from services.registry.errors import Conflict, NotFound, Rejected, StoreUnavailable
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
@@ -18,6 +21,7 @@ from services.server import page
 from services.server.displays import StreamDisplays
 from services.server.measures import StreamMeasures
 from services.server.shown_models import ShownModels
+from services.server.snapshots import ModelExports, StreamSnapshots
 from services.server.streams import SupervisedStreams
 from services.settings import ServiceSettings
 
@@ -28,6 +32,10 @@ ERRORS: dict[type[Exception], type[Problem]] = {
     Rejected: Unprocessable,
     StoreUnavailable: Unavailable,
     BusError: Unavailable,
+    NoSnapshot: Missing,
+    ExportRefused: Unprocessable,
+    ExportBusy: Unavailable,
+    ExportFailed: Unavailable,
 }
 
 
@@ -37,6 +45,8 @@ def assembled(settings: ServiceSettings) -> Parts:
     streams = SupervisedStreams(RuntimeFolder(settings.runtime_dir), measures.count)
     measures.streams = streams
     models = registry_of(settings)
+    snapshots = SnapshotStore(settings.data_dir / "snapshots")
+    exports = ModelExports(models, snapshots, ExportCache(settings.data_dir / "exports"))
     at_start = [
         NewStream(name, stream.source, stream.show, stream.device, stream.options)
         for name, stream in settings.streams.items()
@@ -59,9 +69,12 @@ def assembled(settings: ServiceSettings) -> Parts:
         streams=streams,
         models=models,
         display=StreamDisplays(streams),
+        snapshots=StreamSnapshots(streams, models, snapshots),
+        exports=exports,
         routers=[page.router],
         background=[
             lambda: recovered(models),
+            exports.running,
             lambda: streams.running(at_start, started),
             ShownModels(streams, models).following,
         ],

@@ -29,6 +29,7 @@ from services.supervisor.captured_source import CapturedSource
 from services.supervisor.exit_codes import NO_USE
 from services.supervisor.layers import Layers
 from services.supervisor.live_scene import scene_of
+from services.supervisor.live_snapshots import LiveSnapshots
 from services.supervisor.model_show import ModelShow
 from services.supervisor.screen import Screen
 from services.supervisor.specs import EngineSpec
@@ -62,7 +63,9 @@ def started(settings: LiveSettings, source: CapturedSource, again: bool) -> Live
     return warm_up(settings, source)
 
 
-def reconstruct(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, *, again: bool) -> None:
+def reconstruct(
+    worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, snapshots: LiveSnapshots, *, again: bool
+) -> None:
     """Reconstruct and show until the process is to end, or a finished model is to be shown. Raises a UserError for what cannot work, RunFailed when
     a part failed."""
 
@@ -87,7 +90,8 @@ def reconstruct(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers
         graph = LiveApplication(source, settings, parts, stop_requested=stop_requested, on_scored=scored, on_shown=show)
         worker.tell_figures("graph", lambda: graph_figures(graph))
         worker.say("running", "reconstructs")
-        Session(graph, settings.stated(), command="live", stop_requested=stop_requested).execute()
+        with snapshots.of(graph):
+            Session(graph, settings.stated(), command="live", stop_requested=stop_requested).execute()
         worker.tell_figures("graph", dict)
 
 
@@ -97,14 +101,15 @@ def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again
     check_renderer(spec.renderer, spec.device)
     models = ModelShow(worker, spec, screen, layers)
     worker.tell_figures("screen", lambda: {**screen.figures(), **models.figures(), **layers.figures()})
-    worker.take({"camera": layers.camera})
+    snapshots = LiveSnapshots()
+    worker.take({"camera": layers.camera, "snapshot": snapshots.take})
     layers.open()
     try:
         models.begin()
         worker.take({"show_model": models.show, "show_live": models.show_live, "show_previous": models.show_previous})
         while not worker.stop_requested():
             if screen.wanted == "live":
-                reconstruct(worker, spec, screen, layers, again=again)
+                reconstruct(worker, spec, screen, layers, snapshots, again=again)
                 again = True
             else:
                 worker.say("running", "shows a finished model")

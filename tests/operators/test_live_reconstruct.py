@@ -143,3 +143,26 @@ def test_the_whole_model_is_kept_when_the_run_is_over(live, one_by_one):
 def test_a_run_without_a_frame_has_no_model(live):
     live.operator.stop()
     assert live.operator.model is None and live.operator.parameter_count == 0
+
+
+def test_whoever_asks_for_the_whole_model_gets_it_after_the_next_frame(live, one_by_one):
+    request = live.operator.request_model()
+    assert request.wait(0) is None
+    shown = one_by_one((0, {}), (1, {}))
+    answer = request.wait(0)
+    assert (answer.model.version, answer.frame.seq) == (101, 0) and answer.pause_ns >= 0
+    assert [each.model.version for each in shown] == [1, 2]
+
+
+def test_a_model_that_cannot_be_copied_does_not_end_the_stream(live, one_by_one):
+    def fails(shown):
+        raise MemoryError("there is none")
+
+    whole, live.fake.whole_model = live.fake.whole_model, fails
+    request = live.operator.request_model()
+    assert len(one_by_one((0, {}), (1, {}))) == 2
+    assert request.wait(0) is None and "there is none" in request.refused
+    live.fake.whole_model = whole
+    late = live.operator.request_model()
+    live.operator.stop()
+    assert late.wait(0) is None and "ended" in late.refused

@@ -30,17 +30,34 @@ async function newKey(reason) {
 }
 
 /** Call the API; returns the JSON of the answer, or null where it has none. Throws Problem, and TypeError without a connection. */
-export async function call(method, path, body) {
+export async function call(method, path, body, headers = {}) {
+  return documentOf(await ask(method, path, body, headers));
+}
+
+/** Fetch a file and let the browser save it under the name that the server gives it. Throws as `call`. */
+export async function download(path) {
+  const answer = await ask("GET", path);
+  const name = /filename="([^"]+)"/.exec(answer.headers.get("content-disposition") ?? "")?.[1] ?? "export";
+  const address = URL.createObjectURL(await answer.blob());
+  Object.assign(document.createElement("a"), { href: address, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(address), 60_000);
+}
+
+async function documentOf(answer) {
+  return answer.headers.get("content-type")?.includes("json") ? answer.json() : null;
+}
+
+async function ask(method, path, body, headers = {}) {
   for (;;) {
     if (!key) await newKey("");
     const used = key;
     const answer = await fetch(path, {
       method,
-      headers: { Authorization: `Bearer ${used}`, ...(body === undefined ? {} : { "Content-Type": "application/json" }) },
+      headers: { ...headers, Authorization: `Bearer ${used}`, ...(body === undefined ? {} : { "Content-Type": "application/json" }) },
       body: body === undefined ? undefined : JSON.stringify(body),
     });
-    const document = answer.headers.get("content-type")?.includes("json") ? await answer.json() : null;
-    if (answer.ok) return document;
+    if (answer.ok) return answer;
+    const document = await documentOf(answer);
     if (answer.status !== 401) throw new Problem(answer.status, document);
     if (used === key) await newKey(document?.detail ?? "The key was refused.");
   }

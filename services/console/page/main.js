@@ -3,6 +3,7 @@
 import { setKeyDialog, useKey } from "./api.js";
 import { auditPage } from "./audit.js";
 import { Badge } from "./badge.js";
+import { snapshotsOf } from "./exports.js";
 import { layersOf } from "./layers.js";
 import { modelsPage } from "./models.js";
 import { Plot } from "./plot.js";
@@ -16,6 +17,7 @@ const RENEW_MS = 2000;
 const plots = { age: new Plot(at("age")), psnr: new Plot(at("psnr"), { from_zero: false }) };
 const badges = { raw: new Badge(at("raw-state")), shown: new Badge(at("shown-state")) };
 const watchLayers = layersOf(at("layers"), at("pictures"), report);
+const watchSnapshots = snapshotsOf(at("snapshots"), report);
 let viewers = [];
 let watched = "";
 let heard_ms = 0;
@@ -53,6 +55,7 @@ function watch(stream) {
   plots.psnr.clear();
   say("no picture");
   watchLayers(stream);
+  watchSnapshots(stream);
   if (!stream) return;
   const lost = () => { say("no connection"); badges.shown.lost(); };
   viewers = [

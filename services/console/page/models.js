@@ -1,6 +1,7 @@
 // The page of models: upload, activate, roll back, delete.
 
 import { call, upload } from "./api.js";
+import { exportControls } from "./exports.js";
 import { button, replaceRows, row, size } from "./table.js";
 
 const at = (id) => document.getElementById(id);
@@ -27,6 +28,9 @@ export function modelsPage(report) {
     }
     if (version.state === "active") actions.push(button("Roll back", then(() => call("POST", `${path}/rollback`)), report));
     else actions.push(button("Delete", then(() => call("DELETE", `${path}/versions/${version.version}`)), report));
+    if (["ready", "active", "retired"].includes(version.state)) {
+      actions.push(...exportControls(`${path}/versions/${version.version}`, `${model.name} ${version.version}`, report));
+    }
     const state = version.reason ? `${version.state}: ${version.reason}` : version.state;
     const when = new Date(version.uploaded_at).toLocaleString();
     return row(model.name, version.version, state, size(version.size_bytes), `${when}, ${version.uploaded_by}`, actions);

@@ -7,12 +7,14 @@ from services.control.routes import (
     audit,
     config,
     display,
+    exports,
     health,
     jobs,
     keys,
     metrics,
     models,
     recordings,
+    snapshots,
     streams,
     tickets,
     uploads,
@@ -23,7 +25,7 @@ from services.control.routes import (
 ROUTERS: tuple[APIRouter, ...] = tuple(
     module.router
     for module in (
-        health, version, config, streams, virtual_camera, display, models, uploads, jobs, recordings, keys, tickets, audit, metrics,
+        health, version, config, streams, virtual_camera, display, models, uploads, snapshots, exports, jobs, recordings, keys, tickets, audit, metrics,
         documents,
     )
 )  # fmt: skip

@@ -11,10 +11,10 @@ from starlette.requests import Request
 from services.control.auth.guard import CallerOf, new_router, requires
 from services.control.digests import stated_sha256
 from services.control.incoming import incoming_file
-from services.control.parts import Models
+from services.control.parts import Models, VersionRecord
 from services.control.recorded import recorded
 from services.control.routes.models import VersionView, registry_of
-from services.control.state import control_of
+from services.control.state import ControlState, control_of
 from services.settings import ResourceName
 
 log = logging.getLogger(__name__)
@@ -50,11 +50,16 @@ async def upload_model(
             record = await asyncio.to_thread(registry.upload, name, file.path, file.sha256, str(caller))
         said["version"] = record.version
         said["size_bytes"] = file.size_bytes
-    checking = asyncio.create_task(_check(registry, name, record.version))
-    control.tasks.add(checking)
-    checking.add_done_callback(control.tasks.discard)
+    check_soon(control, registry, record)
     response.headers["Location"] = f"/v1/models/{name}/versions/{record.version}"
     return VersionView.model_validate(record)
+
+
+def check_soon(control: ControlState, registry: Models, record: VersionRecord) -> None:
+    """Have a new version checked, after the answer."""
+    checking = asyncio.create_task(_check(registry, record.name, record.version))
+    control.tasks.add(checking)
+    checking.add_done_callback(control.tasks.discard)
 
 
 async def _check(registry: Models, name: str, version: int) -> None:

@@ -1,0 +1,75 @@
+"""A model, at one time of its window or at several, as a file for other programs."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import BinaryIO
+
+import torch
+
+from gsplat_core.errors import ExportError
+from gsplat_core.io.atomic_files import PartialFile
+from gsplat_core.io.exports.formats import ExportWish
+from gsplat_core.io.exports.glb import glb_pieces
+from gsplat_core.io.exports.rows import rows_of, unit_rotations
+from gsplat_core.io.exports.splat import splat_bytes
+from gsplat_core.io.ply import ply_pieces
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.model import Model
+
+TIMES_FILE = "times.json"
+LONG_AGO = (1980, 1, 1, 0, 0, 0)
+"""The earliest date that an archive holds: the same model gives the same bytes."""
+
+
+def export_model(model: Model, path: Path, wish: ExportWish, *, overwrite: bool = False) -> int:
+    """Write the file, which is whole or not there; returns its size. The same model and wish give the same bytes.
+
+    Raises InvalidSetting for a time outside of the model's window, ExportError for a model that the format cannot hold, OSError where the
+    file cannot be written.
+    """
+    times_s = wish.times_in(model.time_window_s)
+    if model.gaussians.count == 0:
+        raise ExportError("the model has no Gaussians; there is nothing to export")
+    with PartialFile(path, overwrite=overwrite) as partial, torch.inference_mode():
+        if wish.format.is_sequence:
+            _write_sequence(model, partial.file, times_s)
+        else:
+            for piece in _pieces(wish.format.name, model.at(times_s[0]), path.stem, times_s[0]):
+                partial.file.write(piece)
+        return partial.file.seek(0, io.SEEK_END)
+
+
+def _pieces(format_name: str, gaussians: Gaussians, name: str, time_s: float) -> Iterator[bytes]:
+    rows = rows_of(gaussians)
+    if format_name == "splat":
+        yield splat_bytes(rows)
+    elif format_name == "glb":
+        yield from glb_pieces(rows, name, time_s)
+    else:
+        yield from ply_pieces(with_unit_rotations(gaussians))
+
+
+def with_unit_rotations(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians on the host, their quaternions of length 1."""
+    on_host = gaussians.to("cpu", torch.float32)
+    return replace(on_host, quats=torch.from_numpy(unit_rotations(on_host.quats.numpy())))
+
+
+def _write_sequence(model: Model, file: BinaryIO, times_s: list[float]) -> None:
+    """A zip archive, written time by time: memory for one is enough."""
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        names = [f"{index:04d}.ply" for index in range(len(times_s))]
+        said = {"time_window_s": list(model.time_window_s), "files": dict(zip(names, times_s, strict=True))}
+        archive.writestr(zipfile.ZipInfo(TIMES_FILE, LONG_AGO), json.dumps(said, indent=1))
+        for name, time_s in zip(names, times_s, strict=True):
+            gaussians = model.at(time_s)
+            rows_of(gaussians)  # refuses what is not finite
+            with archive.open(zipfile.ZipInfo(name, LONG_AGO), "w", force_zip64=True) as entry:
+                for piece in ply_pieces(with_unit_rotations(gaussians)):
+                    entry.write(piece)

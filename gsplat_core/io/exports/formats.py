@@ -1,0 +1,86 @@
+"""The formats that a model is exported in. No torch is needed to look at them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsplat_core.errors import InvalidSetting
+
+MOST_TIMES = 1000
+DEFAULT_TIMES = 30
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A format by its name."""
+
+    name: str
+    suffix: str
+    media_type: str
+    is_sequence: bool = False
+    """It holds the model at several times of its window, and not at one."""
+
+
+FORMATS: Mapping[str, ExportFormat] = {
+    each.name: each
+    for each in (
+        ExportFormat("ply", ".ply", "application/octet-stream"),
+        ExportFormat("splat", ".splat", "application/octet-stream"),
+        ExportFormat("glb", ".glb", "model/gltf-binary"),
+        ExportFormat("ply-sequence", ".zip", "application/zip", is_sequence=True),
+    )
+}
+
+
+def format_named(name: str) -> ExportFormat:
+    """Raises InvalidSetting for a name that there is not."""
+    if name not in FORMATS:
+        raise InvalidSetting(f"there is no format {name!r:.60}; choose {', '.join(FORMATS)}")
+    return FORMATS[name]
+
+
+def format_of(path: Path) -> ExportFormat:
+    """The format that a file's name ends in. Raises InvalidSetting."""
+    for each in FORMATS.values():
+        if path.suffix.lower() == each.suffix:
+            return each
+    endings = ", ".join(each.suffix for each in FORMATS.values())
+    raise InvalidSetting(f"{path.name!r:.80} ends in none of {endings}; give such a name, or --format")
+
+
+@dataclass(frozen=True)
+class ExportWish:
+    """What is wanted of a model. Raises InvalidSetting."""
+
+    format: ExportFormat
+    time_s: float | None = None
+    """Which time of the model; None: the end of its window."""
+    times: int | None = None
+    """Of a sequence: how many times of the window, evenly spaced."""
+
+    def __post_init__(self) -> None:
+        if self.format.is_sequence and self.time_s is not None:
+            raise InvalidSetting(f"{self.format.name} has many times of the model; leave the time out")
+        if not self.format.is_sequence and self.times is not None:
+            raise InvalidSetting(f"{self.format.name} has one time of the model; leave the number of times out")
+        if self.times is not None and not 1 <= self.times <= MOST_TIMES:
+            raise InvalidSetting(f"the number of times is {self.times}; it must be from 1 to {MOST_TIMES}")
+        if self.time_s is not None and not abs(self.time_s) < 1e9:
+            raise InvalidSetting(f"the time is {self.time_s:g} s; give seconds of the model's window")
+
+    def times_in(self, window_s: tuple[float, float]) -> list[float]:
+        """The times that are exported of a model with such a window. Raises InvalidSetting for one that lies outside."""
+        start_s, end_s = window_s
+        if not self.format.is_sequence:
+            time_s = end_s if self.time_s is None else self.time_s
+            if not start_s - 1e-6 <= time_s <= end_s + 1e-6:
+                raise InvalidSetting(
+                    f"the model has seen nothing at {time_s:g} s; its window is {start_s:.3f} to {end_s:.3f} s"
+                )
+            return [time_s]
+        count = self.times or DEFAULT_TIMES
+        if count == 1 or end_s == start_s:
+            return [end_s]
+        return [start_s + (end_s - start_s) * k / (count - 1) for k in range(count)]

@@ -1,0 +1,42 @@
+"""`intrasplat export`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import typer
+
+from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.exports.export import export_model
+from gsplat_core.io.exports.formats import ExportWish, format_named, format_of
+from operators.errors import OutputError
+from services.cli.exit_codes import OK
+
+
+def export_command(
+    model: Path, file: Path, format_name: str | None, time_s: float | None, times: int | None, *, overwrite: bool,
+    as_json: bool,
+) -> int:  # fmt: skip
+    """Export a model and print where the file is.
+
+    Raises BundleError where the model cannot be used, InvalidSetting and ExportError where it cannot be exported so, OutputError where the file cannot be written.
+    """
+    wish = ExportWish(format_of(file) if format_name is None else format_named(format_name), time_s, times)
+    if not file.parent.is_dir():
+        raise OutputError(f"there is no folder {file.parent} to write {file.name} into; make it first")
+    if file.exists() and not (overwrite and file.is_file()):
+        raise OutputError(f"{file} is there already; give another name, or --overwrite to replace it")
+    loaded = load_bundle(model)
+    try:
+        size = export_model(loaded, file, wish, overwrite=overwrite)
+    except OSError as error:
+        raise OutputError(
+            f"cannot write {file}: {error.strerror or error}; free space or choose another name"
+        ) from error
+    if as_json:
+        said = {"path": str(file), "format": wish.format.name, "bytes": size, "gaussians": loaded.gaussians.count}
+        typer.echo(json.dumps({**said, "times_s": wish.times_in(loaded.time_window_s)}, indent=2))
+    else:
+        typer.echo(str(file))
+    return OK

@@ -1,0 +1,65 @@
+// Files from the server: snapshots of a stream, exports of models. Each is fetched with the key of this tab and then saved.
+
+import { call, download } from "./api.js";
+import { button, size } from "./table.js";
+
+const FORMATS = {
+  isplat: "IntraSplat model (.isplat)",
+  ply: "Gaussians (.ply)",
+  splat: "Gaussians (.splat)",
+  glb: "glTF (.glb)",
+  "ply-sequence": "over time (.zip)",
+};
+
+/** Elements to save something in a format: `path` is what `/exports/FORMAT` follows. */
+export function exportControls(path, name, report) {
+  const choice = document.createElement("select");
+  choice.setAttribute("aria-label", `Format to save ${name} in`);
+  choice.append(...Object.entries(FORMATS).map(([format, text]) => new Option(text, format)));
+  return [choice, button("Save", () => download(`${path}/exports/${choice.value}`), report)];
+}
+
+/** The snapshots of a stream, in `place`. Returns `watch(stream)`. */
+export function snapshotsOf(place, report) {
+  let stream = "";
+  const name = document.createElement("input");
+  Object.assign(name, { id: "snapshot-model", placeholder: "no: keep as a file", pattern: "[a-z0-9][a-z0-9\\-]{0,39}", autocomplete: "off" });
+  const label = document.createElement("label");
+  label.append("Make it a version of model ", name);
+  const said = document.createElement("p");
+  said.className = "said";
+  said.setAttribute("role", "status");
+  const list = document.createElement("ul");
+  list.className = "files";
+  const take = button("Take a snapshot", async () => {
+    if (!name.reportValidity()) return;
+    const key = crypto.randomUUID?.() ?? String(performance.now());
+    const taken = await call("POST", `/v1/streams/${stream}/snapshots`, name.value ? { model: name.value } : {}, { "Idempotency-Key": key });
+    const what = taken.version ? `version ${taken.version.version} of ${taken.version.name}` : "a file below";
+    said.textContent = `Frame ${taken.seq}, ${taken.gaussians} Gaussians: ${what}. Training stood still for ${taken.pause_ms.toFixed(1)} ms.`;
+    await renew();
+  }, report);
+  take.id = "take-snapshot";
+  const row = document.createElement("div");
+  row.className = "row";
+  row.append(take, label);
+  place.append(row, said, list);
+
+  async function renew() {
+    const found = stream ? await call("GET", `/v1/streams/${stream}/snapshots`) : [];
+    list.replaceChildren(...found.slice(0, 5).map((snapshot) => {
+      const line = document.createElement("li");
+      const text = document.createElement("span");
+      text.textContent = `${new Date(snapshot.taken_at).toLocaleTimeString()}, frame ${snapshot.seq}, ${size(snapshot.size_bytes)}`;
+      line.append(text, ...exportControls(`/v1/streams/${stream}/snapshots/${snapshot.id}`, `the snapshot of frame ${snapshot.seq}`, report));
+      return line;
+    }));
+  }
+
+  return (wanted) => {
+    stream = wanted;
+    place.hidden = !stream;
+    said.textContent = "";
+    if (stream) report(renew);
+  };
+}

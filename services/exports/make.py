@@ -1,0 +1,50 @@
+"""Makes an export of an unpacked model, as a program of its own: `python -m services.exports.make FOLDER FILE --format glb`.
+
+Nothing else of the service imports this module: it loads torch. Exit code 0: the file is there; 2: it cannot be had like that, and standard error
+says why in one sentence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import sys
+from pathlib import Path
+
+from gsplat_core.errors import UserError
+from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.exports.export import export_model
+from gsplat_core.io.exports.formats import ExportWish
+from services.exports.formats import ALL, ISPLAT
+from services.registry.bundle_file import pack
+
+NICENESS = 10
+"""Streams that run on this machine go before an export."""
+REFUSED = 2
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Make one file."""
+    parser = argparse.ArgumentParser(prog="python -m services.exports.make", description="Export an unpacked model.")
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument("file", type=Path, metavar="FILE")
+    parser.add_argument("--format", choices=[*ALL], required=True)
+    parser.add_argument("--time", type=float)
+    parser.add_argument("--times", type=int)
+    given = parser.parse_args(arguments)
+    os.nice(NICENESS)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core file with a patient's model in it
+    try:
+        if given.format == ISPLAT.name:
+            pack(given.folder, given.file)
+        else:
+            export_model(load_bundle(given.folder), given.file, ExportWish(ALL[given.format], given.time, given.times))
+    except UserError as error:
+        sys.stderr.write(f"{str(error).replace(f'{given.folder}/', '')}\n")
+        return REFUSED
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

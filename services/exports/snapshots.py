@@ -1,0 +1,120 @@
+"""Snapshots of streams that are kept as files: the newest ones of each stream."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from gsplat_core.io.atomic_files import sync_folder
+from services.exports.errors import ExportFailed, NoSnapshot
+
+NUMBER = re.compile(r"[0-9a-f]{16}")
+ABOUT = "snapshot.json"
+MANIFEST = "manifest.json"
+MOST = 20
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What is known of a snapshot."""
+
+    id: str
+    stream: str
+    taken_at: str
+    taken_by: str
+    seq: int
+    model_version: int
+    gaussians: int
+    time_window_s: list[float]
+    pause_ms: float
+    size_bytes: int
+    digest: str
+    """SHA-256 of its manifest, which has that of its tensors."""
+
+
+def described(folder: Path, stream: str, by: str, said: Mapping[str, Any]) -> Snapshot:
+    """What an engine has written into a folder, with what it said of it."""
+    return Snapshot(
+        id=secrets.token_hex(8),
+        stream=stream,
+        taken_at=datetime.now(UTC).isoformat(timespec="milliseconds"),
+        taken_by=by,
+        size_bytes=sum(each.stat().st_size for each in folder.iterdir()),
+        digest=hashlib.sha256((folder / MANIFEST).read_bytes()).hexdigest(),
+        **{name: said[name] for name in ("seq", "model_version", "gaussians", "time_window_s", "pause_ms")},
+    )
+
+
+class SnapshotStore:
+    """Snapshots in a folder, at most `most` of each stream: then the oldest one leaves. Any thread may use it."""
+
+    def __init__(self, folder: Path, most: int = MOST) -> None:
+        self._folder, self._most = folder, most
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for left in folder.glob(".new-*"):
+            shutil.rmtree(left)
+
+    @contextmanager
+    def new(self) -> Iterator[Path]:
+        """A folder that is written into; what was not kept when the block ends is removed."""
+        path = self._folder / f".new-{secrets.token_hex(8)}"
+        try:
+            path.mkdir(mode=0o700)
+            yield path
+        except OSError as error:
+            raise ExportFailed(f"the snapshot was not kept: {error.strerror or error}; free space") from error
+        finally:
+            shutil.rmtree(path, ignore_errors=True)
+
+    def keep(self, path: Path, made: Snapshot) -> None:
+        """Keep what lies in a folder of `new`."""
+        (path / ABOUT).write_text(json.dumps(asdict(made)))
+        of_stream = self._folder / made.stream
+        of_stream.mkdir(mode=0o700, exist_ok=True)
+        os.rename(path, of_stream / made.id)
+        sync_folder(of_stream)
+        for old in self.all(made.stream)[self._most :]:
+            self.delete(made.stream, old.id)
+
+    def all(self, stream: str) -> list[Snapshot]:
+        """Those of a stream, the newest first."""
+        folder = self._folder / stream
+        found = []
+        for name in os.listdir(folder) if folder.is_dir() else ():
+            with suppress(NoSnapshot):  # deleted meanwhile
+                found.append(self.get(stream, name))
+        return sorted(found, key=lambda each: (each.taken_at, each.id), reverse=True)
+
+    def get(self, stream: str, number: str) -> Snapshot:
+        """One of them. Raises NoSnapshot."""
+        try:
+            return Snapshot(**json.loads((self.folder_of(stream, number) / ABOUT).read_text()))
+        except FileNotFoundError:
+            raise self._absent(stream) from None
+
+    def folder_of(self, stream: str, number: str) -> Path:
+        """Its bundle. Raises NoSnapshot."""
+        path = self._folder / stream / number
+        if not NUMBER.fullmatch(number) or not path.is_dir():
+            raise self._absent(stream)
+        return path
+
+    def delete(self, stream: str, number: str) -> None:
+        """Remove one. Raises NoSnapshot."""
+        path = self.folder_of(stream, number)
+        gone = self._folder / f".new-{secrets.token_hex(8)}"
+        os.rename(path, gone)
+        shutil.rmtree(gone)
+
+    def _absent(self, stream: str) -> NoSnapshot:
+        return NoSnapshot(f"there is no such snapshot of {stream}; GET /v1/streams/{stream}/snapshots lists them")

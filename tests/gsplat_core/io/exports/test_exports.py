@@ -1,0 +1,215 @@
+"""Exports, read back by readers of other programs' conventions."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.errors import ExportError, InvalidSetting
+from gsplat_core.io.exports.export import export_model
+from gsplat_core.io.exports.formats import FORMATS, ExportWish, format_named, format_of
+from gsplat_core.io.ply import load_ply
+from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import SH_C0, Gaussians
+from gsplat_core.scene.model import Model
+from tests.gsplat_core.io.exports.glb_reader import NAME, read_glb
+from tests.recipes.test_deformation_field import DriftField
+
+WINDOW_S = (1.0, 3.0)
+
+
+def random_model(count: int = 50, degree: int = 2, field: bool = False, seed: int = 3) -> Model:
+    random = torch.Generator().manual_seed(seed)
+    normal = lambda *shape: torch.randn(*shape, generator=random)
+    gaussians = Gaussians(
+        10 * normal(count, 3), 3 * normal(count, 4), normal(count, 3) - 1, 2 * normal(count),
+        0.3 * normal(count, (degree + 1) ** 2, 3),
+    )  # fmt: skip
+    drift = DriftField(WINDOW_S)
+    drift.velocity.data += 1.5
+    drift.requires_grad_(False)
+    return Model(4, gaussians, drift if field else None, Camera.from_focal(20.0, 32, 24), WINDOW_S)
+
+
+def exported(tmp_path, model, name, **wish) -> bytes:
+    path = tmp_path / f"out{FORMATS[name].suffix}"
+    size = export_model(model, path, ExportWish(FORMATS[name], **wish), overwrite=True)
+    data = path.read_bytes()
+    assert size == len(data)
+    return data
+
+
+def unit(quats: torch.Tensor) -> np.ndarray:
+    return (quats / quats.norm(dim=1, keepdim=True)).numpy()
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_ply_has_unit_rotations_and_everything_else_as_it_was(tmp_path, degree):
+    model = random_model(degree=degree)
+    exported(tmp_path, model, "ply")
+    back, was = load_ply(tmp_path / "out.ply"), model.gaussians
+    np.testing.assert_allclose(back.quats, unit(was.quats), atol=1e-6)
+    for name in ("means", "log_scales", "logit_opacities", "sh"):
+        assert torch.equal(getattr(back, name), getattr(was, name)), name
+    assert back.sh_degree == degree
+
+
+def test_splat_has_its_32_bytes_the_most_important_first(tmp_path):
+    model = random_model()
+    data = exported(tmp_path, model, "splat")
+    assert len(data) == 32 * 50
+    floats = np.frombuffer(data, "<f4").reshape(-1, 8)
+    whole = np.frombuffer(data, "u1").reshape(-1, 32)
+    g = model.gaussians
+    importance = (g.log_scales.sum(1).exp() * g.logit_opacities.sigmoid()).numpy()
+    order = np.argsort(-importance, kind="stable")
+    np.testing.assert_array_equal(floats[:, :3], g.means.numpy()[order])
+    np.testing.assert_allclose(floats[:, 3:6], g.log_scales.exp().numpy()[order], rtol=1e-6)
+    colours = np.clip((0.5 + SH_C0 * g.sh[:, 0]).numpy()[order] * 255, 0, 255)
+    assert np.abs(whole[:, 24:27] - colours).max() <= 0.5 + 1e-3
+    assert np.abs(whole[:, 27] - 255 * g.logit_opacities.sigmoid().numpy()[order]).max() <= 0.5 + 1e-3
+    rotations = (whole[:, 28:].astype(float) - 128) / 128
+    assert np.abs(rotations - unit(g.quats)[order]).max() <= 1 / 128 + 1e-6
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_glb_is_what_the_extension_asks_for(tmp_path, degree):
+    model = random_model(degree=degree)
+    document, values = read_glb(exported(tmp_path, model, "glb"))
+    g = model.gaussians
+    np.testing.assert_array_equal(values["POSITION"], g.means)
+    np.testing.assert_allclose(values[f"{NAME}:ROTATION"][:, [3, 0, 1, 2]], unit(g.quats), atol=1e-6)
+    np.testing.assert_allclose(values[f"{NAME}:SCALE"], g.log_scales.exp(), rtol=1e-6)
+    np.testing.assert_allclose(values[f"{NAME}:OPACITY"], g.logit_opacities.sigmoid(), atol=1e-6)
+    assert f"{NAME}:SH_DEGREE_{degree + 1}_COEF_0" not in values
+    for level in range(degree + 1):
+        for n in range(2 * level + 1):
+            np.testing.assert_array_equal(values[f"{NAME}:SH_DEGREE_{level}_COEF_{n}"], g.sh[:, level * level + n])
+    srgb = np.clip((0.5 + SH_C0 * g.sh[:, 0]).numpy(), 0, 1)
+    shown = values["COLOR_0"][:, :3]
+    again = np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown ** (1 / 2.4) - 0.055)
+    assert np.abs(again - srgb).max() < 2e-3
+    assert document["accessors"][0]["count"] == 50
+
+
+def test_glb_turns_the_models_axes_into_gltfs(tmp_path):
+    """x right, y down, z forward becomes x right, y up, z backward, right-handed both; millimetres become metres."""
+    document, _ = read_glb(exported(tmp_path, random_model(), "glb"))
+    (node,) = document["nodes"]
+    x, y, z, w = node["rotation"]
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    np.testing.assert_allclose(turn @ [1.0, 2.0, 3.0], [1, -2, -3], atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1)
+    assert node["scale"] == [0.001] * 3
+
+
+def test_our_harmonics_are_the_extensions():
+    """The degree 1 functions of the extension's text: -y, z, -x with the constant 0.4886."""
+    direction = torch.tensor([[0.36, -0.48, 0.8]])
+    for n, factor in enumerate((-direction[0, 1], direction[0, 2], -direction[0, 0])):
+        sh = torch.zeros(1, 4, 3)
+        sh[0, 1 + n] = 1.0
+        seen = spherical_harmonics(1, direction, sh)
+        assert seen[0, 0].item() == pytest.approx(0.4886025119029199 * factor.item(), abs=1e-6)
+
+
+def test_an_export_is_of_the_models_time(tmp_path):
+    model = random_model(field=True)
+    for time_s in (None, 1.0, 1.75):
+        exported(tmp_path, model, "ply", time_s=time_s)
+        at = model.at(3.0 if time_s is None else time_s).means
+        assert torch.equal(load_ply(tmp_path / "out.ply").means, at)
+    assert not torch.equal(model.at(1.0).means, model.at(3.0).means)
+
+
+def test_a_sequence_has_each_of_its_times(tmp_path):
+    model = random_model(field=True)
+    exported(tmp_path, model, "ply-sequence", times=5)
+    with zipfile.ZipFile(tmp_path / "out.zip") as archive:
+        assert archive.testzip() is None
+        said = json.loads(archive.read("times.json"))
+        assert said["time_window_s"] == [1.0, 3.0]
+        assert list(said["files"].values()) == [1.0, 1.5, 2.0, 2.5, 3.0]
+        assert archive.namelist() == ["times.json", *said["files"]]
+        for name, time_s in said["files"].items():
+            archive.extract(name, tmp_path)
+            assert torch.equal(load_ply(tmp_path / name).means, model.at(time_s).means)
+
+
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_the_same_model_gives_the_same_bytes(tmp_path, name):
+    assert exported(tmp_path, random_model(field=True), name) == exported(tmp_path, random_model(field=True), name)
+
+
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_hostile_models_are_refused_and_nothing_is_left(tmp_path, name):
+    model = random_model()
+    broken = model.gaussians.clone()
+    broken.means[7, 1] = math.nan
+    huge = model.gaussians.clone()
+    huge.log_scales[0, 0] = 200.0
+    for gaussians in (broken, huge, model.gaussians.select(slice(0, 0))):
+        with pytest.raises(ExportError):
+            exported(tmp_path, Model(1, gaussians, None, model.camera, WINDOW_S), name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_rotation_of_length_nothing_is_none(tmp_path):
+    gaussians = random_model().gaussians.clone()
+    gaussians.quats[0] = 0
+    gaussians.quats[1] = 1e-30
+    model = Model(1, gaussians, None, Camera.from_focal(20.0, 32, 24), WINDOW_S)
+    exported(tmp_path, model, "ply")
+    quats = load_ply(tmp_path / "out.ply").quats
+    assert quats[0].tolist() == [1, 0, 0, 0]
+    np.testing.assert_allclose(quats[1], [0.5] * 4)
+
+
+def test_one_gaussian_is_enough(tmp_path):
+    for name in FORMATS:
+        assert exported(tmp_path, random_model(count=1), name)
+
+
+def test_harmonics_that_gltf_does_not_hold_are_refused(tmp_path):
+    with pytest.raises(ExportError, match="degree 4"):
+        exported(tmp_path, random_model(degree=4), "glb")
+
+
+@pytest.mark.parametrize("wrong", [{"time_s": 0.5}, {"time_s": 3.1}])
+def test_a_time_that_the_model_has_not_seen_is_refused(tmp_path, wrong):
+    with pytest.raises(InvalidSetting, match="window"):
+        exported(tmp_path, random_model(), "ply", **wrong)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("ply", {"times": 3}),
+        ("ply-sequence", {"time_s": 1.0}),
+        ("ply-sequence", {"times": 0}),
+        ("ply-sequence", {"times": 1001}),
+        ("glb", {"time_s": math.nan}),
+    ],
+)
+def test_a_wish_that_makes_no_sense_is_refused(name, wrong):
+    with pytest.raises(InvalidSetting):
+        ExportWish(FORMATS[name], **wrong)
+
+
+def test_formats_are_found_by_name_and_by_ending(tmp_path):
+    assert format_named("glb") is format_of(tmp_path / "a.GLB")
+    for wrong in (lambda: format_named("obj"), lambda: format_of(tmp_path / "a.obj")):
+        with pytest.raises(InvalidSetting, match=r"ply"):
+            wrong()

@@ -1,0 +1,168 @@
+"""Exports are made once, within bounds, in a process of their own."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from gsplat_core.io.bundle import save_bundle
+from gsplat_core.io.exports.formats import FORMATS, ExportWish
+from services.exports.cache import ExportCache
+from services.exports.errors import ExportBusy, ExportFailed, ExportRefused
+from services.exports.formats import ALL
+from services.exports.programs import ExportPrograms
+from services.registry.bundle_file import members_of
+from tests.services.supervisor.test_model_show import uniform
+
+STUB = (sys.executable, str(Path(__file__).with_name("stub_make.py")))
+PLY = ExportWish(FORMATS["ply"], 1.5)
+
+
+@pytest.fixture
+def cache(tmp_path):
+    made = ExportCache(tmp_path / "exports", most_bytes=2500, programs=ExportPrograms(STUB))
+    yield made
+    made.close()
+
+
+def content(cache, digest: str, name: str = "good", wish: ExportWish = PLY) -> bytes:
+    exported = cache.get(digest, lambda: Path("/nowhere") / name, wish)
+    with exported.file as file:
+        data = file.read()
+    assert (exported.size_bytes, exported.sha256) == (len(data), hashlib.sha256(data).hexdigest())
+    return data
+
+
+def test_an_export_is_made_once(cache):
+    first = content(cache, "a")
+    assert first.startswith(b"good --format=ply --time=1.5 ")
+    assert content(cache, "a") == first and cache.made == 1
+
+
+def test_another_model_time_or_format_is_another_export(cache):
+    for digest, wish in (
+        ("a", PLY),
+        ("b", PLY),
+        ("a", ExportWish(FORMATS["ply"], 2.0)),
+        ("a", ExportWish(FORMATS["glb"], 1.5)),
+    ):
+        content(cache, digest, wish=wish)
+    assert cache.made == 4
+
+
+def test_the_oldest_leave_and_one_that_is_being_read_is_read_to_its_end(cache):
+    reading = cache.get("a", lambda: Path("/nowhere/good"), PLY)
+    content(cache, "b")
+    content(cache, "c")
+    assert len(list(cache._folder.glob("*.data"))) == len(list(cache._folder.glob("*.json"))) == 2
+    with reading.file as file:
+        assert len(file.read()) == reading.size_bytes
+    content(cache, "a")
+    assert cache.made == 4
+
+
+def test_one_that_was_used_stays(cache):
+    content(cache, "a")
+    content(cache, "b")
+    for path in cache._folder.glob("*.data"):
+        os.utime(path, (1, 1))
+    content(cache, "a")
+    content(cache, "c")
+    content(cache, "a")
+    assert cache.made == 3
+
+
+def test_what_is_too_large_to_keep_is_refused(tmp_path):
+    small = ExportCache(tmp_path / "x", most_bytes=10, programs=ExportPrograms(STUB))
+    with pytest.raises(ExportFailed, match="10 bytes"):
+        content(small, "a")
+
+
+@pytest.mark.parametrize(
+    ("folder", "error", "said"),
+    [("refused", ExportRefused, "^the model has no Gaussians$"), ("fails", ExportFailed, "code 1: it broke")],
+)
+def test_what_cannot_be_made_is_said_and_not_kept(cache, folder, error, said):
+    with pytest.raises(error, match=said):
+        content(cache, "a", folder)
+    assert list(cache._folder.iterdir()) == []
+    content(cache, "a")
+
+
+def test_one_that_takes_too_long_is_ended(tmp_path):
+    slow = ExportCache(tmp_path / "x", programs=ExportPrograms(STUB, most_s=0.5))
+    began_s = time.monotonic()
+    with pytest.raises(ExportFailed, match=r"longer than 0\.5 s"):
+        content(slow, "a", "slow")
+    assert time.monotonic() - began_s < 20
+
+
+def test_those_that_wait_are_bounded_and_end_with_the_service(tmp_path):
+    cache = ExportCache(tmp_path / "x", most_waiting=1, programs=ExportPrograms(STUB))
+    ended: list[Exception] = []
+
+    def wait() -> None:
+        try:
+            content(cache, "a", "slow")
+        except ExportFailed as error:
+            ended.append(error)
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    until_s = time.monotonic() + 20
+    while not cache._programs._running:
+        assert time.monotonic() < until_s
+        time.sleep(0.01)
+    with pytest.raises(ExportBusy, match="wait already"):
+        content(cache, "b")
+    cache.close()
+    waiting.join(20)
+    assert len(ended) == 1
+
+
+def test_who_asks_for_the_same_waits_for_the_first_one(cache):
+    found: list[bytes] = []
+    threads = [threading.Thread(target=lambda: found.append(content(cache, "a"))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    assert len(found) == 4 and cache.made == 1
+
+
+def test_what_was_left_half_made_goes_at_start(tmp_path):
+    (tmp_path / "x" / "new-1").mkdir(parents=True)
+    ExportCache(tmp_path / "x")
+    assert list((tmp_path / "x").iterdir()) == []
+
+
+def test_the_program_itself(tmp_path):
+    save_bundle(uniform((0.9, 0.1, 0.1)), tmp_path / "model")
+    cache = ExportCache(tmp_path / "exports")
+    with cache.get("a", lambda: tmp_path / "model", PLY).file as ply:
+        assert ply.read(3) == b"ply"
+    packed = cache.get("a", lambda: tmp_path / "model", ExportWish(ALL["isplat"]))
+    with packed.file as file:
+        names = [member.name for member in members_of(file, packed.size_bytes)]
+    assert names == ["manifest.json", "model.safetensors"]
+    with pytest.raises(ExportRefused, match="window"):
+        cache.get("a", lambda: tmp_path / "model", ExportWish(FORMATS["glb"], 9.0))
+    (tmp_path / "model" / "model.safetensors").unlink()
+    with pytest.raises(ExportRefused, match="missing"):
+        cache.get("b", lambda: tmp_path / "model", PLY)
+
+
+@pytest.mark.parametrize(
+    "module", ["services.exports.cache", "services.exports.snapshots", "services.server.snapshots"]
+)
+def test_this_process_loads_no_torch(module):
+    program = f"import sys, {module}; assert not {{'torch', 'cv2'}} & set(sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
