@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-from gsplat_core.io.recordings.synthetic.rendered import render_recording
+from gsplat_core.io.recordings.synthetic.kept import kept_recording
+from gsplat_core.io.recordings.synthetic.rendered import Asked
 from gsplat_core.io.recordings.synthetic.synthesize import MAX_SEED
 from operators.sources.address import Address
 from operators.sources.options import SourceOptions
@@ -22,7 +23,7 @@ def synthetic_source(rest: str, options: SourceOptions) -> RealtimeSource:
     """`synthetic:?width=640&height=512&fps=30&seed=0&frames=48&moving=1&eyes=1`.
 
     Ray casting takes longer than a frame may: `frames` frames are rendered here, before anything is played, and then played forwards and
-    backwards. Raises InvalidSetting for options out of range.
+    backwards. They are kept, so that the same ones are there at once the next time. Raises InvalidSetting for options out of range.
     """
     address = Address.parse("synthetic", rest)
     width = address.whole("width", 640, 32, 4096)
@@ -37,7 +38,7 @@ def synthetic_source(rest: str, options: SourceOptions) -> RealtimeSource:
     width, height = max(32, round(width * options.scale)), max(32, round(height * options.scale))
     per_frame = width * height * (8 if eyes == 1 else 11)
     fits = max(1, MOST_BYTES // per_frame)
-    recording = render_recording(
+    asked = Asked(
         frames=min(most or DEFAULT_FRAMES, fits),
         width_px=width,
         height_px=height,
@@ -45,8 +46,8 @@ def synthetic_source(rest: str, options: SourceOptions) -> RealtimeSource:
         seed=seed,
         camera="moving" if moving else "fixed",
         stereo=eyes == 2,
-        progress=_say,
     )
+    recording = kept_recording(asked, progress=_say)
     return RealtimeSource(recording, replace(options, loop=True, bounce=recording.frame_count > 2, fps=None))
 
 

@@ -6,10 +6,12 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import astuple, dataclass
 from typing import Literal
 
 import numpy as np
 
+from gsplat_core.io.recordings.calibration import DEFAULT_FOCAL_FACTOR
 from gsplat_core.io.recordings.synthetic.synthesize import (
     BASELINE_MM,
     SyntheticScene,
@@ -20,20 +22,35 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What a synthetic recording is asked to be: as the arguments of `synthesize`."""
+
+    frames: int = 48
+    width_px: int = 320
+    height_px: int = 256
+    fps: float = 30.0
+    seed: int = 0
+    camera: Literal["fixed", "moving"] = "fixed"
+    stereo: bool = False
+
+
 class RenderedRecording:
     """Frames with masks, depth and poses as the generator knows them; a `Recording` that needs no disk."""
 
     notes: tuple[str, ...] = ()
 
-    def __init__(self, frames: list[Frame], scene: SyntheticScene, fps: float, digest: str) -> None:
-        self._frames, self._scene = frames, scene
+    def __init__(self, frames: list[Frame], asked: Asked) -> None:
+        self._frames = frames
         self.name = "synthetic"
-        self.camera = scene.camera_at(0)
-        self.width_px, self.height_px = self.camera.width_px, self.camera.height_px
-        self.frame_count, self.fps, self.digest = len(frames), fps, digest
-        stereo = frames[0].right_image is not None
-        self.fields = frozenset({"mask", "depth", "pose", *(["right_image"] if stereo else [])})
-        self.stereo_baseline_mm = BASELINE_MM if stereo else None
+        self.width_px, self.height_px = asked.width_px, asked.height_px
+        self.camera = Camera.from_focal(
+            DEFAULT_FOCAL_FACTOR * max(asked.width_px, asked.height_px), asked.width_px, asked.height_px
+        )
+        self.frame_count, self.fps = len(frames), asked.fps
+        self.digest = hashlib.sha256(json.dumps(astuple(asked)).encode()).hexdigest()
+        self.fields = frozenset({"mask", "depth", "pose", *(["right_image"] if asked.stereo else [])})
+        self.stereo_baseline_mm = BASELINE_MM if asked.stereo else None
 
     def __iter__(self) -> Iterator[Frame]:
         """The frames, in order."""
@@ -41,24 +58,19 @@ class RenderedRecording:
 
     def camera_at(self, index: int) -> Camera:
         """The camera of one frame."""
-        return self._scene.camera_at(index / self.fps)
+        pose = self._frames[index].pose
+        assert pose is not None
+        return self.camera.with_pose(pose)
 
 
-def render_recording(
-    *,
-    frames: int = 48,
-    width_px: int = 320,
-    height_px: int = 256,
-    fps: float = 30,
-    seed: int = 0,
-    camera: Literal["fixed", "moving"] = "fixed",
-    stereo: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> RenderedRecording:
+def render_recording(asked: Asked, progress: Callable[[int, int], None] | None = None) -> RenderedRecording:
     """The recording that `synthesize` writes, in memory. Raises InvalidSetting for arguments out of range, as `synthesize`."""
-    check_arguments(frames, width_px, height_px, fps, seed, camera)
-    threads = threads_that_fit(width_px, height_px)
-    scene = SyntheticScene.from_seed(seed, width_px, height_px, frames / fps, camera == "moving")
+    frames, fps = asked.frames, asked.fps
+    check_arguments(frames, asked.width_px, asked.height_px, fps, asked.seed, asked.camera)
+    threads = threads_that_fit(asked.width_px, asked.height_px)
+    scene = SyntheticScene.from_seed(
+        asked.seed, asked.width_px, asked.height_px, frames / fps, asked.camera == "moving"
+    )
 
     def rendered(index: int) -> Frame:
         time_s = index / fps
@@ -67,7 +79,7 @@ def render_recording(
             seq=index,
             pts_ns=round(time_s * 1e9),
             image=left.image,
-            right_image=scene.render(time_s, "right").image if stereo else None,
+            right_image=scene.render(time_s, "right").image if asked.stereo else None,
             depth=left.depth.astype(np.float32),
             mask=np.where(left.tool, 0, 1).astype(np.uint8),
             pose=scene.camera_at(time_s).world_to_camera,
@@ -79,5 +91,4 @@ def render_recording(
             made.append(frame)
             if progress is not None:
                 progress(done, frames)
-    what = json.dumps([frames, width_px, height_px, fps, seed, camera, stereo])
-    return RenderedRecording(made, scene, fps, hashlib.sha256(what.encode()).hexdigest())
+    return RenderedRecording(made, asked)

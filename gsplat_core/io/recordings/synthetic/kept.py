@@ -1,0 +1,142 @@
+"""Rendered recordings that are kept, so that the same one is there at once the next time.
+
+    CACHE/                       0700, of this user alone
+      DIGEST.safetensors         image [N, H, W, 3], depth, mask, pose, and right_image of a stereo pair
+
+The digest is that of the arguments and of the renderer's own source: another renderer makes other files. What was not used for longest is removed
+when the folder grows beyond its bound; it holds nothing that could not be rendered again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import stat
+from collections.abc import Callable
+from dataclasses import fields
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save
+
+from gsplat_core.io.atomic_files import PartialFile
+from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
+from gsplat_core.scene.frames import Frame
+
+log = logging.getLogger(__name__)
+MOST_BYTES = 2**30
+SUFFIX = ".safetensors"
+PLANES = ("image", "right_image", "depth", "mask", "pose")
+
+
+def default_folder() -> Path:
+    """Where the system keeps such files for this user."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path("~/.cache").expanduser()) / "intrasplat" / "synthetic"
+
+
+def kept_recording(
+    asked: Asked,
+    folder: Path | None = None,
+    *,
+    most_bytes: int = MOST_BYTES,
+    progress: Callable[[int, int], None] | None = None,
+) -> RenderedRecording:
+    """`render_recording`, from the file of an earlier call where there is one. A folder that cannot be used is no error: it is rendered then.
+
+    Raises InvalidSetting as `render_recording`.
+    """
+    folder = folder or default_folder()
+    path = folder / f"{_digest(asked)}{SUFFIX}"
+    if _is_own(folder) and (found := _read(path, asked)) is not None:
+        with contextlib.suppress(OSError):
+            os.utime(path)  # it was used
+        return found
+    recording = render_recording(asked, progress)
+    try:
+        _keep(recording, path, most_bytes)
+    except OSError as error:
+        log.info("the rendered frames are not kept: %s", error)
+    return recording
+
+
+def _is_own(folder: Path) -> bool:
+    """Whether nobody else can have put anything there."""
+    try:
+        found = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o022
+
+
+def _read(path: Path, asked: Asked) -> RenderedRecording | None:
+    """The recording of a file; None where there is none, or it is damaged, which is removed."""
+    try:
+        planes = load_file(path)
+        frames = [_frame(planes, index, asked.fps) for index in range(asked.frames)]
+        wanted = (asked.height_px, asked.width_px, 3)
+        if frames[0].image.shape != wanted or (frames[0].right_image is None) == asked.stereo:
+            raise ValueError(f"its pictures are {frames[0].image.shape}")
+    except FileNotFoundError:
+        return None
+    except (OSError, SafetensorError, KeyError, IndexError, ValueError) as error:
+        log.warning("%s cannot be read (%s); it is rendered again", path, error)
+        with contextlib.suppress(OSError):
+            path.unlink()
+        return None
+    return RenderedRecording(frames, asked)
+
+
+def _frame(planes: dict[str, NDArray], index: int, fps: float) -> Frame:
+    arrays = {name: planes[name][index] for name in PLANES if name in planes}
+    return Frame(seq=index, pts_ns=round(index / fps * 1e9), **arrays)
+
+
+def _keep(recording: RenderedRecording, path: Path, most_bytes: int) -> None:
+    """Write a recording's file, unless it is too large by itself; then remove what was not used for longest. Raises OSError."""
+    frames = list(recording)
+    named = {name: [getattr(frame, name) for frame in frames] for name in PLANES}
+    planes = {name: np.stack(arrays) for name, arrays in named.items() if arrays[0] is not None}
+    size = sum(plane.nbytes for plane in planes.values())
+    if size > most_bytes:
+        return
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if not _is_own(path.parent):
+        raise OSError(f"{path.parent} may be written to by others")
+    _make_room(path.parent, most_bytes - size)
+    with PartialFile(path) as partial:
+        partial.file.write(save(planes))
+
+
+def _make_room(folder: Path, most_bytes: int) -> None:
+    """Remove files until the others take no more than that; another process may do so, too."""
+    files = []
+    for path in folder.glob(f"*{SUFFIX}"):
+        with contextlib.suppress(FileNotFoundError):
+            found = path.stat()
+            files.append((found.st_mtime_ns, found.st_size, path))
+    total = sum(size for _, size, _ in files)
+    for _, size, path in sorted(files):
+        if total <= most_bytes:
+            return
+        path.unlink(missing_ok=True)
+        total -= size
+
+
+def _digest(asked: Asked) -> str:
+    said = repr([(field.name, getattr(asked, field.name)) for field in fields(asked)])
+    return hashlib.sha256(f"{_renderer()} {said}".encode()).hexdigest()[:40]
+
+
+@cache
+def _renderer() -> str:
+    """Changes with the code that makes the pictures."""
+    whole = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        whole.update(path.read_bytes())
+    return whole.hexdigest()
