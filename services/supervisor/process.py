@@ -31,7 +31,8 @@ PAUSED_S = 1.0
 """When so much more time has passed between two looks, it is the supervisor that stood still."""
 MOST_LOG_BYTES = 1 << 20
 FRESH_AFTER = 3
-"""After so many ends in a row a process is started by a new interpreter: what it was forked from may be what is wrong."""
+"""After so many ends in a row of a process that had not begun to work it is started by a new interpreter: what it was forked from may be what is
+wrong. One that has worked was forked well."""
 WELL = ("live", "running")
 
 Kind = Literal["started", "adopted", "replaced", "ended", "stopped", "left"]
@@ -178,8 +179,9 @@ class ManagedProcess:
         arguments = ["--spec", str(self._spec.write(self._role, self._folder))]
         if self._role == "engine" and self._restarts.total:
             arguments.append("--again")
+        self._down = "starting", "it is being started"
         try:
-            module, fresh = f"services.supervisor.{self._role}", self._restarts.in_a_row >= FRESH_AFTER
+            module, fresh = f"services.supervisor.{self._role}", self._restarts.never_well >= FRESH_AFTER
             pid = await self._start.start(module, arguments, output, self._environment(), fresh=fresh)
         except OSError as error:
             self._down = "down", f"it cannot be started: {error}"
@@ -251,10 +253,10 @@ class ManagedProcess:
     def _take(self, said: dict[str, Any]) -> None:
         now_s = time.monotonic()
         self._heartbeat, self._heard_s = said, now_s
-        if not self._well_s and said.get("state") in WELL:
-            self._well_s = now_s
         figures = said.get("figures")
         published = figures.get("published", 0) if isinstance(figures, dict) else 0
+        if not self._well_s and said.get("state") in WELL and (published or self._role == "capture"):
+            self._well_s = now_s
         if published != self._shown[0]:
             self._shown = published, now_s
 

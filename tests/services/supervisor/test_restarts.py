@@ -14,6 +14,21 @@ def test_a_process_that_has_worked_counts_from_the_beginning():
     assert (restarts.total, restarts.in_a_row) == (4, 2)
 
 
+def test_one_that_has_worked_is_not_kept_waiting_for_long():
+    restarts = Restarts(first_s=0.25, most_s=10.0, settled_s=5.0, most_worked_s=1.0)
+    assert [restarts.ended(0.1) for _ in range(6)] == [0.0, 0.25, 0.5, 1.0, 1.0, 1.0]
+    assert restarts.never_well == 0
+
+
+def test_ends_of_what_never_worked_are_counted_by_themselves():
+    restarts = Restarts()
+    counted = []
+    for well_s in (0.0, 0.0, 0.1, 0.0, 3.0, 0.0):
+        restarts.ended(well_s)
+        counted.append(restarts.never_well)
+    assert counted == [1, 2, 0, 1, 0, 1]
+
+
 def test_many_ends_do_not_overflow():
     restarts = Restarts()
     assert [restarts.ended(0.0) for _ in range(5000)][-1] == 10.0
