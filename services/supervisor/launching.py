@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import signal
@@ -21,6 +22,9 @@ log = logging.getLogger(__name__)
 SOCKET, RECORD = "launcher", "launcher.json"
 FORKED = ("services.supervisor.capture", "services.supervisor.engine")
 """What the launcher forks."""
+LOADS_LONG = ("services.supervisor.engine",)
+"""What takes as long to load as the launcher itself: to wait for a launcher that is loading is no slower than to load it twice at once."""
+LOADING_S = 60.0
 ANSWER_S = 5.0
 LOOK_S = 0.05
 PING_S = 1.0
@@ -79,8 +83,8 @@ class Direct:
 
 
 class ByLauncher:
-    """Has processes forked by the launcher, which it starts, and starts again when it has died; what is asked for while there is none is started
-    directly. One for each runtime folder; streams share it."""
+    """Has processes forked by the launcher, which it starts, and starts again when it has died. While that one is loading engines wait for it, and
+    what loads quickly is started directly. One for each runtime folder; streams share it."""
 
     def __init__(self, folder: RuntimeFolder, orphan_after_s: float = 600.0) -> None:
         self._folder, self._orphan_after_s = folder, orphan_after_s
@@ -125,7 +129,7 @@ class ByLauncher:
         fresh: bool = False,
     ) -> int:
         """See `Start`."""
-        if fresh or module not in FORKED or not self.ready.is_set():
+        if fresh or module not in FORKED or not await self._is_there(module):
             return await self._direct.start(module, arguments, output, environment)
         try:
             answer = await self._ask(
@@ -149,6 +153,13 @@ class ByLauncher:
             except (NoAnswer, BadMessage, OSError, KeyError):
                 return None
         return how
+
+    async def _is_there(self, module: str) -> bool:
+        """Whether there is a launcher for a process, if need be after it has loaded."""
+        if not self.ready.is_set() and self._keeping is not None and module in LOADS_LONG:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self.ready.wait(), LOADING_S)
+        return self.ready.is_set()
 
     async def _keep(self) -> None:
         """Keep a launcher running."""
