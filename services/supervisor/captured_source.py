@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.io.recordings.frame_files import resized_frame
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceUnavailable
 from operators.sources.live import LiveSource
@@ -39,13 +41,22 @@ class CapturedSource(LiveSource):
     when it is back.
     """
 
-    def __init__(self, folder: StreamFolder, stop_requested: Callable[[], bool] = lambda: False) -> None:
-        """Waits until the source is open there. Raises SourceUnavailable when it is told to stop before."""
+    def __init__(
+        self,
+        folder: StreamFolder,
+        stop_requested: Callable[[], bool] = lambda: False,
+        scale_for: Callable[[int, int], float] = lambda width_px, height_px: 1.0,
+    ) -> None:
+        """Waits until the source is open there. scale_for: from the size of its pictures, what they are scaled by. Raises SourceUnavailable when it is
+        told to stop before."""
         super().__init__(waiting=WAITING, order=FrameOrder(trusted=True))
         self._folder = folder
         self._told: tuple[SourceState, str] | None = None
         self._heard_s = time.monotonic()
-        self.description = self._described(stop_requested)
+        about = self._described(stop_requested)
+        self._scale = scale_for(about.width_px, about.height_px)
+        camera = about.camera.scaled(self._scale)
+        self.description = replace(about, width_px=camera.width_px, height_px=camera.height_px, camera=camera)
 
     @property
     def state(self) -> SourceState:
@@ -107,7 +118,9 @@ class CapturedSource(LiveSource):
         try:
             header, pixels = split(parts)
             _, _, arrays = unpacked(pixels)
-            return header, frame_from(header, arrays)
+            frame = frame_from(header, arrays)
+            size = (max(1, round(side * self._scale)) for side in (frame.width_px, frame.height_px))
+            return header, resized_frame(frame, *size)
         except (BadMessage, BadFrame, BadHeader, InvalidInput):
             self.count("bad_messages")
             return None

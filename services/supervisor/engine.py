@@ -31,8 +31,9 @@ from services.supervisor.layers import Layers
 from services.supervisor.live_scene import scene_of
 from services.supervisor.live_snapshots import LiveSnapshots
 from services.supervisor.model_show import ModelShow
+from services.supervisor.priority import ENGINE_ON_CPU, step_back
 from services.supervisor.screen import Screen
-from services.supervisor.specs import EngineSpec
+from services.supervisor.specs import EngineSpec, engine_scale_for
 from services.supervisor.worker import Worker, stream_folder_of
 
 LOOK_S = 0.05
@@ -73,7 +74,7 @@ def reconstruct(
         return worker.stop_requested() or screen.wanted != "live"
 
     worker.say("starting", "waits for the source to be opened by the capture process")
-    source = CapturedSource(worker.folder, stop_requested)
+    source = CapturedSource(worker.folder, stop_requested, lambda width, height: engine_scale_for(spec, width, height))
     check_picture(source.description.camera, 1.0)
     with TemporaryDirectory(prefix="intrasplat-engine-") as folder, low_latency():
         settings = live_settings(spec, Path(folder), source.description.name)
@@ -149,6 +150,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         folder, spec = stream_folder_of(given.spec, "engine")
         assert spec.engine is not None
+        if spec.engine.device == "cpu":
+            step_back(ENGINE_ON_CPU)
         with Worker(folder, spec) as worker:
             publisher = PicturePublisher(folder.pictures("engine"))
             try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -36,12 +37,29 @@ class EngineSpec(_Strict):
     device: Literal["cpu", "cuda"] = "cpu"
     gpu: int | None = Field(default=None, ge=0, le=1023)
     """Which GPU (`CUDA_VISIBLE_DEVICES`); None: whichever is the first."""
+    engine_scale: float | None = Field(default=None, gt=0, le=1)
+    """Size of what is reconstructed beside the stream's pictures. None: the whole, and on a CPU what it keeps up with (`engine_scale_for`)."""
     field: str = "auto"
     renderer: str = "alpha"
     seed: int = Field(default=0, ge=0, lt=2**31)
     budget_ms: float | None = Field(default=None, gt=0, le=10_000)
     tool_mask: str = "builtin"
     out_of_body: Literal["withhold", "off"] = "withhold"
+
+
+CPU_PIXELS = 320 * 256
+"""Two cores keep up with so many at 30 frames/s (docs/live.md)."""
+SCALE_STEPS = 16
+
+
+def engine_scale_for(spec: EngineSpec, width_px: int, height_px: int) -> float:
+    """What a stream's pictures are scaled by before they are reconstructed; viewers of the raw picture see all of it in any case."""
+    if spec.engine_scale is not None:
+        return spec.engine_scale
+    if spec.device != "cpu":
+        return 1.0
+    fits = math.floor(SCALE_STEPS * math.sqrt(CPU_PIXELS / (width_px * height_px))) / SCALE_STEPS
+    return min(1.0, max(1 / SCALE_STEPS, fits))
 
 
 class ProcessLimits(_Strict):

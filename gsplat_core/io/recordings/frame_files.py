@@ -22,6 +22,7 @@ from gsplat_core.io.recordings.image_files import (
     image_size,
 )
 from gsplat_core.io.recordings.plain_files import UnreadableFile
+from gsplat_core.scene.frames import Frame
 
 POLARITY_SAMPLES = 16
 MAX_TOOL_SHARE = 0.5
@@ -242,3 +243,16 @@ def resize_area(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDAr
 def resize_nearest(plane: NDArray, width_px: int, height_px: int) -> NDArray:
     """A mask or depth map at another size: no value that was not there (the pixel whose centre is nearest)."""
     return cv2.resize(plane, (width_px, height_px), interpolation=cv2.INTER_NEAREST_EXACT)
+
+
+def resized_frame(frame: Frame, width_px: int, height_px: int) -> Frame:
+    """A frame at another size: images by the mean over areas, masks and depth by the nearest pixel."""
+    if (width_px, height_px) == (frame.width_px, frame.height_px):
+        return frame
+    planes = {name: getattr(frame, name) for name in ("depth", "mask", "loss_mask", "rehearsal_mask")}
+    right = frame.right_image
+    return frame.with_fields(
+        image=resize_area(frame.image, width_px, height_px),
+        right_image=None if right is None else resize_area(right, width_px, height_px),
+        **{name: resize_nearest(plane, width_px, height_px) for name, plane in planes.items() if plane is not None},
+    )

@@ -14,7 +14,7 @@ from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings.contents import Contents
 from gsplat_core.io.recordings.decoded import DEPENDS, DamagedFrames
 from gsplat_core.io.recordings.findings import Findings, ValidationReport, printable
-from gsplat_core.io.recordings.frame_files import resize_area, resize_nearest
+from gsplat_core.io.recordings.frame_files import resized_frame
 from gsplat_core.io.recordings.image_files import MAX_PIXELS
 from gsplat_core.io.recordings.layouts import inspect
 from gsplat_core.scene.cameras import Camera
@@ -87,7 +87,7 @@ class FileRecording:
         """Frames in order. Raises RecordingInvalid at the first one that cannot be read."""
         for frame in self._contents.frames(Findings(strict=True), self.frame_count):
             assert frame is not None  # a strict collector has raised
-            yield self._resized(frame)
+            yield resized_frame(frame, self.width_px, self.height_px)
 
     def __len__(self) -> int:
         return self.frame_count
@@ -98,20 +98,6 @@ class FileRecording:
             raise InvalidInput(f"frame {index} is not in the recording {self.name} of {self.frame_count} frames")
         poses = self._contents.calibration.poses
         return self.camera if poses is None else self.camera.with_pose(poses[index])
-
-    def _resized(self, frame: Frame) -> Frame:
-        size = self.width_px, self.height_px
-        if size == (frame.width_px, frame.height_px):
-            return frame
-        return frame.with_fields(
-            image=resize_area(frame.image, *size),
-            right_image=None if frame.right_image is None else resize_area(frame.right_image, *size),
-            **{
-                name: resize_nearest(plane, *size)
-                for name in ("depth", "mask", "loss_mask", "rehearsal_mask")
-                if (plane := getattr(frame, name)) is not None
-            },
-        )
 
 
 def open_recording(path: str | os.PathLike[str], *, scale: float = 1.0, max_frames: int | None = None) -> FileRecording:

@@ -136,3 +136,23 @@ def test_waiting_for_capture_ends_when_it_is_told_to(folder):
     threading.Timer(0.2, stop.set).start()
     with pytest.raises(SourceUnavailable, match="has not opened its source"):
         CapturedSource(folder, stop.is_set)
+
+
+def test_frames_are_scaled_to_what_the_engine_keeps_up_with(folder):
+    capture = StandIn(folder, run=1)
+    sizes: list[tuple[int, int]] = []
+
+    def scale_for(width_px: int, height_px: int) -> float:
+        sizes.append((width_px, height_px))
+        return 0.5
+
+    source = CapturedSource(folder, scale_for=scale_for)
+    assert sizes == [(6, 4)]
+    assert source.description.camera == ABOUT.camera.scaled(0.5)
+    assert (source.description.width_px, source.description.height_px) == (3, 2)
+    source.open()
+    frame = first(source, capture, seq=7, mask=np.ones((4, 6), np.uint8))
+    assert frame.image.shape == (2, 3, 3) and frame.mask is not None and frame.mask.shape == (2, 3)
+    np.testing.assert_array_equal(frame.image, frame.seq)
+    source.close()
+    capture.close()

@@ -1,0 +1,22 @@
+"""Processes that let others go first."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+PROGRAM = """
+import os
+from services.supervisor.priority import step_back
+began = os.nice(0)
+step_back(began + 3)
+step_back(began)
+print(os.nice(0) - began)
+"""
+
+
+def test_a_process_steps_back_and_never_forwards():
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, start_new_session=True
+    )
+    assert done.stdout == "3\n"
