@@ -16,7 +16,7 @@ Little-endian throughout.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,11 +42,16 @@ class BadMessage(Exception):
 
 def packed(seq: int, pts_ns: int, arrays: Mapping[str, NDArray]) -> bytes:
     """A frame as a message. arrays: `image` [H, W, 3], and any of the others of the same size. Raises ValueError."""
+    return b"".join(pieces(seq, pts_ns, arrays))
+
+
+def pieces(seq: int, pts_ns: int, arrays: Mapping[str, NDArray]) -> list[bytes | memoryview]:
+    """The same in pieces: the header, and each array where it lies, which nobody may change any more. Raises ValueError."""
     image = arrays["image"]
     height_px, width_px = image.shape[:2]
     if not 0 < width_px * height_px <= MOST_PIXELS:
         raise ValueError(f"a picture of {width_px}x{height_px} px is not sent; at most {MOST_PIXELS} pixels are")
-    bits, parts = 0, []
+    bits, found = 0, []
     for name, (bit, kind, values) in ARRAYS.items():
         if name not in arrays:
             continue
@@ -54,12 +59,43 @@ def packed(seq: int, pts_ns: int, arrays: Mapping[str, NDArray]) -> bytes:
         if array.shape != shape:
             raise ValueError(f"{name} is {list(array.shape)}; with this image it must be {list(shape)}")
         bits |= bit
-        parts.append(np.ascontiguousarray(array, kind).tobytes())
-    return b"".join([HEADER.pack(MAGIC, VERSION, bits, width_px, height_px, seq, pts_ns), *parts])
+        found.append(np.ascontiguousarray(array, kind).reshape(-1).view(np.uint8).data)
+    return [HEADER.pack(MAGIC, VERSION, bits, width_px, height_px, seq, pts_ns), *found]
 
 
 def unpacked(data: memoryview) -> tuple[int, int, dict[str, NDArray]]:
     """Number, time and arrays of a message; the arrays look into its memory. Raises BadMessage before anything is allocated."""
+    seq, pts_ns, announced = _announced(data)
+    found: list[memoryview] = []
+    begin = HEADER.size
+    for name, _, _, size in announced:
+        if begin + size > len(data):
+            raise BadMessage(f"it ends within {name}: it has {len(data)} bytes")
+        found.append(data[begin : begin + size])
+        begin += size
+    if begin != len(data):
+        raise BadMessage(f"it has {len(data)} bytes; its header says {begin}")
+    return seq, pts_ns, _arrays(announced, found)
+
+
+def unpacked_pieces(data: Sequence[memoryview]) -> tuple[int, int, dict[str, NDArray]]:
+    """`unpacked`, of a message in pieces. Raises BadMessage."""
+    if not data:
+        raise BadMessage("it has no pieces")
+    if len(data[0]) != HEADER.size:
+        raise BadMessage(f"its header has {len(data[0])} bytes in place of {HEADER.size}")
+    seq, pts_ns, announced = _announced(data[0])
+    sizes = [size for _, _, _, size in announced]
+    if [len(piece) for piece in data[1:]] != sizes:
+        raise BadMessage(f"its arrays have {[len(piece) for piece in data[1:]]} bytes; its header says {sizes}")
+    return seq, pts_ns, _arrays(announced, data[1:])
+
+
+_Announced = tuple[str, str, tuple[int, ...], int]
+
+
+def _announced(data: memoryview) -> tuple[int, int, list[_Announced]]:
+    """Number, time, and name, type, shape and bytes of each array that a header announces."""
     if len(data) < HEADER.size:
         raise BadMessage(f"it has {len(data)} bytes, less than a header")
     magic, version, bits, width_px, height_px, seq, pts_ns = HEADER.unpack_from(data)
@@ -74,21 +110,19 @@ def unpacked(data: memoryview) -> tuple[int, int, dict[str, NDArray]]:
         raise BadMessage(f"its picture has {width_px}x{height_px} px; at most {MOST_PIXELS} pixels are read")
     if seq >= 2**62 or abs(pts_ns) >= 2**62:
         raise BadMessage(f"its number {seq} or its time {pts_ns} is out of range")
-    arrays: dict[str, NDArray] = {}
-    begin = HEADER.size
+    announced = []
     for name, (bit, kind, values) in ARRAYS.items():
-        if bit and not bits & bit:
-            continue
-        shape = _shape(values, width_px, height_px)
-        count = int(np.prod(shape))
-        end = begin + count * np.dtype(kind).itemsize
-        if end > len(data):
-            raise BadMessage(f"it ends within {name}: it has {len(data)} bytes")
-        arrays[name] = np.frombuffer(data, kind, count, begin).reshape(shape)
-        begin = end
-    if begin != len(data):
-        raise BadMessage(f"it has {len(data)} bytes; its header says {begin}")
-    return seq, pts_ns, arrays
+        if not bit or bits & bit:
+            shape = _shape(values, width_px, height_px)
+            announced.append((name, kind, shape, int(np.prod(shape)) * np.dtype(kind).itemsize))
+    return seq, pts_ns, announced
+
+
+def _arrays(announced: Sequence[_Announced], found: Sequence[memoryview]) -> dict[str, NDArray]:
+    return {
+        name: np.frombuffer(piece, kind).reshape(shape)
+        for (name, kind, shape, _), piece in zip(announced, found, strict=True)
+    }
 
 
 def _shape(values: int, width_px: int, height_px: int) -> tuple[int, ...]:

@@ -1,8 +1,8 @@
 """Pictures over ZeroMQ: published to any number of readers, none of whom slows the sender. The newest one wins.
 
-A message has two parts: a JSON object, and the pixels. Where the object says `"pixels": "frame"` they are a whole frame as in
-`operators/sources/zeromq_message.py` (what capture publishes), where it says `"rgb"` they are uint8 [H, W, 3] of its `width_px` and `height_px` (what an
-engine shows).
+A message is a JSON object and the pixels. Where the object says `"pixels": "frame"` a whole frame follows, in the pieces of
+`operators/sources/zeromq_message.py` (what capture publishes); where it says `"rgb"` one part, uint8 [H, W, 3] of its `width_px` and `height_px` (what an
+engine shows). Pixels are sent from where they lie: a copy of a 1920x1080 picture costs more than the socket (ADR 14).
 """
 
 from __future__ import annotations
@@ -22,6 +22,9 @@ from services.bus.messages import MOST_BYTES, packed_json, parsed_json
 HIGH_WATER = 4
 """Pictures that wait for a reader that does not keep up, on either side; what comes then is dropped for it. Readers take all that waits and use the
 newest. Fewer would be lost to readers that do keep up: ZeroMQ takes note of what was read only now and then."""
+
+MOST_PARTS = 2 + len(zeromq_message.ARRAYS)
+"""Of a message."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +47,9 @@ class PicturePublisher:
         self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER)
         self._socket.bind(endpoint)
 
-    def publish_frame(self, header: Mapping[str, Any], frame: bytes) -> None:
-        """Send a frame that was packed; it never waits."""
-        self._send({**header, "pixels": "frame"}, frame)
+    def publish_frame(self, header: Mapping[str, Any], pieces: Sequence[bytes | memoryview]) -> None:
+        """Send a frame in the pieces of `zeromq_message`, which nobody may change any more; it never waits."""
+        self._send({**header, "pixels": "frame"}, *pieces)
 
     def publish(self, header: Mapping[str, Any], image: NDArray[np.uint8]) -> None:
         """Send a picture, RGB uint8 [H, W, 3], which nobody may change any more; it never waits."""
@@ -54,9 +57,9 @@ class PicturePublisher:
         said = {**header, "pixels": "rgb", "width_px": width_px, "height_px": height_px}
         self._send(said, np.ascontiguousarray(image).data)
 
-    def _send(self, header: Mapping[str, Any], pixels: bytes | memoryview) -> None:
+    def _send(self, header: Mapping[str, Any], *pixels: bytes | memoryview) -> None:
         # What has no reader, or whose reader does not keep up, is dropped by ZeroMQ here.
-        self._socket.send_multipart([packed_json(header), pixels], copy=False)
+        self._socket.send_multipart([packed_json(header), *pixels], copy=False)
 
     def close(self) -> None:
         """Stop sending, and remove the socket."""
@@ -80,11 +83,11 @@ def subscribe(socket: Any, *endpoints: str, waiting: int = HIGH_WATER) -> Any:
     return socket
 
 
-def split(parts: Sequence[zmq.Frame]) -> tuple[dict[str, Any], memoryview]:
+def split(parts: Sequence[zmq.Frame]) -> tuple[dict[str, Any], list[memoryview]]:
     """The header and the pixels of a message. Raises BadMessage."""
-    if len(parts) != 2:
-        raise BadMessage(f"a picture has 2 parts, this message {len(parts)}")
-    header, pixels = (part.buffer for part in parts)
+    if not 2 <= len(parts) <= MOST_PARTS:
+        raise BadMessage(f"a picture has 2 to {MOST_PARTS} parts, this message {len(parts)}")
+    header, *pixels = (part.buffer for part in parts)
     if len(header) > MOST_BYTES:
         raise BadMessage(f"a picture's header has {len(header)} bytes; at most {MOST_BYTES} are read")
     return parsed_json(header), pixels
@@ -95,17 +98,17 @@ def picture_from(parts: Sequence[zmq.Frame]) -> Picture:
     header, pixels = split(parts)
     if header.get("pixels") == "frame":
         try:
-            _, _, arrays = zeromq_message.unpacked(pixels)
+            _, _, arrays = zeromq_message.unpacked_pieces(pixels)
         except zeromq_message.BadMessage as error:
             raise BadMessage(f"a frame cannot be read: {error}") from None
         return Picture(header, arrays["image"])
     width_px, height_px = (_side(header.get(name)) for name in ("width_px", "height_px"))
-    if header.get("pixels") != "rgb" or not 0 < 3 * width_px * height_px == len(pixels):
+    size = sum(len(part) for part in pixels)
+    if header.get("pixels") != "rgb" or len(pixels) != 1 or not 0 < 3 * width_px * height_px == size:
         raise BadMessage(
-            f"a picture of {width_px}x{height_px} px cannot be made from {len(pixels)} bytes of"
-            f" {header.get('pixels')!s:.20}"
+            f"a picture of {width_px}x{height_px} px cannot be made from {size} bytes of {header.get('pixels')!s:.20}"
         )
-    return Picture(header, np.frombuffer(pixels, np.uint8).reshape(height_px, width_px, 3))
+    return Picture(header, np.frombuffer(pixels[0], np.uint8).reshape(height_px, width_px, 3))
 
 
 def _side(value: Any) -> int:

@@ -20,7 +20,7 @@ from operators.sources.options import SourceOptions
 from operators.sources.registry import open_source
 from operators.sources.source import FrameSource, ReportingSource, SourceState
 from operators.sources.wire import description_to, frame_header, planes_of
-from operators.sources.zeromq_message import packed
+from operators.sources.zeromq_message import pieces
 from services.bus.errors import CommandRefused
 from services.bus.pictures import PicturePublisher
 from services.supervisor.exit_codes import NO_USE
@@ -100,7 +100,7 @@ class Capture:
 
     def _send(self, frame: Frame, publisher: PicturePublisher) -> None:
         header = {**frame_header(frame), "run": self._run}
-        publisher.publish_frame(header, packed(frame.seq, frame.pts_ns, planes_of(frame)))
+        publisher.publish_frame(header, pieces(frame.seq, frame.pts_ns, planes_of(frame)))
         self.frames += 1
         self._last_ns = time.monotonic_ns()
 

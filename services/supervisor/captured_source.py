@@ -20,7 +20,7 @@ from operators.sources.shared_memory import BadHeader
 from operators.sources.source import SourceDescription, SourceState
 from operators.sources.wire import description_from, frame_from
 from operators.sources.zeromq_message import BadMessage as BadFrame
-from operators.sources.zeromq_message import unpacked
+from operators.sources.zeromq_message import unpacked_pieces
 from services.bus.commands import ask
 from services.bus.errors import BadMessage, BusError
 from services.bus.messages import parsed_json
@@ -117,7 +117,7 @@ class CapturedSource(LiveSource):
     def _frame(self, parts: list[zmq.Frame]) -> tuple[dict[str, Any], Frame] | None:
         try:
             header, pixels = split(parts)
-            _, _, arrays = unpacked(pixels)
+            _, _, arrays = unpacked_pieces(pixels)
             frame = frame_from(header, arrays)
             size = (max(1, round(side * self._scale)) for side in (frame.width_px, frame.height_px))
             return header, resized_frame(frame, *size)

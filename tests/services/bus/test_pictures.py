@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import zmq
 
-from operators.sources.zeromq_message import packed
+from operators.sources.zeromq_message import pieces
 from services.bus.errors import BadMessage
 from services.bus.pictures import HIGH_WATER, PicturePublisher, picture_from, subscribe
 
@@ -49,7 +49,7 @@ def test_a_shown_picture_arrives_as_it_was(runtime, context):
         got = received(socket)
         assert (got.header["seq"], got.header["state"]) == (7, "live")
         np.testing.assert_array_equal(got.image, image[:, ::-1])
-        publisher.publish_frame({"seq": 8}, packed(8, 0, {"image": image, "mask": image[..., 0]}))
+        publisher.publish_frame({"seq": 8}, pieces(8, 0, {"image": image, "mask": image[..., 0]}))
         np.testing.assert_array_equal(received(socket).image, image)
     publisher.close()
 
@@ -121,6 +121,9 @@ def test_a_slow_reader_gets_few_of_many(runtime, context):
     publisher.close()
 
 
+FRAME = [bytes(piece) for piece in pieces(0, 0, {"image": np.zeros((2, 2, 3), np.uint8)})]
+
+
 @pytest.mark.parametrize(
     "parts",
     [
@@ -134,7 +137,12 @@ def test_a_slow_reader_gets_few_of_many(runtime, context):
         [b'{"pixels":"rgb","width_px":true,"height_px":1}', b"123"],
         [b'{"pixels":"rgb","width_px":1e0,"height_px":1}', b"123"],
         [b'{"pixels":"frame"}', b"123"],
-        [b'{"pixels":"frame"}', packed(0, 0, {"image": np.zeros((2, 2, 3), np.uint8)})[:-1]],
+        [b'{"pixels":"frame"}', FRAME[0]],
+        [b'{"pixels":"frame"}', FRAME[0], FRAME[1][:-1]],
+        [b'{"pixels":"frame"}', FRAME[0], FRAME[1], b"1234"],
+        [b'{"pixels":"frame"}', b"".join(FRAME)],
+        [b'{"pixels":"frame"}', *[FRAME[1]] * 7],
+        [b'{"pixels":"rgb","width_px":1,"height_px":1}', b"12", b"3"],
         [b'{"x":"' + b"y" * (1 << 17) + b'"}', b"123"],
     ],
     ids=lambda parts: repr(parts[0][:40]),

@@ -11,7 +11,7 @@ from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.errors import SourceUnavailable
 from operators.sources.source import SourceDescription, SourceState
 from operators.sources.wire import description_to, frame_header, planes_of
-from operators.sources.zeromq_message import packed
+from operators.sources.zeromq_message import pieces
 from services.bus.commands import CommandServer
 from services.bus.heartbeats import Heartbeats
 from services.bus.pictures import PicturePublisher
@@ -37,7 +37,7 @@ class StandIn:
             seq, seq * 40_000_000, np.full((4, 6, 3), seq, np.uint8), arrived_ns=time.monotonic_ns(), **changes
         )
         header = {**frame_header(frame), "run": self.run}
-        self.publisher.publish_frame(header, packed(frame.seq, frame.pts_ns, planes_of(frame)))
+        self.publisher.publish_frame(header, pieces(frame.seq, frame.pts_ns, planes_of(frame)))
 
     def close(self) -> None:
         self.publisher.close()
@@ -123,7 +123,7 @@ def test_a_message_that_is_no_frame_is_counted(folder):
     source = CapturedSource(folder)
     source.open()
     first(source, capture)
-    capture.publisher.publish_frame({"seq": 1}, b"nonsense")
+    capture.publisher.publish_frame({"seq": 1}, [b"nonsense"])
     until(lambda: source.counts().get("bad_messages") == 1)
     capture.publisher.publish({"seq": 1}, np.zeros((4, 6, 3), np.uint8))
     until(lambda: source.counts().get("bad_messages") == 2)
