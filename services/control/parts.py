@@ -15,6 +15,8 @@ from services.control.problems import Problem
 from services.control.snapshot_parts import Exports, Snapshots
 
 PictureKind = Literal["raw", "shown", "depth", "confidence", "orbit"]
+BOUNDARY = "picture"
+"""Between the pictures of a multipart answer."""
 
 
 class VersionRecord(Protocol):
@@ -114,12 +116,15 @@ class Streams(Protocol):
 
 
 class EncodedPicture(Protocol):
-    """A picture as viewers get it."""
+    """A picture as viewers get it; it is made once for all of them."""
 
     @property
-    def header(self) -> Mapping[str, Any]: ...
+    def message(self) -> bytes:
+        """As one message of a WebSocket: the length of the header in four bytes, big end first, the header in JSON, the JPEG."""
+
     @property
-    def jpeg(self) -> bytes: ...
+    def part(self) -> bytes:
+        """As a part of a multipart answer with the boundary `BOUNDARY`."""
 
 
 class Display(Protocol):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import simplejpeg
@@ -11,17 +14,31 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidSetting
 
 LEAST_QUALITY, MOST_QUALITY = 10, 95
+BOUNDARY = "picture"
+"""Between the parts of a multipart answer, as `services.control.parts` announces it."""
 DIMMED_TO = 0.5
 """Of its brightness, what is left of a picture that nobody may take for a live one."""
 
 
 @dataclass(frozen=True)
 class EncodedPicture:
-    """A picture for a viewer."""
+    """A picture for viewers; all of them share it."""
 
     header: dict[str, object]
     """JSON: `seq`, `pts_ns`, `arrived_ns`, `age_ms`, `state`, and of reconstructions `model_version`, `steps`, `psnr_db` (docs/processes.md)."""
     jpeg: bytes
+
+    @cached_property
+    def message(self) -> bytes:
+        """As one message: the length of the header in four bytes, big end first, the header in JSON, the JPEG."""
+        header = json.dumps(self.header, separators=(",", ":")).encode()
+        return b"".join((struct.pack(">I", len(header)), header, self.jpeg))
+
+    @cached_property
+    def part(self) -> bytes:
+        """As a part of a multipart answer."""
+        head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(self.jpeg)}\r\n\r\n"
+        return b"".join((head.encode(), self.jpeg, b"\r\n"))
 
 
 def check_quality(quality: int) -> int:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, suppress
 from typing import Annotated
@@ -16,7 +14,7 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketState
 
 from services.control.auth.guard import CallerOf, new_router, requires
-from services.control.parts import EncodedPicture, PictureKind
+from services.control.parts import BOUNDARY, EncodedPicture, PictureKind
 from services.control.viewers import ViewerStalled, in_time, until_ended, viewing
 from services.settings import ResourceName
 
@@ -29,22 +27,9 @@ Kind = Annotated[
     ),
 ]
 Quality = Annotated[int, Query(ge=10, le=95, description="Of the JPEG.")]
-BOUNDARY = "picture"
 GOING_AWAY = 1001
 CLOSE_S = 1.0
 """How long a viewer may take to hear that it is over."""
-
-
-def message_of(picture: EncodedPicture) -> bytes:
-    """A picture as one message: the length of the header in four bytes, big end first, the header in JSON, the JPEG."""
-    header = json.dumps(dict(picture.header), separators=(",", ":")).encode()
-    return struct.pack(">I", len(header)) + header + picture.jpeg
-
-
-def part_of(picture: EncodedPicture) -> bytes:
-    """A picture as a part of a multipart answer."""
-    head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture.jpeg)}\r\n\r\n"
-    return head.encode() + picture.jpeg + b"\r\n"
 
 
 @router.websocket("/streams/{name}/display")
@@ -63,7 +48,7 @@ async def display(
         with suppress(ViewerStalled):  # the server closes the connection, and the system cuts it off
             async with until_ended(socket, _left(socket)):
                 async for picture in pictures:
-                    await send(message_of(picture))
+                    await send(picture.message)
             if socket.client_state is WebSocketState.CONNECTED and socket.application_state is WebSocketState.CONNECTED:
                 with anyio.move_on_after(CLOSE_S):
                     await socket.close(GOING_AWAY, "the stream or the server has ended")
@@ -109,7 +94,7 @@ class MjpegResponse(Response):
             with suppress(ViewerStalled):
                 async with until_ended(self._request, _hung_up(receive)):
                     async for picture in self._pictures:
-                        await send_part({"type": "http.response.body", "body": part_of(picture), "more_body": True})
+                        await send_part({"type": "http.response.body", "body": picture.part, "more_body": True})
                 with anyio.move_on_after(CLOSE_S):
                     await send({"type": "http.response.body", "body": b"", "more_body": False})
 

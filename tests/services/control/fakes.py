@@ -11,6 +11,7 @@ from typing import Any
 
 from services.control.parts import NewStream, Parts
 from services.control.problems import Conflicting, Missing, Unprocessable
+from services.display.encoder import EncodedPicture
 
 
 class NotThere(Exception):
@@ -157,12 +158,6 @@ class FakeStreams:
         return self.kept[name]
 
 
-@dataclass(frozen=True)
-class FakePicture:
-    header: Mapping[str, Any]
-    jpeg: bytes
-
-
 class FakeDisplay:
     """A picture every few milliseconds, without an end; counts who looks."""
 
@@ -173,7 +168,7 @@ class FakeDisplay:
         self.asked: list[tuple[str, str, int]] = []
 
     @asynccontextmanager
-    async def subscribe(self, stream: str, kind: str, quality: int) -> AsyncIterator[AsyncIterator[FakePicture]]:
+    async def subscribe(self, stream: str, kind: str, quality: int) -> AsyncIterator[AsyncIterator[EncodedPicture]]:
         self.asked.append((stream, kind, quality))
         self.open += 1
         try:
@@ -181,10 +176,10 @@ class FakeDisplay:
         finally:
             self.open -= 1
 
-    async def pictures(self) -> AsyncIterator[FakePicture]:
+    async def pictures(self) -> AsyncIterator[EncodedPicture]:
         seq = 0
         while self.most is None or seq < self.most:
-            yield FakePicture({"seq": seq, "state": "live"}, self.jpeg)
+            yield EncodedPicture({"seq": seq, "state": "live"}, self.jpeg)
             seq += 1
             await asyncio.sleep(0.005)
 
