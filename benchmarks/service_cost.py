@@ -26,7 +26,7 @@ from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.sources.live import LiveSource
 from operators.sources.source import SourceDescription
 from operators.sources.wire import description_to, frame_header, planes_of
-from operators.sources.zeromq_message import packed
+from operators.sources.zeromq_message import pieces
 from services.bus.commands import CommandServer
 from services.bus.heartbeats import Heartbeats
 from services.bus.pictures import PicturePublisher, picture_from, subscribe
@@ -82,7 +82,7 @@ def raw_hop(options: argparse.Namespace, runtime: RuntimeFolder) -> dict[str, An
     delays_ms: list[float] = []
 
     def send(frame: Frame) -> None:
-        publisher.publish_frame({**frame_header(frame), "run": 1}, packed(frame.seq, frame.pts_ns, planes_of(frame)))
+        publisher.publish_frame({**frame_header(frame), "run": 1}, pieces(frame.seq, frame.pts_ns, planes_of(frame)))
 
     def both() -> int:
         captured = CapturedSource(folder)

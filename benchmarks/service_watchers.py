@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from typing import Any
 
 import zmq
 
@@ -20,6 +21,9 @@ class Watch:
         self.sent_gaps_ms: list[float] = []
         """Between the same two, when they came in at the capture process."""
         self.ages_ms: list[float] = []
+        self.shown_ms: list[float] = []
+        """Ages when they were shown, as their headers say."""
+        self.steps: list[int] = []
         self.pictures = 0
         self.last_ns = 0
         self._sent_ns = 0
@@ -33,6 +37,8 @@ class Watch:
         self.gaps_ms.clear()
         self.sent_gaps_ms.clear()
         self.ages_ms.clear()
+        self.shown_ms.clear()
+        self.steps.clear()
 
     def last_from_after(self, at_ns: int) -> bool:
         """Whether a picture of something that came in after that time is there."""
@@ -43,6 +49,19 @@ class Watch:
         self._stop.set()
         self._thread.join()
 
+    def note(self, header: dict[str, Any], now_ns: int) -> None:
+        """A new picture, and when it came."""
+        sent_ns = header["arrived_ns"]
+        if self.last_ns:
+            self.gaps_ms.append((now_ns - self.last_ns) * 1e-6)
+            self.sent_gaps_ms.append((sent_ns - self._sent_ns) * 1e-6)
+        self.ages_ms.append((now_ns - sent_ns) * 1e-6)
+        if "age_ms" in header:
+            self.shown_ms.append(header["age_ms"])
+            self.steps.append(header["steps"])
+        self.last_ns, self._sent_ns = now_ns, sent_ns
+        self.pictures += 1
+
     def _watch(self) -> None:
         socket = subscribe(zmq.Context.instance().socket(zmq.SUB), self._endpoint)
         while not self._stop.is_set():
@@ -52,13 +71,7 @@ class Watch:
             now_ns = time.monotonic_ns()
             if header.get("new") is False:
                 continue
-            sent_ns = header["arrived_ns"]
-            if self.last_ns:
-                self.gaps_ms.append((now_ns - self.last_ns) * 1e-6)
-                self.sent_gaps_ms.append((sent_ns - self._sent_ns) * 1e-6)
-            self.ages_ms.append((now_ns - sent_ns) * 1e-6)
-            self.last_ns, self._sent_ns = now_ns, sent_ns
-            self.pictures += 1
+            self.note(header, now_ns)
         socket.close()
 
 
