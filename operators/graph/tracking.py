@@ -6,6 +6,7 @@ Each histogram has one writer (an operator computes in one thread at a time), so
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,22 +32,35 @@ class DurationSummary:
 class Histogram:
     """Durations in buckets of 1/32 of an octave, after HdrHistogram (G. Tene)."""
 
-    __slots__ = ("_counts", "_max_ns")
+    __slots__ = ("_counts", "_max_ns", "_sum_ns")
 
     def __init__(self) -> None:
         self._counts = [0] * (_bucket(_LONGEST_NS) + 1)
-        self._max_ns = 0
+        self._max_ns = self._sum_ns = 0
 
     def record(self, duration_ns: int) -> None:
         """Count one duration; beyond 4.9 h it counts as 4.9 h."""
         if duration_ns > self._max_ns:
             self._max_ns = duration_ns
+        self._sum_ns += max(duration_ns, 0)
         self._counts[_bucket(min(max(duration_ns, 0), _LONGEST_NS))] += 1
 
     def summary(self) -> DurationSummary:
         """The percentiles so far; from any thread."""
         p50_ms, p95_ms, p99_ms = self.quantiles_ms((0.50, 0.95, 0.99))
         return DurationSummary(sum(self._counts), p50_ms, p95_ms, p99_ms, self._max_ns * 1e-6)
+
+    @property
+    def sum_ns(self) -> int:
+        """All durations together."""
+        return self._sum_ns
+
+    def between(self, bounds_ns: Sequence[int]) -> list[int]:
+        """How many durations lie up to each of these bounds (ascending) and above the one before it, and how many above the last; a bucket that a
+        bound cuts counts as below it. From any thread."""
+        counts = self._counts.copy()
+        ends = [0, *(_bucket(min(bound_ns, _LONGEST_NS)) + 1 for bound_ns in bounds_ns), len(counts)]
+        return [sum(counts[begin:end]) for begin, end in itertools.pairwise(ends)]
 
     def quantiles_ms(self, fractions: Sequence[float]) -> list[float]:
         """The durations that these shares (ascending, 0..1) of all do not exceed, in milliseconds; from any thread."""
@@ -114,6 +128,14 @@ class FlowTracker:
     def reset(self) -> None:
         """Forget everything; run() begins so."""
         self._roots, self._paths, self._computes = {}, {}, {}
+
+    def paths(self) -> dict[str, Histogram]:
+        """Per path, its latencies; from any thread."""
+        return self._paths.copy()
+
+    def operators(self) -> dict[str, Histogram]:
+        """Per operator, the durations of its computes; from any thread."""
+        return self._computes.copy()
 
     def latency(self) -> dict[str, DurationSummary]:
         """Per path, named `source,depth,display`; from any thread."""

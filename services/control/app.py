@@ -87,7 +87,7 @@ def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
         keys=keys,
         tickets=Tickets(settings.auth.ticket_s),
         audit=audit,
-        measures=Measures(parts.collectors),
+        measures=Measures(parts.collectors, lambda: audit.head.seq + 1),
         key_rate=TokenBuckets(limits.requests_per_s, limits.requests_per_s * limits.burst_s),
         uploads_dir=uploads,
         uploads=asyncio.Semaphore(limits.uploads),

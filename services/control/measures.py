@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, Metric
+from prometheus_client.core import CounterMetricFamily
 from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
@@ -14,14 +15,26 @@ from services.version import product_version
 DURATIONS_S = (0.001, 0.0025, 0.005, 0.01, 0.0167, 0.0333, 0.05, 0.0667, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
 
 
+class AuditEntries(Collector):
+    """How many entries the audit log has had, those that the service wrote by itself among them."""
+
+    def __init__(self, entries: Callable[[], int]) -> None:
+        self._entries = entries
+
+    def collect(self) -> Iterable[Metric]:
+        """See `Collector`."""
+        return [CounterMetricFamily("intrasplat_audit_entries", "Entries of the audit log", value=self._entries())]
+
+
 class Measures:
     """The metrics of one application, in a registry of its own."""
 
-    def __init__(self, collectors: Sequence[Collector] = ()) -> None:
+    def __init__(self, collectors: Sequence[Collector] = (), audit_entries: Callable[[], int] = lambda: 0) -> None:
+        """audit_entries: how many the audit log has had, whoever wrote them."""
         self.registry = CollectorRegistry(auto_describe=True)
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)
-        for collector in collectors:
+        for collector in (*collectors, AuditEntries(audit_entries)):
             self.registry.register(collector)
         self.requests = Counter(
             "intrasplat_http_requests", "Answered requests", ["method", "route", "status"], registry=self.registry
@@ -38,5 +51,4 @@ class Measures:
             "intrasplat_viewers_dropped", "Displays that were closed by the server", ["reason"], registry=self.registry
         )
         self.upload_bytes = Counter("intrasplat_upload_bytes", "Bytes of uploads taken in", registry=self.registry)
-        self.audit_entries = Counter("intrasplat_audit_entries", "Entries of the audit log", registry=self.registry)
         Info("intrasplat_build", "Version of this server", registry=self.registry).info({"version": product_version()})

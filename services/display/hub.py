@@ -6,12 +6,14 @@ import asyncio
 import logging
 import time
 from collections import Counter
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
 
 import zmq
 import zmq.asyncio
 
+from services.bus.durations import Durations
 from services.bus.errors import BadMessage
 from services.bus.pictures import Picture, picture_from, subscribe
 from services.bus.runtime import LAYERS, Layer, StreamFolder
@@ -54,6 +56,11 @@ class DisplayHub:
         channel = self._channels.get(kind)
         return {} if channel is None else dict(channel.counts)
 
+    def ages(self, kind: Pictures) -> Mapping[str, Any]:
+        """From the arrival of frames to when their pictures were there for viewers."""
+        channel = self._channels.get(kind)
+        return {} if channel is None else channel.ages.told()
+
     async def close(self) -> None:
         """Let all viewers go."""
         for channel in self._channels.values():
@@ -68,6 +75,7 @@ class _Channel:
         self._endpoint, self._kind, self._encoders = endpoint, kind, encoders
         self.viewers: set[Viewer] = set()
         self.counts: Counter[str] = Counter()
+        self.ages = Durations()
         self._task: asyncio.Task[None] | None = None
 
     def add(self, quality: int) -> Viewer:
@@ -134,6 +142,9 @@ class _Channel:
             said = EncodedPicture(header, jpeg)
             for viewer in [viewer for viewer in self.viewers if viewer.quality == quality]:
                 viewer.offer(said)
+        arrived_ns = header.get("arrived_ns")
+        if isinstance(arrived_ns, int) and header.get("new", True):
+            self.ages.add((time.monotonic_ns() - arrived_ns) * 1e-9)
 
 
 def _header(picture: Picture, kind: Pictures) -> dict[str, object]:

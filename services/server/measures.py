@@ -7,10 +7,13 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from prometheus_client import Metric
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.registry import Collector
 
+from services.bus.durations import cumulative
+from services.bus.runtime import ROLES
 from services.display.hub import KINDS
+from services.server.graph_measures import GraphFamilies
 from services.supervisor.process import StreamEvent
 
 if TYPE_CHECKING:
@@ -37,7 +40,9 @@ class StreamMeasures(Collector):
             "intrasplat_stream_state", "1 for the state that a stream is in.", labels=["stream", "state"]
         )
         restarts = CounterMetricFamily(
-            "intrasplat_process_restarts", "Times that a process was started again.", labels=["stream", "role"]
+            "intrasplat_process_restarts",
+            "Times that a process ended and was started again.",
+            labels=["stream", "role", "reason"],
         )
         events = CounterMetricFamily(
             "intrasplat_process_events", "What happened to processes.", labels=["stream", "role", "kind"]
@@ -47,21 +52,31 @@ class StreamMeasures(Collector):
             "intrasplat_pictures_dropped", "Pictures that viewers missed.", labels=["stream", "picture", "reason"]
         )
         viewers = GaugeMetricFamily("intrasplat_stream_viewers", "Open displays.", labels=["stream", "picture"])
+        ages = HistogramMetricFamily(
+            "intrasplat_display_latency_seconds",
+            "From a frame's arrival to when its picture was encoded for viewers.",
+            labels=["stream", "picture"],
+        )
+        graphs = GraphFamilies()
         for facts in [] if self.streams is None else self.streams.now():
             for each in STATES:
                 state.add_metric([facts.name, each], float(facts.state == each))
-            for role, process in facts.processes.items():
-                restarts.add_metric([facts.name, role], process["restarts"])
             hub = self.streams.hub(facts.name) if self.streams is not None else None
-            if hub is None:
+            if hub is None or self.streams is None:
                 continue
+            graphs.add(facts.name, facts.processes, self.streams.measures(facts.name, "engine"))
+            for role in ROLES:
+                for cause, count in self.streams.causes(facts.name, role).items():
+                    restarts.add_metric([facts.name, role, cause], count)
             for kind in KINDS:
                 viewers.add_metric([facts.name, kind], hub.viewers(kind))
+                if (found := cumulative(hub.ages(kind))) is not None:
+                    ages.add_metric([facts.name, kind], *found)
                 for reason, count in hub.counts(kind).items():
                     if reason == "encoded":
                         encoded.add_metric([facts.name, kind], count)
                     else:
                         dropped.add_metric([facts.name, kind, reason], count)
-        for (stream, role, what), count in self._events.items():
-            events.add_metric([stream, role, what], count)
-        return [state, restarts, events, encoded, dropped, viewers]
+        for (stream, of_role, what), count in self._events.items():
+            events.add_metric([stream, of_role, what], count)
+        return [state, restarts, events, encoded, dropped, viewers, ages, *graphs.families()]

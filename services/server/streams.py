@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from gsplat_core.errors import InvalidSetting
-from services.bus.runtime import RuntimeFolder
+from services.bus.runtime import Role, RuntimeFolder
 from services.control.parts import NewStream
 from services.control.problems import Conflicting, Missing, Unprocessable
 from services.display.hub import DisplayHub
@@ -104,6 +104,16 @@ class SupervisedStreams:
         """The viewers of a stream; None while it does not run."""
         stream = self._streams.get(name)
         return None if stream is None else stream.hub
+
+    def measures(self, name: str, role: Role) -> Mapping[str, Any]:
+        """What a process of a stream tells for Prometheus; nothing while it does not run."""
+        supervisor = self._streams[name].supervisor if name in self._streams else None
+        return {} if supervisor is None else supervisor.measures(role)
+
+    def causes(self, name: str, role: Role) -> Mapping[str, int]:
+        """How often a process has ended since its stream was started, by cause."""
+        supervisor = self._streams[name].supervisor if name in self._streams else None
+        return {} if supervisor is None else supervisor.causes(role)
 
     def now(self) -> Sequence[StreamFacts]:
         """Every stream."""

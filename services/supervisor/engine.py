@@ -27,6 +27,7 @@ from operators.metrics import ScoredFrame
 from services.bus.pictures import PicturePublisher
 from services.supervisor.captured_source import CapturedSource
 from services.supervisor.exit_codes import NO_USE
+from services.supervisor.graph_measures import graph_measures
 from services.supervisor.layers import Layers
 from services.supervisor.live_scene import scene_of
 from services.supervisor.live_snapshots import LiveSnapshots
@@ -90,10 +91,12 @@ def reconstruct(
 
         graph = LiveApplication(source, settings, parts, stop_requested=stop_requested, on_scored=scored, on_shown=show)
         worker.tell_figures("graph", lambda: graph_figures(graph))
+        worker.tell_measures("graph", lambda: graph_measures(graph))
         worker.say("running", "reconstructs")
         with snapshots.of(graph):
             Session(graph, settings.stated(), command="live", stop_requested=stop_requested).execute()
         worker.tell_figures("graph", dict)
+        worker.tell_measures("graph", dict)
 
 
 def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again: bool) -> None:
@@ -102,6 +105,7 @@ def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again
     check_renderer(spec.renderer, spec.device)
     models = ModelShow(worker, spec, screen, layers)
     worker.tell_figures("screen", lambda: {**screen.figures(), **models.figures(), **layers.figures()})
+    worker.tell_measures("screen", lambda: {"ages": screen.ages.told()})
     snapshots = LiveSnapshots()
     worker.take({"camera": layers.camera, "snapshot": snapshots.take})
     layers.open()

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import signal
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -20,7 +21,7 @@ from services.bus.pictures import subscribe
 from services.bus.process_identity import ProcessIdentity
 from services.bus.runtime import Role, StreamFolder
 from services.supervisor.launching import Start
-from services.supervisor.process_end import is_of_no_use, last_words
+from services.supervisor.process_end import cause_of, is_of_no_use, last_words
 from services.supervisor.restarts import MOST_S, Restarts
 from services.supervisor.specs import StreamSpec
 
@@ -78,6 +79,7 @@ class ManagedProcess:
         self._start, self._on_event = start, on_event
         self._restarts = Restarts()
         self._identity: ProcessIdentity | None = None
+        self._causes: Counter[str] = Counter()
         self._down: tuple[str, str] = "stopped", "it was not started"
         self._heartbeat: dict[str, Any] | None = None
         self._heard_s = self._well_s = 0.0
@@ -100,6 +102,18 @@ class ManagedProcess:
         return ProcessState(
             *said, identity.pid, restarts, figures if isinstance(figures, dict) else {}, round(silent_s, 3)
         )
+
+    @property
+    def causes(self) -> Mapping[str, int]:
+        """How often the process has ended, by cause."""
+        return dict(self._causes)
+
+    @property
+    def measures(self) -> Mapping[str, Any]:
+        """What its newest heartbeat tells for Prometheus."""
+        heartbeat = self._heartbeat
+        told = None if heartbeat is None else heartbeat.get("measures")
+        return told if isinstance(told, dict) else {}
 
     def open(self) -> None:
         """Take over the process that runs, or start one, and keep it running."""
@@ -150,6 +164,7 @@ class ManagedProcess:
             self._folder.clean(self._role)
             well_s = time.monotonic() - self._well_s if self._well_s else 0.0
             wait_s = self._restarts.ended(well_s)
+            self._causes[cause_of(how)] += 1
             if is_of_no_use(how):
                 how, wait_s = last_words(self._folder.log(self._role)) or how, MOST_S
             self._down = ("failed" if wait_s >= MOST_S else "down"), how

@@ -33,6 +33,17 @@ def is_of_no_use(how: str | None) -> bool:
     return how == f"exit code {NO_USE}"
 
 
+def cause_of(how: str) -> str:
+    """An end in one or two words, of which there are few: for metrics."""
+    if how.endswith("it was killed"):
+        return "hung"
+    if how.startswith("killed by "):
+        return how.removeprefix("killed by ")
+    if is_of_no_use(how):
+        return "refused"
+    return how if how.startswith("exit code ") else "ended"
+
+
 def last_words(log: Path) -> str:
     """The last line that a process has printed; empty where there is none."""
     try:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from operators.messages import ShownPicture
 from operators.metrics import ScoredFrame
+from services.bus.durations import Durations
 from services.bus.pictures import PicturePublisher
 
 Shows = Literal["live", "model"]
@@ -34,6 +35,8 @@ class Screen:
         """New pictures that were shown."""
         self.published = 0
         """With those that were shown again, with another state or age."""
+        self.ages = Durations()
+        """Of new pictures, when they were shown."""
         self._last: dict[str, Any] = {}
         self._psnr_db: float | None = None
 
@@ -64,7 +67,9 @@ class Screen:
             self._shown = shows
             self._publisher.publish({"show": shows, **header}, image)
             self.published += 1
-            self.pictures += bool(header["new"])
+            if header["new"]:
+                self.pictures += 1
+                self.ages.add(header["age_ms"] * 1e-3)
             self._last = {name: header[name] for name in ("state", "age_ms", "model_version", "psnr_db")}
             self._last |= {"show": shows, "shown_ns": time.monotonic_ns()}
             return True

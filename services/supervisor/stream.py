@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,6 +74,14 @@ class StreamSupervisor:
     def state(self) -> StreamState:
         """What is known now."""
         return StreamState(self.spec.name, self._capture.state, self._engine.state)
+
+    def measures(self, role: Role) -> Mapping[str, Any]:
+        """What a process tells for Prometheus."""
+        return self._process(role).measures
+
+    def causes(self, role: Role) -> Mapping[str, int]:
+        """How often a process has ended, by cause."""
+        return self._process(role).causes
 
     async def command(
         self, role: Role, command: str, *, timeout_s: float = ANSWER_S, **arguments: Any

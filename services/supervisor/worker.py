@@ -19,6 +19,7 @@ from services.supervisor.specs import ProcessSpec
 log = logging.getLogger(__name__)
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOOK_S = 0.25
+MEASURED_EVERY_S = 1.0
 
 
 class Worker:
@@ -40,6 +41,9 @@ class Worker:
         self._saying = threading.Lock()
         self._said: dict[str, Any] = {"state": "starting", "reason": f"the {spec.role} process starts"}
         self._figures: dict[str, Callable[[], Mapping[str, Any]]] = {}
+        self._measures: dict[str, Callable[[], Mapping[str, Any]]] = {}
+        self._measured: dict[str, Any] = {}
+        self._measured_s = -MEASURED_EVERY_S
         self.stop_reason = ""
 
     def __enter__(self) -> Worker:
@@ -86,6 +90,10 @@ class Worker:
         """What each heartbeat tells of a part of the process besides; called in its thread."""
         self._figures[part] = figures
 
+    def tell_measures(self, part: str, measures: Callable[[], Mapping[str, Any]]) -> None:
+        """What heartbeats tell for Prometheus besides: made once a second."""
+        self._measures[part] = measures
+
     def stop_requested(self) -> bool:
         """Whether the process is to finish what it has and to end."""
         return self._stop.is_set()
@@ -110,7 +118,14 @@ class Worker:
         with self._saying:
             said = dict(self._said)
         figures = {name: value for part in list(self._figures.values()) for name, value in part().items()}
-        return {"role": self.role, **said, "figures": figures}
+        return {"role": self.role, **said, "figures": figures, "measures": self._newest_measures()}
+
+    def _newest_measures(self) -> Mapping[str, Any]:
+        now_s = time.monotonic()
+        if now_s - self._measured_s >= MEASURED_EVERY_S:
+            self._measured_s = now_s
+            self._measured = {name: value for part in list(self._measures.values()) for name, value in part().items()}
+        return self._measured
 
     def _look_after(self) -> None:
         limits = self.spec.limits

@@ -42,6 +42,23 @@ def test_durations_beyond_the_range_are_kept_as_the_longest():
     assert histogram.summary().count == 2 and histogram.summary().max_ms == 2**60 * 1e-6
 
 
+@given(
+    st.lists(st.integers(0, 10**10), max_size=100),
+    st.lists(st.integers(0, 10**10), min_size=1, max_size=9, unique=True),
+)
+def test_durations_between_bounds_are_all_counted_once(durations, bounds):
+    histogram, bounds = Histogram(), sorted(bounds)
+    for duration in durations:
+        histogram.record(duration)
+    found = histogram.between(bounds)
+    assert len(found) == len(bounds) + 1 and sum(found) == len(durations) and histogram.sum_ns == sum(durations)
+    for bound, below in zip(bounds, np.cumsum(found), strict=False):
+        # Those above the bound in the bucket that it cuts are counted below it, and no others.
+        assert (
+            sum(each <= bound for each in durations) <= below <= sum(each <= bound * (1 + 1 / 32) for each in durations)
+        )
+
+
 def test_an_empty_histogram_is_all_zero():
     assert Histogram().summary().count == 0 and Histogram().summary().p99_ms == 0.0
 

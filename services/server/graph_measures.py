@@ -1,0 +1,109 @@
+"""What the processes of streams tell with their heartbeats, as Prometheus' families."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from prometheus_client import Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+
+from services.bus.durations import cumulative
+
+SOURCE_STATES = ("starting", "opening", "live", "stalled", "reconnecting", "lost", "ended", "failed", "down", "stopped")
+LOST_BY_SOURCES = ("too_late", "bad_messages")
+"""What sources count that is a frame lost; the rest is something that they repaired or went through."""
+
+
+class GraphFamilies:
+    """The families of one collection; `add` puts a stream's figures in."""
+
+    def __init__(self) -> None:
+        of_stream = ["stream"]
+        self._age = HistogramMetricFamily(
+            "intrasplat_frame_age_seconds", "From a frame's arrival to the showing of its picture.", labels=of_stream
+        )
+        self._path = HistogramMetricFamily(
+            "intrasplat_path_latency_seconds", "Through the engine's graph, by path.", labels=["stream", "path"]
+        )
+        self._operator = HistogramMetricFamily(
+            "intrasplat_operator_duration_seconds", "One compute of an operator.", labels=["stream", "operator"]
+        )
+        self._queue = GaugeMetricFamily(
+            "intrasplat_queue_depth", "Messages that wait between operators.", labels=["stream", "queue"]
+        )
+        self._frames = CounterMetricFamily(
+            "intrasplat_frames", "Frames that got as far as this.", labels=["stream", "stage"]
+        )
+        self._dropped = CounterMetricFamily(
+            "intrasplat_frames_dropped", "Frames that got no further.", labels=["stream", "reason"]
+        )
+        self._events = CounterMetricFamily(
+            "intrasplat_source_events", "What a source repaired or went through.", labels=["stream", "role", "event"]
+        )
+        self._source = GaugeMetricFamily(
+            "intrasplat_source_state", "1 for the state that a source is in.", labels=["stream", "state"]
+        )
+        self._gaussians = GaugeMetricFamily("intrasplat_gaussians", "Gaussians of the live scene.", labels=of_stream)
+        self._steps = CounterMetricFamily("intrasplat_training_steps", "Optimiser steps.", labels=of_stream)
+        self._model = GaugeMetricFamily(
+            "intrasplat_model_info", "1 for what a stream shows.", labels=["stream", "show", "model", "version"]
+        )
+
+    def add(self, stream: str, processes: Mapping[str, Mapping[str, Any]], measures: Mapping[str, Any]) -> None:
+        """A stream that runs: the state of its processes, and what its engine has measured."""
+        capture, engine = (processes.get(role, {}) for role in ("capture", "engine"))
+        for each in SOURCE_STATES:
+            self._source.add_metric([stream, each], float(capture.get("state") == each))
+        self._add_counts(stream, capture.get("figures") or {}, engine.get("figures") or {})
+        if engine.get("state") == "running":
+            self._add_shown(stream, engine.get("figures") or {})
+        if (ages := cumulative(measures.get("ages"))) is not None:
+            self._age.add_metric([stream], *ages)
+        for family, name in ((self._path, "paths"), (self._operator, "operators")):
+            for label, told in _items(measures.get(name)):
+                if (found := cumulative(told)) is not None:
+                    family.add_metric([stream, label], *found)
+        for queue, told in _items(measures.get("queues")):
+            self._queue.add_metric([stream, queue], told["queued"])
+            for reason, count in _items(told["dropped"]):
+                self._dropped.add_metric([stream, f"{queue}: {reason}"], count)
+
+    def families(self) -> Iterable[Metric]:
+        """All of them."""
+        return [value for value in vars(self).values() if isinstance(value, Metric)]
+
+    def _add_counts(self, stream: str, capture: Mapping[str, Any], engine: Mapping[str, Any]) -> None:
+        stages = {"captured": capture.get("frames"), "trained": engine.get("trained"), "shown": engine.get("pictures")}
+        stages["taken"] = engine.get("frames")
+        for stage, count in stages.items():
+            if count is not None:
+                self._frames.add_metric([stream, stage], count)
+        for role, counts in (("capture", capture.get("counts")), ("engine", engine.get("source_counts"))):
+            for event, count in _items(counts):
+                if event in LOST_BY_SOURCES:
+                    self._dropped.add_metric([stream, f"{role}: {event}"], count)
+                else:
+                    self._events.add_metric([stream, role, event], count)
+        if "passed_over" in engine:
+            self._dropped.add_metric([stream, "passed over"], engine["passed_over"])
+        for reason, count in _items(engine.get("withheld")):
+            self._dropped.add_metric([stream, f"withheld: {reason}"], count)
+        if "steps" in engine:
+            self._steps.add_metric([stream], engine["steps"])
+        if "gaussians" in engine:
+            self._gaussians.add_metric([stream], engine["gaussians"])
+
+    def _add_shown(self, stream: str, engine: Mapping[str, Any]) -> None:
+        shown, model = engine.get("picture") or {}, engine.get("model") or {}
+        if shown.get("show") == "model":
+            self._model.add_metric([stream, "model", str(model.get("name", "")), str(model.get("version", ""))], 1)
+        elif shown.get("show") == "live":
+            # Its version counts up with every frame, and each would be a series of its own.
+            self._model.add_metric([stream, "live", "", ""], 1)
+
+
+def _items(told: Any) -> Iterator[tuple[str, Any]]:
+    """The items of an object of a heartbeat; nothing where it is none."""
+    if isinstance(told, Mapping):
+        yield from told.items()

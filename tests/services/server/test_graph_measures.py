@@ -1,0 +1,144 @@
+"""What streams tell Prometheus."""
+
+from __future__ import annotations
+
+import numpy as np
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.registry import Collector
+
+from services.bus.durations import BOUNDS_S, Durations
+from services.server.graph_measures import GraphFamilies
+from services.server.measures import StreamMeasures
+from services.supervisor.process_end import cause_of
+
+
+class Collected(Collector):
+    def __init__(self, families):
+        self.families = families
+
+    def collect(self):
+        return self.families.families()
+
+
+def samples(families: GraphFamilies) -> dict[str, float]:
+    """As Prometheus reads them."""
+    registry = CollectorRegistry()
+    registry.register(Collected(families))
+    lines = generate_latest(registry).decode().splitlines()
+    return {line.rpartition(" ")[0]: float(line.rpartition(" ")[2]) for line in lines if not line.startswith("#")}
+
+
+def durations(*values: float) -> dict:
+    counted = Durations()
+    for value in values:
+        counted.add(value)
+    return counted.told()
+
+
+ENGINE = {
+    "state": "running",
+    "figures": {
+        "frames": 9,
+        "trained": 6,
+        "pictures": 5,
+        "steps": 12,
+        "gaussians": 400,
+        "passed_over": 3,
+        "withheld": {"blur": 2},
+        "source_counts": {"too_late": 1, "reconnections": 4},
+        "picture": {"show": "model"},
+        "model": {"name": "liver", "version": 3},
+    },
+}
+CAPTURE = {"state": "stalled", "figures": {"frames": 10, "counts": {"clock_restarts": 2}}}
+
+
+def test_all_that_a_stream_tells_is_there():
+    families = GraphFamilies()
+    measures = {
+        "ages": durations(0.02, 0.03, 9.0),
+        "paths": {"source,display": durations(0.01)},
+        "operators": {"display": durations(0.002)},
+        "queues": {"a.x -> b.y": {"queued": 2, "dropped": {"drop_oldest": 7}}},
+    }
+    families.add("one", {"capture": CAPTURE, "engine": ENGINE}, measures)
+    found = samples(families)
+    assert found['intrasplat_frame_age_seconds_bucket{le="0.025",stream="one"}'] == 1
+    assert found['intrasplat_frame_age_seconds_count{stream="one"}'] == 3
+    assert found['intrasplat_frame_age_seconds_sum{stream="one"}'] == 9.05
+    assert found['intrasplat_path_latency_seconds_count{path="source,display",stream="one"}'] == 1
+    assert found['intrasplat_operator_duration_seconds_count{operator="display",stream="one"}'] == 1
+    assert found['intrasplat_queue_depth{queue="a.x -> b.y",stream="one"}'] == 2
+    stages = {"captured": 10, "taken": 9, "trained": 6, "shown": 5}
+    assert {stage: found[f'intrasplat_frames_total{{stage="{stage}",stream="one"}}'] for stage in stages} == stages
+    dropped = {"engine: too_late": 1, "passed over": 3, "withheld: blur": 2, "a.x -> b.y: drop_oldest": 7}
+    assert dropped == {
+        reason: found[f'intrasplat_frames_dropped_total{{reason="{reason}",stream="one"}}'] for reason in dropped
+    }
+    assert found['intrasplat_source_events_total{event="clock_restarts",role="capture",stream="one"}'] == 2
+    assert found['intrasplat_source_events_total{event="reconnections",role="engine",stream="one"}'] == 4
+    assert found['intrasplat_source_state{state="stalled",stream="one"}'] == 1
+    assert found['intrasplat_source_state{state="live",stream="one"}'] == 0
+    assert found['intrasplat_model_info{model="liver",show="model",stream="one",version="3"}'] == 1
+
+
+def test_a_stream_that_has_told_nothing_yet_has_a_source_state_alone():
+    families = GraphFamilies()
+    families.add("one", {"capture": {"state": "starting", "figures": {}}, "engine": {"state": "down"}}, {"ages": "x"})
+    assert {name.partition("{")[0] for name in samples(families)} == {"intrasplat_source_state"}
+
+
+def test_the_live_model_is_one_series_however_often_it_is_published():
+    families = GraphFamilies()
+    engine = {"state": "running", "figures": {"picture": {"show": "live", "model_version": 812}, "model": None}}
+    families.add("one", {"capture": CAPTURE, "engine": engine}, {})
+    assert samples(families)['intrasplat_model_info{model="",show="live",stream="one",version=""}'] == 1
+
+
+def test_a_graph_tells_what_its_tracker_has_seen():
+    from operators.graph import Application, Operator
+    from services.supervisor.graph_measures import graph_measures
+
+    class Source(Operator):
+        def setup(self, spec):
+            spec.output("out")
+
+        def compute(self, op_input, op_output, context):
+            op_output.emit(np.zeros(1), "out")
+            self.left = getattr(self, "left", 3) - 1
+            if not self.left:
+                self.stop_execution()
+
+    class Sink(Operator):
+        def setup(self, spec):
+            spec.input("in")
+
+        def compute(self, op_input, op_output, context):
+            op_input.receive("in")
+
+    class Small(Application):
+        def compose(self):
+            self.add_flow(Source(self, name="source"), Sink(self, name="sink"), {("out", "in")})
+
+    graph = Small(track=True)
+    graph.run()
+    told = graph_measures(graph)
+    assert set(told["operators"]) == {"source", "sink"} and set(told["paths"]) == {"source,sink"}
+    for each in (*told["paths"].values(), told["operators"]["sink"]):
+        assert sum(each["counts"]) == 3 and len(each["counts"]) == len(BOUNDS_S) + 1 and each["sum_s"] > 0
+    assert list(told["queues"].values()) == [{"queued": 0, "dropped": {}}]
+
+
+def test_ends_have_few_causes():
+    said = {
+        "killed by SIGKILL": "SIGKILL",
+        "it has said nothing for 3.1 s; it was killed": "hung",
+        "exit code 1": "exit code 1",
+        "exit code 2": "refused",
+        "it was told to stop": "ended",
+    }
+    assert {how: cause_of(how) for how in said} == said
+
+
+def test_without_streams_there_are_families_and_no_samples():
+    assert all(not family.samples for family in StreamMeasures().collect())
