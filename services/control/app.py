@@ -19,6 +19,7 @@ from services.control.auth.keys import KeyStore, first_admin_key
 from services.control.auth.tickets import Tickets
 from services.control.documents import ABOUT, describe
 from services.control.headers import SecurityHeaders
+from services.control.hosts import KnownHosts
 from services.control.limits import AddressRate, TokenBuckets
 from services.control.measures import Measures
 from services.control.observed import Observed
@@ -60,6 +61,7 @@ def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:
     limits = settings.limits
     by_address = TokenBuckets(limits.address_requests_per_s, limits.address_requests_per_s * limits.burst_s)
     # Each is put around those before it.
+    app.add_middleware(KnownHosts, server=settings.server, measures=control.measures)
     app.add_middleware(AddressRate, buckets=by_address, measures=control.measures)
     app.add_middleware(Observed, measures=control.measures)
     app.add_middleware(SecurityHeaders)

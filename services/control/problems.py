@@ -10,6 +10,7 @@ Problem
 ├── Conflicting           409  it is not in the state that this needs
 ├── TooLarge              413  the body is longer than it may be
 ├── WrongContent          415  the body is of another type
+├── Misdirected           421  for another server than this one
 ├── Unprocessable         422  understood, and refused for what it says
 ├── TooManyRequests       429  later
 ├── Internal              500  a bug of ours: the log has it, the answer has not
@@ -108,6 +109,12 @@ class WrongContent(Problem):
     """The body is of another type."""
 
     status, title = 415, "Unsupported media type"
+
+
+class Misdirected(Problem):
+    """For another server than this one."""
+
+    status, title = 421, "Misdirected request"
 
 
 class Unprocessable(Problem):

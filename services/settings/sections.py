@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,6 +25,16 @@ def _network(text: str) -> str:
 Network = Annotated[str, AfterValidator(_network), Field(examples=["10.0.0.0/8"])]
 
 
+def _host_pattern(text: str) -> str:
+    name = text.lower().rstrip(".")
+    if not re.fullmatch(r"(\*\.)?[a-z0-9]([a-z0-9._-]{0,250}[a-z0-9])?", name):
+        raise ValueError(f"{text!r:.80} is no name of a host, such as room-1.example, or *.example for all below it")
+    return name
+
+
+HostPattern = Annotated[str, AfterValidator(_host_pattern), Field(examples=["room-1.example"])]
+
+
 class Section(BaseModel):
     """Values that do not change, without keys that are not known, and with errors that do not repeat a secret."""
 
@@ -39,6 +50,11 @@ class ServerSettings(Section):
     keyfile: Path | None = Field(default=None, description="TLS private key (PEM).")
     plaintext: bool = Field(
         default=False, description="Listen beyond this machine without TLS: keys then travel in the clear."
+    )
+    allowed_hosts: tuple[HostPattern, ...] = Field(
+        default=(),
+        description="Names by which this server may be asked, such as room-1.example or *.example. Addresses and localhost always may."
+        " Without a list: no other name, or with TLS those of the certificate.",
     )
     trusted_proxies: tuple[Network, ...] = Field(
         default=(), description="Whose X-Forwarded-For and X-Forwarded-Proto are believed; nobody's by default."

@@ -20,7 +20,7 @@ def served(tmp_path):
         folder = tmp_path / "data"
         app = new_app(ServiceSettings(paths={"data": folder}, **settings))
         app.state.key = (folder / "admin.key").read_text().strip()
-        return TestClient(app, client=client, raise_server_exceptions=False)
+        return TestClient(app, "http://localhost", client=client, raise_server_exceptions=False)
 
     made = []
 

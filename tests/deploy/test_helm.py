@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from services.settings.sections import ServerSettings
+
 ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "deploy" / "helm"
 OF_AN_OPERATOR = {"ServiceMonitor", "PrometheusRule"}
@@ -134,3 +136,15 @@ def test_values_and_their_schema_name_the_same_keys():
     for name, each in schema["properties"].items():
         if "properties" in each:
             assert set(each["properties"]) == set(values[name]), name
+
+
+def test_names_that_users_ask_for_are_let_in(render):
+    def hosts(*values: str) -> list[str]:
+        given = {each["name"]: each["value"] for each in container(render(list(values)))["env"]}
+        return json.loads(given.get("INTRASPLAT_SERVER__ALLOWED_HOSTS", "null"))
+
+    assert hosts("tls.secretName=x") is None, "those of the certificate"
+    inside = ["room-1-intrasplat", "room-1-intrasplat.theatres", "room-1-intrasplat.theatres.svc"]
+    assert hosts("plaintext=true") == [*inside, f"{inside[-1]}.cluster.local"]
+    assert hosts("tls.secretName=x", "allowedHosts[0]=room-1.example")[:2] == ["room-1.example", inside[0]]
+    ServerSettings(allowed_hosts=hosts("plaintext=true"))

@@ -59,7 +59,8 @@ def new_plane(tmp_path) -> Iterator[Any]:
 
     def make(parts: Parts | None = None, **settings: Any) -> Plane:
         folder = tmp_path / f"data{len(opened)}"
-        app = new_app(ServiceSettings(paths={"data": folder}, **settings), parts or fakes.fake_parts())
+        server = {"allowed_hosts": ["testserver"], **settings.pop("server", {})}
+        app = new_app(ServiceSettings(paths={"data": folder}, server=server, **settings), parts or fakes.fake_parts())
         store = app.state.control.keys
         keys = {role: store.create(f"test-{role}", Role(role))[1] for role in ("viewer", "operator")}
         keys["admin"] = (folder / "admin.key").read_text().strip()

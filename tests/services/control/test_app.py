@@ -173,7 +173,7 @@ def test_background_is_entered_and_left_in_reverse(tmp_path):
         return running
 
     parts = Parts(background=[part("registry"), part("streams")])
-    with TestClient(new_app(ServiceSettings(paths={"data": tmp_path}), parts)) as client:
+    with TestClient(new_app(ServiceSettings(paths={"data": tmp_path}), parts), "http://localhost") as client:
         assert client.get("/livez").status_code == 200
         assert said == ["registry on", "streams on"]
     assert said[2:] == ["streams off", "registry off"]

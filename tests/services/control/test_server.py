@@ -113,14 +113,14 @@ def test_the_key_is_printed_nowhere(served):
 
 def test_a_head_that_does_not_come_is_not_waited_for(served):
     _, port, _ = served
-    assert raw(port, b"GET /livez HTTP/1.1\r\nHost: x\r\nX-Slow: ") == b""
+    assert raw(port, b"GET /livez HTTP/1.1\r\nHost: localhost\r\nX-Slow: ") == b""
     assert raw(port, b"") == b""
 
 
 def test_a_body_that_does_not_come_is_refused(served):
     _, port, key = served
     head = (
-        f"POST /v1/tickets HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {key}\r\nContent-Type: application/json\r\n"
+        f"POST /v1/tickets HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {key}\r\nContent-Type: application/json\r\n"
         'Content-Length: 100\r\n\r\n{"path'
     )
     answer = raw(port, head.encode())
@@ -130,7 +130,7 @@ def test_a_body_that_does_not_come_is_refused(served):
 def test_a_body_that_is_refused_is_not_waited_for(served):
     _, port, key = served
     for authorization, status in ((f"Authorization: Bearer {key}\r\n", b"413"), ("", b"401")):
-        head = f"PUT /v1/models/a/versions HTTP/1.1\r\nHost: x\r\n{authorization}Content-Length: 999999999999\r\n\r\n"
+        head = f"PUT /v1/models/a/versions HTTP/1.1\r\nHost: localhost\r\n{authorization}Content-Length: 999999999999\r\n\r\n"
         answer = raw(port, head.encode())
         assert answer.startswith(b"HTTP/1.1 " + status) and b"connection: close" in answer.lower()
 
@@ -138,11 +138,11 @@ def test_a_body_that_is_refused_is_not_waited_for(served):
 @pytest.mark.parametrize(
     "head",
     [
-        "GET /livez HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
-        "GET /livez HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\n",
-        "GET /livez HTTP/1.1\r\nHost: x\r\nContent-Length: -1\r\n\r\n",
-        "GET /livez HTTP/1.1\r\nHost : x\r\n\r\n",
-        "GET /livez HTTP/1.1\r\nHost: x\r\n folded: y\r\nTransfer-Encoding: x\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nHost: localhost\r\nContent-Length: -1\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nHost : localhost\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nHost: localhost\r\n folded: y\r\nTransfer-Encoding: x\r\n\r\n",
         "\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n",
     ],
 )
@@ -156,7 +156,7 @@ def test_two_ways_to_read_a_request_are_none(served, head):
 def test_a_head_without_an_end_is_refused(served):
     _, port, _ = served
     try:
-        answer = raw(port, b"GET /livez HTTP/1.1\r\nHost: x\r\nA: " + 1_000_000 * b"a")
+        answer = raw(port, b"GET /livez HTTP/1.1\r\nHost: localhost\r\nA: " + 1_000_000 * b"a")
     except ConnectionResetError:
         return  # closed while there was more to read
     assert answer.startswith(b"HTTP/1.1 400")

@@ -41,7 +41,7 @@ def served(tmp_path) -> Iterator[tuple[int, str, FakeDisplay, DrainingServer]]:
 
 
 def request(path: str, key: str, *more: str) -> bytes:
-    lines = [f"GET {path} HTTP/1.1", "Host: x", f"Authorization: Bearer {key}", *more]
+    lines = [f"GET {path} HTTP/1.1", "Host: localhost", f"Authorization: Bearer {key}", *more]
     return ("\r\n".join(lines) + "\r\n\r\n").encode()
 
 
