@@ -17,6 +17,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from gsplat_core.errors import UserError
 from services.control.state import ControlState
+from services.control.systemd import ServiceManager
 from services.settings import ServiceSettings
 
 MOST_HEAD_BYTES = 32 * 1024
@@ -76,6 +77,8 @@ class DrainingServer(uvicorn.Server):
         self._control = control
         self._listening = listening
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._manager = ServiceManager()
+        self._feeding: asyncio.Task[None] | None = None
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begin to take requests."""
@@ -83,11 +86,14 @@ class DrainingServer(uvicorn.Server):
         await super().startup(sockets)
         if self.started:
             self._listening()
+            self._manager.tell("READY=1", "STATUS=serving")
+            self._feeding = self._loop.create_task(self._manager.feed_watchdog(), name="watchdog")
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """The first signal drains; a second SIGINT ends at once."""
         if self._loop is not None:
             self._loop.call_soon_threadsafe(self._control.draining.set)
+        self._manager.tell("STOPPING=1", "STATUS=ending")
         super().handle_exit(sig, frame)
 
 

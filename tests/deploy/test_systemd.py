@@ -36,9 +36,8 @@ def test_the_unit_is_closed(tool, units):
     assert done.returncode == 0, done.stdout[-200:]
 
 
-def test_the_unit_asks_for_no_watchdog_that_nothing_feeds():
-    """`sd_notify` and the two lines of the unit come together or not at all."""
-    speaks = any("NOTIFY_SOCKET" in path.read_text() for path in (ROOT / "services").rglob("*.py"))
+def test_the_unit_waits_for_what_the_service_says():
+    """`sd_notify` (services/control/systemd.py) and these lines come together."""
     text = (ROOT / "deploy" / "systemd" / "intrasplat.service").read_text()
-    assert bool(re.search(r"^WatchdogSec=", text, re.MULTILINE)) is speaks
-    assert ("\nType=notify\n" in text) is speaks
+    assert "\nType=notify\n" in text and "\nNotifyAccess=main\n" in text
+    assert re.search(r"^WatchdogSec=\d+s$", text, re.MULTILINE)
