@@ -8,6 +8,17 @@ AuditError
 from services.audit.entries import Entry
 from services.audit.errors import AuditError, AuditInUse, AuditUnwritable
 from services.audit.log import AuditLog
+from services.audit.segments import Keeping
 from services.audit.verify import Finding, Verdict, verify
 
-__all__ = ["AuditError", "AuditInUse", "AuditLog", "AuditUnwritable", "Entry", "Finding", "Verdict", "verify"]
+__all__ = [
+    "AuditError",
+    "AuditInUse",
+    "AuditLog",
+    "AuditUnwritable",
+    "Entry",
+    "Finding",
+    "Keeping",
+    "Verdict",
+    "verify",
+]

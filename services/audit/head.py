@@ -1,4 +1,5 @@
-"""The newest entry's number and digest in a file of their own: what shows that whole lines were cut off the log's end."""
+"""Numbers and digests of entries in files of their own: the head is the newest entry, and shows that whole lines were cut off the log's end; the
+anchor is the newest of those that were removed because they were old, which the first entry that is kept must follow."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from services.audit.entries import FIRST
 
 @dataclass(frozen=True)
 class Head:
-    """The newest entry. `seq` is -1 before the first one."""
+    """An entry, the newest of its kind. `seq` is -1 before the first one."""
 
     seq: int = -1
     digest: str = FIRST
@@ -23,10 +24,34 @@ def head_path(log: Path) -> Path:
     return log.with_suffix(".head")
 
 
+def anchor_path(log: Path) -> Path:
+    """Where the anchor of a log lies, from which entries were removed."""
+    return log.with_suffix(".anchor")
+
+
 def read_head(log: Path) -> Head | None:
     """The head beside a log; None where there is none, ValueError where it is none."""
+    return _read(head_path(log))
+
+
+def read_anchor(log: Path) -> Head | None:
+    """The anchor beside a log; None where nothing was removed, ValueError where it is none."""
+    return _read(anchor_path(log))
+
+
+def write_head(log: Path, head: Head) -> None:
+    """Replace the head, whole or not at all."""
+    _write(head_path(log), head)
+
+
+def write_anchor(log: Path, anchor: Head) -> None:
+    """Replace the anchor, whole or not at all."""
+    _write(anchor_path(log), anchor)
+
+
+def _read(path: Path) -> Head | None:
     try:
-        values = json.loads(head_path(log).read_bytes())
+        values = json.loads(path.read_bytes())
     except FileNotFoundError:
         return None
     if not isinstance(values, dict) or set(values) != {"seq", "digest"}:
@@ -34,10 +59,8 @@ def read_head(log: Path) -> Head | None:
     return Head(int(values["seq"]), str(values["digest"]))
 
 
-def write_head(log: Path, head: Head) -> None:
-    """Replace the head, whole or not at all."""
-    path = head_path(log)
-    unfinished = path.with_suffix(".head.new")
+def _write(path: Path, head: Head) -> None:
+    unfinished = path.with_suffix(f"{path.suffix}.new")
     descriptor = os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     with os.fdopen(descriptor, "wb") as file:
         file.write(json.dumps(asdict(head)).encode())

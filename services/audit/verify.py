@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from services.audit.entries import MOST_LINE_BYTES, Entry, digest_of_entry, parse_line
-from services.audit.head import Head, read_head
+from services.audit.head import Head, read_anchor, read_head
+from services.audit.segments import closed_segments
 
 MOST_FINDINGS = 100
+MOST_READINGS = 5
+"""Of a log that the service closes segments of meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -18,8 +21,10 @@ class Finding:
     """Something that does not fit."""
 
     line: int
-    """Counted from 1; the line after the last one for what is missing at the end."""
+    """Counted from 1 in its file; the line after the last one for what is missing at the end."""
     what: str
+    file: str = ""
+    """Name of the closed segment; empty for the file that is written now."""
 
 
 @dataclass(frozen=True)
@@ -31,39 +36,87 @@ class Verdict:
     findings: tuple[Finding, ...]
     cut_by_a_crash: bool
     """The last line has no end and was never finished: the service stopped while it wrote. Its next start takes the line off."""
+    removed: int = 0
+    """Older entries that the service removed, as its settings say; an entry names the last of them."""
 
     @property
     def intact(self) -> bool:
-        """Nothing was changed, removed, inserted or cut off."""
+        """Nothing was changed, removed, inserted or cut off, but for what the service itself says that it removed."""
         return not self.findings
 
 
+@dataclass
+class _Walk:
+    """What is known after some lines."""
+
+    before: Head
+    """The last entry."""
+    count: int = 0
+    last_line: int = 0
+    unfinished: bool = False
+    findings: list[Finding] = field(default_factory=list)
+    digests: dict[str, int] = field(default_factory=dict)
+    retired: set[Head] = field(default_factory=set)
+    """What entries say was removed."""
+
+    def read(self, path: Path, name: str) -> None:
+        """Take the lines of a file; `name` is empty for the one that is written now."""
+        self.last_line = 0
+        for number, line in enumerate(_lines(path), start=1):
+            if not line.endswith(b"\n") and len(line) <= MOST_LINE_BYTES and not name:
+                self.unfinished = True
+                return
+            self.last_line, self.count = number, self.count + 1
+            try:
+                entry, stated = parse_line(line)
+            except ValueError as error:
+                self.findings.append(Finding(number, f"is no entry: {error}", name))
+                continue
+            self.findings += [Finding(number, what, name) for what in _misfits(entry, stated, self.before)]
+            self.before = Head(entry.seq, stated)
+            self.digests[stated] = entry.seq
+            last = entry.detail.get("last")
+            if (entry.event, entry.actor) == ("audit.retired", "system") and isinstance(last, int):
+                self.retired.add(Head(last, str(entry.detail.get("digest"))))
+
+
 def verify(path: Path, expected_head: str | None = None) -> Verdict:
-    """Check every line's digest, number and predecessor, and the end against the head beside the log, and against `expected_head`, a digest
-    that was noted elsewhere: it must be some entry's. Raises OSError for a file that cannot be read."""
-    findings: list[Finding] = []
-    try:
-        kept = read_head(path)  # first: the service may be writing
-    except ValueError as error:
-        return Verdict(0, Head(), (Finding(0, f"the head beside the log cannot be read: {error}"),), False)
-    before, digests, count, unfinished = Head(), {}, 0, False
-    for number, line in enumerate(_lines(path), start=1):
-        if not line.endswith(b"\n") and len(line) <= MOST_LINE_BYTES:
-            unfinished = True
-            break
-        count = number
+    """Check every line's digest, number and predecessor, from the oldest segment that is kept to the end, and the end against the head beside
+    the log, and against `expected_head`, a digest that was noted elsewhere: it must be some entry's. Raises OSError for a file that cannot be
+    read."""
+    for _ in range(MOST_READINGS):
         try:
-            entry, stated = parse_line(line)
+            kept, anchor = read_head(path), read_anchor(path)  # first: the service may be writing
+            closed = closed_segments(path)
         except ValueError as error:
-            findings.append(Finding(number, f"is no entry: {error}"))
-            continue
-        findings += [Finding(number, what) for what in _misfits(entry, stated, before)]
-        before = Head(entry.seq, stated)
-        digests[stated] = entry.seq
-    end = [Finding(count + 1, what) for what in _misfits_at_the_end(path, before, kept, digests, unfinished)]
-    if expected_head is not None and expected_head not in digests:
-        findings.append(Finding(count + 1, f"no entry has the digest {expected_head:.64}, which was expected"))
-    return Verdict(count, before, tuple([*findings, *end][:MOST_FINDINGS]), unfinished and not end)
+            said = f"the head or the anchor beside the log cannot be read: {error}"
+            return Verdict(0, Head(), (Finding(0, said),), False)
+        walk = _Walk(anchor or Head())
+        try:
+            for segment in closed:
+                walk.read(segment.path, segment.path.name)
+            if path.exists() or not closed:
+                walk.read(path, "")
+        except FileNotFoundError:
+            if closed == closed_segments(path):
+                raise
+        if closed == closed_segments(path):  # else the service has closed one or removed one meanwhile
+            break
+    return _verdict(path, walk, kept, anchor, expected_head)
+
+
+def _verdict(path: Path, walk: _Walk, kept: Head | None, anchor: Head | None, expected_head: str | None) -> Verdict:
+    at_end = walk.last_line + 1
+    missing = _misfits_at_the_end(path, walk.before, kept, walk.digests, walk.unfinished)
+    end = [Finding(at_end, what) for what in missing]
+    if anchor is not None and anchor not in walk.retired:
+        end.append(Finding(1, f"entries up to {anchor.seq} are gone, and no entry says that the service removed them"))
+    if expected_head is not None and expected_head not in {*walk.digests, anchor and anchor.digest}:
+        older = "" if anchor is None else f"; it may be older than entry {anchor.seq}, the last that was removed"
+        walk.findings.append(Finding(at_end, f"no entry has the digest {expected_head:.64}, which was expected{older}"))
+    findings = tuple([*walk.findings, *end][:MOST_FINDINGS])
+    removed = 0 if anchor is None else anchor.seq + 1
+    return Verdict(walk.count, walk.before, findings, walk.unfinished and not end, removed)
 
 
 def _misfits(entry: Entry, stated: str, before: Head) -> Iterator[str]:

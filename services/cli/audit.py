@@ -25,7 +25,9 @@ def audit_verify_command(file: Path | None, config: Path | None, head: str | Non
         typer.echo(json.dumps({"intact": verdict.intact, **asdict(verdict)}, indent=2))
         return OK if verdict.intact else BAD_INPUT
     for finding in verdict.findings:
-        typer.echo(f"line {finding.line}: {finding.what}")
+        typer.echo(f"{finding.file or path.name}, line {finding.line}: {finding.what}")
+    if verdict.removed:
+        typer.echo(f"{verdict.removed} older entries were removed by the service, as its settings say")
     if verdict.cut_by_a_crash:
         typer.echo("the last line has no end: the service stopped while it wrote; its next start takes the line off")
     kept = "intact" if verdict.intact else "NOT as it was written"

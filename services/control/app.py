@@ -13,7 +13,7 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
-from services.audit import AuditLog
+from services.audit import AuditLog, Keeping
 from services.control.answers import answer_with_problems
 from services.control.auth.keys import KeyStore, first_admin_key
 from services.control.auth.tickets import Tickets
@@ -75,7 +75,9 @@ def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
     uploads = data / "uploads"
     for folder in (data, uploads):
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    audit = AuditLog(data / AUDIT_FILE)  # first: its lock says that no other server uses these folders
+    keep = settings.audit
+    # First: its lock says that no other server uses these folders.
+    audit = AuditLog(data / AUDIT_FILE, Keeping(keep.segment_bytes, keep.keep_segments, keep.keep_days))
     _remove_unfinished(uploads)
     keys = KeyStore(data / KEYS_FILE)
     made = first_admin_key(keys, settings.admin_key_file)

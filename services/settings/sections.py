@@ -87,6 +87,20 @@ class AuthSettings(Section):
     ticket_s: float = Field(default=30.0, gt=0, le=300, description="How long a ticket may wait for its one use.")
 
 
+class AuditSettings(Section):
+    """How long the audit log's files grow, and how long they are kept: for ever, unless one of the last two says otherwise."""
+
+    segment_bytes: int = Field(
+        default=16 * MIB, ge=64 * 1024, description="A file that is longer is closed, and the next one goes on."
+    )
+    keep_segments: int | None = Field(default=None, ge=1, description="Closed files that are kept; null: all.")
+    keep_days: float | None = Field(
+        default=None,
+        gt=0,
+        description="A closed file whose last entry is older goes, at the start or when the next is closed.",
+    )
+
+
 class LimitSettings(Section):
     """What one caller may take."""
 

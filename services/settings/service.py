@@ -13,6 +13,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from services.settings.addresses import masked_address
 from services.settings.sections import (
+    AuditSettings,
     AuthSettings,
     LimitSettings,
     LogSettings,
@@ -36,6 +37,7 @@ class ServiceSettings(BaseSettings):
     server: ServerSettings = ServerSettings()
     paths: PathSettings = PathSettings()
     auth: AuthSettings = AuthSettings()
+    audit: AuditSettings = AuditSettings()
     limits: LimitSettings = LimitSettings()
     sources: SourceRules = SourceRules()
     registry: RegistrySettings = RegistrySettings()

@@ -1,0 +1,83 @@
+"""The log's older lines: closed segments, files beside it that are named for the number of their first entry and never written again.
+
+    audit.jsonl                  what is written now
+    audit.000000000000.jsonl     entries 0 to 41,999, closed
+    audit.000000042000.jsonl     entries 42,000 to …
+    audit.anchor                 where old segments were removed: the last entry of the last of them
+
+The chain of digests goes on from one file to the next, and from the anchor to the first entry that is kept.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from services.audit.entries import Entry, parse_line
+from services.audit.head import read_anchor
+from services.audit.lines import lines_backwards
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """How long a file grows, and how many closed ones are kept: all, unless one of the two says otherwise."""
+
+    segment_bytes: int = 16 * 2**20
+    segments: int | None = None
+    days: float | None = None
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A closed file of the log."""
+
+    first_seq: int
+    path: Path
+
+    def last(self) -> tuple[Entry, str]:
+        """Its last entry, with the digest that it states; ValueError where it has none."""
+        line = next(lines_backwards(self.path), None)
+        if line is None:
+            raise ValueError(f"{self.path.name} is empty")
+        return parse_line(line)
+
+
+def closed_segments(log: Path) -> list[Segment]:
+    """The closed segments that are kept, the oldest first. ValueError where the anchor is none."""
+    anchor = read_anchor(log)
+    removed = -1 if anchor is None else anchor.seq
+    return [each for each in all_segments(log) if each.first_seq > removed]
+
+
+def all_segments(log: Path) -> list[Segment]:
+    """Those too that were to be removed, when the service was killed meanwhile."""
+    name = re.compile(rf"{re.escape(log.stem)}\.(\d{{12}}){re.escape(log.suffix)}")
+    found = ((name.fullmatch(each), log.parent / each) for each in os.listdir(log.parent))
+    return sorted((Segment(int(match[1]), path) for match, path in found if match), key=lambda each: each.first_seq)
+
+
+def segment_path(log: Path, first_seq: int) -> Path:
+    """What the file is called once it is closed."""
+    return log.with_name(f"{log.stem}.{first_seq:012d}{log.suffix}")
+
+
+def too_old(segments: list[Segment], keeping: Keeping) -> list[Segment]:
+    """The oldest of the segments that are kept no longer."""
+    surplus = 0 if keeping.segments is None else max(0, len(segments) - keeping.segments)
+    if keeping.days is not None:
+        until = datetime.now(UTC) - timedelta(days=keeping.days)
+        while surplus < len(segments) and datetime.fromisoformat(segments[surplus].last()[0].at) < until:
+            surplus += 1
+    return segments[:surplus]
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring renamed and removed files of a folder to the disk."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
