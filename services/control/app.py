@@ -103,6 +103,7 @@ def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     control: ControlState = app.state.control
     async with AsyncExitStack() as running:
+        await running.enter_async_context(control.parts.events.written_to(control.audit))
         for enter in control.parts.background:
             await running.enter_async_context(enter())
         audit = control.audit

@@ -13,6 +13,7 @@ from prometheus_client.registry import Collector
 
 from services.control.problems import Problem
 from services.control.snapshot_parts import Exports, Snapshots
+from services.control.system_events import SystemEvents
 
 PictureKind = Literal["raw", "shown", "depth", "confidence", "orbit"]
 BOUNDARY = "picture"
@@ -176,5 +177,7 @@ class Parts:
     """For /readyz, by name."""
     collectors: Sequence[Collector] = ()
     """For /metrics."""
+    events: SystemEvents = field(default_factory=SystemEvents)
+    """What the parts do by themselves, for the audit log."""
     errors: Mapping[type[Exception], type[Problem]] = field(default_factory=dict)
     """What the parts' errors mean to a caller; their text is shown."""

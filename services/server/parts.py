@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator
+import re
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
+from services.audit.entries import Outcome
 from services.bus.errors import BusError
 from services.bus.runtime import RuntimeFolder
 from services.control.parts import CheckResult, NewStream, Parts
@@ -14,6 +16,7 @@ from services.control.problems import Conflicting, Missing, Problem, Unavailable
 from services.exports.cache import ExportCache
 from services.exports.errors import ExportBusy, ExportFailed, ExportRefused, NoSnapshot
 from services.exports.snapshots import SnapshotStore
+from services.control.system_events import SystemEvents
 from services.registry.errors import Conflict, NotFound, Rejected, StoreUnavailable
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
@@ -24,8 +27,13 @@ from services.server.shown_models import ShownModels
 from services.server.snapshots import ModelExports, StreamSnapshots
 from services.server.streams import SupervisedStreams
 from services.settings import ServiceSettings
+from services.supervisor.process import StreamEvent
 
 log = logging.getLogger(__name__)
+OWN_WORDS = re.compile(
+    r"killed by SIG[A-Z0-9]+|exit code -?\d+|again|for the first time|the server ends"
+    r"|its? [a-z]+( [a-z]+)*( \d+(\.\d+)? s)?(; it was killed)?"
+)
 ERRORS: dict[type[Exception], type[Problem]] = {
     NotFound: Missing,
     Conflict: Conflicting,
@@ -42,7 +50,8 @@ ERRORS: dict[type[Exception], type[Problem]] = {
 def assembled(settings: ServiceSettings) -> Parts:
     """Everything that the control plane serves. Raises RuntimeFolderUnusable, StoreUnavailable."""
     measures = StreamMeasures()
-    streams = SupervisedStreams(RuntimeFolder(settings.runtime_dir), measures.count)
+    events = SystemEvents()
+    streams = SupervisedStreams(RuntimeFolder(settings.runtime_dir), told(measures, events))
     measures.streams = streams
     models = registry_of(settings)
     snapshots = SnapshotStore(settings.data_dir / "snapshots")
@@ -73,15 +82,29 @@ def assembled(settings: ServiceSettings) -> Parts:
         exports=exports,
         routers=[page.router],
         background=[
-            lambda: recovered(models),
+            lambda: recovered(models, events),
             exports.running,
             lambda: streams.running(at_start, started),
-            ShownModels(streams, models).following,
+            ShownModels(streams, models, events).following,
         ],
         checks={"streams": streams_are_well, "models": models_are_there},
         collectors=[measures],
+        events=events,
         errors=ERRORS,
     )
+
+
+def told(measures: StreamMeasures, events: SystemEvents) -> Callable[[StreamEvent], None]:
+    """Who hears what happens to the streams' processes. In the audit log a reason stands only in the supervisor's own words: others could name
+    a file, and so a patient."""
+
+    def tell(event: StreamEvent) -> None:
+        measures.count(event)
+        reason = event.reason if OWN_WORDS.fullmatch(event.reason) else "the log has the reason"
+        outcome: Outcome = "failed" if event.kind == "ended" else "done"
+        events.tell(f"process.{event.kind}", f"{event.stream}/{event.role}", outcome, pid=event.pid, reason=reason)
+
+    return tell
 
 
 def registry_of(settings: ServiceSettings) -> ModelRegistry:
@@ -98,7 +121,7 @@ def registry_of(settings: ServiceSettings) -> ModelRegistry:
 
 
 @asynccontextmanager
-async def recovered(models: ModelRegistry) -> AsyncIterator[None]:
+async def recovered(models: ModelRegistry, events: SystemEvents) -> AsyncIterator[None]:
     """Clear away what a server that died had half written, say what else is wrong, and check what waits to be checked; close it in the end."""
     found = await asyncio.to_thread(models.recover)
     for name, version, sentence in found.damaged:
@@ -111,7 +134,8 @@ async def recovered(models: ModelRegistry) -> AsyncIterator[None]:
     async def check_waiting() -> None:
         for name, version in found.unchecked:
             try:
-                await asyncio.to_thread(models.check, name, version)
+                record = await asyncio.to_thread(models.check, name, version)
+                events.tell("model.check", f"{name}/{version}", "refused" if record.state == "rejected" else "done")
             except (NotFound, StoreUnavailable) as error:
                 log.error("%s/%d was not checked: %s", name, version, error)
 

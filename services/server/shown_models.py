@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from services.bus.errors import BusError
+from services.control.system_events import SystemEvents
 from services.registry.errors import RegistryError
 from services.registry.models import ModelRegistry
 from services.server.streams import Stream, SupervisedStreams
@@ -39,8 +40,9 @@ class Asked:
 class ShownModels:
     """Looks four times a second whether each stream shows what it is to show. An engine that is started again is told again."""
 
-    def __init__(self, streams: SupervisedStreams, registry: ModelRegistry) -> None:
+    def __init__(self, streams: SupervisedStreams, registry: ModelRegistry, events: SystemEvents | None = None) -> None:
         self._streams, self._registry = streams, registry
+        self._events = events or SystemEvents()
         self._refused: dict[tuple[str, str, int], float] = {}
         """When an engine refused a version, by stream, model and version."""
         self._asked: dict[str, Asked] = {}
@@ -104,6 +106,7 @@ class ShownModels:
         change = await asyncio.to_thread(
             self._registry.rollback, name, "engine", expected_current=version, reason=reason
         )
+        self._events.tell("model.rollback", name, given_up=version, version=change.version, stream=stream)
         log.error("%s/%d was rolled back to %d: %s", name, version, change.version, reason)
 
 

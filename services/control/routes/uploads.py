@@ -15,6 +15,7 @@ from services.control.parts import Models, VersionRecord
 from services.control.recorded import recorded
 from services.control.routes.models import VersionView, registry_of
 from services.control.state import ControlState, control_of
+from services.control.system_events import SystemEvents
 from services.settings import ResourceName
 
 log = logging.getLogger(__name__)
@@ -57,16 +58,18 @@ async def upload_model(
 
 def check_soon(control: ControlState, registry: Models, record: VersionRecord) -> None:
     """Have a new version checked, after the answer."""
-    checking = asyncio.create_task(_check(registry, record.name, record.version))
+    checking = asyncio.create_task(_check(registry, record.name, record.version, control.parts.events))
     control.tasks.add(checking)
     checking.add_done_callback(control.tasks.discard)
 
 
-async def _check(registry: Models, name: str, version: int) -> None:
+async def _check(registry: Models, name: str, version: int, events: SystemEvents) -> None:
     """What a check finds is the version's state. One that fails by a bug leaves it as it was, which the next start takes up again."""
     try:
         record = await asyncio.to_thread(registry.check, name, version)
     except Exception:  # nobody waits for this task: what it raised would be seen by no one
         log.exception("the check of %s/%d failed", name, version)
+        events.tell("model.check", f"{name}/{version}", "failed")
     else:
+        events.tell("model.check", f"{name}/{version}", "refused" if record.state == "rejected" else "done")
         log.info("%s/%d was checked: %s", name, version, record.state)

@@ -58,7 +58,8 @@ def test_the_life_of_a_model(plane):
     assert plane.ask("DELETE", f"{VERSIONS}/1").status_code == 409
     assert plane.ask("DELETE", f"{VERSIONS}/2").status_code == 204
     assert [version["version"] for version in plane.ask("GET", VERSIONS).json()] == [1]
-    assert [event for event in plane.events() if event[0].startswith("model.")] == [
+    mine = [event for event in plane.events() if event[0].startswith("model.") and event[0] != "model.check"]
+    assert mine == [
         ("model.upload", "liver", "done"),
         ("model.upload", "liver", "done"),
         ("model.activate", "liver/1", "done"),

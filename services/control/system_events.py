@@ -1,0 +1,74 @@
+"""What the service does by itself and the audit log is to have: processes that ended, checks of models, rollbacks that nobody asked for."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+
+from services.audit import AuditLog, AuditUnwritable
+from services.audit.entries import Detail, Outcome
+
+log = logging.getLogger(__name__)
+MOST_WAITING = 1000
+
+
+@dataclass(frozen=True)
+class SystemEvent:
+    """An entry to be; see `Entry` for what may be in it."""
+
+    event: str
+    subject: str
+    outcome: Outcome
+    detail: Detail
+
+
+class SystemEvents:
+    """Events of one server, told in its event loop and written one after another, so that nobody waits for the disk."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[SystemEvent] = deque()
+        self._missed = 0
+        self._come = asyncio.Event()
+
+    def tell(self, event: str, subject: str, outcome: Outcome = "done", **detail: str | int | None) -> None:
+        """Have an event written soon. When more wait than may, the newest are counted and left out."""
+        if len(self._waiting) >= MOST_WAITING:
+            self._missed += 1
+            return
+        self._waiting.append(SystemEvent(event, subject, outcome, {**detail}))
+        self._come.set()
+
+    @asynccontextmanager
+    async def written_to(self, audit: AuditLog) -> AsyncIterator[None]:
+        """Write while the block lasts, and what is left when it ends."""
+        writing = asyncio.create_task(self._write(audit), name="audit of system events")
+        try:
+            yield
+        finally:
+            writing.cancel()
+            await asyncio.gather(writing, return_exceptions=True)
+            await self._write_waiting(audit)
+
+    async def _write(self, audit: AuditLog) -> None:
+        while True:
+            await self._come.wait()
+            self._come.clear()
+            await asyncio.shield(self._write_waiting(audit))
+
+    async def _write_waiting(self, audit: AuditLog) -> None:
+        while self._waiting:
+            await asyncio.to_thread(_append, audit, self._waiting.popleft())
+        missed, self._missed = self._missed, 0
+        if missed:
+            await asyncio.to_thread(_append, audit, SystemEvent("audit.missed", "audit", "failed", {"events": missed}))
+
+
+def _append(audit: AuditLog, said: SystemEvent) -> None:
+    try:
+        audit.append(said.event, actor="system", subject=said.subject, outcome=said.outcome, detail=said.detail)
+    except (AuditUnwritable, ValueError) as error:  # nobody is there to be refused: the log and the metrics have it
+        log.error("%s of %s is not in the audit log: %s", said.event, said.subject, error)

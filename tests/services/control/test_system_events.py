@@ -1,0 +1,79 @@
+"""What a service does by itself is in the audit log, and nobody waits for that."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+import pytest
+
+from services.audit import AuditLog, AuditUnwritable
+from services.control.system_events import MOST_WAITING, SystemEvents
+
+
+@pytest.fixture
+def audit(tmp_path):
+    log = AuditLog(tmp_path / "audit.jsonl")
+    yield log
+    log.close()
+
+
+def said(audit: AuditLog) -> list[tuple[str, str, str]]:
+    return [(entry.event, entry.subject, entry.outcome) for entry in reversed(audit.newest(2000))]
+
+
+def test_events_are_written_while_the_server_runs_and_what_is_left_when_it_ends(audit):
+    async def run() -> None:
+        events = SystemEvents()
+        events.tell("process.started", "theatre/engine", pid=7)
+        async with events.written_to(audit):
+            while not said(audit):
+                await asyncio.sleep(0.01)
+            events.tell("process.ended", "theatre/engine", "failed", reason="killed by SIGKILL")
+
+    asyncio.run(run())
+    assert said(audit) == [("process.started", "theatre/engine", "done"), ("process.ended", "theatre/engine", "failed")]
+    newest = audit.newest(1)[0]
+    assert (newest.actor, newest.detail) == ("system", {"reason": "killed by SIGKILL"})
+
+
+def test_more_than_may_wait_are_counted(audit):
+    async def run() -> None:
+        events = SystemEvents()
+        for _ in range(MOST_WAITING + 3):
+            events.tell("process.ended", "theatre/engine", "failed")
+        async with events.written_to(audit):
+            pass
+
+    asyncio.run(run())
+    assert len(said(audit)) == MOST_WAITING + 1
+    assert audit.newest(1)[0].event == "audit.missed" and audit.newest(1)[0].detail == {"events": 3}
+
+
+def test_what_cannot_be_written_is_in_the_log_and_the_next_one_is_tried(audit, caplog, monkeypatch):
+    async def run() -> None:
+        events = SystemEvents()
+        async with events.written_to(audit):
+            events.tell("process.ended", 'a "name"')
+            events.tell("process.ended", "theatre/engine")
+
+    asyncio.run(run())
+    assert said(audit) == [("process.ended", "theatre/engine", "done")]
+    assert "is not in the audit log" in caplog.text
+    monkeypatch.setattr(audit, "append", lambda *_, **__: (_ for _ in ()).throw(AuditUnwritable("the disk is full")))
+    asyncio.run(run())
+    assert "the disk is full" in caplog.text
+
+
+def test_a_check_of_a_model_is_an_event(plane):
+    import hashlib
+    from base64 import b64encode
+
+    for body in (b"GOOD", b"bad"):
+        digest = b64encode(hashlib.sha256(body).digest()).decode()
+        headers = {"Content-Type": "application/octet-stream", "Content-Digest": f"sha-256=:{digest}:"}
+        assert plane.ask("PUT", "/v1/models/liver/versions", content=body, headers=headers).status_code == 201
+    end_s = time.monotonic() + 10
+    while time.monotonic() < end_s and len(found := [each for each in plane.events() if each[0] == "model.check"]) < 2:
+        time.sleep(0.01)
+    assert sorted(found) == [("model.check", "liver/1", "done"), ("model.check", "liver/2", "refused")]

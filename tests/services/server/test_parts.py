@@ -1,0 +1,27 @@
+"""What the parts of a server tell each other."""
+
+from __future__ import annotations
+
+import pytest
+
+from services.control.system_events import SystemEvents
+from services.server.measures import StreamMeasures
+from services.server.parts import told
+from services.supervisor.process import StreamEvent
+
+
+@pytest.mark.parametrize(
+    ("reason", "kept"),
+    [
+        ("killed by SIGKILL", True), ("exit code 3", True), ("it has said nothing for 3.1 s; it was killed", True),
+        ("for the first time", True), ("it was asked for", True), ("the server ends", True),
+        ("cannot open /recordings/Smith_Jane.mp4", False), ("smith", False), ("it cannot be started: /x", False),
+        ("rtsp://user:pass@10.0.0.5/x does not answer", False),
+    ],
+)  # fmt: skip
+def test_reasons_that_could_name_a_file_are_not_in_the_audit_log(reason, kept):
+    events, heard = SystemEvents(), []
+    events.tell = lambda *values, **detail: heard.append((values, detail))  # type: ignore[method-assign]
+    told(StreamMeasures(), events)(StreamEvent("theatre", "engine", "ended", reason, 7))
+    expected = {"pid": 7, "reason": reason if kept else "the log has the reason"}
+    assert heard == [(("process.ended", "theatre/engine", "failed"), expected)]
