@@ -25,9 +25,9 @@ from services.control.measures import Measures
 from services.control.observed import Observed
 from services.control.parts import Parts
 from services.control.routes import ROUTERS
-from services.control.state import ControlState
+from services.control.state import ControlState, Persons
 from services.control.viewer_count import ViewerCount
-from services.settings import ServiceSettings
+from services.settings import ServiceSettings, SettingsInvalid
 from services.version import product_version
 
 log = logging.getLogger(__name__)
@@ -71,6 +71,7 @@ def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:
 
 
 def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
+    persons = _persons(settings)
     data = settings.data_dir
     uploads = data / "uploads"
     for folder in (data, uploads):
@@ -96,7 +97,18 @@ def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
         uploads_dir=uploads,
         uploads=asyncio.Semaphore(limits.uploads),
         viewers=ViewerCount(limits.viewers),
+        persons=persons,
     )
+
+
+def _persons(settings: ServiceSettings) -> Persons | None:
+    if settings.auth.oidc is None:
+        return None
+    try:
+        from services.control.auth.oidc import OpenIdPersons
+    except ModuleNotFoundError as error:
+        raise SettingsInvalid("auth.oidc needs PyJWT; install intrasplat with the extra oidc") from error
+    return OpenIdPersons(settings.auth.oidc)
 
 
 @asynccontextmanager

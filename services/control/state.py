@@ -6,12 +6,13 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 from starlette.requests import HTTPConnection
 
 from services.audit import AuditLog
 from services.control.auth.keys import KeyStore
+from services.control.auth.roles import Caller
 from services.control.auth.tickets import Tickets
 from services.control.limits import TokenBuckets
 from services.control.measures import Measures
@@ -22,6 +23,13 @@ from services.control.viewer_count import ViewerCount
 from services.settings import ServiceSettings
 
 Part = TypeVar("Part")
+
+
+class Persons(Protocol):
+    """Who has signed in elsewhere."""
+
+    async def caller_of(self, token: str) -> Caller:
+        """Whose token it is. Raises Unauthenticated, Forbidden, Unavailable."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,8 @@ class ControlState:
     uploads_dir: Path
     uploads: asyncio.Semaphore
     viewers: ViewerCount
+    persons: Persons | None = None
+    """Of an OpenID Connect issuer, where the settings name one."""
     draining: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server is asked to end: what has no end of its own then ends."""
     repeated: Repeated = field(default_factory=Repeated)

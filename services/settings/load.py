@@ -117,10 +117,16 @@ def _keys(location: Location) -> list[str]:
     for part in location:
         if isinstance(kind, type) and issubclass(kind, BaseModel):
             field = kind.model_fields.get(str(part))
-            kind = None if field is None else field.annotation
+            kind = None if field is None else _without_none(field.annotation)
         else:
             kind = (get_args(kind) or (None,))[-1]
     return sorted(kind.model_fields) if isinstance(kind, type) and issubclass(kind, BaseModel) else []
+
+
+def _without_none(kind: Any) -> Any:
+    """The section of one that may be absent."""
+    kinds = [each for each in get_args(kind) if each is not type(None)]
+    return kinds[0] if len(kinds) == 1 and type(None) in get_args(kind) else kind
 
 
 def _dotted(location: Location) -> str:

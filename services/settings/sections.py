@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, SecretStr, model_validator
 
+from services.settings.oidc import OidcSettings
+
 NAME_PATTERN = r"^[a-z0-9][a-z0-9-]{0,39}$"
 ResourceName = Annotated[str, Field(pattern=NAME_PATTERN, examples=["theatre-1"])]
 """What streams, models and keys are called: short, and safe in an address, a file name and a metric's label."""
@@ -85,6 +87,7 @@ class AuthSettings(Section):
         description="Holds the first administrator's key: read if it is there, else made at the first start. Default: admin.key in paths.data.",
     )
     ticket_s: float = Field(default=30.0, gt=0, le=300, description="How long a ticket may wait for its one use.")
+    oidc: OidcSettings | None = Field(default=None, description="Persons of an OpenID Connect issuer.")
 
 
 class AuditSettings(Section):

@@ -80,7 +80,7 @@ class GuardedRoute(APIRoute):
 
         async def guarded(request: Request) -> Response:
             control = control_of(request)
-            request.scope["state"]["caller"] = _admit(request, rule, control)
+            request.scope["state"]["caller"] = await _admit(request, rule, control)
             limits = control.settings.limits
             most_bytes: int = getattr(limits, rule.most)
             refuse_by_length(request, most_bytes)
@@ -96,10 +96,10 @@ def new_router(tag: str, prefix: str = "/v1") -> APIRouter:
     return APIRouter(prefix=prefix, tags=[tag], route_class=GuardedRoute)
 
 
-def _caller_of(connection: HTTPConnection) -> Caller:
+async def _caller_of(connection: HTTPConnection) -> Caller:
     """Who makes this request. A WebSocket is guarded here: it has no body, and its route no handler to wrap."""
     if connection.scope["type"] == "websocket":
-        return _admit(connection, rule_of(connection.scope["endpoint"]), control_of(connection))
+        return await _admit(connection, rule_of(connection.scope["endpoint"]), control_of(connection))
     caller: Caller = connection.scope["state"]["caller"]
     return caller
 
@@ -107,11 +107,11 @@ def _caller_of(connection: HTTPConnection) -> Caller:
 CallerOf = Annotated[Caller, Depends(_caller_of)]
 
 
-def _admit(connection: HTTPConnection, rule: Rule, control: ControlState) -> Caller:
+async def _admit(connection: HTTPConnection, rule: Rule, control: ControlState) -> Caller:
     if rule.role is Role.PUBLIC:
         return ANYBODY
     try:
-        caller = _authenticated(connection, rule, control)
+        caller = await _authenticated(connection, rule, control)
     except Unauthenticated:
         control.measures.refused.labels("not authenticated").inc()
         raise
@@ -125,14 +125,14 @@ def _admit(connection: HTTPConnection, rule: Rule, control: ControlState) -> Cal
     return caller
 
 
-def _authenticated(connection: HTTPConnection, rule: Rule, control: ControlState) -> Caller:
+async def _authenticated(connection: HTTPConnection, rule: Rule, control: ControlState) -> Caller:
     given = connection.headers.getlist("authorization")
     tickets = connection.query_params.getlist("ticket") if rule.ticket else []
     if len(given) + len(tickets) > 1:
         raise Unauthenticated("more than one key or ticket was sent; send one")
     if tickets:
         caller = control.tickets.use(tickets[0][:MOST_TOKEN_LENGTH], connection.url.path)
-        if caller is None or control.keys.is_revoked(caller.key_id):
+        if caller is None or (not caller.federated and control.keys.is_revoked(caller.key_id)):
             raise Unauthenticated(
                 "the ticket is unknown, used, too old or for another path; get one from POST /v1/tickets"
             )
@@ -140,6 +140,8 @@ def _authenticated(connection: HTTPConnection, rule: Rule, control: ControlState
     scheme, _, token = (given[0] if given else "").partition(" ")
     if scheme.lower() != "bearer" or not token:
         raise Unauthenticated("send an API key as `Authorization: Bearer KEY`")
+    if control.persons is not None and token.count(".") == 2:  # a signed token's three parts; no API key has them
+        return await control.persons.caller_of(token.strip())
     key = control.keys.find(token.strip()) if len(token) <= MOST_TOKEN_LENGTH else None
     if key is None:
         raise Unauthenticated("the API key is not known here; it may have been revoked")

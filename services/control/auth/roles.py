@@ -22,11 +22,13 @@ class Role(StrEnum):
 
 @dataclass(frozen=True)
 class Caller:
-    """Who makes a request: the name and number of a key, and its role."""
+    """Who makes a request: the name and number of a key, or of a person, and the role."""
 
     name: str
     key_id: str
     role: Role
+    federated: bool = False
+    """A person of an OpenID Connect issuer: `key_id` is no key's number."""
 
     def __str__(self) -> str:
         return f"{self.name} ({self.key_id})" if self.key_id else self.name
