@@ -2,6 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 OUT ?= out/demo
+EXAMPLES ?= 200
 # Waiting threads sleep: tests and benchmarks share the machine.
 export OMP_WAIT_POLICY ?= PASSIVE
 MODULES := $(wildcard $(sort $(shell git ls-files --cached --others --exclude-standard 'gsplat_core/*.py' 'operators/*.py' 'services/*.py')))
@@ -11,7 +12,7 @@ CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*
 CUDA_ARCHITECTURES ?= native
 CUDA_TOOLKIT := build/cuda-toolkit
 
-.PHONY: demo test lint format bench native cuda compilers lock licences clean always
+.PHONY: demo test lint format fuzz bench native cuda compilers lock licences clean always
 
 # On the NVIDIA GPU where there is one that torch can use: the CUDA kernels are built for it first. A build that fails ends it.
 demo: native
@@ -32,6 +33,10 @@ format: .venv/.development
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i $(CPP)
+
+# The API of a real server, called in ways that its document allows and forbids (EXAMPLES of each), by schemathesis.
+fuzz: native .venv/.development
+	$(BIN)/python -m tests.system.api_fuzzing --examples $(EXAMPLES)
 
 bench: native .venv/.development
 	benchmarks/run_all.sh

@@ -11,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
 
 from services.control.auth.guard import new_router, requires
-from services.control.problems import Missing
+from services.control.problems import PROBLEM_JSON, TITLES, Missing
 
 SWAGGER_UI = Path(__file__).parent / "swagger"
 FILES = {
@@ -83,8 +83,24 @@ PROBLEM_SCHEMA: dict[str, Any] = {
         "errors": {"type": "array", "items": {"type": "object"}},
     },
 }
-PROBLEMS = {"4XX": "Refused; the body says why.", "5XX": "Not done; the body says why."}
-"""Answers that every operation may give."""
+
+
+def _problems_of(path: str, method: str, operation: dict[str, Any]) -> set[int]:
+    """Which problems an operation may answer with, from what it is: a check holds this against a running server."""
+    found = {400, 413, 421, 429, 500, 503}
+    if operation["security"]:
+        found |= {401, 403}
+    if "parameters" in operation:
+        found |= {422}
+    if "{" in path:
+        found |= {404}
+    if "requestBody" in operation:
+        found |= {408, 415, 422}
+    if method != "get":
+        found |= {409}
+    if method == "put":
+        found |= {507}
+    return found
 
 
 def describe(app: FastAPI) -> None:
@@ -108,10 +124,10 @@ def _add_common(document: dict[str, Any]) -> None:
     for unused in ("HTTPValidationError", "ValidationError"):
         schemas.pop(unused, None)
     schemas["Problem"] = PROBLEM_SCHEMA
-    content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
-    for operations in document["paths"].values():
-        for operation in operations.values():
+    content = {PROBLEM_JSON: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
             responses = operation["responses"]
             responses.pop("422", None)  # as FastAPI would answer
-            for status, description in PROBLEMS.items():
-                responses[status] = {"description": description, "content": content}
+            for status in sorted(_problems_of(path, method, operation)):
+                responses.setdefault(str(status), {"description": TITLES[status], "content": content})

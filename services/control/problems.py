@@ -157,8 +157,12 @@ class NoSpace(Problem):
 OF_STATUS: dict[int, type[Problem]] = {
     kind.status: kind
     for kind in (
-        BadRequest, Forbidden, Missing, WrongMethod, TooSlow, Conflicting, TooLarge, WrongContent, Unprocessable,
+        BadRequest, Forbidden, Missing, WrongMethod, TooSlow, Conflicting, TooLarge, WrongContent, Misdirected, Unprocessable,
         Internal, Unavailable, NoSpace,
     )
 }  # fmt: skip
 """Problems by status, for the framework's own errors."""
+TITLES: dict[int, str] = {status: kind.title for status, kind in OF_STATUS.items()} | {
+    Unauthenticated.status: Unauthenticated.title,
+    TooManyRequests.status: TooManyRequests.title,
+}

@@ -168,7 +168,9 @@ class StreamSettings(Section):
     """A stream that is there from the start."""
 
     source: str = Field(
-        max_length=1000, description="Address of the source (docs/sources.md).", examples=["synthetic:?moving=1"]
+        max_length=1000,
+        description="Address of the source (docs/sources.md).",
+        examples=["synthetic:?width=160&height=128&frames=12"],
     )
     show: str = Field(
         default="live",

@@ -117,6 +117,23 @@ def test_odd_methods_are_405_and_no_label(served, method):
     assert 1000 * "X" not in metrics and "PROPFIND" not in metrics
 
 
+@pytest.mark.parametrize(
+    "body",
+    [
+        b'{"name": "a", "role": NaN}', b'{"name": "\\ud800", "role": "viewer"}', 50_000 * b"[", 50_000 * b'{"a":', b"1" + 9000 * b"0",
+        b'{"name": 1e999, "role": "viewer"}', b'\xff\xfe{\x00', b"\xef\xbb\xbf{}", b'"\xff"', b"\x00", b"", b"null", b"[]",
+        b'{"name": "a", "role": "viewer", "role": "admin", "x": 1}', b'{"__proto__": {}}',
+    ],
+    ids=lambda body: repr(body[:20]),
+)  # fmt: skip
+def test_bodies_that_are_none_are_refused(served, body):
+    client = served()
+    headers = {"Authorization": f"Bearer {client.app.state.key}", "Content-Type": "application/json"}
+    for path in ("/v1/keys", "/v1/tickets", "/v1/streams", "/v1/models/a/activate"):
+        answer = client.post(path, content=body, headers=headers)
+        assert answer.status_code in (400, 422) and answer.headers["content-type"] == PROBLEM_JSON, answer.text
+
+
 def test_paths_are_no_labels(served):
     client = served()
     for number in range(20):

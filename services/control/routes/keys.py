@@ -22,7 +22,7 @@ router = new_router("keys")
 class NewKey(BaseModel):
     """A name may have two keys with one role, the old and the new one, while callers change over."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
     name: ResourceName
     role: Literal["viewer", "operator", "admin"] = Field(examples=["viewer"])
 

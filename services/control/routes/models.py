@@ -45,7 +45,7 @@ class ModelView(BaseModel):
 class Activation(BaseModel):
     """Which version is to be shown, and which one the caller believes is now: another one refuses it."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
     version: int = Field(ge=1, le=2**31 - 1, examples=[3])
     expected_current: int | None = Field(ge=1, le=2**31 - 1, examples=[2], description="null: none is active.")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, field_validator
 from starlette.requests import Request
 
 from services.control.auth.guard import CallerOf, new_router, requires
@@ -18,23 +18,25 @@ from services.settings.addresses import masked_address
 
 router = new_router("streams")
 MOST_OPTIONS = 50
-Option = str | int | float | bool | None
+Option = str | int | FiniteFloat | bool | None
 
 
 class StreamOptions(BaseModel):
     """Options of the source and of the reconstruction, by name; null takes one back to its default."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
     options: dict[str, Option] = Field(max_length=MOST_OPTIONS, examples=[{"tool_mask": "builtin"}])
 
 
 class StreamWanted(StreamSettings):
     """A new stream."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
     name: ResourceName
     start: bool = Field(True, description="Start it at once.")
-    options: dict[str, Any] = Field({}, max_length=MOST_OPTIONS)
+    options: dict[str, Any] = Field(
+        {}, max_length=MOST_OPTIONS, json_schema_extra={"additionalProperties": TypeAdapter(Option).json_schema()}
+    )
 
     @field_validator("options")
     @classmethod

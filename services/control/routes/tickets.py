@@ -14,7 +14,7 @@ router = new_router("keys")
 class TicketFor(BaseModel):
     """What it is for."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
     path: str = Field(
         pattern=r"^/v1/[A-Za-z0-9/._-]{1,200}$",
         description="The path that will be asked for, without its query.",

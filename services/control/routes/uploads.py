@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 
-from fastapi import Header, Response
+from fastapi import Response
 from starlette.requests import Request
 
 from services.control.auth.guard import CallerOf, new_router, requires
@@ -21,31 +21,38 @@ from services.settings import ResourceName
 log = logging.getLogger(__name__)
 router = new_router("models")
 OCTETS = "application/octet-stream"
-BODY = {
+DIGEST = "sha-256=:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=:"
+DESCRIBED = {
+    "parameters": [
+        {
+            "name": "Content-Digest",
+            "in": "header",
+            "required": True,
+            "description": "`sha-256=:BASE64:` of the file (RFC 9530).",
+            "schema": {"type": "string", "examples": [DIGEST]},
+        }
+    ],
     "requestBody": {
         "required": True,
         "description": "A model packed by `intrasplat pack`, not longer than limits.model_bytes.",
         "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}},
-    }
+    },
 }
+"""Of what is read from the request itself."""
 
 
-@router.put("/models/{name}/versions", status_code=201, openapi_extra=BODY)
+@router.put("/models/{name}/versions", status_code=201, openapi_extra=DESCRIBED)
 @requires("operator", takes=OCTETS, most="model_bytes")
 async def upload_model(
     request: Request,
     response: Response,
     caller: CallerOf,
     name: ResourceName,
-    content_digest: str | None = Header(
-        None, max_length=1000, description="`sha-256=:BASE64:` of the file (RFC 9530).",
-        examples=["sha-256=:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=:"],
-    ),
-) -> VersionView:  # fmt: skip
+) -> VersionView:
     """Upload a model's next version. It is `uploaded` at first; a check makes it `ready`, or `rejected` with a reason."""
     control = control_of(request)
     registry = registry_of(request)
-    expected = stated_sha256(content_digest)
+    expected = stated_sha256(", ".join(request.headers.getlist("content-digest")) or None)
     async with recorded(request, caller, "model.upload", name, {"sha256": expected.hex()}) as said:
         async with incoming_file(request, control, expected) as file:
             record = await asyncio.to_thread(registry.upload, name, file.path, file.sha256, str(caller))

@@ -88,10 +88,15 @@ def test_every_operation_is_described(plane):
     assert len(names) == len(set(names))
     for path, operation in operations:
         assert operation["description"] and operation["x-role"], path
-        assert {"4XX", "5XX"} <= set(operation["responses"]) and "422" not in operation["responses"]
+        assert {"400", "421", "429", "500"} <= set(operation["responses"])
+        assert operation["responses"]["429"]["content"] == {
+            PROBLEM_JSON: {"schema": {"$ref": "#/components/schemas/Problem"}}
+        }
+        assert ("401" in operation["responses"]) == (operation["x-role"] != "public")
         assert bool(operation["security"]) == (operation["x-role"] != "public")
     upload = document["paths"]["/v1/models/{name}/versions"]["put"]
     assert list(upload["requestBody"]["content"]) == ["application/octet-stream"]
+    assert [each["name"] for each in upload["parameters"]] == ["name", "Content-Digest"]
     assert document["components"]["schemas"]["Activation"]["properties"]["version"]["examples"] == [3]
 
 

@@ -1,0 +1,21 @@
+"""What the API's document says holds for a real server: `make fuzz` tries more of it, for longer."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from tests.system.api_fuzzing import fuzz, serving
+
+pytest.importorskip("schemathesis", reason="schemathesis comes with the development packages")
+
+
+def test_no_answer_is_a_server_error_or_undocumented():
+    """Every operation with its examples, values at and beyond each limit of its schema, and a few at random, the same ones each time."""
+    with tempfile.TemporaryDirectory(prefix="isf-") as folder, serving(Path(folder)) as (url, key):
+        bounded = ("--phases", "examples,coverage,fuzzing", "--generation-deterministic")
+        done = fuzz(url, key, Path(folder), 3, *bounded)
+    assert done.returncode == 0, done.stdout[-8000:] + done.stderr
+    assert (" 0 passed" not in done.stdout and "No issues found" in done.stdout) or "passed" in done.stdout
