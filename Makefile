@@ -12,7 +12,7 @@ CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*
 CUDA_ARCHITECTURES ?= native
 CUDA_TOOLKIT := build/cuda-toolkit
 
-.PHONY: demo test lint format fuzz bench native cuda compilers lock licences clean always
+.PHONY: demo test lint format fuzz bench native cuda compilers lock licences sbom clean always
 
 # On the NVIDIA GPU where there is one that torch can use: the CUDA kernels are built for it first. A build that fails ends it.
 demo: native
@@ -82,10 +82,16 @@ build/modules.txt: always
 
 lock: .venv/.development
 	$(BIN)/uv pip compile pyproject.toml --extra build --universal --generate-hashes --quiet --no-emit-index-url -o requirements.lock
+	$(BIN)/uv pip compile pyproject.toml --extra build --extra postgresql --extra s3 --extra oidc --universal --generate-hashes --quiet --no-emit-index-url -c requirements.lock -o requirements-service.lock
 	$(BIN)/uv pip compile pyproject.toml --extra build --extra dev --extra holoscan --universal --generate-hashes --quiet --no-emit-index-url -c requirements.lock -o requirements-dev.lock
 	$(BIN)/python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['optional-dependencies']['cuda-build'], sep='\n')" \
 	  | $(BIN)/uv pip compile - --no-deps --universal --generate-hashes --quiet --no-emit-index-url --no-annotate \
 	    --custom-compile-command "make lock (the compiler of make cuda, installed without dependencies)" -o requirements-cuda.lock
+
+# What the images hold, as CycloneDX: name, version, digests and address of each package that the service's lock pins.
+sbom: .venv/.development
+	@mkdir -p out
+	$(BIN)/cyclonedx-py requirements requirements-service.lock --pyproject pyproject.toml --output-reproducible --of JSON -o out/sbom.json
 
 licences: .venv/.development
 	$(BIN)/python deploy/third_party_licences.py

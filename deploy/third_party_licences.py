@@ -1,4 +1,4 @@
-"""Write LICENSES.md: name, version and licence of every package that `requirements.lock` pins for this platform.
+"""Write LICENSES.md: name, version and licence of every package that `requirements-service.lock` pins for this platform.
 
 The versions are those of the lock file, the licences those that the installed packages state, as `pip-licenses` reads them.
 
@@ -21,8 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent
 UNSTATED = {"cuda-toolkit": "no code of its own: requires NVIDIA's CUDA packages"}
 """Packages whose metadata have no licence, and why that is no gap."""
 HEADER = """# Third-party licences
-The packages that `requirements.lock` installs on Linux with Python {python}, and the licence that each states. Written by
-`deploy/third_party_licences.py`. None of them is part of this repository.
+The packages that `requirements-service.lock` installs on Linux with Python {python}, those of `requirements.lock` among them, and the licence
+that each states. Written by `deploy/third_party_licences.py`. None of them is part of this repository.
 
 OpenCV's wheel carries FFmpeg's libraries, which are under the LGPL 2.1. PyAV (`av`) is under the BSD licence; its wheel carries
 FFmpeg's libraries, which state LGPL 3 or later, and beside them x264 and x265, which are under the GPL 2 or later. IntraSplat uses
@@ -68,11 +68,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "LICENSES.md")
     out = parser.parse_args().out
-    here, elsewhere = locked(ROOT / "requirements.lock")
+    here, elsewhere = locked(ROOT / "requirements-service.lock")
     licences = stated_licences() | UNSTATED
     unknown = [name for name in here if licences.get(name, "UNKNOWN") == "UNKNOWN"]
     if unknown:
-        sys.stderr.write(f"no licence is stated by {', '.join(unknown)}: install requirements.lock, or look it up\n")
+        sys.stderr.write(
+            f"no licence is stated by {', '.join(unknown)}: install requirements-service.lock, or look it up\n"
+        )
         return 1
     rows = [f"| {name} | {version_of(entry)} | {licences[name]} |\n" for name, entry in sorted(here.items())]
     text = HEADER.format(python=f"{sys.version_info.major}.{sys.version_info.minor}") + "".join(rows)

@@ -163,7 +163,7 @@ def test_private_places_are_recognised(line):
 
 def test_every_locked_package_has_its_licence():
     text = (ROOT / "LICENSES.md").read_text(encoding="utf-8").lower()
-    lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+    lock = "".join((ROOT / f"requirements{each}.lock").read_text(encoding="utf-8") for each in ("", "-service"))
     pinned = re.findall(r"^([A-Za-z0-9._-]+)==([^\s;\\]+)", lock, re.MULTILINE)
     assert pinned
     missing = [

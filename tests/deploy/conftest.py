@@ -18,6 +18,7 @@ WHERE = {
     "systemd-analyze": "Debian's package systemd",
     "docker-compose": "the extra dev",
     "hadolint": "the extra dev",
+    "cyclonedx-py": "the extra dev",
     "helm": "tests/deploy/get_helm.sh",
 }
 Run = Callable[..., subprocess.CompletedProcess[str]]

@@ -62,7 +62,7 @@ def copied_from_the_repository() -> list[str]:
 
 def test_what_is_copied_is_there_and_reaches_the_build():
     sources = copied_from_the_repository()
-    assert {"services", "requirements.lock", "docker/healthcheck.py"} <= set(sources)
+    assert {"services", "requirements-service.lock", "docker/healthcheck.py"} <= set(sources)
     for source in sources:
         assert (ROOT / source).exists(), source
         assert let_through(source), source

@@ -1,0 +1,36 @@
+"""`make sbom` lists every package that the images hold, and the images hold what is tested."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def pinned(lock: str) -> dict[str, str]:
+    text = (ROOT / lock).read_text()
+    return dict(re.findall(r"^([A-Za-z0-9._-]+)==([^\s;\\]+)", text, re.MULTILINE))
+
+
+def test_every_locked_package_is_listed_with_its_digests(tool, tmp_path):
+    recipe = (ROOT / "Makefile").read_text().partition("\nsbom:")[2].partition("\n\n")[0]
+    command = re.search(r"\$\(BIN\)/cyclonedx-py (.*) -o out/sbom.json", recipe)
+    assert command is not None
+    done = tool("cyclonedx-py", *command[1].split(), "-o", tmp_path / "sbom.json", cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    bom = json.loads((tmp_path / "sbom.json").read_text())
+    assert (bom["bomFormat"], bom["metadata"]["component"]["name"]) == ("CycloneDX", "intrasplat")
+    listed = {each["name"]: each for each in bom["components"]}
+    wanted = pinned("requirements-service.lock")
+    assert len(wanted) > 90 and {name: each["version"] for name, each in listed.items()} == wanted
+    for name, each in listed.items():
+        assert each["purl"] == f"pkg:pypi/{name}@{wanted[name]}"
+        assert any(reference.get("hashes") for reference in each["externalReferences"]), name
+
+
+def test_the_service_s_lock_has_the_same_versions_and_its_extras():
+    service, default = pinned("requirements-service.lock"), pinned("requirements.lock")
+    assert {name: service[name] for name in default} == default
+    assert {"psycopg", "s3fs", "pyjwt", "cryptography"} <= set(service) - set(default)
