@@ -7,9 +7,13 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
+
+from tests.system.servers import serving
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -23,6 +27,12 @@ RUNS = {
         ["--out", "bundle"],
         r"format 1, ",
         ["bundle/model.safetensors", "bundle/manifest.json", "bundle/last_frame.ply"],
+    ),
+    "06_service_life_cycle.py": (
+        ["--url", "URL", "--key-file", "KEY_FILE"],
+        r"(?s)red is life-cycle/1: ready.*a picture of version 1.*refused \(409\).*a picture of version 2.*rolled back to 1.*"
+        r"a picture of version 1.*the old key: 401.*audit \d+: key.revoke .* done\n.*intrasplat_upload_bytes_total [1-9]",
+        [],
     ),
 }
 """Options, what the output must say, and the files that must be there."""
@@ -41,9 +51,25 @@ def test_docstring_opens_with_a_sentence_and_gives_the_usage(path):
     assert re.search(rf"^Usage: python examples/{re.escape(path.name)}", docstring, re.MULTILINE)
 
 
+@pytest.fixture
+def server():
+    """Starts a service, for an example that asks one: what stands for its address and for the file with its key."""
+    with ExitStack() as running:
+
+        def start() -> dict[str, str]:
+            folder = Path(running.enter_context(TemporaryDirectory(prefix="ise-")))  # sockets need a short path
+            url, _ = running.enter_context(serving(folder))
+            return {"URL": url, "KEY_FILE": str(folder / "data" / "admin.key")}
+
+        yield start
+
+
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
-def test_runs(path, tmp_path):
+def test_runs(path, tmp_path, server):
     options, expected, files = RUNS[path.name]
+    if "URL" in options:
+        places = server()
+        options = [places.get(option, option) for option in options]
     search = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     done = subprocess.run(
         [sys.executable, "-W", "error", str(path), *options],

@@ -15,6 +15,8 @@ from pydantic import TypeAdapter
 from services.client.errors import ClientError, Refused, Unreachable
 from services.client.pictures import Picture, pictures
 from services.client.snapshots import SnapshotMethods
+from services.control.routes.audit import AuditPage
+from services.control.routes.keys import KeyView, MadeKey
 from services.control.routes.models import ModelView, VersionView
 from services.control.routes.streams import StreamView
 
@@ -143,6 +145,27 @@ class Client(SnapshotMethods):
         """The server's version, and which parts it has."""
         return dict(self._ask("GET", "/v1/version"))
 
+    def keys(self) -> list[KeyView]:
+        """Every API key, without what makes it one."""
+        return TypeAdapter(list[KeyView]).validate_python(self._ask("GET", "/v1/keys"))
+
+    def make_key(self, name: str, role: str) -> MadeKey:
+        """Make a key; a name may have two, while its callers change over. It is shown this once."""
+        return MadeKey.model_validate(self._ask("POST", "/v1/keys", json={"name": name, "role": role}))
+
+    def revoke_key(self, key_id: str) -> None:
+        """End a key at once."""
+        self._ask("DELETE", f"/v1/keys/{key_id}")
+
+    def audit(self, count: int = 100, before: int | None = None) -> AuditPage:
+        """Entries of the audit log, the newest first; with `before`, those before that number."""
+        wanted = {"count": count} | ({} if before is None else {"before": before})
+        return AuditPage.model_validate(self._ask("GET", "/v1/audit", params=wanted))
+
+    def metrics(self) -> str:
+        """What is measured, in Prometheus' format."""
+        return self._answer("GET", "/metrics").text
+
     def close(self) -> None:
         """Close the connections."""
         self._http.close()
@@ -154,6 +177,10 @@ class Client(SnapshotMethods):
         self.close()
 
     def _ask(self, method: str, path: str, **options: Any) -> Any:
+        answer = self._answer(method, path, **options)
+        return answer.json() if answer.content else None
+
+    def _answer(self, method: str, path: str, **options: Any) -> httpx2.Response:
         try:
             answer = self._http.request(method, path, **options)
         except httpx2.HTTPError as error:
@@ -161,7 +188,7 @@ class Client(SnapshotMethods):
                 f"{self.url} does not answer: {error or type(error).__name__}; check the address, and that the server runs"
             ) from error
         if answer.is_success:
-            return answer.json() if answer.content else None
+            return answer
         try:
             said = answer.json()
             sentence = str(said.get("detail") or said.get("title"))

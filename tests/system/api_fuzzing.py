@@ -6,30 +6,19 @@ Usage: python -m tests.system.api_fuzzing [--examples N] [--seed N]
 from __future__ import annotations
 
 import argparse
-import re
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from gsplat_core.io.bundle import save_bundle
 from services.client import Client
 from services.registry.bundle_file import pack
 from tests.services.supervisor.test_model_show import uniform
+from tests.system.servers import ROOT, serving
 
-ROOT = Path(__file__).resolve().parents[2]
 NAME = "theatre-1"
 """The document's example of a name."""
-SETTINGS = """
-server: {{port: 0}}
-paths: {{data: {folder}/data, runtime: {folder}/r}}
-log: {{format: text}}
-limits: {{requests_per_s: 100000, address_requests_per_s: 100000}}
-streams: {{theatre-1: {{source: "synthetic:?width=64&height=48&frames=4&fps=2", device: cpu, start: false}}}}
-"""
 CHECKS = (
     "not_a_server_error", "status_code_conformance", "content_type_conformance", "response_headers_conformance",
     "response_schema_conformance", "negative_data_rejection", "missing_required_header", "unsupported_method", "ignored_auth",
@@ -39,33 +28,6 @@ ENDLESS = "/v1/streams/{name}/mjpeg"
 ABSENT = {"jobs": "/v1/replays", "recordings": "/v1/recordings"}
 """Resources that this server may have been built without: then they answer 503, and only that."""
 ANSWER_S = 30
-
-
-@contextmanager
-def serving(folder: Path) -> Iterator[tuple[str, str]]:
-    """A server of its own: its address and its administrator's key."""
-    settings = folder / "settings.yaml"
-    settings.write_text(SETTINGS.format(folder=folder))
-    log = folder / "log"
-    with log.open("w") as output:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "services.cli", "serve", "--config", settings],
-            cwd=ROOT,
-            stdout=output,
-            stderr=output,
-        )
-    try:
-        end_s = time.monotonic() + 60
-        while not (found := re.search(r"IntraSplat is on (http://[^/\s]+)", log.read_text())):
-            assert time.monotonic() < end_s and process.poll() is None, log.read_text()
-            time.sleep(0.05)
-        yield found[1], (folder / "data" / "admin.key").read_text().strip()
-        process.terminate()
-        assert process.wait(60) == 0, log.read_text()[-4000:]
-        assert "Traceback" not in log.read_text(), log.read_text()
-    finally:
-        process.kill()
-        process.wait()
 
 
 def with_models(client: Client, folder: Path) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.api_fuzzing import fuzz, serving
+from tests.system.api_fuzzing import fuzz
+from tests.system.servers import serving
 
 pytest.importorskip("schemathesis", reason="schemathesis comes with the development packages")
 

@@ -1,0 +1,115 @@
+"""The service's API from a model's upload to its rollback, through the typed client.
+
+Needs a running service (`intrasplat serve`) and its administrator's key. Makes two models of one colour each, uploads them as versions of one
+model, shows it as a stream, and changes what is shown: activate, roll back, stop, start. Then it rotates an API key, and reads the audit log
+and the metrics. What it has made it deletes, but for the versions of the model that must stay: the active one.
+
+Usage: python examples/06_service_life_cycle.py --key-file ~/.local/share/intrasplat/admin.key [--url http://127.0.0.1:8000]
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+from gsplat_core import Camera, Gaussians
+from gsplat_core.io.bundle import save_bundle
+from gsplat_core.scene.model import Model
+from services.client import Client, Refused
+from services.registry.bundle_file import pack
+
+MODEL = STREAM = "life-cycle"
+SOURCE = "synthetic:?width=64&height=48&frames=4&fps=10"
+WITHIN_S = 60.0
+
+
+def wall(colour: tuple[float, float, float]) -> Model:
+    """A wall of one colour in front of the camera: 144 Gaussians that do not move."""
+    x, y = torch.meshgrid(torch.linspace(-2, 2, 12), torch.linspace(-2, 2, 12), indexing="xy")
+    means = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((144,), 4.0)], 1)
+    colours = ((torch.tensor(colour) - 0.5) / 0.28209479).expand(144, 1, 3).clone()
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(144, 1)
+    gaussians = Gaussians(means, quats, torch.full((144, 3), -1.0), torch.full((144,), 6.0), colours)
+    return Model(1, gaussians, None, Camera.from_focal(40.0, 64, 48), (0.0, 1.0))
+
+
+def uploaded(client: Client, folder: Path, name: str, colour: tuple[float, float, float]) -> int:
+    """Save, pack and upload a model, and wait until the server has checked it; its version."""
+    save_bundle(wall(colour), folder / name)
+    pack(folder / name, folder / f"{name}.isplat")
+    version = client.upload(MODEL, folder / f"{name}.isplat").version  # sends the file's SHA-256 along
+    checked = client.checked(MODEL, version)
+    print(f"{name} is {MODEL}/{version}: {checked.state}")
+    return version
+
+
+def wait_until_shown(client: Client, version: int) -> None:
+    """Watch the stream until its pictures are of a version."""
+    end_s = time.monotonic() + WITHIN_S
+    while time.monotonic() < end_s:
+        if client.stream(STREAM).state == "live":
+            for picture in client.pictures(STREAM):
+                if picture.header["model_version"] == version:
+                    print(
+                        f"a picture of version {version}: {len(picture.jpeg)} bytes, {picture.header['age_ms']:.0f} ms old"
+                    )
+                    return
+        time.sleep(0.2)
+    raise SystemExit(f"no picture of version {version} within {WITHIN_S:g} s")
+
+
+def models_change(client: Client, folder: Path) -> None:
+    """Upload, activate, roll back; the stream's pictures follow."""
+    active = {model.name: model.active for model in client.models()}.get(MODEL)
+    red, green = (uploaded(client, folder, *each) for each in (("red", (0.9, 0.1, 0.1)), ("green", (0.1, 0.9, 0.1))))
+    client.activate(MODEL, red, expected_current=active)
+    client.create_stream(STREAM, SOURCE, show=f"model {MODEL}", device="cpu")
+    wait_until_shown(client, red)
+    try:
+        client.activate(MODEL, green, expected_current=None)  # somebody who does not know that red is active
+    except Refused as refused:
+        print(f"refused ({refused.status}): {refused.sentence}")
+    client.activate(MODEL, green, expected_current=red)
+    wait_until_shown(client, green)
+    print(f"rolled back to {client.rollback(MODEL).version}")
+    wait_until_shown(client, red)
+    client.stop_stream(STREAM)
+    client.start_stream(STREAM)
+    wait_until_shown(client, red)
+    client.delete_stream(STREAM)
+    client.delete_version(MODEL, green)
+
+
+def keys_change(client: Client) -> None:
+    """A second key of the same name, the caller changes over, the first one goes."""
+    old = client.make_key("life-cycle", "viewer")
+    new = client.make_key("life-cycle", "viewer")
+    client.revoke_key(old.id)
+    with Client(client.url, old.key) as gone, Client(client.url, new.key) as caller:
+        print(f"the new key sees {len(caller.streams())} streams")
+        try:
+            gone.streams()
+        except Refused as refused:
+            print(f"the old key: {refused.status}")
+    client.revoke_key(new.id)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--url", default="http://127.0.0.1:8000")
+    parser.add_argument("--key-file", type=Path, required=True)
+    options = parser.parse_args()
+    with Client(options.url, options.key_file.read_text()) as client, tempfile.TemporaryDirectory() as folder:
+        print(f"IntraSplat {client.about()['version']}")
+        models_change(client, Path(folder))
+        keys_change(client)
+        for entry in client.audit(count=5).entries:
+            print(f"audit {entry.seq}: {entry.event} {entry.subject} by {entry.actor}: {entry.outcome}")
+        counted = [line for line in client.metrics().splitlines() if line.startswith("intrasplat_upload_bytes_total")]
+        print(*counted, sep="\n")
+
+
+if __name__ == "__main__":
+    main()
