@@ -1,0 +1,41 @@
+"""The commands of the service's guide do what it says, on a server that has nothing yet."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from gsplat_core.io.bundle import save_bundle
+from services.registry.bundle_file import pack
+from tests.services.supervisor.test_model_show import uniform
+from tests.system.servers import ROOT, serving
+
+pytestmark = pytest.mark.skipif(
+    not (shutil.which("curl") and shutil.which("openssl")), reason="there is no curl or openssl"
+)
+
+
+def test_the_life_cycle_with_curl(tmp_path):
+    (commands,) = re.findall(
+        r"^```bash\n(.*?)^```", (ROOT / "docs" / "service.md").read_text(), re.MULTILINE | re.DOTALL
+    )
+    for name, colour in (("one", (0.9, 0.1, 0.1)), ("two", (0.1, 0.9, 0.1))):
+        save_bundle(uniform(colour), tmp_path / name)
+        pack(tmp_path / name, tmp_path / f"{name}.isplat")
+    with tempfile.TemporaryDirectory(prefix="isg-") as folder, serving(Path(folder)) as (url, _):
+        environment = {**os.environ, "URL": url, "KEY_FILE": f"{folder}/data/admin.key"}
+        done = subprocess.run(
+            ["bash", "-euc", commands], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
+        )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "pictures.mjpeg").read_bytes().count(b"\xff\xd8\xff") >= 1
+    events = [entry["event"] for entry in json.loads((tmp_path / "audit.json").read_text())["entries"]]
+    assert {"model.rollback", "model.check", "stream.create", "key.revoke", "process.started"} <= set(events)
+    assert "intrasplat_build_info{" in (tmp_path / "metrics.txt").read_text()
