@@ -1,8 +1,9 @@
 """The service's API from a model's upload to its rollback, through the typed client.
 
 Needs a running service (`intrasplat serve`) and its administrator's key. Makes two models of one colour each, uploads them as versions of one
-model, shows it as a stream, and changes what is shown: activate, roll back, stop, start. Then it rotates an API key, and reads the audit log
-and the metrics. What it has made it deletes, but for the versions of the model that must stay: the active one.
+model, shows it as a stream, and changes what is shown: activate, roll back, stop, start. It exports the model, and a snapshot of a live
+reconstruction. Then it rotates an API key, and reads the audit log and the metrics. What it has made it deletes, but for the version of the
+model that is active.
 
 Usage: python examples/06_service_life_cycle.py --key-file ~/.local/share/intrasplat/admin.key [--url http://127.0.0.1:8000]
 """
@@ -80,6 +81,23 @@ def models_change(client: Client, folder: Path) -> None:
     wait_until_shown(client, red)
     client.delete_stream(STREAM)
     client.delete_version(MODEL, green)
+    size = client.export_version(MODEL, red, "glb", folder / "red.glb")
+    print(f"red.glb: {size} bytes")
+
+
+def snapshot_is_taken(client: Client, folder: Path) -> None:
+    """What a stream has reconstructed up to now, as a file for other programs."""
+    client.create_stream(STREAM, SOURCE, show="live", device="cpu")
+    end_s = time.monotonic() + WITHIN_S
+    while client.stream(STREAM).state != "live" and time.monotonic() < end_s:
+        time.sleep(0.2)
+    next(client.pictures(STREAM))
+    number = client.take_snapshot(STREAM).id
+    assert number is not None  # it did not become a model's version
+    size = client.export_snapshot(STREAM, number, "ply", folder / "live.ply")
+    print(f"live.ply: {size} bytes of snapshot {number}")
+    client.delete_snapshot(STREAM, number)
+    client.delete_stream(STREAM)
 
 
 def keys_change(client: Client) -> None:
@@ -104,6 +122,7 @@ def main() -> None:
     with Client(options.url, options.key_file.read_text()) as client, tempfile.TemporaryDirectory() as folder:
         print(f"IntraSplat {client.about()['version']}")
         models_change(client, Path(folder))
+        snapshot_is_taken(client, Path(folder))
         keys_change(client)
         for entry in client.audit(count=5).entries:
             print(f"audit {entry.seq}: {entry.event} {entry.subject} by {entry.actor}: {entry.outcome}")

@@ -13,10 +13,10 @@ from services.bus.errors import BusError
 from services.bus.runtime import RuntimeFolder
 from services.control.parts import CheckResult, NewStream, Parts
 from services.control.problems import Conflicting, Missing, Problem, Unavailable, Unprocessable
+from services.control.system_events import SystemEvents
 from services.exports.cache import ExportCache
 from services.exports.errors import ExportBusy, ExportFailed, ExportRefused, NoSnapshot
 from services.exports.snapshots import SnapshotStore
-from services.control.system_events import SystemEvents
 from services.registry.errors import Conflict, NotFound, Rejected, StoreUnavailable
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
