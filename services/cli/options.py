@@ -21,7 +21,7 @@ def _path(text: str) -> Path:
     return Path(text)
 
 
-def _path_argument(name: str, help_text: str) -> Any:
+def path_argument(name: str, help_text: str) -> Any:
     return typer.Argument(parser=_path, metavar=name, help=help_text, show_default=False)
 
 
@@ -30,7 +30,7 @@ def path_option(name: str, help_text: str) -> Any:
 
 
 RecordingArgument = Annotated[
-    Path, _path_argument("RECORDING", "A video, or a folder with video.mp4, images/, cameras.json or session.json.")
+    Path, path_argument("RECORDING", "A video, or a folder with video.mp4, images/, cameras.json or session.json.")
 ]
 SourceArgument = Annotated[
     str,
@@ -40,14 +40,14 @@ SourceArgument = Annotated[
         show_default=False,
     ),
 ]
-ModelArgument = Annotated[Path, _path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
-PackedFileArgument = Annotated[Path, _path_argument("FILE", "The packed file, which ends in .isplat.")]
-ExportedFileArgument = Annotated[Path, _path_argument("FILE", "The exported file.")]
+ModelArgument = Annotated[Path, path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
+PackedFileArgument = Annotated[Path, path_argument("FILE", "The packed file, which ends in .isplat.")]
+ExportedFileArgument = Annotated[Path, path_argument("FILE", "The exported file.")]
 OutOption = Annotated[Path, path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
 LiveOutOption = Annotated[
     Path | None, path_option("--out", "Folder for the report and the model; without it nothing is kept.")
 ]
-EvaluatedArgument = Annotated[Path, _path_argument("MODEL|RUN", "A model folder, or the output folder of a run.")]
+EvaluatedArgument = Annotated[Path, path_argument("MODEL|RUN", "A model folder, or the output folder of a run.")]
 EvaluationOutOption = Annotated[
     Path | None,
     path_option("--out", "Folder for evaluation.json and evaluation.html: new, empty, or left by an earlier run."),

@@ -9,7 +9,7 @@ import typer
 
 from services.cli import ctl_models
 from services.cli.ctl import ctl
-from services.cli.options import JsonOption, path_option
+from services.cli.options import JsonOption, path_argument, path_option
 
 ConfigOption = Annotated[Path | None, path_option("--config", "Settings file (YAML); without one: the defaults.")]
 DataOption = Annotated[Path | None, path_option("--data", "Folder of what is kept (paths.data).")]
@@ -22,6 +22,8 @@ def add_to(app: typer.Typer) -> None:
     """Give the program the service's commands."""
     app.command()(serve)
     app.command()(schema)
+    app.command()(igtl)
+    app.command()(view)
     app.add_typer(keys, name="keys")
     app.add_typer(audit, name="audit")
     assert ctl_models.ctl is ctl  # it has added its commands
@@ -49,6 +51,41 @@ def schema() -> int:
     from services.cli.serve import schema_command
 
     return schema_command()
+
+
+def igtl(
+    stream: Annotated[str, typer.Argument(metavar="STREAM", help="One that runs on this machine.", show_default=False)],
+    config: ConfigOption = None,
+    runtime: Annotated[Path | None, path_option("--runtime", "Folder of the sockets (paths.runtime).")] = None,
+    kind: Annotated[str, typer.Option(help="raw, shown, depth, confidence or orbit.")] = "shown",
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on.", min=0, max=65535)] = 18944,
+    name: Annotated[str | None, typer.Option(help="Of the device.", show_default="the stream's")] = None,
+    spacing_mm: Annotated[float, typer.Option(help="Width and height of a pixel in millimetres.")] = 1.0,
+    plaintext: Annotated[
+        bool, typer.Option("--plaintext", help="Listen beyond this machine, though nothing is encrypted.")
+    ] = False,
+) -> int:
+    """Send a stream's pictures and the pose of its camera to 3D Slicer and others over OpenIGTLink."""
+    from services.cli.igtl import igtl_command
+
+    return igtl_command(
+        stream, config, runtime, kind=kind, host=host, port=port, name=name, spacing_mm=spacing_mm, plaintext=plaintext
+    )
+
+
+def view(
+    model: Annotated[Path, path_argument("MODEL", "A model folder, or a packed model (.isplat).")],
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 8080,
+    plaintext: Annotated[
+        bool, typer.Option("--plaintext", help="Listen beyond this machine, though nothing is encrypted.")
+    ] = False,
+) -> int:
+    """Show a model in browsers, to be turned and played (extra `viser`)."""
+    from services.cli.view import view_command
+
+    return view_command(model, host, port, plaintext=plaintext)
 
 
 @keys.command("list")

@@ -84,7 +84,9 @@ def header_of(shown: ShownPicture) -> dict[str, Any]:
     """What is said of a picture of the live reconstruction (docs/processes.md)."""
     rendered = shown.rendered
     content = rendered.content or rendered.frame
+    pose = rendered.frame.pose
     return {
+        **({} if pose is None else {"world_to_camera": pose.tolist()}),
         "seq": rendered.frame.seq,
         "pts_ns": rendered.frame.pts_ns,
         "arrived_ns": content.arrived_ns,

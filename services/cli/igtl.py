@@ -1,0 +1,40 @@
+"""`intrasplat igtl`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import typer
+
+from gsplat_core.errors import InvalidSetting
+from services.cli.exit_codes import OK
+from services.cli.interrupt import InterruptRequest
+from services.cli.listening import check_host
+from services.display.hub import KINDS
+from services.openigtlink.messages import StreamMessages
+from services.openigtlink.sender import folder_of, send
+from services.openigtlink.server import MessageServer
+from services.settings import load_settings
+
+
+def igtl_command(
+    stream: str, config: Path | None, runtime: Path | None, *, kind: str, host: str, port: int, name: str | None,
+    spacing_mm: float, plaintext: bool,
+) -> int:  # fmt: skip
+    """Send a stream's pictures until asked to end."""
+    if kind not in KINDS:
+        raise InvalidSetting(f"there is no picture {kind!r:.60}; choose {', '.join(KINDS)}")
+    check_host(host, plaintext, "OpenIGTLink has no keys, and sends pictures in the clear to whoever connects")
+    folder = folder_of(runtime or load_settings(config, {}).runtime_dir, stream)
+    messages = StreamMessages(name or stream[:13], spacing_mm)
+    server = MessageServer(host, port)
+    try:
+        with InterruptRequest() as interrupt:
+            print(f"OpenIGTLink server on {server.address[0]}:{server.address[1]}", file=sys.stderr, flush=True)  # noqa: T201
+            counts = send(folder.endpoint(kind), messages, server, interrupt)
+    finally:
+        server.close()
+    typer.echo(json.dumps(counts))
+    return OK

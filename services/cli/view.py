@@ -1,0 +1,43 @@
+"""`intrasplat view`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from gsplat_core.errors import BundleError
+from gsplat_core.io.bundle import load_bundle
+from services.cli.exit_codes import OK
+from services.cli.interrupt import InterruptRequest
+from services.cli.listening import check_host
+from services.model_view.viewer import ModelView
+from services.registry.bundle_file import SUFFIX, unpack
+
+
+def view_command(model: Path, host: str, port: int, *, plaintext: bool) -> int:
+    """Serve a model to browsers until asked to end."""
+    check_host(host, plaintext, "the viewer has no keys, and shows the model to whoever connects")
+    with bundle_in(model) as folder:
+        loaded = load_bundle(folder)
+    with InterruptRequest() as interrupt, ModelView(loaded, host, port) as view:
+        print(f"the model is on http://{view.address[0]}:{view.address[1]}/", file=sys.stderr, flush=True)  # noqa: T201
+        view.run(interrupt)
+    return OK
+
+
+@contextmanager
+def bundle_in(model: Path) -> Iterator[Path]:
+    """The folder of a model, also of a packed one. Raises BundleError, Rejected."""
+    if model.suffix != SUFFIX or model.is_dir():
+        yield model
+        return
+    with TemporaryDirectory(prefix="intrasplat-view-") as folder:
+        try:
+            with model.open("rb") as file:
+                unpack(file, model.stat().st_size, Path(folder))
+        except OSError as error:
+            raise BundleError(f"{model} cannot be read: {error.strerror or error}; check the name") from error
+        yield Path(folder)

@@ -1,0 +1,1 @@
+"""A model in a browser, to be turned and played, by viser (extra `viser`)."""

@@ -1,0 +1,143 @@
+"""What a client of OpenIGTLink receives: orientation, order of channels, spacing, pose, and what becomes of slow clients."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from operators.errors import OutputError
+from services.bus.pictures import PicturePublisher
+from services.openigtlink.messages import StreamMessages, ijk_to_camera
+from services.openigtlink.sender import folder_of, send
+from services.openigtlink.server import MessageServer
+
+pyigtl = pytest.importorskip("pyigtl", reason="pip install 'intrasplat[igtl]'")
+SOON_S = 20.0
+POSE = np.array([[0.0, -1, 0, 5], [1, 0, 0, -6], [0, 0, 1, 7], [0, 0, 0, 1]])
+
+
+def asymmetric() -> np.ndarray:
+    """Red in the upper left corner, green in the upper right one, blue in the lower left one, white in the lower right one; wider than high."""
+    image = np.zeros((4, 7, 3), np.uint8)
+    image[0, 0], image[0, -1], image[-1, 0], image[-1, -1] = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
+    return image
+
+
+@contextlib.contextmanager
+def sending(runtime, header, image, **options):
+    """A stream that publishes, a server, and its port."""
+    folder = runtime.stream("theatre")
+    publisher, server, stop = (
+        PicturePublisher(folder.pictures("engine")),
+        MessageServer("127.0.0.1", 0),
+        threading.Event(),
+    )
+    messages = StreamMessages("theatre", **options)
+
+    def publish() -> None:
+        while not stop.wait(0.02):
+            publisher.publish({**header, "arrived_ns": time.monotonic_ns() - 40_000_000}, image)
+
+    threads = [
+        threading.Thread(target=publish),
+        threading.Thread(target=send, args=(folder.pictures("engine"), messages, server, stop.is_set)),
+    ]
+    for thread in threads:
+        thread.start()
+    try:
+        yield server
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+        server.close()
+        publisher.close()
+
+
+@contextlib.contextmanager
+def connected(server):
+    client = pyigtl.OpenIGTLinkClient("127.0.0.1", server.address[1])
+    try:
+        yield client
+    finally:
+        client.stop()
+
+
+def test_an_asymmetric_picture_arrives_as_it_is(runtime):
+    image = asymmetric()
+    header = {"state": "stale", "age_ms": 41.3, "world_to_camera": POSE.tolist()}
+    with sending(runtime, header, image, spacing_mm=0.25) as server, connected(server) as client:
+        got = client.wait_for_message("theatre", SOON_S)
+        assert got is not None and got.message_type == "IMAGE"
+        # (k, j, i, component): j counts rows downwards, i columns to the right, and the first component is red.
+        assert got.image.shape == (1, 4, 7, 3) and got.image.dtype == np.uint8
+        np.testing.assert_array_equal(got.image[0], image)
+        assert got.world_coordinate_system == "ras"
+        np.testing.assert_allclose(got.ijk_to_world_matrix, ijk_to_camera(7, 4, 0.25), atol=1e-6)
+        np.testing.assert_allclose(got.ijk_to_world_matrix @ [3, 1.5, 0, 1], [0, 0, 0, 1], atol=1e-6)
+        np.testing.assert_allclose(got.ijk_to_world_matrix @ [6, 1.5, 0, 1], [0.75, 0, 0, 1], atol=1e-6)
+        assert 0.03 < time.time() - got.timestamp < SOON_S
+        pose = client.wait_for_message("theatre_Camera", SOON_S)
+        np.testing.assert_allclose(pose.matrix, np.linalg.inv(POSE), atol=1e-6)
+        assert client.wait_for_message("theatre_State", SOON_S).string == "stale 41 ms"
+
+
+def test_without_clients_nothing_is_read_and_with_one_again_it_is(runtime):
+    with sending(runtime, {"state": "live", "age_ms": 1.0}, asymmetric()) as server:
+        assert server.clients == 0
+        for _ in range(2):
+            with connected(server) as client:
+                assert client.wait_for_message("theatre", SOON_S) is not None
+            until(lambda: server.clients == 0)
+
+
+def test_a_client_that_takes_nothing_does_not_slow_another_one(runtime):
+    large = np.zeros((500, 800, 3), np.uint8)
+    with (
+        sending(runtime, {"state": "live", "age_ms": 1.0}, large) as server,
+        socket.create_connection(server.address) as sleeper,
+        connected(server) as client,
+    ):
+        sleeper.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        for _ in range(10):
+            assert client.wait_for_message("theatre", SOON_S) is not None
+        assert server.clients == 2
+
+
+def test_a_stream_that_says_nothing_is_said(runtime):
+    folder = runtime.stream("silent")
+    server, stop = MessageServer("127.0.0.1", 0), threading.Event()
+    messages = StreamMessages("silent")
+    thread = threading.Thread(target=send, args=(folder.pictures("engine"), messages, server, stop.is_set))
+    thread.start()
+    with connected(server) as client:
+        assert client.wait_for_message("silent_State", SOON_S).string == "no picture"
+    stop.set()
+    thread.join()
+    server.close()
+
+
+def until(what) -> None:
+    until_s = time.monotonic() + SOON_S
+    while not what():
+        assert time.monotonic() < until_s
+        time.sleep(0.02)
+
+
+def test_what_cannot_be_is_refused(runtime):
+    for name in ("", "a" * 14, "größe", "a\n"):
+        with pytest.raises(InvalidSetting, match="name"):
+            StreamMessages(name)
+    for spacing in (0.0, -1.0, float("nan")):
+        with pytest.raises(InvalidSetting, match="spacing"):
+            StreamMessages("a", spacing)
+    with pytest.raises(InvalidSetting, match="no stream"):
+        folder_of(runtime.path, "nobody")
+    with MessageServer("127.0.0.1", 0)._listener as taken, pytest.raises(OutputError, match="cannot be listened on"):
+        MessageServer("127.0.0.1", taken.getsockname()[1])
