@@ -19,7 +19,7 @@ export function auditPage(report) {
   async function older() {
     const page = await call("GET", `/v1/audit?count=${COUNT}${before === null ? "" : `&before=${before}`}`);
     for (const entry of page.entries) {
-      at("entries").append(row(entry.seq, new Date(entry.at).toLocaleString(), entry.event, `${entry.actor} (${entry.role})`, entry.subject, entry.outcome));
+      at("entries").append(row(entry.seq, new Date(entry.at).toLocaleString(), entry.event, entry.role ? `${entry.actor} (${entry.role})` : entry.actor, entry.subject, entry.outcome));
     }
     before = page.next_before;
     at("older").hidden = before === null;
