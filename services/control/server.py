@@ -21,6 +21,9 @@ from services.control.systemd import ServiceManager
 from services.settings import ServiceSettings
 
 MOST_HEAD_BYTES = 32 * 1024
+MOST_UNSENT_BYTES = 64 * 1024
+"""What the system keeps of an answer that it has not sent yet: for a viewer who is slow the newest picture is to wait here, and not twenty old ones
+there."""
 MOST_MESSAGE_BYTES = 4096
 """Of what a viewer sends by WebSocket: nothing that anybody reads."""
 
@@ -147,6 +150,8 @@ def bind(settings: ServiceSettings) -> socket.socket:
     # Connections inherit both. asyncio turns Nagle's algorithm off only for sockets that name their protocol, and this one does not: an answer's
     # body would wait 40 ms for its head to be acknowledged.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    # The system would take 4 MB for a viewer who is slow: seconds of pictures that are old before they are sent.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MOST_UNSENT_BYTES)
     # One whose peer takes nothing for so long is cut off by the system, whatever still waits to be sent.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(settings.limits.viewer_stall_s * 1000))
     return listener

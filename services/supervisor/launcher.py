@@ -54,7 +54,7 @@ MOST_REMEMBERED = 256
 
 
 class Launcher:
-    """Listens at its socket and forks until it is told to stop, or nobody has asked for anything in `orphan_after_s`."""
+    """Listens at its socket and forks until it is told to stop, nobody has asked for anything in `orphan_after_s`, or nobody can: the socket is gone."""
 
     def __init__(self, path: Path, orphan_after_s: float) -> None:
         self._path, self._orphan_after_s = path, orphan_after_s
@@ -74,6 +74,8 @@ class Launcher:
         """Until the end."""
         while not self._stopped and time.monotonic() - self._heard_s < self._orphan_after_s:
             self._reap()
+            if not self._path.exists():
+                break
             if not select.select([self._listener], [], [], LOOK_S)[0]:
                 continue
             connection, _ = self._listener.accept()

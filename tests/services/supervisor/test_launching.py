@@ -61,6 +61,12 @@ def test_a_launcher_that_nobody_asks_ends(runtime):
     assert not (runtime.path / SOCKET).exists()
 
 
+def test_a_launcher_whose_socket_was_removed_ends(runtime):
+    launcher = Launcher(runtime.path / SOCKET, orphan_after_s=600.0)
+    (runtime.path / SOCKET).unlink()
+    launcher.serve()
+
+
 def test_a_direct_start_is_a_session_of_its_own_and_says_how_it_ended(runtime):
     output = runtime.path / "log"
 
