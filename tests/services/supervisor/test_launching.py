@@ -98,3 +98,31 @@ def test_without_a_launcher_processes_are_started_directly(runtime):
     assert asyncio.run(run()) == "exit code 2"
     assert "/none cannot be read" in last_words(runtime.path / "log")
     assert recorded_launcher(runtime) is None
+
+
+def test_engines_wait_for_a_launcher_that_is_loading_and_capture_does_not(runtime, monkeypatch):
+    directly: list[str] = []
+
+    async def start_directly(module, arguments, output, environment, *, fresh=False) -> int:
+        directly.append(module)
+        return 1
+
+    async def by_the_launcher(command, **arguments) -> dict:
+        return {"ok": True, "pid": 7}
+
+    async def run() -> None:
+        start = ByLauncher(runtime)
+        start._keeping = asyncio.create_task(asyncio.sleep(600))
+        monkeypatch.setattr(start._direct, "start", start_directly)
+        monkeypatch.setattr(start, "_ask", by_the_launcher)
+        engine, capture = (f"services.supervisor.{role}" for role in ("engine", "capture"))
+        waiting = asyncio.create_task(start.start(engine, [], runtime.path / "log", {}))
+        assert await start.start(capture, [], runtime.path / "log", {}) == 1
+        assert await start.start(engine, [], runtime.path / "log", {}, fresh=True) == 1
+        assert not waiting.done()
+        start.ready.set()
+        assert await waiting == 7
+        assert directly == [capture, engine]
+        start._keeping.cancel()
+
+    asyncio.run(run())
