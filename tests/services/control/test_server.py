@@ -51,7 +51,8 @@ def serving(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen, int
         reader = threading.Thread(target=lambda: lines.extend(process.stderr))
         reader.start()
         yield process, int(found[1]), (folder / "admin.key").read_text().strip()
-        process.kill()
+        process.terminate()  # killed, it would leave the launcher of its processes to the next server
+        process.wait(timeout=20)
         reader.join()
     finally:
         process.kill()
