@@ -41,8 +41,10 @@ async function quietly(act) {
 function say(state, age_ms) {
   const place = at("state");
   const age = Number.isFinite(age_ms) ? (age_ms < 1000 ? ` ${Math.round(age_ms)} ms` : ` ${(age_ms / 1000).toFixed(1)} s`) : "";
-  if (place.dataset.state !== state) place.dataset.state = state;
-  place.firstElementChild.textContent = state;
+  if (place.dataset.state !== state) { // once: it is read aloud
+    place.dataset.state = state;
+    place.firstElementChild.textContent = state;
+  }
   place.lastElementChild.textContent = age;
 }
 
