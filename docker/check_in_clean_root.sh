@@ -58,6 +58,6 @@ for _ in $(seq 60); do
   if as_user env HEALTHCHECK_URL=http://127.0.0.1:8791/livez python -I /opt/intrasplat/healthcheck.py > /dev/null; then break; fi
 done
 as_user env HEALTHCHECK_URL=http://127.0.0.1:8791/livez python -I /opt/intrasplat/healthcheck.py
-kill -TERM "$(pgrep --newest --parent "$(pgrep --parent $served --newest || echo $served)" || echo $served)"
+pkill -TERM --parent $served  # tini, which hands it on
 wait $served
 step "done: the service ended with 0"

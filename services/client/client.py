@@ -13,7 +13,7 @@ import httpx2
 from pydantic import TypeAdapter
 
 from services.client.errors import ClientError, Refused, Unreachable
-from services.client.pictures import Picture, pictures
+from services.client.pictures import Picture, pictures, tls_context
 from services.client.snapshots import SnapshotMethods
 from services.control.routes.audit import AuditPage
 from services.control.routes.keys import KeyView, MadeKey
@@ -42,7 +42,10 @@ class Client(SnapshotMethods):
         self._key = key.strip()
         self._verify = verify
         self._http = httpx2.Client(
-            base_url=self.url, headers={"Authorization": f"Bearer {self._key}"}, timeout=timeout_s, verify=verify
+            base_url=self.url,
+            headers={"Authorization": f"Bearer {self._key}"},
+            timeout=timeout_s,
+            verify=tls_context(verify),
         )
 
     def streams(self) -> list[StreamView]:

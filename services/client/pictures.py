@@ -36,7 +36,7 @@ def pictures(url: str, path: str, ticket: str, kind: str, quality: int, verify: 
         with connect(
             f"{scheme}://{parts.netloc}{path}?{query}",
             max_size=MOST_BYTES,
-            ssl=_tls(verify) if scheme == "wss" else None,
+            ssl=tls_context(verify) if scheme == "wss" else None,
         ) as socket:
             for message in socket:
                 if isinstance(message, bytes):
@@ -53,7 +53,8 @@ def picture_of(message: bytes) -> Picture:
     return Picture(json.loads(message[4 : 4 + length]), message[4 + length :])
 
 
-def _tls(verify: bool | str) -> ssl.SSLContext:
+def tls_context(verify: bool | str) -> ssl.SSLContext:
+    """How a server's certificate is checked: as the system does, against the authority in a file, or not at all (False)."""
     context = ssl.create_default_context(cafile=verify if isinstance(verify, str) else None)
     if verify is False:
         context.check_hostname = False

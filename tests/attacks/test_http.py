@@ -61,6 +61,19 @@ def test_behind_a_proxy_the_last_stranger_counts(served, caplog):
     assert client.get("/livez", headers={"X-Forwarded-Proto": "https"}).headers["strict-transport-security"]
 
 
+def test_a_proxy_s_other_headers_name_no_host_and_no_scheme_of_their_own(served, caplog):
+    client = served(server={"trusted_proxies": ["10.0.0.9"], "allowed_hosts": ["room-1.example"]})
+    for forged in ({"X-Forwarded-Host": "localhost"}, {"Forwarded": "host=localhost"}, {"X-Host": "localhost"}):
+        assert client.get("/livez", headers={"Host": "evil.example", **forged}).status_code == 421
+    answer = client.get("/v1/version", headers={"Host": "room-1.example", "X-Forwarded-Host": "evil.example"})
+    assert answer.status_code == 401 and "evil" not in answer.text + str(answer.headers)
+    odd = client.get("/livez", headers={"X-Forwarded-Proto": "javascript", "X-Forwarded-Prefix": "//evil.example"})
+    assert odd.status_code == 200 and "strict-transport-security" not in odd.headers
+    assert asked_from(client, {"X_Forwarded_For": "1.2.3.4"}, caplog) == "10.0.0.9", "another name than with dashes"
+    for value in ("", ",", "1.2.3.4,", " , 6.6.6.6,,10.0.0.9", "evil\tname", "[::1", "1.2.3.4:99999"):
+        assert client.get("/livez", headers={"X-Forwarded-For": value}).status_code == 200, value
+
+
 def test_a_rate_is_not_escaped_by_forged_addresses(served):
     client = served(limits={"address_requests_per_s": 0.05, "burst_s": 40})
     answers = [client.get("/livez", headers={"X-Forwarded-For": f"1.2.3.{n}"}).status_code for n in range(5)]

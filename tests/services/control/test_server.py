@@ -19,6 +19,7 @@ from pathlib import Path
 
 import pytest
 
+from services.client import Client, Unreachable
 from services.control.server import bind
 from services.settings import ServiceSettings
 
@@ -144,6 +145,12 @@ def test_a_body_that_is_refused_is_not_waited_for(served):
         "GET /livez HTTP/1.1\r\nHost: localhost\r\nContent-Length: -1\r\n\r\n",
         "GET /livez HTTP/1.1\r\nHost : localhost\r\n\r\n",
         "GET /livez HTTP/1.1\r\nHost: localhost\r\n folded: y\r\nTransfer-Encoding: x\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nHost: localhost\r\nHost: localhost\r\n\r\n",
+        "GET /livez HTTP/1.1\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked, identity\r\n\r\n0\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: xchunked\r\n\r\n0\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\nContent-Length\x00: 5\r\n\r\n",
+        "GET /livez HTTP/1.1\nHost: localhost\rX: y\n\n",
         "\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n",
     ],
 )
@@ -217,6 +224,18 @@ def certificate(tmp_path_factory) -> Path:
     return folder
 
 
+def _nothing() -> None:
+    raise ConnectionError("closed without a word")
+
+
+def test_a_key_of_another_certificate_is_refused(certificate, tmp_path):
+    other = tmp_path / "other.pem"
+    subprocess.run(["openssl", "genrsa", "-out", str(other), "2048"], check=True, capture_output=True)
+    given = ["--set", f"server.certfile={certificate / 'cert.pem'}", "--set", f"server.keyfile={other}"]
+    done = subprocess.run([*SERVE, "--data", str(tmp_path / "x"), *given], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 2 and "check server.certfile" in done.stderr and "Traceback" not in done.stderr
+
+
 def test_tls(certificate, tmp_path):
     options = [
         "--set",
@@ -224,13 +243,20 @@ def test_tls(certificate, tmp_path):
         "--set",
         f"server.keyfile={certificate / 'key.pem'}",
     ]
-    with serving(tmp_path, *options) as (_, port, _key):
+    with serving(tmp_path, *options) as (_, port, key):
         context = ssl.create_default_context(cafile=str(certificate / "cert.pem"))
         connection = http.client.HTTPSConnection("127.0.0.1", port, context=context, timeout=10)
         connection.request("GET", "/livez")
         answer = connection.getresponse()
         assert answer.status == 200 and answer.headers["strict-transport-security"]
         connection.close()
+        url = f"https://127.0.0.1:{port}"
+        with Client(url, key, verify=str(certificate / "cert.pem")) as client:
+            assert "streams" in client.about()["parts"]
+        with Client(url, key) as stranger, pytest.raises(Unreachable, match="certificate"):
+            stranger.about()
+        with pytest.raises(ConnectionError):  # an answer would be in the clear
+            raw(port, b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n") or _nothing()
         old = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         old.check_hostname, old.verify_mode = False, ssl.CERT_NONE
         with pytest.warns(DeprecationWarning):
