@@ -89,7 +89,6 @@ class SupervisedStreams:
     @asynccontextmanager
     async def running(self, at_start: Sequence[NewStream], started: Sequence[str]) -> AsyncIterator[None]:
         """Make the streams `at_start`, start those named in `started`; when the server ends, they end with it."""
-        self._launcher.open()
         for stream in at_start:
             await self.create(stream)
         for name in started:
@@ -145,6 +144,7 @@ class SupervisedStreams:
         stream = self._stream(name)
         async with stream.changing:
             if stream.supervisor is None:
+                self._launcher.open()  # with the first stream: it loads what engines need, and takes memory for it
                 supervisor = StreamSupervisor(stream.spec, self._runtime, start=self._launcher, on_event=self._on_event)
                 await supervisor.start()
                 stream.supervisor, stream.hub = supervisor, DisplayHub(supervisor.folder)

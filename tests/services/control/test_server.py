@@ -18,10 +18,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from fastapi import FastAPI
 
+from services.cli.serve import serve_command
 from services.client import Client, Unreachable
-from services.control.server import bind
-from services.settings import ServiceSettings
+from services.control.server import CannotServe, bind, serve
+from services.settings import ServiceSettings, SettingsInvalid
 
 ROOT = Path(__file__).resolve().parents[3]
 SERVE = [sys.executable, "-m", "services.cli", "serve", "--port", "0", "--set", "streams={}"]
@@ -52,8 +54,8 @@ def serving(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen, int
         reader = threading.Thread(target=lambda: lines.extend(process.stderr))
         reader.start()
         yield process, int(found[1]), (folder / "admin.key").read_text().strip()
-        process.terminate()  # killed, it would leave the launcher of its processes to the next server
-        process.wait(timeout=20)
+        process.terminate()  # not killed: it ends what it has started
+        process.wait(20)
         reader.join()
     finally:
         process.kill()
@@ -199,18 +201,17 @@ def test_a_second_server_of_the_same_folder_is_refused(served, tmp_path):
 
 
 def test_what_cannot_be_served_is_a_sentence(served, tmp_path):
+    """As an exit code without a traceback: `test_a_second_server_of_the_same_folder_is_refused`."""
     _, port, _ = served
-    for options, said in (
-        (["--port", str(port)], "cannot listen on 127.0.0.1"),
-        (["--host", "0.0.0.0"], "without TLS"),
-        (["--set", "server.prt=1"], "the nearest is 'port'"),
-        (["--set", "server"], "--set 'server' has no value"),
-        (["--set", "server.certfile=/nope", "--set", "server.keyfile=/nope"], "check server.certfile"),
+    for server, said in (
+        ({"port": port}, "cannot listen on 127.0.0.1"),
+        ({"host": "0.0.0.0", "port": 0}, "without TLS"),
     ):
-        done = subprocess.run(
-            [*SERVE, "--data", str(tmp_path / "x"), *options], capture_output=True, text=True, cwd=ROOT
-        )
-        assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr, done.stderr
+        with pytest.raises(CannotServe, match=said):
+            bind(ServiceSettings(server=server))
+    for setting, said in (("server.prt=1", "the nearest is 'port'"), ("server", "--set 'server' has no value")):
+        with pytest.raises(SettingsInvalid, match=re.escape(said)):
+            serve_command(None, None, None, tmp_path, [setting])
 
 
 @pytest.fixture(scope="module")
@@ -228,12 +229,14 @@ def _nothing() -> None:
     raise ConnectionError("closed without a word")
 
 
-def test_a_key_of_another_certificate_is_refused(certificate, tmp_path):
-    other = tmp_path / "other.pem"
-    subprocess.run(["openssl", "genrsa", "-out", str(other), "2048"], check=True, capture_output=True)
-    given = ["--set", f"server.certfile={certificate / 'cert.pem'}", "--set", f"server.keyfile={other}"]
-    done = subprocess.run([*SERVE, "--data", str(tmp_path / "x"), *given], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 2 and "check server.certfile" in done.stderr and "Traceback" not in done.stderr
+@pytest.mark.parametrize("files", [("cert.pem", "other.pem"), ("cert.pem", "nope"), ("key.pem", "key.pem")])
+def test_a_certificate_that_cannot_be_used_is_refused(certificate, files):
+    other = ["openssl", "genpkey", "-algorithm", "ed25519", "-out", str(certificate / "other.pem")]
+    subprocess.run(other, check=True, capture_output=True)
+    certfile, keyfile = (certificate / name for name in files)
+    settings = ServiceSettings(server={"port": 0, "certfile": certfile, "keyfile": keyfile})
+    with bind(settings) as listener, pytest.raises(CannotServe, match=r"check server\.certfile"):
+        serve(FastAPI(), settings, listener, print)
 
 
 def test_tls(certificate, tmp_path):
