@@ -27,9 +27,16 @@ from tests.services.registry.stub_check import ALWAYS_READY, says
 IN_A_SECOND = RegistryLimits(check_passed_s=1.0)
 
 
-def checked(folder, *options):
-    done = subprocess.run([*PROGRAM, folder, "--json", *options], capture_output=True, text=True, check=True)
-    return [json.loads(line) for line in done.stdout.splitlines()]
+@pytest.fixture
+def checked(monkeypatch, capsys):
+    """The verdicts of the program, in this process and so without limits on it: its start alone takes two seconds, and has tests of its own."""
+    monkeypatch.setattr(check, "_limit_resources", lambda options: None)
+
+    def verdicts(folder, *options):
+        assert check.main([str(folder), "--json", *options]) == 0
+        return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+    return verdicts
 
 
 def test_a_good_model_is_described_and_rendered(tmp_path):
@@ -65,13 +72,13 @@ def test_words_for_people(tmp_path):
         (["--pixels=191"], r"192 pixels \(16x12\); at most 191"),
     ],
 )
-def test_a_model_over_a_budget_is_rejected_before_it_is_read(tmp_path, options, reason):
+def test_a_model_over_a_budget_is_rejected_before_it_is_read(tmp_path, options, reason, checked):
     (verdict,) = checked(save_model(tmp_path / "model"), *options)
     assert verdict["stage"] == "rejected"
     assert re.search(reason, verdict["reason"])
 
 
-def test_a_model_without_gaussians_is_rejected(tmp_path):
+def test_a_model_without_gaussians_is_rejected(tmp_path, checked):
     (verdict,) = checked(save_model(tmp_path / "model", count=0))
     assert verdict["stage"] == "rejected" and "no Gaussians" in verdict["reason"]
 
@@ -92,7 +99,7 @@ def test_a_machine_without_memory_says_nothing_about_the_model(tmp_path, monkeyp
     assert said.out == "" and "of memory to load" in said.err
 
 
-def test_the_reason_names_no_folder_of_the_machine(tmp_path):
+def test_the_reason_names_no_folder_of_the_machine(tmp_path, checked):
     folder = save_model(tmp_path / "model")
     (folder / "model.safetensors").write_bytes(b"short")
     (verdict,) = checked(folder)
