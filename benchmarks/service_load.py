@@ -70,7 +70,9 @@ async def asking(server: Server, per_s: float, took_ms: list[float]) -> None:
 
     async def one(path: str, due_s: float) -> None:
         reader, writer = await connections.get()
-        writer.write(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nAuthorization: Bearer {key}\r\n\r\n".encode())
+        writer.write(
+            f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nAuthorization: Bearer {key}\r\n\r\n".encode()
+        )
         head = await reader.readuntil(b"\r\n\r\n")
         assert b" 200 " in head[:15], head
         length = next(line for line in head.lower().split(b"\r\n") if line.startswith(b"content-length:"))
