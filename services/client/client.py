@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import httpx2
 from pydantic import TypeAdapter
 
-from services.client.errors import ClientError, Refused, Unreachable
-from services.client.pictures import Picture, pictures, tls_context
+from services.client.pictures import Picture, pictures
+from services.client.replays import ReplayMethods
+from services.client.requests import waited_for
 from services.client.snapshots import SnapshotMethods
 from services.control.routes.audit import AuditPage
 from services.control.routes.keys import KeyView, MadeKey
@@ -21,11 +18,10 @@ from services.control.routes.models import ModelView, VersionView
 from services.control.routes.streams import StreamView
 
 TIMEOUT_S = 30.0
-CHUNK_BYTES = 1 << 20
 WAITING = ("uploaded", "validated")
 
 
-class Client(SnapshotMethods):
+class Client(ReplayMethods, SnapshotMethods):
     """A server's API, with one key.
 
         with Client("http://127.0.0.1:8000", key) as client:
@@ -38,15 +34,7 @@ class Client(SnapshotMethods):
 
     def __init__(self, url: str, key: str, *, timeout_s: float = TIMEOUT_S, verify: bool | str = True) -> None:
         """verify: whether the server's certificate is checked, or the file of the authority that signed it."""
-        self.url = url.rstrip("/")
-        self._key = key.strip()
-        self._verify = verify
-        self._http = httpx2.Client(
-            base_url=self.url,
-            headers={"Authorization": f"Bearer {self._key}"},
-            timeout=timeout_s,
-            verify=tls_context(verify),
-        )
+        super().__init__(url, key, timeout_s, verify)
 
     def streams(self) -> list[StreamView]:
         """Every stream."""
@@ -102,34 +90,13 @@ class Client(SnapshotMethods):
     def upload(self, name: str, file: Path) -> VersionView:
         """Upload a file that `intrasplat pack` made; the server checks it afterwards (`checked` waits for that). Raises ClientError for a file
         that cannot be read."""
-        try:
-            digest, size = _digest_of(file)
-            with file.open("rb") as content:
-                answer = self._ask(
-                    "PUT",
-                    f"/v1/models/{name}/versions",
-                    content=iter(lambda: content.read(CHUNK_BYTES), b""),
-                    headers={
-                        "Content-Type": "application/octet-stream",
-                        "Content-Length": str(size),
-                        "Content-Digest": f"sha-256=:{digest}:",
-                    },
-                )
-        except OSError as error:
-            raise ClientError(f"{file} cannot be read: {error.strerror or error}") from error
-        return VersionView.model_validate(answer)
+        return VersionView.model_validate(self._put_file(f"/v1/models/{name}/versions", file))
 
     def checked(self, name: str, number: int, *, within_s: float = 300.0) -> VersionView:
         """A version once the server has checked it: `ready`, or `rejected` with a reason. Raises ClientError when that takes too long."""
-        until_s, wait_s = time.monotonic() + within_s, 0.1
-        while True:
-            found = self.version(name, number)
-            if found.state not in WAITING:
-                return found
-            if time.monotonic() > until_s:
-                raise ClientError(f"{name}/{number} is still {found.state} after {within_s:g} s; ask again later")
-            time.sleep(wait_s)
-            wait_s = min(2 * wait_s, 2.0)
+        return waited_for(
+            lambda: self.version(name, number), lambda found: found.state not in WAITING, within_s, f"{name}/{number}"
+        )
 
     def activate(self, name: str, number: int, expected_current: int | None) -> VersionView:
         """Let a version be shown in place of `expected_current` (None: no one is active)."""
@@ -178,30 +145,3 @@ class Client(SnapshotMethods):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _ask(self, method: str, path: str, **options: Any) -> Any:
-        answer = self._answer(method, path, **options)
-        return answer.json() if answer.content else None
-
-    def _answer(self, method: str, path: str, **options: Any) -> httpx2.Response:
-        try:
-            answer = self._http.request(method, path, **options)
-        except httpx2.HTTPError as error:
-            raise Unreachable(
-                f"{self.url} does not answer: {error or type(error).__name__}; check the address, and that the server runs"
-            ) from error
-        if answer.is_success:
-            return answer
-        try:
-            said = answer.json()
-            sentence = str(said.get("detail") or said.get("title"))
-        except (ValueError, AttributeError):
-            sentence = f"an answer that is no problem document; is {self.url} an IntraSplat server?"
-        raise Refused(answer.status_code, sentence)
-
-
-def _digest_of(file: Path) -> tuple[str, int]:
-    """SHA-256 in base64, and the size."""
-    with file.open("rb") as content:
-        digest = hashlib.file_digest(content, "sha256").digest()
-        return base64.b64encode(digest).decode(), content.tell()

@@ -11,21 +11,16 @@ import httpx2
 from pydantic import TypeAdapter
 
 from gsplat_core.io.atomic_files import PartialFile
-from services.client.errors import ClientError, Refused, Unreachable
+from services.client.errors import ClientError, Unreachable
+from services.client.requests import Requests, refused_by
 from services.control.routes.snapshots import SnapshotView
 
 EXPORT_S = 330.0
 """A server may take so long for an export."""
 
 
-class SnapshotMethods:
+class SnapshotMethods(Requests):
     """Methods of `Client` for snapshots and exports."""
-
-    url: str
-    _http: httpx2.Client
-
-    def _ask(self, method: str, path: str, **options: Any) -> Any:
-        raise NotImplementedError
 
     def take_snapshot(
         self, stream: str, model: str | None = None, *, idempotency_key: str | None = None
@@ -58,8 +53,8 @@ class SnapshotMethods:
         try:
             with PartialFile(file) as partial, self._http.stream("GET", path, params=given, timeout=EXPORT_S) as answer:
                 if not answer.is_success:
-                    said = answer.read()
-                    raise _refused(answer.status_code, said)
+                    answer.read()
+                    raise refused_by(answer, self.url)
                 sha256 = hashlib.sha256()
                 for piece in answer.iter_bytes():
                     partial.file.write(piece)
@@ -71,11 +66,3 @@ class SnapshotMethods:
             raise Unreachable(f"{self.url} broke off: {error or type(error).__name__}; try again") from error
         except OSError as error:
             raise ClientError(f"{file} cannot be written: {error.strerror or error}") from error
-
-
-def _refused(status: int, body: bytes) -> Refused:
-    try:
-        problem = TypeAdapter(dict[str, Any]).validate_json(body)
-    except ValueError:
-        problem = {}
-    return Refused(status, str(problem.get("detail") or problem.get("title") or "it gave no reason"))

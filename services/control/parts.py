@@ -12,6 +12,7 @@ from fastapi import APIRouter
 from prometheus_client.registry import Collector
 
 from services.control.problems import Problem
+from services.control.replay_parts import Jobs, Recordings
 from services.control.snapshot_parts import Exports, Snapshots
 from services.control.system_events import SystemEvents
 
@@ -53,8 +54,8 @@ class ModelRecord(Protocol):
 class Models(Protocol):
     """The registry of models. Synchronous and safe for threads: the API calls it in one. Its errors are named in `Parts.errors`."""
 
-    def upload(self, name: str, file: Path, digest: str, by: str) -> VersionRecord:
-        """Keep a file as a new version; `digest` is its SHA-256 in hex."""
+    def upload(self, name: str, file: Path, digest: str | None, by: str) -> VersionRecord:
+        """Keep a file as a new version; `digest` is its SHA-256 in hex, where somebody states it."""
 
     def check(self, name: str, version: int) -> VersionRecord:
         """Validate a version: afterwards it is ready, or rejected with a reason."""
@@ -135,18 +136,6 @@ class Display(Protocol):
         self, stream: str, kind: PictureKind, quality: int
     ) -> AbstractAsyncContextManager[AsyncIterator[EncodedPicture]]:
         """A viewer while it is entered; its pictures end when the stream is gone."""
-
-
-class Jobs(Protocol):
-    """Replays that run by themselves."""
-
-    async def all(self) -> Sequence[Mapping[str, Any]]: ...
-
-
-class Recordings(Protocol):
-    """Recordings that were uploaded."""
-
-    async def all(self) -> Sequence[Mapping[str, Any]]: ...
 
 
 @dataclass(frozen=True)

@@ -27,11 +27,10 @@ from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, parse_manifest
 from gsplat_core.io.model_files import open_model_file
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.scene.model import Model
+from services.registry.check_limits import NICENESS, lower_limit, taken_bytes
 
 FAINTEST = 1 / 255
 """An opacity below it changes no pixel of a picture."""
-NICENESS = 10
-"""Streams that run on this machine go before a check."""
 _MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memory", "bad_alloc")
 
 
@@ -87,23 +86,8 @@ def _limit_resources(options: argparse.Namespace) -> None:
     os.nice(NICENESS)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if options.device == "cpu":
-        _lower(resource.RLIMIT_DATA, _taken_bytes() + options.memory_bytes)
-    _lower(resource.RLIMIT_CPU, math.ceil(time.process_time() + options.seconds), spare=5)
-
-
-def _taken_bytes() -> int:
-    """What the system counts for RLIMIT_DATA at this moment."""
-    fields = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines() if ":" in line)
-    return int(fields["VmData"].split()[0]) * 1024
-
-
-def _lower(kind: int, wanted: int, spare: int = 0) -> None:
-    """Set a limit, unless there is a lower one. spare: between the warning (of processor time: SIGXCPU) and the end."""
-    _, hard = resource.getrlimit(kind)
-    allowed = [wanted, wanted + spare]
-    if hard != resource.RLIM_INFINITY:
-        allowed = [min(each, hard) for each in allowed]
-    resource.setrlimit(kind, (allowed[0], allowed[1]))
+        lower_limit(resource.RLIMIT_DATA, taken_bytes() + options.memory_bytes)
+    lower_limit(resource.RLIMIT_CPU, math.ceil(time.process_time() + options.seconds), spare=5)
 
 
 def _read(options: argparse.Namespace) -> Model:

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from services.registry.errors import CheckFailed
 from services.registry.limits import RegistryLimits
@@ -44,6 +44,10 @@ _OF_THE_MODEL = {
     signal.SIGXCPU,
 }
 """Signals that end a check because of what it checked: too much memory or time, or a fault. Others come from people."""
+
+
+class BroughtDown(Exception):
+    """A check was ended by what it checked; the text says how."""
 
 
 @dataclass(frozen=True)
@@ -96,26 +100,52 @@ def run_check(
     A check that takes too much processor time or memory, or that a model brings down, is a verdict too. validated: called once the contents are in order.
     running: where the process is counted while it runs. Raises CheckFailed where the check could not be run at all, or was ended with the others.
     """
-    running = running or RunningChecks()
     command = [*program, str(folder), "--json", "--device", device, *_budgets(limits)]
     verdict, description = None, dict[str, Any]()
+
+    def take(line: dict[str, Any]) -> None:
+        nonlocal verdict
+        stage = line.pop("stage", None)
+        if stage == "rejected":
+            verdict = Verdict(str(line.get("reason"))[:MOST_REASON], description)
+        elif stage in ("validated", "ready"):
+            description.update(line)
+            verdict = Verdict(None, description) if stage == "ready" else verdict
+            if stage == "validated":
+                validated(description)
+
+    try:
+        words = run_program(command, limits.check_passed_s, take, device=device, running=running)
+    except BroughtDown as error:
+        return Verdict(str(error))
+    if verdict is None:
+        raise CheckFailed(f"the check ended with code 0 and without a verdict: {words}; repair that and check again")
+    return verdict
+
+
+def run_program(
+    command: list[str],
+    passed_s: float,
+    take: Callable[[dict[str, Any]], None],
+    *,
+    device: str = "cpu",
+    running: RunningChecks | None = None,
+) -> str:
+    """Run a check, hand each object that it prints to `take`; returns its last words when it has ended well.
+
+    Raises BroughtDown where what it checked has ended it, CheckFailed where it could not be run at all, or was ended with the others.
+    """
+    running = running or RunningChecks()
     with tempfile.TemporaryFile() as said, _started(command, said, device) as process, running.counted(process):
-        with _time_limit(process, limits.check_passed_s) as late:
+        with _time_limit(process, passed_s) as late:
             for line in _lines(process):
-                stage = line.pop("stage", None)
-                if stage == "rejected":
-                    verdict = Verdict(str(line.get("reason"))[:MOST_REASON], description)
-                elif stage in ("validated", "ready"):
-                    description |= line
-                    verdict = Verdict(None, description) if stage == "ready" else verdict
-                    if stage == "validated":
-                        validated(description)
+                take(line)
             code = process.wait()
-        if code == 0 and verdict is not None:
-            return verdict
-        if running.ended:
-            raise CheckFailed("the check was ended because the service stops; the version waits for another one")
-        return _of_the_end(code, late.is_set(), limits, said)
+        if code != 0 and running.ended:
+            raise CheckFailed("the check was ended because the service stops; it waits for another one")
+        if code != 0:
+            _raise_for_the_end(code, late.is_set(), passed_s, said)
+        return _last_words(said)
 
 
 def _budgets(limits: RegistryLimits) -> list[str]:
@@ -192,18 +222,20 @@ def _lines(process: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
             yield values
 
 
-def _of_the_end(code: int, late: bool, limits: RegistryLimits, said: Any) -> Verdict:
-    """The verdict on a check that ended without one. Raises CheckFailed where that says nothing about the model."""
+def _raise_for_the_end(code: int, late: bool, passed_s: float, said: Any) -> NoReturn:
+    """Raises BroughtDown or CheckFailed for a check that ended badly."""
     if late:
-        raise CheckFailed(
-            f"the check lasted longer than {limits.check_passed_s:g} s; check again when this machine is less busy"
-        )
+        raise CheckFailed(f"the check lasted longer than {passed_s:g} s; check again when this machine is less busy")
     if code < 0 and -code in _OF_THE_MODEL:
-        return Verdict(
+        raise BroughtDown(
             f"its check was ended by {signal.Signals(-code).name}, as one is that takes too much memory or time"
         )
+    raise CheckFailed(
+        f"the check ended with code {code} and without a verdict: {_last_words(said)}; repair that and check again"
+    )
+
+
+def _last_words(said: Any) -> str:
     said.seek(max(0, said.seek(0, os.SEEK_END) - 2000))
     words = said.read().decode(errors="replace").strip().splitlines() or ["it said nothing"]
-    raise CheckFailed(
-        f"the check ended with code {code} and without a verdict: {words[-1][:300]}; repair that and check again"
-    )
+    return str(words[-1][:300])

@@ -1,9 +1,13 @@
-"""The registry's database: SQLite in a file by default, PostgreSQL by URL. One writer at a time on either, in a transaction each."""
+"""The service's database: SQLite in a file by default, PostgreSQL by URL. One writer at a time on either, in a transaction each.
+
+The registry, the recordings and the jobs have tables of their own in it, each with its own row of migrations (`Schema`).
+"""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +22,35 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from services.registry.errors import SchemaTooNew, StoreUnavailable
 
-MIGRATIONS = Path(__file__).parent / "migrations"
 BUSY_TIMEOUT_S = 10.0
 """How long a writer waits for another one."""
 _WRITERS_LOCK = 0x1_5B1A7
 """The advisory lock that writers to PostgreSQL take; SQLite has its own."""
 
 
-class Database:
-    """Connections to the registry's database. Any thread may use it."""
+@dataclass(frozen=True)
+class Schema:
+    """One package's tables: where its migrations lie, and the table that says which of them were made."""
 
-    def __init__(self, url: str) -> None:
+    migrations: Path
+    version_table: str
+
+
+REGISTRY = Schema(Path(__file__).parent / "migrations", "alembic_version")
+
+
+class Database:
+    """Connections to the database. Any thread may use it."""
+
+    def __init__(self, url: str, schema: Schema = REGISTRY) -> None:
         """url: `sqlite:///PATH` or `postgresql://USER@HOST/NAME`; nothing is connected yet. Raises StoreUnavailable for what cannot be one."""
+        self._schema = schema
         try:
             self._url = _with_driver(sa.make_url(url))
             self._engine = _new_engine(self._url)
         except (ArgumentError, NoSuchModuleError, ModuleNotFoundError) as error:
             raise StoreUnavailable(
-                f"the registry's database cannot be opened: {error}; give sqlite:///PATH, or postgresql://… with the extra `postgresql`"
+                f"the database cannot be opened: {error}; give sqlite:///PATH, or postgresql://… with the extra `postgresql`"
             ) from error
 
     @contextlib.contextmanager
@@ -55,14 +70,16 @@ class Database:
     def migrate(self) -> None:
         """Bring the schema to this program's, in one transaction. Raises SchemaTooNew, StoreUnavailable."""
         config = alembic.config.Config()
-        config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
+        config.set_main_option("script_location", str(self._schema.migrations).replace("%", "%%"))
+        options = {"version_table": self._schema.version_table}
         with self.writing() as connection:
-            current = alembic.runtime.migration.MigrationContext.configure(connection).get_current_heads()
+            context = alembic.runtime.migration.MigrationContext.configure(connection, opts=options)
+            current = context.get_current_heads()
             script = alembic.script.ScriptDirectory.from_config(config)
             for revision in current:
                 self._check_known(script, revision)
             if set(current) != set(script.get_heads()):
-                config.attributes["connection"] = connection
+                config.attributes.update(connection=connection, **options)
                 alembic.command.upgrade(config, "head")
 
     def close(self) -> None:
@@ -74,7 +91,7 @@ class Database:
             script.get_revision(revision)
         except CommandError as error:
             raise SchemaTooNew(
-                f"the registry's database {self} has schema {revision}, which this version of the program does not know (it knows up to"
+                f"the database {self} has schema {revision}, which this version of the program does not know (it knows up to"
                 f" {', '.join(script.get_heads())}); start the version that wrote it, or restore a backup from before"
             ) from error
 
@@ -85,7 +102,7 @@ class Database:
         except (DBAPIError, PoolTimeout) as error:
             said = " ".join(str(getattr(error, "orig", None) or error).split())[:300]
             raise StoreUnavailable(
-                f"the registry's database {self} does not answer: {said}; check that it runs and may be written"
+                f"the database {self} does not answer: {said}; check that it runs and may be written"
             ) from error
 
     def __str__(self) -> str:

@@ -1,7 +1,7 @@
-"""Errors of the registry. Each says what happened, the value that was seen, and what to do.
+"""Errors of the registry, and of the recordings and jobs that are kept beside it. Each says what happened, the value that was seen, and what to do.
 
 RegistryError (UserError)
-├── NotFound                    there is no such model or version
+├── NotFound                    there is no such model, version, recording or job
 ├── Conflict                    somebody else was first, or the version is not in a state that allows this
 │   └── StillActive             the active version is never deleted
 ├── Rejected                    an upload is not what it has to be; nothing was kept

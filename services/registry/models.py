@@ -34,6 +34,7 @@ from services.registry.staging import StagedUpload, stage
 from services.registry.tables import MODELS
 from services.registry.unpacked import UnpackedModels, folder_name
 
+DATABASE_FILE = "registry.sqlite"
 CHECKER = "registry"
 """Who brings versions into the states that a check leads to."""
 RECOVERY_WAIT_S = 5.0
@@ -89,7 +90,7 @@ class ModelRegistry:
         self._checks = threading.BoundedSemaphore(limits.checks_at_once)
         self._running = RunningChecks()
         self._lock = FolderLock(folder / "lock")
-        self._database = Database(database_url or f"sqlite:///{folder.absolute() / 'registry.sqlite'}")
+        self._database = Database(database_url or f"sqlite:///{folder.absolute() / DATABASE_FILE}")
         self._database.migrate()
 
     def upload(

@@ -21,6 +21,7 @@ from services.registry.errors import Conflict, NotFound, Rejected, StoreUnavaila
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
 from services.server import page
+from services.server.archive import new_archive
 from services.server.displays import StreamDisplays
 from services.server.measures import StreamMeasures
 from services.server.shown_models import ShownModels
@@ -56,6 +57,7 @@ def assembled(settings: ServiceSettings) -> Parts:
     models = registry_of(settings)
     snapshots = SnapshotStore(settings.data_dir / "snapshots")
     exports = ModelExports(models, snapshots, ExportCache(settings.data_dir / "exports"))
+    archive = new_archive(settings, events)
     at_start = [
         NewStream(name, stream.source, stream.show, stream.device, stream.options)
         for name, stream in settings.streams.items()
@@ -80,15 +82,19 @@ def assembled(settings: ServiceSettings) -> Parts:
         display=StreamDisplays(streams),
         snapshots=StreamSnapshots(streams, models, snapshots),
         exports=exports,
+        jobs=archive.replays,
+        recordings=archive.recordings,
         routers=[page.router],
         background=[
             lambda: recovered(models, events),
             exports.running,
             lambda: streams.running(at_start, started),
             ShownModels(streams, models, events).following,
+            archive.kept.kept,
+            archive.pool.keeping,
         ],
         checks={"streams": streams_are_well, "models": models_are_there},
-        collectors=[measures],
+        collectors=[measures, archive.measures],
         events=events,
         errors=ERRORS,
     )

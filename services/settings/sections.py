@@ -14,7 +14,7 @@ from services.settings.oidc import OidcSettings
 NAME_PATTERN = r"^[a-z0-9][a-z0-9-]{0,39}$"
 ResourceName = Annotated[str, Field(pattern=NAME_PATTERN, examples=["theatre-1"])]
 """What streams, models and keys are called: short, and safe in an address, a file name and a metric's label."""
-MIB = 2**20
+MIB, GIB = 2**20, 2**30
 
 
 def _network(text: str) -> str:
@@ -109,6 +109,7 @@ class LimitSettings(Section):
 
     body_bytes: int = Field(default=MIB, ge=1024, description="Longest body of a request that is not an upload.")
     model_bytes: int = Field(default=2048 * MIB, ge=MIB, description="Longest uploaded model.")
+    recording_bytes: int = Field(default=16 * GIB, ge=MIB, description="Longest uploaded recording.")
     uploads: int = Field(default=2, ge=1, le=64, description="Uploads at one time.")
     stall_s: float = Field(default=10.0, gt=0, description="Longest wait for the next part of a body.")
     slowest_bytes_per_s: int = Field(
@@ -152,6 +153,37 @@ class RegistrySettings(Section):
     )
     blob_options: dict[str, SecretStr] = Field(
         default={}, description="Options of that file system, credentials among them."
+    )
+
+
+class RecordingSettings(Section):
+    """Uploaded recordings, and how long they stay. One that a replay uses is never removed."""
+
+    folder: Path | None = Field(default=None, description="Where they lie. Default: recordings in paths.data.")
+    unpacked_bytes: int = Field(default=64 * GIB, ge=MIB, description="Most that an archive may hold.")
+    keep_days: float | None = Field(default=None, gt=0, description="Remove those that are older. Default: never.")
+    keep_bytes: int | None = Field(
+        default=None, ge=MIB, description="Remove the oldest while all of them take more. Default: never."
+    )
+
+
+class JobSettings(Section):
+    """Replays as jobs."""
+
+    folder: Path | None = Field(default=None, description="Where results lie. Default: replays in paths.data.")
+    workers: int = Field(default=1, ge=1, le=256, description="Replays at one time.")
+    threads: int | None = Field(
+        default=None, ge=1, le=256, description="Threads of each. Default: half of this machine's, shared among them."
+    )
+    attempts: int = Field(default=5, ge=1, le=100, description="A job whose process died so often has failed.")
+    lease_s: float = Field(
+        default=15.0,
+        ge=2,
+        le=3600,
+        description="What a pool that died had claimed is taken by another one after so long.",
+    )
+    ray: str | None = Field(
+        default=None, max_length=300, description="Address of a Ray cluster (extra `ray`). Default: this machine."
     )
 
 

@@ -15,9 +15,11 @@ from services.settings.addresses import masked_address
 from services.settings.sections import (
     AuditSettings,
     AuthSettings,
+    JobSettings,
     LimitSettings,
     LogSettings,
     PathSettings,
+    RecordingSettings,
     RegistrySettings,
     ResourceName,
     ServerSettings,
@@ -41,6 +43,8 @@ class ServiceSettings(BaseSettings):
     limits: LimitSettings = LimitSettings()
     sources: SourceRules = SourceRules()
     registry: RegistrySettings = RegistrySettings()
+    recordings: RecordingSettings = RecordingSettings()
+    jobs: JobSettings = JobSettings()
     log: LogSettings = LogSettings()
     streams: dict[ResourceName, StreamSettings] = Field(
         default={"endoscope": StreamSettings(source="synthetic:?width=320&height=256&frames=24&moving=1")},

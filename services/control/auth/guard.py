@@ -18,6 +18,8 @@ from services.control.state import ControlState, control_of
 
 JSON = "application/json"
 MOST_TOKEN_LENGTH = 256
+BodyLimit = Literal["body_bytes", "model_bytes", "recording_bytes"]
+"""Which limit of the settings bounds a body."""
 Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 
 
@@ -30,8 +32,7 @@ class Rule:
     """A ticket in the address is taken in place of a key."""
     takes: str | None = None
     """Content type of the body; JSON where the route declares a body."""
-    most: Literal["body_bytes", "model_bytes"] = "body_bytes"
-    """Which limit of the settings bounds the body."""
+    most: BodyLimit = "body_bytes"
 
 
 def requires(
@@ -39,7 +40,7 @@ def requires(
     *,
     ticket: bool = False,
     takes: str | None = None,
-    most: Literal["body_bytes", "model_bytes"] = "body_bytes",
+    most: BodyLimit = "body_bytes",
 ) -> Callable[[Endpoint], Endpoint]:
     """Declare what a route asks for. It stands between the route's decorator and its function."""
     rule = Rule(Role(role), ticket, takes, most)

@@ -14,6 +14,7 @@ from services.control.routes import (
     metrics,
     models,
     recordings,
+    results,
     snapshots,
     streams,
     tickets,
@@ -25,7 +26,8 @@ from services.control.routes import (
 ROUTERS: tuple[APIRouter, ...] = tuple(
     module.router
     for module in (
-        health, version, config, streams, virtual_camera, display, models, uploads, snapshots, exports, jobs, recordings, keys, tickets, audit, metrics,
+        health, version, config, streams, virtual_camera, display, models, uploads, snapshots, exports, jobs, results,
+        recordings, keys, tickets, audit, metrics,
         documents,
     )
 )  # fmt: skip

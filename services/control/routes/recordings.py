@@ -1,20 +1,136 @@
-"""Uploaded recordings."""
+"""Recordings: uploaded as the body itself, checked in a process of their own after the answer, listed, deleted."""
 
 from __future__ import annotations
 
-from typing import Any
+import asyncio
+import logging
+from datetime import datetime
 
+from fastapi import Header, Response
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import Request
 
-from services.control.auth.guard import new_router, requires
-from services.control.state import part
+from services.control.auth.guard import CallerOf, new_router, requires
+from services.control.digests import stated_sha256
+from services.control.incoming import incoming_file
+from services.control.recorded import recorded
+from services.control.replay_parts import Recordings
+from services.control.state import control_of, part
+from services.settings import ResourceName
 
+log = logging.getLogger(__name__)
 router = new_router("recordings")
+OCTETS = "application/octet-stream"
+BODY = {
+    "requestBody": {
+        "required": True,
+        "description": "A video (MP4, AVI, Matroska), or a zip archive of a recording's folder; not longer than limits.recording_bytes.",
+        "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+
+class RecordingDescription(BaseModel):
+    """What was found in a recording."""
+
+    model_config = ConfigDict(extra="ignore")
+    layout: str | None = Field(None, examples=["video"])
+    frames: int | None = Field(None, examples=[900])
+    frames_damaged: int | None = None
+    width_px: int | None = Field(None, examples=[640])
+    height_px: int | None = Field(None, examples=[512])
+    fps: float | None = Field(None, examples=[30.0])
+    duration_s: float | None = Field(None, examples=[30.0])
+    fields: list[str] = Field([], examples=[["depth", "mask"]])
+    calibration: str | None = None
+    warnings: int = 0
+
+
+class RecordingView(BaseModel):
+    """A recording. `state`: uploaded, ready, or rejected with a reason."""
+
+    model_config = ConfigDict(from_attributes=True)
+    name: str = Field(examples=["case-7"])
+    kind: str = Field(examples=["video"], description="video or archive.")
+    state: str = Field(examples=["ready"])
+    reason: str | None = None
+    digest: str = Field(description="SHA-256 of the uploaded file.")
+    size_bytes: int = Field(description="Of the uploaded file.")
+    kept_bytes: int = Field(description="What it takes on the disk.")
+    uploaded_at: datetime | str
+    uploaded_by: str
+    description: RecordingDescription = RecordingDescription.model_validate({})
+
+
+def recordings_of(request: Request) -> Recordings:
+    """The recordings of this server."""
+    return part(request, lambda parts: parts.recordings, "recordings")
 
 
 @router.get("/recordings")
 @requires("viewer")
-async def recordings(request: Request) -> list[dict[str, Any]]:
+async def recordings(request: Request) -> list[RecordingView]:
     """Every recording."""
-    kept = part(request, lambda parts: parts.recordings, "recordings")
-    return [dict(recording) for recording in await kept.all()]
+    found = await asyncio.to_thread(recordings_of(request).all)
+    return [RecordingView.model_validate(each) for each in found]
+
+
+@router.get("/recordings/{name}")
+@requires("viewer")
+async def recording(request: Request, name: ResourceName) -> RecordingView:
+    """One recording."""
+    return RecordingView.model_validate(await asyncio.to_thread(recordings_of(request).get, name))
+
+
+@router.put(
+    "/recordings/{name}",
+    status_code=201,
+    openapi_extra=BODY,
+    responses={200: {"model": RecordingView, "description": "This very file is there under this name."}},
+)
+@requires("operator", takes=OCTETS, most="recording_bytes")
+async def upload_recording(
+    request: Request,
+    response: Response,
+    caller: CallerOf,
+    name: ResourceName,
+    content_digest: str | None = Header(
+        None, max_length=1000, description="`sha-256=:BASE64:` of the file (RFC 9530).",
+        examples=["sha-256=:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=:"],
+    ),
+) -> RecordingView:  # fmt: skip
+    """Upload a recording. It is `uploaded` at first; a check makes it `ready`, or `rejected` with a reason. 409 where another one has this name."""
+    control = control_of(request)
+    kept = recordings_of(request)
+    expected = stated_sha256(content_digest)
+    async with recorded(request, caller, "recording.upload", name, {"sha256": expected.hex()}) as said:
+        async with incoming_file(request, control, expected) as file:
+            record, is_new = await asyncio.to_thread(kept.add, name, file.path, file.sha256, str(caller))
+        said["size_bytes"] = file.size_bytes
+    if is_new:
+        checking = asyncio.create_task(_check(kept, name))
+        control.tasks.add(checking)
+        checking.add_done_callback(control.tasks.discard)
+    else:
+        response.status_code = 200
+    response.headers["Location"] = f"/v1/recordings/{name}"
+    return RecordingView.model_validate(record)
+
+
+@router.delete("/recordings/{name}", status_code=204)
+@requires("operator")
+async def delete_recording(request: Request, caller: CallerOf, name: ResourceName) -> None:
+    """Delete a recording; never one that a replay reads or waits to read."""
+    kept = recordings_of(request)
+    async with recorded(request, caller, "recording.delete", name):
+        await asyncio.to_thread(kept.delete, name)
+
+
+async def _check(kept: Recordings, name: str) -> None:
+    """What a check finds is the recording's state. One that fails by a bug leaves it as it was, which the next start takes up again."""
+    try:
+        record = await asyncio.to_thread(kept.check, name)
+    except Exception:  # nobody waits for this task: what it raised would be seen by no one
+        log.exception("the check of a recording failed")
+    else:
+        log.info("a recording was checked: %s", record.state)

@@ -1,0 +1,130 @@
+"""Who runs which job. A claim is a row's owner and the end of its lease; the owner alone may write the job's end.
+
+Whoever is killed renews nothing, so that its jobs are free again when the lease is over. Times of leases are of the wall clock: machines that share a
+database must agree on it to a few seconds.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import sqlalchemy as sa
+
+from services.jobs.records import Claimed, JobProgress, JobState
+from services.jobs.tables import JOBS
+from services.registry.database import Database
+from services.registry.rows import now
+
+MOST_REASON = 1000
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What an owner learns when it renews its claims."""
+
+    lost: frozenset[str]
+    """Jobs that it has no more: somebody else took them, or they are gone."""
+    cancelled: Mapping[str, str]
+    """Jobs that are to be ended, and who wants that."""
+
+
+class Claims:
+    """The claims of one owner."""
+
+    def __init__(
+        self, database: Database, owner: str, lease_s: float, most_attempts: int, is_published: Callable[[str], bool]
+    ) -> None:
+        """is_published: whether the result that belongs into a folder is there, which whoever put it there had no time to write down."""
+        self._database, self.owner, self._lease_ms = database, owner, int(lease_s * 1000)
+        self._most, self._is_published = most_attempts, is_published
+
+    def take(self) -> Claimed | None:
+        """The oldest job that nobody runs; None where there is none. One that was begun too often, because all who ran it died, has failed."""
+        at_ms = _now_ms()
+        free = sa.or_(
+            JOBS.c.state == str(JobState.QUEUED),
+            sa.and_(JOBS.c.state == str(JobState.RUNNING), JOBS.c.lease_until_ms < at_ms),
+        )
+        with self._database.writing() as connection:
+            while True:
+                row = (
+                    connection.execute(sa.select(JOBS).where(free).order_by(JOBS.c.number).limit(1)).mappings().first()
+                )
+                if row is None:
+                    return None
+                mine = sa.update(JOBS).where(JOBS.c.number == row["number"])
+                end = self._end_of(row)
+                if end is not None:
+                    connection.execute(mine.values(**end, owner=None, lease_until_ms=None, ended_at=now().isoformat()))
+                    continue
+                attempt = row["attempts"] + 1
+                values = {
+                    "state": str(JobState.RUNNING), "owner": self.owner, "attempts": attempt, "reason": None,
+                    "lease_until_ms": at_ms + self._lease_ms, "frames_done": 0, "started_at": now().isoformat(),
+                }  # fmt: skip
+                connection.execute(mine.values(values))
+                return Claimed(row["id"], row["recording"], row["source"], row["folder"], dict(row["options"]), attempt)
+
+    def renew(self, progress: Mapping[str, JobProgress]) -> Heard:
+        """Hold the jobs that are named for another lease, and say how far each has come."""
+        until_ms = _now_ms() + self._lease_ms
+        lost, cancelled = set(), {}
+        with self._database.writing() as connection:
+            for job_id, reached in progress.items():
+                values = {
+                    "lease_until_ms": until_ms, "frames_done": reached.frames_done, "frames": reached.frames,
+                    "psnr_db": reached.psnr_db,
+                }  # fmt: skip
+                connection.execute(sa.update(JOBS).where(*self._mine(job_id)).values(values))
+                row = connection.execute(sa.select(JOBS.c.cancelled_by).where(*self._mine(job_id))).first()
+                if row is None:
+                    lost.add(job_id)
+                elif row.cancelled_by is not None:
+                    cancelled[job_id] = row.cancelled_by
+        return Heard(frozenset(lost), cancelled)
+
+    def end(self, job_id: str, state: JobState, reason: str | None = None) -> bool:
+        """Write how a job ended; False where it is not this owner's any more, and nothing is written."""
+        values: dict[str, Any] = {
+            "state": str(state), "reason": reason and reason[:MOST_REASON], "owner": None, "lease_until_ms": None,
+            "ended_at": now().isoformat(),
+        }  # fmt: skip
+        if state is JobState.DONE:
+            values["frames_done"] = sa.func.coalesce(JOBS.c.frames, JOBS.c.frames_done)
+        return self._write(job_id, values)
+
+    def give_back(self, job_id: str, *, counts: bool) -> bool:
+        """Queue a job again. counts: whether the attempt did; one that was ended together with its pool did not."""
+        values = {"state": str(JobState.QUEUED), "owner": None, "lease_until_ms": None, "frames_done": 0}
+        return self._write(job_id, values if counts else {**values, "attempts": JOBS.c.attempts - 1})
+
+    def free(self, owners: list[str]) -> None:
+        """Queue the jobs of owners that are known to have died, in place of waiting for the end of their leases."""
+        values = {"state": str(JobState.QUEUED), "owner": None, "lease_until_ms": None, "frames_done": 0}
+        theirs = (JOBS.c.owner.in_(owners), JOBS.c.state == str(JobState.RUNNING))
+        with self._database.writing() as connection:
+            connection.execute(sa.update(JOBS).where(*theirs).values(values))
+
+    def _end_of(self, row: sa.RowMapping) -> dict[str, str | None] | None:
+        if self._is_published(row["folder"]):
+            return {"state": str(JobState.DONE), "reason": None}
+        if row["cancelled_by"] is not None:
+            return {"state": str(JobState.CANCELLED), "reason": f"cancelled by {row['cancelled_by']}"}
+        if row["attempts"] >= self._most:
+            reason = f"it was begun {row['attempts']} times, and each time the process that ran it died; look at its memory and at the log"
+            return {"state": str(JobState.FAILED), "reason": reason}
+        return None
+
+    def _write(self, job_id: str, values: dict) -> bool:
+        with self._database.writing() as connection:
+            return connection.execute(sa.update(JOBS).where(*self._mine(job_id)).values(values)).rowcount == 1
+
+    def _mine(self, job_id: str) -> tuple[sa.ColumnElement[bool], ...]:
+        return JOBS.c.id == job_id, JOBS.c.owner == self.owner, JOBS.c.state == str(JobState.RUNNING)
+
+
+def _now_ms() -> int:
+    return int(time.time() * 1000)

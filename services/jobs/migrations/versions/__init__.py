@@ -1,0 +1,1 @@
+"""One file for each change of the schema, the oldest number first."""

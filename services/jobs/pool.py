@@ -1,0 +1,164 @@
+"""The pool: claims jobs, has a runner make attempts at them, and publishes what comes of it.
+
+Only the pool publishes, and only what it still has a claim on; a result is put in its place by one rename, which fails where one is there. So an
+attempt whose pool died, or that lost its claim, leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from services.jobs.claims import Claims
+from services.jobs.records import Claimed, JobState
+from services.jobs.results import Results, Workspace
+from services.jobs.runner import Runner
+from services.jobs.task import Task
+from services.registry.database import Database
+from services.registry.errors import StoreUnavailable
+
+log = logging.getLogger(__name__)
+LOOK_S = 0.02
+TELL_S = 0.5
+"""So often claims are renewed, progress is written down, and a new job is looked for."""
+AGAIN_S = 2.0
+"""After the database has not answered."""
+
+
+@dataclass(frozen=True)
+class PoolSettings:
+    """How a pool works."""
+
+    workers: int = 1
+    threads: int = 1
+    """Of each attempt."""
+    lease_s: float = 15.0
+    most_attempts: int = 5
+    niceness: int = 0
+    pack_models: bool = False
+
+
+class JobPool:
+    """A bounded number of attempts beside each other, until `run` ends. One thread."""
+
+    def __init__(self, database: Database, results: Results, runner: Runner, settings: PoolSettings) -> None:
+        pool = secrets.token_hex(8)
+        self._database, self._results, self._runner, self._settings = database, results, runner, settings
+        self._claims = Claims(database, pool, settings.lease_s, settings.most_attempts, results.is_published)
+        self._workspace = Workspace(results, pool)
+        dead = self._workspace.dead()
+        if dead:
+            self._claims.free(dead)
+            self._workspace.remove_dead(dead)
+        self._running: dict[str, tuple[Claimed, Task]] = {}
+        self._ended: dict[str, str] = {}
+        self._told_s = self._looked_s = self._busy_s = time.monotonic() - TELL_S
+
+    @property
+    def idle_s(self) -> float:
+        """For how long there has been nothing to do."""
+        return 0.0 if self._running else time.monotonic() - self._busy_s
+
+    def run(self, is_over: Callable[[], bool]) -> None:
+        """Work until `is_over`, then end what runs and give it back. What the database does not take is written down as soon as it answers."""
+        try:
+            while not is_over():
+                try:
+                    self.step()
+                except StoreUnavailable as error:
+                    log.warning("%s", error)
+                    time.sleep(AGAIN_S)
+                time.sleep(LOOK_S)
+        finally:
+            self._close()
+
+    def step(self) -> None:
+        """Look at everything once. Raises StoreUnavailable."""
+        self._ended.update(self._runner.ended())
+        for job_id, how in list(self._ended.items()):
+            self._settle(*self._running[job_id], how)
+            del self._running[job_id], self._ended[job_id]
+        now_s = time.monotonic()
+        if self._running and now_s - self._told_s >= TELL_S:
+            self._told_s = now_s
+            self._tell()
+        if now_s - self._looked_s >= TELL_S:
+            self._fill()
+
+    def _fill(self) -> None:
+        """Begin attempts while there are jobs and room."""
+        while len(self._running) < self._settings.workers:
+            claimed = self._claims.take()
+            if claimed is None:
+                self._looked_s = time.monotonic()
+                return
+            self._begin(claimed)
+
+    def _begin(self, claimed: Claimed) -> None:
+        self._busy_s = time.monotonic()
+        settings = self._settings
+        folder = self._workspace.attempt(claimed.id, claimed.attempt)
+        task = Task(
+            claimed.id, claimed.source, str(folder), claimed.options,
+            threads=settings.threads, niceness=settings.niceness, pack_model=settings.pack_models,
+        )  # fmt: skip
+        self._database.close()  # a connection must not be shared with a process that is forked
+        self._running[claimed.id] = claimed, task
+        self._runner.start(task)
+        log.info("%s began, attempt %d", claimed.id, claimed.attempt)
+
+    def _tell(self) -> None:
+        """Renew the claims and hear what became of the jobs meanwhile."""
+        heard = self._claims.renew({job_id: task.progress() for job_id, (_, task) in self._running.items()})
+        for job_id in heard.lost:
+            log.warning("%s is another's now; this attempt is ended", job_id)
+        for job_id in {*heard.lost, *heard.cancelled}:
+            self._runner.kill(job_id)
+        for job_id, who in heard.cancelled.items():
+            self._claims.end(job_id, JobState.CANCELLED, f"cancelled by {who}")
+
+    def _settle(self, claimed: Claimed, task: Task, how: str) -> None:
+        """Publish what an attempt has made, or say why there is nothing."""
+        self._busy_s = time.monotonic()
+        outcome = task.outcome()
+        if outcome is None:
+            # Its process died of something, or was killed: somebody begins anew, unless it was cancelled or begun too often.
+            if self._claims.give_back(claimed.id, counts=True):
+                log.warning("%s: its process died: %s", claimed.id, how)
+        elif outcome[0] is JobState.DONE:
+            # Whoever has lost its claim must not publish any more: renewing says so.
+            if claimed.id not in self._claims.renew({claimed.id: task.progress()}).lost:
+                self._publish(claimed, task)
+        else:
+            self._claims.end(claimed.id, *outcome)
+            log.info("%s is %s", claimed.id, outcome[0])
+        self._workspace.remove(Path(task.folder))
+        self._looked_s -= TELL_S  # there is room: look for the next one at once
+
+    def _publish(self, claimed: Claimed, task: Task) -> None:
+        self._results.publish(task.out, claimed.folder)
+        if self._results.is_published(claimed.folder):
+            self._claims.end(claimed.id, JobState.DONE)
+            log.info("%s is done", claimed.id)
+        else:
+            reason = f"where its result goes, {claimed.folder}, is something else; move it away and try again"
+            self._claims.end(claimed.id, JobState.FAILED, reason)
+
+    def _close(self) -> None:
+        self._runner.close()
+        try:
+            for claimed, task in self._running.values():
+                outcome = task.outcome()
+                if outcome is not None and outcome[0] is JobState.DONE:
+                    self._settle(claimed, task, "")
+                else:
+                    self._claims.give_back(claimed.id, counts=False)
+        except StoreUnavailable as error:
+            log.warning("%s; its jobs are free when their leases are over", error)
+        self._running.clear()
+        self._workspace.close()
+        self._database.close()

@@ -1,0 +1,119 @@
+"""Results of jobs on the disk: made aside, and put in their place whole, once.
+
+RESULTS/FOLDER/            the result of a job
+RESULTS/.running/POOL/     what one pool is making; `lock` is held while it lives
+  ID-ATTEMPT/              one attempt: `out/`, `progress.json`, `outcome.json`, `log`
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import shutil
+from pathlib import Path
+
+from gsplat_core.io.atomic_files import sync_folder
+from services.registry.errors import StoreUnavailable
+
+RUNNING, LOCK = ".running", "lock"
+OUT = "out"
+FILES = {
+    "report.html": "text/html; charset=utf-8",
+    "report.json": "application/json",
+    "frames.jsonl": "application/x-ndjson",
+    "reconstruction.mp4": "video/mp4",
+    "model.isplat": "application/octet-stream",
+}
+"""What a result may hold that is handed out, and its type."""
+
+
+class Results:
+    """A folder of results. Raises StoreUnavailable where it cannot be used."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            (folder / RUNNING).mkdir(mode=0o700, parents=True, exist_ok=True)
+        except OSError as error:
+            raise StoreUnavailable(
+                f"results cannot be kept in {folder}: {error.strerror}; choose another one"
+            ) from error
+
+    def is_published(self, folder: str) -> bool:
+        """Whether a result is there."""
+        return (self.folder / folder / "report.json").is_file()
+
+    def files(self, folder: str) -> list[str]:
+        """The files of a result that are handed out."""
+        return [name for name in FILES if (self.folder / folder / name).is_file()]
+
+    def publish(self, made: Path, folder: str) -> bool:
+        """Put the folder `made` in its place, by one rename; False where something is there already, which stays as it is."""
+        sync_folder(made)
+        try:
+            os.rename(made, self.folder / folder)
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                return False
+            raise
+        sync_folder(self.folder)
+        return True
+
+    def remove(self, folder: str) -> None:
+        """Remove a result: from here on it is not there, even where its files are removed later."""
+        gone = self.folder / RUNNING / f"removed-{folder}"
+        try:
+            os.rename(self.folder / folder, gone)
+        except FileNotFoundError:
+            return
+        shutil.rmtree(gone, ignore_errors=True)
+
+
+class Workspace:
+    """Where one pool makes its results; removed when it is closed."""
+
+    def __init__(self, results: Results, pool: str) -> None:
+        self._running = results.folder / RUNNING
+        self.folder = self._running / pool
+        self.folder.mkdir(mode=0o700)
+        self._lock = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
+
+    def attempt(self, job_id: str, number: int) -> Path:
+        """A new folder for one attempt."""
+        folder = self.folder / f"{job_id}-{number}"
+        folder.mkdir(mode=0o700)
+        return folder
+
+    def remove(self, folder: Path) -> None:
+        """Remove an attempt's folder; its process has ended."""
+        shutil.rmtree(folder, ignore_errors=True)
+
+    def close(self) -> None:
+        """Remove everything, and let go of the lock."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        os.close(self._lock)
+
+    def dead(self) -> list[str]:
+        """Pools that have died: nobody holds their locks."""
+        return [path.name for path in self._running.iterdir() if not _is_locked(path / LOCK)]
+
+    def remove_dead(self, pools: list[str]) -> None:
+        """Remove what they have left."""
+        for pool in pools:
+            shutil.rmtree(self._running / pool, ignore_errors=True)
+
+
+def _is_locked(lock: Path) -> bool:
+    try:
+        held = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(held)
+    return False

@@ -1,0 +1,161 @@
+"""The store of jobs, as those see it who submit, watch and cancel them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import secrets
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from services.jobs.records import OPEN, JobRecord, JobState, NewJob, Submission, job_record
+from services.jobs.tables import JOBS, SCHEMA, SUBMISSIONS
+from services.registry.database import Database
+from services.registry.errors import Conflict, NotFound, Rejected
+from services.registry.rows import now
+
+MOST_AT_ONCE = 2000
+FindSource = Callable[[sa.Connection, str], Path]
+
+
+class JobStore:
+    """Jobs in the database. Synchronous; any thread may call it, and several processes may have the same one open. Raises StoreUnavailable."""
+
+    def __init__(self, database_url: str, find_source: FindSource | None = None) -> None:
+        """find_source: where a recording lies by its name, asked in the transaction that makes the job; raises NotFound, Conflict."""
+        self.database = Database(database_url, SCHEMA)
+        self._find_source = find_source
+        self.database.migrate()
+
+    def submit(
+        self, jobs: Sequence[NewJob], options: Mapping[str, Any], by: str, idempotency_key: str | None = None
+    ) -> Submission:
+        """Queue a job for each recording, all of them or none. A second request with the same key and by the same caller gets what the first one got.
+
+        Raises NotFound and Conflict for a recording that cannot be read, Rejected for a key that came with another request.
+        """
+        if not 1 <= len(jobs) <= MOST_AT_ONCE:
+            raise Rejected(f"{len(jobs)} recordings were named; name 1 to {MOST_AT_ONCE} at once")
+        at, batch = now().isoformat(), secrets.token_hex(8)
+        request = _digest([[job.recording for job in jobs], dict(options)])
+        key = None if idempotency_key is None else _digest([by, idempotency_key])
+        with self.database.writing() as connection:
+            if key is not None:
+                earlier = _submission(connection, key)
+                if earlier is not None:
+                    return _same(connection, earlier, request)
+                values = {"key": key, "request": request, "batch": batch, "created_at": at}
+                connection.execute(sa.insert(SUBMISSIONS).values(values))
+            rows = [self._row(connection, job, options, by, batch, at) for job in jobs]
+            connection.execute(sa.insert(JOBS), rows)
+        return Submission(batch, [row["id"] for row in rows])
+
+    def get(self, job_id: str) -> JobRecord:
+        """One job. Raises NotFound."""
+        with self.database.reading() as connection:
+            return job_record(job_row(connection, job_id))
+
+    def newest(
+        self, count: int = 100, *, before: int | None = None, batch: str | None = None, state: str | None = None
+    ) -> list[JobRecord]:
+        """Up to `count` jobs, the newest first; those whose number is under `before`."""
+        query = sa.select(JOBS).order_by(JOBS.c.number.desc()).limit(count)
+        for column, value in ((JOBS.c.batch, batch), (JOBS.c.state, state)):
+            if value is not None:
+                query = query.where(column == value)
+        if before is not None:
+            query = query.where(JOBS.c.number < before)
+        with self.database.reading() as connection:
+            return [job_record(row) for row in connection.execute(query).mappings()]
+
+    def counts(self, batch: str | None = None) -> dict[str, int]:
+        """How many jobs are in each state, of one batch or of all."""
+        query = sa.select(JOBS.c.state, sa.func.count()).group_by(JOBS.c.state)
+        if batch is not None:
+            query = query.where(JOBS.c.batch == batch)
+        with self.database.reading() as connection:
+            found = {str(state): int(count) for state, count in connection.execute(query)}
+        return {str(state): found.get(str(state), 0) for state in JobState}
+
+    def cancel(self, job_id: str, by: str) -> JobRecord:
+        """Cancel a job: at once where it is queued, and within a second where it runs. Raises NotFound, Conflict for one that has ended."""
+        with self.database.writing() as connection:
+            row = job_row(connection, job_id)
+            state = JobState(row["state"])
+            if state not in OPEN:
+                raise Conflict(f"the replay {job_id} is {state} and cannot be cancelled")
+            values: dict[str, Any] = {"cancelled_by": by}
+            if state is JobState.QUEUED:
+                values |= {
+                    "state": str(JobState.CANCELLED),
+                    "reason": f"cancelled by {by}",
+                    "ended_at": now().isoformat(),
+                }
+            connection.execute(sa.update(JOBS).where(JOBS.c.id == job_id).values(values))
+            return job_record(job_row(connection, job_id))
+
+    def forget(self, job_id: str) -> JobRecord:
+        """Remove the row of a job that has ended; its files are the caller's. Raises NotFound, Conflict."""
+        with self.database.writing() as connection:
+            record = job_record(job_row(connection, job_id))
+            if record.is_open:
+                raise Conflict(f"the replay {job_id} is {record.state}; cancel it first")
+            connection.execute(sa.delete(JOBS).where(JOBS.c.id == job_id))
+        return record
+
+    def retry(self, states: Sequence[JobState]) -> int:
+        """Queue jobs anew that ended in these states; returns how many."""
+        fresh = {"state": str(JobState.QUEUED), "reason": None, "cancelled_by": None, "attempts": 0, "ended_at": None}
+        with self.database.writing() as connection:
+            query = sa.update(JOBS).where(JOBS.c.state.in_([str(state) for state in states]))
+            return connection.execute(query.values(fresh)).rowcount
+
+    def close(self) -> None:
+        """Close the connections."""
+        self.database.close()
+
+    def _row(
+        self, connection: sa.Connection, job: NewJob, options: Mapping[str, Any], by: str, batch: str, at: str
+    ) -> dict[str, Any]:
+        source = job.source
+        if source is None:
+            assert self._find_source is not None
+            source = str(self._find_source(connection, job.recording))
+        job_id = secrets.token_hex(8)
+        return {
+            "id": job_id, "batch": batch, "recording": job.recording, "source": source, "folder": job.folder or job_id,
+            "options": dict(options), "state": str(JobState.QUEUED), "attempts": 0, "frames_done": 0,
+            "created_by": by, "created_at": at,
+        }  # fmt: skip
+
+
+def uses_recording(connection: sa.Connection, recording: str) -> bool:
+    """Whether a job that has not ended reads this recording."""
+    query = sa.select(JOBS.c.id).where(JOBS.c.recording == recording, JOBS.c.state.in_([str(state) for state in OPEN]))
+    return connection.execute(query.limit(1)).first() is not None
+
+
+def job_row(connection: sa.Connection, job_id: str) -> sa.RowMapping:
+    """The row of a job; raises NotFound."""
+    row = connection.execute(sa.select(JOBS).where(JOBS.c.id == job_id)).mappings().one_or_none()
+    if row is None:
+        raise NotFound(f"there is no replay {job_id[:40]!r}; GET /v1/replays lists those that are there")
+    return row
+
+
+def _submission(connection: sa.Connection, key: str) -> sa.RowMapping | None:
+    return connection.execute(sa.select(SUBMISSIONS).where(SUBMISSIONS.c.key == key)).mappings().one_or_none()
+
+
+def _same(connection: sa.Connection, earlier: sa.RowMapping, request: str) -> Submission:
+    if earlier["request"] != request:
+        raise Rejected("this Idempotency-Key came with another request before; take a new key for a new request")
+    query = sa.select(JOBS.c.id).where(JOBS.c.batch == earlier["batch"]).order_by(JOBS.c.number)
+    return Submission(earlier["batch"], [row.id for row in connection.execute(query)], is_new=False)
+
+
+def _digest(what: Any) -> str:
+    return hashlib.sha256(json.dumps(what, sort_keys=True, default=str).encode()).hexdigest()

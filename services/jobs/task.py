@@ -1,0 +1,72 @@
+"""One attempt at a job, as its process gets it, and what the process says while it runs: in files, so that it may run anywhere."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from services.jobs.records import JobProgress, JobState
+from services.jobs.results import OUT
+
+PROGRESS, OUTCOME, LOG = "progress.json", "outcome.json", "log"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What to do, and where; all of it is JSON."""
+
+    id: str
+    source: str
+    folder: str
+    """Of this attempt."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    threads: int = 1
+    niceness: int = 0
+    pack_model: bool = False
+    """Leave the model as one file for the registry, in place of a folder."""
+
+    @property
+    def out(self) -> Path:
+        """Where the result is made."""
+        return Path(self.folder) / OUT
+
+    @property
+    def log(self) -> Path:
+        """What its process prints."""
+        return Path(self.folder) / LOG
+
+    def say_progress(self, reached: JobProgress) -> None:
+        """Say how far it has come."""
+        reached_values = {"frames_done": reached.frames_done, "frames": reached.frames, "psnr_db": reached.psnr_db}
+        _write(Path(self.folder) / PROGRESS, reached_values)
+
+    def say_outcome(self, state: JobState, reason: str | None = None) -> None:
+        """Say how it ended, once everything is written."""
+        _write(Path(self.folder) / OUTCOME, {"state": str(state), "reason": reason})
+
+    def progress(self) -> JobProgress:
+        """How far it has come."""
+        said = _read(Path(self.folder) / PROGRESS)
+        return JobProgress(**said) if said else JobProgress(0, None, None)
+
+    def outcome(self) -> tuple[JobState, str | None] | None:
+        """How it ended; None where its process has not said so, because it died."""
+        said = _read(Path(self.folder) / OUTCOME)
+        return (JobState(said["state"]), said["reason"]) if said else None
+
+
+def _write(path: Path, values: Mapping[str, Any]) -> None:
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(values), encoding="utf-8")
+    os.replace(part, path)
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        return None

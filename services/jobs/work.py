@@ -1,0 +1,65 @@
+"""What the process of a job does: a replay, its reports, and its model packed. The only part of the jobs that loads torch."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+import traceback
+from pathlib import Path
+
+import torch
+
+from operators.applications.progress import Progress
+from operators.applications.replay import ReplaySettings, replay
+from operators.applications.result import RunOutcome
+from services.cli.exit_codes import user_sentence
+from services.jobs.records import JobProgress, JobState
+from services.jobs.task import Task
+from services.registry.bundle_file import SUFFIX, pack
+from services.reports.build import write_reports
+
+SAY_S = 0.2
+MODEL = "model"
+
+
+def work(task: Task) -> None:
+    """Make one attempt and say how it ended. A mistake in this program is an outcome, too: the same would happen again."""
+    torch.set_num_threads(task.threads)
+    try:
+        settings = ReplaySettings(recording=Path(task.source), out=task.out, **task.options)
+        replay(settings, _Teller(task), report=_write_reports)
+        if task.pack_model:
+            _pack(task.out)
+    except Exception as error:  # noqa: BLE001 - whoever waits for this job gets to know it as its reason
+        traceback.print_exc(file=sys.stderr)
+        sentence = user_sentence(error, [task.source])
+        reason = (
+            f"a bug in this program ({type(error).__name__}); the log has the rest" if sentence is None else sentence
+        )
+        task.say_outcome(JobState.FAILED, reason.replace(f"{Path(task.source).parent}/", ""))
+    else:
+        task.say_outcome(JobState.DONE)
+
+
+class _Teller:
+    """Says how far a replay has come, a few times a second."""
+
+    def __init__(self, task: Task) -> None:
+        self._task, self._said_s = task, 0.0
+
+    def __call__(self, progress: Progress) -> None:
+        now_s = time.monotonic()
+        if now_s - self._said_s >= SAY_S or progress.done == progress.total:
+            self._said_s = now_s
+            self._task.say_progress(JobProgress(progress.done, progress.total, progress.psnr_tissue_db))
+
+
+def _write_reports(outcome: RunOutcome, folder: Path) -> None:
+    write_reports(outcome, folder)
+
+
+def _pack(out: Path) -> None:
+    if (out / MODEL).is_dir():
+        pack(out / MODEL, out / f"{MODEL}{SUFFIX}")
+        shutil.rmtree(out / MODEL)

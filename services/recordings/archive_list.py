@@ -1,0 +1,160 @@
+"""What a zip archive says that it holds, looked at before anything is unpacked.
+
+Python's own reader loads the whole list of an archive, whatever its length, and believes it. So the end of the file is read here first, and
+every entry is held against the rules of `entries_of`.
+"""
+
+from __future__ import annotations
+
+import re
+import stat
+import struct
+import zipfile
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import BinaryIO
+
+from services.recordings.limits import RecordingLimits
+
+MOST_LIST_BYTES = 16 << 20
+MOST_PARTS = 5
+MIB = 1 << 20
+_END = struct.Struct("<4s4H2LH")
+_LOCAL = struct.Struct("<4s5H3L2H")
+_ZIP64_LOCATOR_BYTES = 20
+_PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._ -]{0,99}")
+_ENCRYPTED = 0x1 | 0x40 | 0x2000
+_PLAIN = (0, stat.S_IFREG, stat.S_IFDIR)
+_LEFT_OUT = "__MACOSX"
+_OF_A_LAYOUT = {"images", "images_right", "masks", "depth", "segments"}
+"""Folders that mean something in a recording: one of them alone at the top is not the recording's own folder."""
+
+
+class ArchiveInvalid(Exception):
+    """Why an archive is not unpacked, in a sentence without the names in it: they may say whose recording it is."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A file of an archive and where it goes, which stays inside of the folder."""
+
+    info: zipfile.ZipInfo
+    path: PurePosixPath
+
+
+def check_end(file: BinaryIO) -> int:
+    """The number of entries; raises ArchiveInvalid unless the file ends with one small list of them and nothing behind it."""
+    size = file.seek(0, 2)
+    if size < _END.size:
+        raise ArchiveInvalid(f"the archive is cut off: it has {size} bytes")
+    file.seek(max(0, size - _END.size - _ZIP64_LOCATOR_BYTES))
+    tail = file.read()
+    end = tail[-_END.size :]
+    kind, disk, list_disk, entries, every, list_bytes, list_at, comment_bytes = _END.unpack(end)
+    if kind != b"PK\x05\x06" or comment_bytes:
+        raise ArchiveInvalid(
+            "the archive is cut off, or something follows its list of files; pack it again without a comment"
+        )
+    if (
+        tail[: -_END.size].startswith(b"PK\x06\x07")
+        or 0xFFFF in (entries, every)
+        or 0xFFFFFFFF in (list_bytes, list_at)
+    ):
+        raise ArchiveInvalid(
+            "the archive is of the format for over 4 GiB or 65,534 files (zip64); upload a video, or less at once"
+        )
+    if disk or list_disk or entries != every:
+        raise ArchiveInvalid("the archive is one of several parts; pack it into one file")
+    if list_bytes > MOST_LIST_BYTES:
+        raise ArchiveInvalid(f"the archive's list of files has {list_bytes} bytes; at most {MOST_LIST_BYTES} are read")
+    if list_at + list_bytes != size - _END.size:
+        raise ArchiveInvalid("the archive's list of files is not where its end says; pack it again")
+    return entries
+
+
+def entries_of(archive: zipfile.ZipFile, file: BinaryIO, stated: int, limits: RecordingLimits) -> list[Entry]:
+    """The files to unpack, in the archive's order. Raises ArchiveInvalid for an entry that breaks a rule; nothing is unpacked then."""
+    infos = archive.infolist()
+    if len(infos) != stated:
+        raise ArchiveInvalid(f"the archive lists {len(infos)} files and says that there are {stated}; pack it again")
+    if stated > limits.entries:
+        raise ArchiveInvalid(f"the archive has {stated} files; at most {limits.entries} are unpacked")
+    for number, info in enumerate(infos):
+        _check_entry(info, number, limits)
+    whole = sum(info.file_size for info in infos)
+    if whole > limits.unpacked_bytes:
+        raise ArchiveInvalid(f"the archive holds {whole} bytes; at most {limits.unpacked_bytes} are unpacked")
+    _check_places(infos, file, archive.start_dir)
+    kept = [Entry(info, PurePosixPath(info.filename)) for info in infos if not info.is_dir() and not _is_left_out(info)]
+    return _with_paths_of_their_own(_without_their_common_folder(kept))
+
+
+def _check_entry(info: zipfile.ZipInfo, number: int, limits: RecordingLimits) -> None:
+    which = f"file {number + 1} of the archive"
+    name = info.orig_filename
+    parts = name.removesuffix("/").split("/")
+    if any(part in ("", ".", "..") for part in parts) or "\\" in name or "\0" in name or ":" in name:
+        raise ArchiveInvalid(f"the name of {which} leads out of the recording; pack names like images/000000.png")
+    if len(parts) > MOST_PARTS:
+        raise ArchiveInvalid(f"{which} lies {len(parts)} folders deep; at most {MOST_PARTS} are unpacked")
+    if not _is_left_out(info) and not all(_PART.fullmatch(part) for part in parts):
+        raise ArchiveInvalid(
+            f"the name of {which} has other signs than letters, digits, dot, dash, underscore and space"
+        )
+    if stat.S_IFMT(info.external_attr >> 16) not in _PLAIN:
+        raise ArchiveInvalid(f"{which} is a link or a device; pack the files themselves")
+    if info.flag_bits & _ENCRYPTED:
+        raise ArchiveInvalid(f"{which} is encrypted; pack it without a password")
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ArchiveInvalid(f"{which} is packed by method {info.compress_type}; use `zip`, which stores and deflates")
+    if info.file_size > limits.entry_bytes:
+        raise ArchiveInvalid(f"{which} holds {info.file_size} bytes; at most {limits.entry_bytes} are unpacked")
+    if info.file_size > MIB and info.file_size > limits.ratio * info.compress_size:
+        raise ArchiveInvalid(
+            f"{which} holds {info.file_size} bytes, packed into {info.compress_size}: over {limits.ratio} times as many"
+        )
+
+
+def _check_places(infos: list[zipfile.ZipInfo], file: BinaryIO, list_at: int) -> None:
+    """No two entries may share bytes: by that a small file unpacks to a huge one."""
+    end = 0
+    for info in sorted(infos, key=lambda each: each.header_offset):
+        if info.header_offset < end:
+            raise ArchiveInvalid("two files of the archive lie in the same place; pack it again")
+        file.seek(info.header_offset)
+        head = file.read(_LOCAL.size)
+        if len(head) < _LOCAL.size or not head.startswith(b"PK\x03\x04"):
+            raise ArchiveInvalid("a file of the archive is not where its list says; pack it again")
+        *_, name_bytes, extra_bytes = _LOCAL.unpack(head)
+        end = info.header_offset + _LOCAL.size + name_bytes + extra_bytes + info.compress_size
+        if end > list_at:
+            raise ArchiveInvalid("a file of the archive goes on into the list of files; pack it again")
+
+
+def _is_left_out(info: zipfile.ZipInfo) -> bool:
+    """What file managers add: hidden files, and a Mac's folder of them."""
+    parts = info.orig_filename.removesuffix("/").split("/")
+    return parts[0] == _LEFT_OUT or any(part.startswith(".") for part in parts)
+
+
+def _without_their_common_folder(entries: list[Entry]) -> list[Entry]:
+    """Often the recording's folder itself was packed: what lies in it is the recording."""
+    first = {entry.path.parts[0] for entry in entries}
+    if len(first) != 1 or first & _OF_A_LAYOUT or any(len(entry.path.parts) == 1 for entry in entries):
+        return entries
+    return [Entry(entry.info, PurePosixPath(*entry.path.parts[1:])) for entry in entries]
+
+
+def _with_paths_of_their_own(entries: list[Entry]) -> list[Entry]:
+    if not entries:
+        raise ArchiveInvalid("the archive holds no files; pack a recording")
+    taken, folders = set(), set()
+    for entry in entries:
+        name = str(entry.path).casefold()
+        if name in taken:
+            raise ArchiveInvalid("two files of the archive have the same name, but for capital letters")
+        taken.add(name)
+        folders |= {str(parent).casefold() for parent in entry.path.parents}
+    if taken & folders:
+        raise ArchiveInvalid("a file of the archive has the name of a folder in it")
+    return entries

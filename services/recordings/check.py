@@ -1,0 +1,97 @@
+"""The check of an uploaded recording, run as a program of its own: `python -m services.recordings.check FOLDER --kind KIND --name NAME`.
+
+FOLDER has the uploaded file, `upload`. An archive is unpacked into FOLDER/NAME, a video gets the name NAME with its usual suffix; then every frame is
+read, as `intrasplat validate` does. One line of JSON is the verdict: `{"stage": "ready", …}` or `{"stage": "rejected", "reason": …}`. Exit code 0: there
+is a verdict. Nothing else imports this module: it loads OpenCV and the decoders.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+from gsplat_core.io.recordings import validate_recording
+from services.recordings.archive_list import ArchiveInvalid
+from services.recordings.kinds import ARCHIVE
+from services.recordings.limits import RecordingLimits
+from services.recordings.unpack import unpack
+from services.registry.check_limits import NICENESS, lower_limit, taken_bytes
+
+UPLOAD = "upload"
+TOLD = ("layout", "frames", "frames_damaged", "width_px", "height_px", "fps", "duration_s", "fields", "calibration")
+MOST_PROBLEMS = 3
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Check one upload and print what was found."""
+    options = _options(arguments)
+    limits = RecordingLimits(**json.loads(options.limits))
+    _limit_resources(limits)
+    path = options.folder / _file_name(options)
+    try:
+        _put(options, path, limits)
+        verdict = _verdict(path, options.folder)
+    except ArchiveInvalid as error:
+        verdict = {"stage": "rejected", "reason": str(error)}
+    except MemoryError:
+        verdict = {
+            "stage": "rejected",
+            "reason": f"it needs more than {limits.check_memory_bytes} bytes of memory to read",
+        }
+    sys.stdout.write(json.dumps(verdict, allow_nan=False) + "\n")
+    return 0
+
+
+def _options(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m services.recordings.check", description="Check an uploaded recording."
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument("--kind", required=True, help="archive, or a video's suffix")
+    parser.add_argument("--name", required=True, help="what it is called")
+    parser.add_argument("--limits", default="{}", help="RecordingLimits as JSON")
+    return parser.parse_args(arguments)
+
+
+def _limit_resources(limits: RecordingLimits) -> None:
+    os.nice(NICENESS)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    lower_limit(resource.RLIMIT_FSIZE, max(limits.entry_bytes, 1 << 20))
+    lower_limit(resource.RLIMIT_DATA, taken_bytes() + limits.check_memory_bytes)
+    lower_limit(resource.RLIMIT_CPU, int(limits.check_s) + 1, spare=5)
+
+
+def _file_name(options: argparse.Namespace) -> str:
+    return str(options.name) if options.kind == ARCHIVE else f"{options.name}{options.kind}"
+
+
+def _put(options: argparse.Namespace, path: Path, limits: RecordingLimits) -> None:
+    """Bring the recording to its place; what an earlier check that was ended has left there goes first."""
+    upload = options.folder / UPLOAD
+    if options.kind == ARCHIVE:
+        shutil.rmtree(path, ignore_errors=True)
+        unpack(upload, path, limits)
+    else:
+        path.unlink(missing_ok=True)
+        os.link(upload, path)
+
+
+def _verdict(path: Path, folder: Path) -> dict[str, Any]:
+    report = validate_recording(path)
+    if report.ok:
+        told = {name: report.facts[name] for name in TOLD if name in report.facts}
+        return {"stage": "ready", **told, "warnings": len(report.warnings)}
+    said = "; ".join(str(problem) for problem in report.problems[:MOST_PROBLEMS])
+    more = len(report.problems) - MOST_PROBLEMS
+    reason = said.replace(f"{folder}/", "") + (f"; and {more} more" if more > 0 else "")
+    return {"stage": "rejected", "reason": reason}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,17 @@
+"""What Alembic runs for every migration: on the connection, and in the transaction, that `Database.migrate` gives it."""
+
+from __future__ import annotations
+
+from alembic import context
+
+from services.recordings.tables import METADATA
+
+context.configure(
+    connection=context.config.attributes["connection"],
+    target_metadata=METADATA,
+    version_table=context.config.attributes["version_table"],
+    render_as_batch=True,
+    transactional_ddl=True,
+)
+with context.begin_transaction():
+    context.run_migrations()

@@ -1,0 +1,251 @@
+"""The store of uploaded recordings."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from gsplat_core.io.atomic_files import sync_folder
+from services.recordings.kinds import ARCHIVE, kind_of
+from services.recordings.limits import RecordingLimits
+from services.recordings.records import Expired, RecordingRecord, State, recording_record
+from services.recordings.tables import RECORDINGS, SCHEMA
+from services.registry.checking import BroughtDown, RunningChecks, run_program
+from services.registry.database import Database
+from services.registry.errors import CheckFailed, Conflict, NotFound, StoreUnavailable
+from services.registry.rows import now
+
+PROGRAM = (sys.executable, "-P", "-m", "services.recordings.check")
+UPLOAD = "upload"
+MOST_REASON = 1000
+
+
+def _nobody(_: sa.Connection, __: str) -> bool:
+    return False
+
+
+class RecordingStore:
+    """Recordings by name. Synchronous; any thread may call it. Every method raises StoreUnavailable where database or files do not answer.
+
+    A recording is a row and a folder. The folder is there before the row and goes after it, so that a process that ends in between leaves at most a
+    folder without a row, which `recover` removes.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        database_url: str,
+        *,
+        limits: RecordingLimits = RecordingLimits(),
+        in_use: Callable[[sa.Connection, str], bool] = _nobody,
+        check_program: tuple[str, ...] = PROGRAM,
+    ) -> None:
+        """in_use: whether a job that has not ended reads a recording; asked in the transaction that would remove it."""
+        self._folder, self._limits, self._in_use, self._program = folder, limits, in_use, check_program
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        except OSError as error:
+            raise StoreUnavailable(
+                f"recordings cannot be kept in {folder}: {error.strerror}; choose another one"
+            ) from error
+        self._checks = threading.BoundedSemaphore(limits.checks_at_once)
+        self._running = RunningChecks()
+        self._database = Database(database_url, SCHEMA)
+        self._database.migrate()
+
+    def add(self, name: str, file: Path, digest: str, by: str) -> tuple[RecordingRecord, bool]:
+        """Move a whole file, whose SHA-256 is `digest`, into the store as a recording; True where it is new, False where that very file had this name.
+
+        Raises Rejected for a file that is neither video nor archive, Conflict for another recording of this name.
+        """
+        kind = kind_of(file)
+        folder = self._folder / f"{name}-{secrets.token_hex(6)}"
+        size = file.stat().st_size
+        row: dict[str, Any] = {
+            "name": name, "folder": folder.name, "kind": kind, "state": str(State.UPLOADED), "reason": None, "digest": digest,
+            "size_bytes": size, "kept_bytes": size, "uploaded_by": by, "uploaded_at": now().isoformat(), "description": {},
+        }  # fmt: skip
+        try:
+            self._take_in(file, folder)
+            with self._database.writing() as connection:
+                there = _row(connection, name)
+                if there is None:
+                    connection.execute(sa.insert(RECORDINGS).values(row))
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        if there is None:
+            return self.get(name), True
+        shutil.rmtree(folder, ignore_errors=True)
+        if there["digest"] != digest:
+            raise Conflict(f"there is another recording {name}; delete it first, or choose another name")
+        return recording_record(there), False
+
+    def check(self, name: str) -> RecordingRecord:
+        """Unpack and read an uploaded recording in a process of its own; blocks until it is `ready` or `rejected`.
+
+        One that was checked before is answered as it is. Raises NotFound, and CheckFailed where the check could not be run: it then waits for another one.
+        """
+        with self._checks:
+            with self._database.reading() as connection:
+                row = _found(connection, name)
+            if State(row["state"]) is not State.UPLOADED:
+                return recording_record(row)
+            return self._after_check(row, self._verdict(row))
+
+    def all(self) -> list[RecordingRecord]:
+        """Every recording, by name."""
+        with self._database.reading() as connection:
+            return [recording_record(row) for row in _rows(connection)]
+
+    def get(self, name: str) -> RecordingRecord:
+        """One recording. Raises NotFound."""
+        with self._database.reading() as connection:
+            return recording_record(_found(connection, name))
+
+    def path_of(self, connection: sa.Connection, name: str) -> Path:
+        """Where a recording lies that can be read, asked in the transaction of who wants to read it. Raises NotFound, Conflict."""
+        row = _found(connection, name)
+        if State(row["state"]) is not State.READY:
+            raise Conflict(f"the recording {name} is {row['state']}, not ready; GET /v1/recordings/{name} says why")
+        return self._folder / row["folder"] / _file_name(row)
+
+    def delete(self, name: str) -> RecordingRecord:
+        """Remove a recording. Raises NotFound, Conflict while a job reads it or waits to."""
+        with self._database.writing() as connection:
+            row = _found(connection, name)
+            if self._in_use(connection, name):
+                raise Conflict(f"a replay that has not ended uses the recording {name}; cancel it first")
+            connection.execute(sa.delete(RECORDINGS).where(RECORDINGS.c.name == name))
+        shutil.rmtree(self._folder / row["folder"], ignore_errors=True)
+        return recording_record(row)
+
+    def expire(self, max_age_s: float | None, max_bytes: int | None) -> list[Expired]:
+        """Remove recordings that are older than they may be, then the oldest until all of them take no more than `max_bytes`. Those that a job uses stay,
+        and those that wait for their check."""
+        kept = [
+            record
+            for record in sorted(self.all(), key=lambda each: each.uploaded_at)
+            if record.state is not State.UPLOADED
+        ]
+        whole = sum(record.kept_bytes for record in kept)
+        removed = []
+        for record in kept:
+            why = _why(record, whole, max_age_s, max_bytes)
+            if why is None:
+                continue
+            try:
+                self.delete(record.name)
+            except (Conflict, NotFound):
+                continue
+            whole -= record.kept_bytes
+            removed.append(Expired(record.name, why))
+        return removed
+
+    def recover(self) -> list[str]:
+        """Called at start: remove folders without a row; returns the names of recordings that wait for their check."""
+        on_disk = sorted(self._folder.iterdir())  # before the rows: one that comes in between has both
+        with self._database.reading() as connection:
+            rows = _rows(connection)
+        known = {row["folder"] for row in rows}
+        for path in on_disk:
+            if path.name not in known:
+                shutil.rmtree(path, ignore_errors=True)
+        return [row["name"] for row in rows if State(row["state"]) is State.UPLOADED]
+
+    def close(self) -> None:
+        """End the checks that run and close the connections."""
+        self._running.end()
+        self._database.close()
+
+    def _take_in(self, file: Path, folder: Path) -> None:
+        try:
+            folder.mkdir(mode=0o700)
+            os.replace(file, folder / UPLOAD)
+            sync_folder(folder)
+            sync_folder(self._folder)
+        except OSError as error:
+            raise StoreUnavailable(
+                f"the recording cannot be kept: {error.strerror}; free space on that disk"
+            ) from error
+
+    def _verdict(self, row: sa.RowMapping) -> dict[str, Any]:
+        told: list[dict[str, Any]] = []
+        folder, limits = self._folder / row["folder"], json.dumps(asdict(self._limits))
+        arguments = ["--kind", row["kind"], "--name", row["name"], "--limits", limits]
+        command = [*self._program, str(folder), *arguments]
+        try:
+            words = run_program(command, self._limits.check_passed_s, told.append, running=self._running)
+        except BroughtDown as error:
+            return {"stage": "rejected", "reason": str(error)}
+        if not told:
+            raise CheckFailed(
+                f"the check of {row['name']} ended without a verdict: {words}; repair that and check again"
+            )
+        return told[-1]
+
+    def _after_check(self, row: sa.RowMapping, verdict: dict[str, Any]) -> RecordingRecord:
+        ready = verdict.pop("stage", None) == "ready"
+        folder = self._folder / row["folder"]
+        path = folder / _file_name(row)
+        reason = None if ready else str(verdict.pop("reason", "it cannot be read"))[:MOST_REASON]
+        values = {
+            "state": str(State.READY if ready else State.REJECTED), "reason": reason,
+            "kept_bytes": _bytes_below(path) if ready else 0, "description": verdict if ready else {},
+        }  # fmt: skip
+        same = (RECORDINGS.c.name == row["name"], RECORDINGS.c.folder == row["folder"])
+        with self._database.writing() as connection:
+            connection.execute(sa.update(RECORDINGS).where(*same).values(values))
+        # What is not needed any more: the archive of a recording that was unpacked, everything of one that cannot be used.
+        (folder / UPLOAD).unlink(missing_ok=True)
+        if not ready:
+            shutil.rmtree(folder, ignore_errors=True)
+        return self.get(row["name"])
+
+
+def _why(record: RecordingRecord, whole: int, max_age_s: float | None, max_bytes: int | None) -> str | None:
+    if max_age_s is not None and _is_over(record.uploaded_at, max_age_s):
+        return f"it is older than {max_age_s / 86400:g} days"
+    if max_bytes is not None and whole > max_bytes:
+        return f"all recordings take more than {max_bytes} bytes, and it is the oldest"
+    return None
+
+
+def _is_over(at: datetime, age_s: float) -> bool:
+    return now() - at > timedelta(seconds=age_s)
+
+
+def _bytes_below(path: Path) -> int:
+    if path.is_file():
+        return path.stat().st_size
+    return sum(each.lstat().st_size for each in path.rglob("*"))
+
+
+def _file_name(row: sa.RowMapping) -> str:
+    return str(row["name"]) if row["kind"] == ARCHIVE else f"{row['name']}{row['kind']}"
+
+
+def _row(connection: sa.Connection, name: str) -> sa.RowMapping | None:
+    return connection.execute(sa.select(RECORDINGS).where(RECORDINGS.c.name == name)).mappings().one_or_none()
+
+
+def _found(connection: sa.Connection, name: str) -> sa.RowMapping:
+    row = _row(connection, name)
+    if row is None:
+        raise NotFound(f"there is no recording {name[:80]!r}; GET /v1/recordings lists those that are there")
+    return row
+
+
+def _rows(connection: sa.Connection) -> Sequence[sa.RowMapping]:
+    return connection.execute(sa.select(RECORDINGS).order_by(RECORDINGS.c.name)).mappings().all()

@@ -1,0 +1,97 @@
+"""Recordings and replays of a server, put together: they share the registry's database, so that a recording in use cannot go."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from prometheus_client import Metric
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.registry import Collector
+
+from services.control.system_events import SystemEvents
+from services.jobs.pool import PoolSettings
+from services.jobs.process import PoolProcess
+from services.jobs.results import Results
+from services.jobs.store import JobStore, uses_recording
+from services.recordings.limits import RecordingLimits
+from services.recordings.records import State
+from services.recordings.store import RecordingStore
+from services.registry.check_limits import NICENESS
+from services.registry.errors import StoreUnavailable
+from services.registry.models import DATABASE_FILE
+from services.server.pool_keeper import PoolKeeper
+from services.server.replays import Replays
+from services.server.retention import KeptRecordings
+from services.settings import ServiceSettings
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Archive:
+    """The parts."""
+
+    recordings: RecordingStore
+    kept: KeptRecordings
+    replays: Replays
+    pool: PoolKeeper
+    measures: ArchiveMeasures
+
+
+def new_archive(settings: ServiceSettings, events: SystemEvents) -> Archive:
+    """As the settings want it; the registry has made the folder of the database. Raises StoreUnavailable."""
+    data, wanted, jobs = settings.data_dir, settings.recordings, settings.jobs
+    database = settings.registry.database
+    url = (
+        f"sqlite:///{(data / 'registry' / DATABASE_FILE).absolute()}"
+        if database is None
+        else database.get_secret_value()
+    )
+    recordings = RecordingStore(
+        wanted.folder or data / "recordings",
+        url,
+        limits=RecordingLimits(unpacked_bytes=wanted.unpacked_bytes, entry_bytes=wanted.unpacked_bytes),
+        in_use=uses_recording,
+    )
+    store = JobStore(url, recordings.path_of)
+    results = Results((jobs.folder or data / "replays").absolute())
+    threads = jobs.threads or max(1, (os.cpu_count() or 1) // (2 * jobs.workers))
+    pool = PoolSettings(jobs.workers, threads, jobs.lease_s, jobs.attempts, NICENESS, pack_models=True)
+    told = PoolProcess(url, str(results.folder), pool, jobs.ray)
+    return Archive(
+        recordings,
+        KeptRecordings(recordings, wanted.keep_days, wanted.keep_bytes, events),
+        Replays(store, results),
+        PoolKeeper(told, lambda: _open(store.counts())),
+        ArchiveMeasures(recordings, store),
+    )
+
+
+def _open(counts: dict[str, int]) -> int:
+    return counts["queued"] + counts["running"]
+
+
+class ArchiveMeasures(Collector):
+    """What Prometheus is told of recordings and replays, at the moment when it asks: numbers by state, no names."""
+
+    def __init__(self, recordings: RecordingStore, store: JobStore) -> None:
+        self._recordings, self._store = recordings, store
+
+    def collect(self) -> Iterable[Metric]:
+        """See `Collector`."""
+        replays = GaugeMetricFamily("intrasplat_replays", "Replays in each state.", labels=["state"])
+        recordings = GaugeMetricFamily("intrasplat_recordings", "Uploaded recordings in each state.", labels=["state"])
+        kept = GaugeMetricFamily("intrasplat_recordings_bytes", "What uploaded recordings take on the disk.")
+        try:
+            for state, count in self._store.counts().items():
+                replays.add_metric([state], count)
+            found = self._recordings.all()
+            for each in State:
+                recordings.add_metric([str(each)], sum(record.state is each for record in found))
+            kept.add_metric([], sum(record.kept_bytes for record in found))
+        except StoreUnavailable as error:
+            log.warning("%s", error)
+        return [replays, recordings, kept]

@@ -1,0 +1,90 @@
+"""Keeps the process of the pool running while there are jobs for it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+from services.jobs.process import PoolProcess
+from services.registry.errors import StoreUnavailable
+from services.supervisor.restarts import Restarts
+
+log = logging.getLogger(__name__)
+LOOK_S = 0.5
+END_S = 10.0
+"""How long a pool may take to give its jobs back."""
+PASSED_ON = (
+    "PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TMPDIR", "HOME", "OMP_NUM_THREADS", "OMP_WAIT_POLICY",
+    "CUDA_VISIBLE_DEVICES", "NVIDIA_VISIBLE_DEVICES", "INTRASPLAT_ISA",
+)  # fmt: skip
+"""What a pool gets of the environment: no credentials are among it."""
+
+
+class PoolKeeper:
+    """Starts the pool when jobs wait for one, and again when it has died; what it prints goes to standard error."""
+
+    def __init__(self, told: PoolProcess, open_jobs: Callable[[], int]) -> None:
+        self._told, self._open_jobs = told, open_jobs
+        self._process: asyncio.subprocess.Process | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """Of the pool; None while there is none."""
+        process = self._process
+        return None if process is None or process.returncode is not None else process.pid
+
+    @asynccontextmanager
+    async def keeping(self) -> AsyncIterator[None]:
+        """Keep it until the block is left; then it gives its jobs back and ends."""
+        task = asyncio.create_task(self._keep(), name="pool of jobs")
+        try:
+            yield
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+            await self._end()
+
+    async def _keep(self) -> None:
+        restarts, loop = Restarts(), asyncio.get_running_loop()
+        while True:
+            if await self._is_wanted():
+                began_s = loop.time()
+                code = await self._run()
+                if code != 0:
+                    wait_s = restarts.ended(loop.time() - began_s)
+                    log.error("the pool of jobs ended with code %d; it is started again in %.1f s", code, wait_s)
+                    await asyncio.sleep(wait_s)
+            await asyncio.sleep(LOOK_S)
+
+    async def _is_wanted(self) -> bool:
+        try:
+            return await asyncio.to_thread(self._open_jobs) > 0
+        except StoreUnavailable as error:
+            log.warning("%s", error)
+            return False
+
+    async def _run(self) -> int:
+        environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
+        self._process = await asyncio.create_subprocess_exec(
+            sys.executable, "-P", "-m", "services.jobs.process",
+            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.DEVNULL, env=environment, start_new_session=True,
+        )  # fmt: skip
+        assert self._process.stdin is not None
+        self._process.stdin.write(self._told.line())
+        return await self._process.wait()
+
+    async def _end(self) -> None:
+        process = self._process
+        if process is None or process.returncode is not None:
+            return
+        assert process.stdin is not None
+        process.stdin.close()
+        try:
+            await asyncio.wait_for(process.wait(), END_S)
+        except TimeoutError:
+            process.kill()
+            await process.wait()

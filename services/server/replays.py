@@ -1,0 +1,61 @@
+"""Replays as jobs of a server: the store of jobs, and the files that they have made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from services.control import replay_parts
+from services.jobs.records import JobRecord, JobState, NewJob, Submission
+from services.jobs.results import FILES, Results
+from services.jobs.store import JobStore
+from services.registry.errors import NotFound
+
+
+class Replays:
+    """See `services.control.replay_parts.Jobs`."""
+
+    def __init__(self, store: JobStore, results: Results) -> None:
+        self._store, self._results = store, results
+
+    def submit(
+        self, recordings: Sequence[str], options: Mapping[str, Any], by: str, idempotency_key: str | None
+    ) -> Submission:
+        """See `Jobs`."""
+        return self._store.submit([NewJob(name) for name in recordings], options, by, idempotency_key)
+
+    def newest(self, count: int, *, before: int | None, batch: str | None, state: str | None) -> list[JobRecord]:
+        """See `Jobs`."""
+        return self._store.newest(count, before=before, batch=batch, state=state)
+
+    def get(self, job_id: str) -> JobRecord:
+        """See `Jobs`."""
+        return self._store.get(job_id)
+
+    def counts(self, batch: str | None = None) -> dict[str, int]:
+        """See `Jobs`."""
+        return self._store.counts(batch)
+
+    def cancel(self, job_id: str, by: str) -> JobRecord:
+        """See `Jobs`."""
+        return self._store.cancel(job_id, by)
+
+    def delete(self, job_id: str) -> JobRecord:
+        """See `Jobs`."""
+        record = self._store.forget(job_id)
+        self._results.remove(record.folder)
+        return record
+
+    def files(self, job: replay_parts.JobRecord) -> list[str]:
+        """See `Jobs`."""
+        return self._results.files(job.folder) if job.state == JobState.DONE else []
+
+    def file(self, job_id: str, name: str) -> Path:
+        """See `Jobs`. Raises NotFound."""
+        job = self.get(job_id)
+        if name not in FILES or name not in self.files(job):
+            raise NotFound(
+                f"the replay {job_id} is {job.state} and has no {name[:40]}; GET /v1/replays/{job_id} lists its results"
+            )
+        return self._results.folder / job.folder / name

@@ -1,0 +1,65 @@
+"""Recordings are removed when they are older, or take more, than the settings allow: at start and every few minutes, each in the audit log."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from services.control.system_events import SystemEvents
+from services.recordings.store import RecordingStore
+from services.registry.errors import CheckFailed, NotFound, StoreUnavailable
+
+log = logging.getLogger(__name__)
+AGAIN_S = 300.0
+DAY_S = 86400.0
+
+
+class KeptRecordings:
+    """Looks after a store of recordings while the server runs."""
+
+    def __init__(
+        self, store: RecordingStore, keep_days: float | None, keep_bytes: int | None, events: SystemEvents
+    ) -> None:
+        self._store, self._keep_bytes, self._events = store, keep_bytes, events
+        self._max_age_s = None if keep_days is None else keep_days * DAY_S
+
+    @asynccontextmanager
+    async def kept(self) -> AsyncIterator[None]:
+        """Clear away what a server that died had half done, check what waits for it, and enforce the bounds until the block is left."""
+        waiting = await asyncio.to_thread(self._store.recover)
+        tasks = [
+            asyncio.create_task(self._check(waiting), name="checks of waiting recordings"),
+            asyncio.create_task(self._enforce_again_and_again(), name="retention of recordings"),
+        ]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            await asyncio.to_thread(self._store.close)
+
+    async def enforce(self) -> None:
+        """Remove what is too old or too much. Raises StoreUnavailable."""
+        if self._max_age_s is None and self._keep_bytes is None:
+            return
+        for each in await asyncio.to_thread(self._store.expire, self._max_age_s, self._keep_bytes):
+            log.info("a recording was removed: %s", each.why)
+            self._events.tell("recording.expire", each.name, why=each.why)
+
+    async def _enforce_again_and_again(self) -> None:
+        while True:
+            try:
+                await self.enforce()
+            except StoreUnavailable as error:
+                log.error("%s", error)
+            await asyncio.sleep(AGAIN_S)
+
+    async def _check(self, waiting: list[str]) -> None:
+        for name in waiting:
+            try:
+                await asyncio.to_thread(self._store.check, name)
+            except (NotFound, CheckFailed, StoreUnavailable) as error:
+                log.error("a recording was not checked: %s", error)
