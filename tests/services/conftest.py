@@ -1,6 +1,16 @@
-"""A report as a run would make it, and keyframes to go with it."""
+"""A report as a run would make it, keyframes to go with it, and databases: SQLite, and PostgreSQL from Debian's package."""
 
 from __future__ import annotations
+
+import os
+import pwd
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +20,9 @@ from gsplat_core.training.metrics import FrameQuality
 from operators.messages import RenderedFrame
 from operators.metrics import ScoredFrame
 from services.reports.schema import RunReport
+from tests.services.registry.servers import new_database
+
+SERVER_STARTS_S = 30.0
 
 PATH = "source,tool_mask,reconstruct,deform,rasterize,video"
 
@@ -80,3 +93,64 @@ def scored() -> ScoredFrame:
         trained=False,
     )
     return ScoredFrame(rendered, FrameQuality(1, 33.0, 34.0, 0.9), 36.0)
+
+
+@pytest.fixture(scope="session")
+def postgresql() -> Iterator[str]:
+    """A PostgreSQL server without a port of its own: the folder of its socket."""
+    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
+    if not programs:
+        pytest.skip("PostgreSQL is not installed (apt-get install postgresql)")
+    user = None
+    if os.geteuid() == 0:  # the server refuses to run as root
+        try:
+            user = pwd.getpwnam("postgres").pw_name
+        except KeyError:
+            pytest.skip("there is no user postgres to run PostgreSQL as")
+    folder = Path(tempfile.mkdtemp(prefix="pg-"))
+    try:
+        if user is not None:
+            shutil.chown(folder, user)
+        subprocess.run(
+            [programs[-1].with_name("initdb"), "-D", folder / "data", "-U", "tester", "-A", "trust", "-E", "UTF8"],
+            user=user, cwd=folder, check=True, capture_output=True,
+        )  # fmt: skip
+        options = ["-c", "listen_addresses=", "-c", "fsync=off", "-k", str(folder)]
+        with open(folder / "log", "wb") as log:
+            server = subprocess.Popen(
+                [programs[-1], "-D", folder / "data", *options], user=user, cwd=folder, stdout=log, stderr=log
+            )
+        try:
+            _wait_for(server, lambda: _answers_postgresql(folder))
+            yield str(folder)
+        finally:
+            server.send_signal(signal.SIGINT)
+            server.wait(SERVER_STARTS_S)
+    finally:
+        shutil.rmtree(folder)
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest) -> str | None:
+    """None for SQLite in a folder of the test; the URL of an empty database of PostgreSQL."""
+    if request.param == "sqlite":
+        return None
+    return new_database(request.getfixturevalue("postgresql"))
+
+
+def _answers_postgresql(folder: Path) -> bool:
+    import psycopg
+
+    try:
+        psycopg.connect(f"host={folder} user=tester dbname=postgres").close()
+    except psycopg.OperationalError:
+        return False
+    return True
+
+
+def _wait_for(server: subprocess.Popen[bytes], answers: Callable[[], bool]) -> None:
+    until = time.monotonic() + SERVER_STARTS_S
+    while not answers():
+        assert server.poll() is None, f"the server ended with {server.returncode}"
+        assert time.monotonic() < until, f"the server did not answer within {SERVER_STARTS_S:g} s"
+        time.sleep(0.1)

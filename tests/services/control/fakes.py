@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
@@ -48,8 +49,9 @@ class FakeModels:
         self.bytes: dict[tuple[str, int], bytes] = {}
         self.active: dict[str, list[int]] = {}
 
-    def upload(self, name: str, file: Path, digest: str, by: str) -> FakeVersion:
+    def upload(self, name: str, file: Path, digest: str | None, by: str) -> FakeVersion:
         data = file.read_bytes()
+        digest = digest or hashlib.sha256(data).hexdigest()
         numbers = self.kept.setdefault(name, {})
         number = max(numbers, default=0) + 1
         numbers[number] = FakeVersion(name, number, "uploaded", digest, len(data), by)
@@ -184,7 +186,62 @@ class FakeDisplay:
             await asyncio.sleep(0.005)
 
 
+class FakeRecordings:
+    """Takes what begins with `GOOD`."""
+
+    def __init__(self) -> None:
+        self.kept: dict[str, FakeRecording] = {}
+        self.used: set[str] = set()
+
+    def add(self, name: str, file: Path, digest: str, by: str) -> tuple[FakeRecording, bool]:
+        there = self.kept.get(name)
+        if there is not None and there.digest != digest:
+            raise NotNow(f"there is another recording {name}")
+        state = "ready" if file.read_bytes().startswith(b"GOOD") else "rejected"
+        made = FakeRecording(name, digest, file.stat().st_size, by, later=state)
+        return self.kept.setdefault(name, made), there is None
+
+    def check(self, name: str) -> FakeRecording:
+        record = self.get(name)
+        self.kept[name] = replace(record, state=record.later, description={"frames": 3, "layout": "video"})
+        return self.kept[name]
+
+    def all(self) -> list[FakeRecording]:
+        return list(self.kept.values())
+
+    def get(self, name: str) -> FakeRecording:
+        if name not in self.kept:
+            raise NotThere(f"there is no recording {name}")
+        return self.kept[name]
+
+    def delete(self, name: str) -> FakeRecording:
+        if name in self.used:
+            raise NotNow(f"a replay uses {name}")
+        self.get(name)
+        return self.kept.pop(name)
+
+
+@dataclass(frozen=True)
+class FakeRecording:
+    name: str
+    digest: str
+    size_bytes: int
+    uploaded_by: str
+    kind: str = "video"
+    state: str = "uploaded"
+    reason: str | None = None
+    kept_bytes: int = 0
+    uploaded_at: str = "2026-01-01T00:00:00+00:00"
+    description: Mapping[str, Any] = field(default_factory=dict)
+    later: str = "ready"
+
+
 def fake_parts(**other: Any) -> Parts:
     """All that the routes need."""
-    given: dict[str, Any] = {"streams": FakeStreams(), "models": FakeModels(), "display": FakeDisplay()}
+    given: dict[str, Any] = {
+        "streams": FakeStreams(),
+        "models": FakeModels(),
+        "display": FakeDisplay(),
+        "recordings": FakeRecordings(),
+    }
     return Parts(**{**given, "errors": {NotThere: Missing, NotNow: Conflicting}, **other})

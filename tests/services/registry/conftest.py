@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import pwd
-import shutil
-import signal
 import subprocess
 import sys
-import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +11,6 @@ from typing import Any
 import pytest
 
 from services.registry.models import ModelRegistry
-from tests.services.registry.servers import new_database
 from tests.services.registry.stub_check import ALWAYS_READY
 
 SERVER_STARTS_S = 30.0
@@ -27,49 +20,6 @@ SERVER_STARTS_S = 30.0
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where packed models lie that several tests upload."""
     return tmp_path_factory.mktemp("uploads")
-
-
-@pytest.fixture(scope="session")
-def postgresql() -> Iterator[str]:
-    """A PostgreSQL server without a port of its own: the folder of its socket."""
-    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
-    if not programs:
-        pytest.skip("PostgreSQL is not installed (apt-get install postgresql)")
-    user = None
-    if os.geteuid() == 0:  # the server refuses to run as root
-        try:
-            user = pwd.getpwnam("postgres").pw_name
-        except KeyError:
-            pytest.skip("there is no user postgres to run PostgreSQL as")
-    folder = Path(tempfile.mkdtemp(prefix="pg-"))
-    try:
-        if user is not None:
-            shutil.chown(folder, user)
-        subprocess.run(
-            [programs[-1].with_name("initdb"), "-D", folder / "data", "-U", "tester", "-A", "trust", "-E", "UTF8"],
-            user=user, cwd=folder, check=True, capture_output=True,
-        )  # fmt: skip
-        options = ["-c", "listen_addresses=", "-c", "fsync=off", "-k", str(folder)]
-        with open(folder / "log", "wb") as log:
-            server = subprocess.Popen(
-                [programs[-1], "-D", folder / "data", *options], user=user, cwd=folder, stdout=log, stderr=log
-            )
-        try:
-            _wait_for(server, lambda: _answers_postgresql(folder))
-            yield str(folder)
-        finally:
-            server.send_signal(signal.SIGINT)
-            server.wait(SERVER_STARTS_S)
-    finally:
-        shutil.rmtree(folder)
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database_url(request: pytest.FixtureRequest) -> str | None:
-    """None for SQLite in the registry's folder; the URL of an empty database of PostgreSQL."""
-    if request.param == "sqlite":
-        return None
-    return new_database(request.getfixturevalue("postgresql"))
 
 
 @pytest.fixture
@@ -98,24 +48,6 @@ def sqlite_registry(tmp_path: Path) -> Iterator[ModelRegistry]:
     """An empty registry where the database does not matter."""
     with ModelRegistry(tmp_path / "registry", check_program=ALWAYS_READY) as registry:
         yield registry
-
-
-def _answers_postgresql(folder: Path) -> bool:
-    import psycopg
-
-    try:
-        psycopg.connect(f"host={folder} user=tester dbname=postgres").close()
-    except psycopg.OperationalError:
-        return False
-    return True
-
-
-def _wait_for(server: subprocess.Popen[bytes], answers: Callable[[], bool]) -> None:
-    until = time.monotonic() + SERVER_STARTS_S
-    while not answers():
-        assert server.poll() is None, f"the server ended with {server.returncode}"
-        assert time.monotonic() < until, f"the server did not answer within {SERVER_STARTS_S:g} s"
-        time.sleep(0.1)
 
 
 @pytest.fixture(scope="session")

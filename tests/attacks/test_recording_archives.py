@@ -1,0 +1,214 @@
+"""Archives of a stranger in place of a recording: each is refused with a sentence, and nothing is written outside of its folder."""
+
+from __future__ import annotations
+
+import io
+import stat
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+
+import pytest
+
+from services.recordings.archive_list import MOST_LIST_BYTES, ArchiveInvalid
+from services.recordings.limits import RecordingLimits
+from services.recordings.unpack import unpack
+
+SMALL = RecordingLimits(unpacked_bytes=3 << 20, entry_bytes=2 << 20, entries=5)
+
+
+def archive(*entries: tuple[str | zipfile.ZipInfo, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
+    """A zip archive of these files."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as opened:
+        for name, content in entries:
+            opened.writestr(name, content)
+    return buffer.getvalue()
+
+
+def marked(name: str, **attributes: int) -> zipfile.ZipInfo:
+    """An entry with other attributes than `zipfile` gives it."""
+    info = zipfile.ZipInfo(name)
+    for attribute, value in attributes.items():
+        setattr(info, attribute, value)
+    return info
+
+
+@pytest.fixture
+def refused(tmp_path):
+    """The sentence with which an archive is refused; nothing but its own folder was made."""
+
+    def refuse(content: bytes, limits: RecordingLimits = SMALL) -> str:
+        (tmp_path / "inside").mkdir(exist_ok=True)
+        (tmp_path / "inside" / "upload").write_bytes(content)
+        with pytest.raises(ArchiveInvalid) as error:
+            unpack(tmp_path / "inside" / "upload", tmp_path / "inside" / "recording", limits)
+        assert {path.name for path in tmp_path.iterdir()} == {"inside"}
+        assert {path.name for path in (tmp_path / "inside").iterdir()} <= {"upload", "recording"}
+        return str(error.value)
+
+    return refuse
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../evil", "images/../../evil", "/etc/evil", "a//b", "./a", "a/./b", "..", "images/..", "C:/evil", "c:evil",
+        "..\\evil", "images\\..\\evil", "\\\\host\\share", "../.hidden", "__MACOSX/../../evil",
+    ],
+)  # fmt: skip
+def test_no_name_leads_out(refused, name):
+    assert "leads out of the recording" in refused(archive((name, b"x")))
+
+
+@pytest.mark.parametrize(
+    "name", ["imag\u00e9s/1.png", "a\nb", "a\x1b[31m", "-rf", "a" * 101, "a;b", "\u202egnp.exe", "$(id)"]
+)
+def test_odd_names_are_refused_and_not_repeated(refused, name):
+    said = refused(archive((name, b"x")))
+    assert "other signs than letters" in said and name not in said
+
+
+def test_a_zero_byte_in_a_name_hides_nothing(refused):
+    content = archive(("aaaa/evil.png", b"x")).replace(b"aaaa/evil", b"aaaa\0evil")
+    assert "leads out" in refused(content) or "damaged" in refused(content)
+
+
+@pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFCHR, stat.S_IFIFO, stat.S_IFSOCK, stat.S_IFBLK])
+@pytest.mark.parametrize("system", [0, 3])
+def test_links_and_devices_are_refused(refused, kind, system):
+    entry = marked("images", external_attr=(kind | 0o777) << 16, create_system=system)
+    assert "link or a device" in refused(archive((entry, b"/etc")))
+
+
+def test_a_link_made_by_unzip_is_never_followed(refused):
+    link = marked("images", external_attr=(stat.S_IFLNK | 0o777) << 16)
+    assert "link or a device" in refused(archive((link, b"/tmp"), ("images/evil", b"x")))
+
+
+def test_a_bomb_is_refused_before_it_is_unpacked(refused, tmp_path):
+    said = refused(archive(("depth.npy", bytes(2 << 20)), method=zipfile.ZIP_DEFLATED))
+    assert "over 100 times as many" in said and not (tmp_path / "inside" / "recording").exists()
+
+
+def test_many_small_bombs_are_one(refused):
+    files = [(f"{n}.npy", bytes(1 << 20)) for n in range(4)]
+    assert "holds 4194304 bytes; at most 3145728" in refused(archive(*files, method=zipfile.ZIP_DEFLATED))
+
+
+def test_a_file_may_not_be_larger_than_it_may(refused):
+    assert "file 1 of the archive holds 2097153 bytes; at most 2097152" in refused(archive(("a", bytes((2 << 20) + 1))))
+
+
+def test_so_many_files_and_no_more(refused, tmp_path):
+    assert "has 6 files; at most 5" in refused(archive(*[(f"{n}.png", b"x") for n in range(6)]))
+    (tmp_path / "five").write_bytes(archive(*[(f"{n}.png", b"x") for n in range(5)]))
+    unpack(tmp_path / "five", tmp_path / "recording", SMALL)
+    assert len(list((tmp_path / "recording").iterdir())) == 5
+
+
+def test_a_file_that_is_longer_than_its_list_says(refused):
+    packed = zlib.compressobj(9, zlib.DEFLATED, -15)
+    data = packed.compress(bytes(1 << 20)) + packed.flush()
+    content = bytearray(archive(("a.npy", bytes(1 << 20)), method=zipfile.ZIP_DEFLATED))
+    assert data in bytes(content)
+    for signature, offset in ((b"PK\x03\x04", 22), (b"PK\x01\x02", 24)):
+        struct.pack_into("<I", content, content.index(signature) + offset, 10)
+    assert "damaged" in refused(bytes(content))
+
+
+def test_files_in_the_same_place_are_refused(refused):
+    content = bytearray(archive(("a.png", b"x" * 100), ("b.png", b"y" * 100)))
+    second = content.rindex(b"PK\x01\x02")
+    struct.pack_into("<I", content, second + 42, 0)  # b's list entry points at a
+    assert "in the same place" in refused(bytes(content))
+
+
+def test_a_file_may_not_reach_into_the_list(refused):
+    content = bytearray(archive(("a.png", b"x" * 100)))
+    for signature, offset in ((b"PK\x03\x04", 18), (b"PK\x01\x02", 20)):
+        struct.pack_into("<II", content, content.index(signature) + offset, 120, 120)
+    assert "into the list" in refused(bytes(content))
+
+
+def test_a_giant_list_is_not_read(refused):
+    end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 1, 1, MOST_LIST_BYTES + 1, 4, 0)
+    assert "list of files has" in refused(b"PK\x03\x04" + bytes(MOST_LIST_BYTES + 1) + end)
+
+
+@pytest.mark.parametrize("stated", [0, 1, 3, 60000])
+def test_the_number_of_files_must_be_the_stated_one(refused, stated):
+    content = bytearray(archive(("a.png", b"x"), ("b.png", b"y")))
+    struct.pack_into("<HH", content, len(content) - 14, stated, stated)
+    assert "says that there are" in refused(bytes(content))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content[:-1],
+        lambda content: content[: len(content) // 2],
+        lambda content: content + b"tail",
+        lambda content: b"#!/bin/sh\n" + content,
+        lambda content: content[:-2] + b"\x04\x00evil",
+        lambda content: b"PK\x05\x06",
+        lambda content: content.replace(b"PK\x01\x02", b"PK\x01\x03"),
+    ],
+)
+def test_cut_and_extended_archives_are_refused(refused, change):
+    assert refused(change(archive(("a.png", b"x" * 50))))
+
+
+def test_the_larger_format_is_refused(refused):
+    content = archive(("a.png", b"x"))
+    locator = struct.pack("<4sLQL", b"PK\x06\x07", 0, 0, 1)
+    assert "zip64" in refused(content[:-22] + locator + content[-22:])
+    saturated = bytearray(content)
+    struct.pack_into("<HH", saturated, len(saturated) - 14, 0xFFFF, 0xFFFF)
+    assert "zip64" in refused(bytes(saturated))
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_other_ways_of_packing_are_refused(refused, method):
+    assert f"by method {method}" in refused(archive(("a.png", b"x" * 100), method=method))
+
+
+def test_encrypted_files_are_refused(refused):
+    content = bytearray(archive(("a.png", b"x" * 100)))
+    for signature, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        struct.pack_into("<H", content, content.index(signature) + offset, 1)
+    assert "encrypted" in refused(bytes(content))
+
+
+def test_a_wrong_checksum_is_damage(refused):
+    content = archive(("a.png", b"x" * 100))
+    assert "damaged" in refused(content.replace(b"x" * 100, b"x" * 99 + b"y"))
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize("names", [("a.png", "a.png"), ("a.png", "A.PNG"), ("images", "images/a.png")])
+def test_no_file_takes_anothers_place(refused, names):
+    assert "same name" in refused(archive(*[(name, b"x") for name in names])) or "name of a folder" in refused(
+        archive(*[(name, b"x") for name in names])
+    )
+
+
+def test_a_local_name_that_differs_from_the_listed_one_is_damage(refused):
+    content = archive(("aa/bb/evil", b"x"))
+    assert "damaged" in refused(content.replace(b"aa/bb/evil", b"../../evil", 1))
+
+
+@pytest.mark.parametrize("entries", [(), (("folder/", b""),), ((".hidden", b"x"),), (("__MACOSX/._a", b"x"),)])
+def test_an_archive_without_files_is_refused(refused, entries):
+    assert "holds no files" in refused(archive(*entries))
+
+
+def test_what_file_managers_add_is_left_out(tmp_path: Path):
+    entries = [("case/images/0.png", b"x"), ("__MACOSX/case/images/._0.png", b"y"), ("case/.DS_Store", b"z")]
+    (tmp_path / "upload").write_bytes(archive(*entries))
+    unpack(tmp_path / "upload", tmp_path / "recording", SMALL)
+    assert [path.relative_to(tmp_path / "recording").as_posix() for path in (tmp_path / "recording").rglob("*.*")] == [
+        "images/0.png"
+    ]
+    assert stat.S_IMODE((tmp_path / "recording" / "images" / "0.png").stat().st_mode) == 0o600

@@ -1,0 +1,113 @@
+"""Claims: one owner for each job, for the length of a lease."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from services.jobs import claims as module
+from services.jobs.claims import Claims
+from services.jobs.records import JobProgress, JobState, NewJob
+
+NOTHING = JobProgress(0, None, None)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The wall clock in milliseconds, in a list of one number."""
+    at = [1_000_000]
+    monkeypatch.setattr(module, "_now_ms", lambda: at[0])
+    return at
+
+
+def of(store, owner, most_attempts=3, published=()):
+    return Claims(store.database, owner, 10, most_attempts, lambda folder: folder in published)
+
+
+def submitted(store, count=1):
+    return list(store.submit([NewJob(f"r{number}") for number in range(count)], {}, "operator").ids)
+
+
+def test_many_owners_never_share_a_job(new_store):
+    ids = submitted(new_store(), 20)
+    taken = []
+
+    def take_all(claims):
+        while (claimed := claims.take()) is not None:
+            taken.append(claimed.id)
+
+    threads = [threading.Thread(target=take_all, args=(of(new_store(), f"pool{n}"),)) for n in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(taken) == sorted(ids)
+
+
+def test_a_lease_that_is_renewed_is_kept_and_another_is_lost(new_store, clock):
+    store = new_store()
+    (job_id,) = submitted(store)
+    first, second = of(store, "first"), of(store, "second")
+    assert first.take().attempt == 1
+    clock[0] += 9_000
+    assert first.renew({job_id: JobProgress(5, 9, 30.0)}).lost == frozenset() and second.take() is None
+    assert (store.get(job_id).frames_done, store.get(job_id).frames, store.get(job_id).psnr_db) == (5, 9, 30.0)
+    clock[0] += 11_000
+    assert second.take().attempt == 2
+    assert first.renew({job_id: NOTHING}).lost == {job_id}
+    assert not first.end(job_id, JobState.DONE) and not first.give_back(job_id, counts=True)
+    assert store.get(job_id).state is JobState.RUNNING
+    assert second.end(job_id, JobState.DONE) and not second.end(job_id, JobState.FAILED, "again")
+    assert store.get(job_id).state is JobState.DONE
+
+
+def test_a_job_whose_process_dies_again_and_again_has_failed(new_store):
+    store = new_store()
+    (job_id,) = submitted(store)
+    claims = of(store, "pool", most_attempts=2)
+    for _ in range(2):
+        assert claims.take().id == job_id
+        claims.give_back(job_id, counts=True)
+    assert claims.take() is None
+    assert store.get(job_id).state is JobState.FAILED and "begun 2 times" in store.get(job_id).reason
+
+
+def test_an_attempt_that_ended_with_its_pool_does_not_count(new_store):
+    store = new_store()
+    (job_id,) = submitted(store)
+    claims = of(store, "pool", most_attempts=1)
+    for _ in range(3):
+        assert claims.take().attempt == 1
+        claims.give_back(job_id, counts=False)
+
+
+def test_a_result_that_is_there_is_not_made_again(new_store, clock):
+    store = new_store()
+    (job_id,) = submitted(store)
+    of(store, "dies between its rename and its note").take()
+    clock[0] += 11_000
+    assert of(store, "next", published={job_id}).take() is None
+    assert store.get(job_id).state is JobState.DONE
+
+
+def test_who_wants_a_job_to_end_is_heard(new_store):
+    store = new_store()
+    (job_id,) = submitted(store)
+    claims = of(store, "pool")
+    claims.take()
+    store.cancel(job_id, "nurse")
+    assert claims.renew({job_id: NOTHING}).cancelled == {job_id: "nurse"}
+    claims.give_back(job_id, counts=True)  # it died before it was ended
+    assert claims.take() is None and store.get(job_id).state is JobState.CANCELLED
+
+
+def test_jobs_of_the_dead_are_free_at_once(new_store):
+    store = new_store()
+    submitted(store, 2)
+    of(store, "dead").take()
+    of(store, "alive").take()
+    next_one = of(store, "next")
+    assert next_one.take() is None
+    next_one.free(["dead"])
+    assert next_one.take().attempt == 2 and next_one.take() is None
