@@ -1,0 +1,173 @@
+"""Recordings and replays of a running service: uploaded, replayed, read, kept as a model; and what becomes of a replay when processes are killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from services.client import Client, Refused
+
+WITHIN_S = 60.0
+QUICK = {"steps_per_frame": 2}
+LONG = {"steps_per_frame": 300}
+"""Some seconds of work on six small frames: time to be killed."""
+
+
+class Server:
+    """`intrasplat serve` without streams, in a folder that outlives it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.log = folder, folder / "log"
+        config = folder / "service.yaml"
+        config.write_text(
+            f"server: {{port: 0}}\npaths: {{data: {folder}/data, runtime: {folder}/run}}\nlog: {{format: text}}\nstreams: {{}}\n"
+            "jobs: {workers: 1, threads: 1}\n"
+        )
+
+    def start(self) -> Client:
+        """Start it; a client with its administrator's key."""
+        with self.log.open("w") as output:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "services.cli", "serve", "--config", self.folder / "service.yaml"],
+                stdout=output, stderr=output,
+            )  # fmt: skip
+        self.url = self.until(lambda: re.search(r"IntraSplat is on (http://\S+?)(?:/\S*)?\n", self.log.read_text()))[1]
+        self.client = Client(self.url, (self.folder / "data" / "admin.key").read_text())
+        return self.client
+
+    def until(self, found):
+        """What `found` returns once that is true."""
+        end_s = time.monotonic() + WITHIN_S
+        while time.monotonic() < end_s:
+            result = found()
+            if result:
+                return result
+            time.sleep(0.05)
+        raise AssertionError(f"it did not come about within {WITHIN_S} s:\n{self.log.read_text()[-4000:]}")
+
+    def pool(self) -> int | None:
+        """The process of the pool."""
+        return next((pid for pid in children(self.process.pid) if b"services.jobs.process" in command(pid)), None)
+
+    def attempt(self) -> int | None:
+        """The process of the attempt that runs."""
+        pool = self.pool()
+        return None if pool is None else next(iter(children(pool)), None)
+
+
+def children(pid: int) -> list[int]:
+    """Processes that a process has started."""
+    try:
+        return [
+            int(each)
+            for task in Path(f"/proc/{pid}/task").iterdir()
+            for each in (task / "children").read_text().split()
+        ]
+    except FileNotFoundError:
+        return []
+
+
+def command(pid: int) -> bytes:
+    """What a process was started with."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except FileNotFoundError:
+        return b""
+
+
+@pytest.fixture(scope="module")
+def server(tiny, tmp_path_factory):
+    """A service that has the recording `tiny`."""
+    server = Server(tmp_path_factory.mktemp("served"))
+    client = server.start()
+    upload = server.folder / "tiny.zip"
+    with zipfile.ZipFile(upload, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(tiny.rglob("*")):
+            archive.write(path, f"tiny/{path.relative_to(tiny)}")
+    assert client.upload_recording("tiny", upload).state == "uploaded"
+    assert client.checked_recording("tiny").state == "ready"
+    yield server
+    server.client.close()
+    server.process.kill()
+    server.process.wait()
+
+
+def running(server, job_id):
+    """Wait until an attempt at a replay runs; its process."""
+    server.until(lambda: server.client.replay(job_id).state == "running")
+    return server.until(server.attempt)
+
+
+def results(server):
+    """Every result that lies on the disk, by the replay's id; and nothing half-made."""
+    folder = server.folder / "data" / "replays"
+    assert list((folder / ".running").glob("*/*-*")) == []
+    return {
+        path.name: json.loads((path / "report.json").read_text()) for path in folder.iterdir() if path.name[0] != "."
+    }
+
+
+def test_a_recording_is_replayed_and_its_report_read(server, tmp_path):
+    job = server.client.start_replay("tiny", QUICK, idempotency_key="first")
+    assert server.client.start_replay("tiny", QUICK, idempotency_key="first").id == job.id
+    done = server.client.ended_replay(job.id, within_s=WITHIN_S)
+    assert (done.state, done.frames_done, done.frames, done.attempts) == ("done", 6, 6, 1)
+    for name in done.results:
+        server.client.result(job.id, name, tmp_path / name)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["recording"]["name"] == "tiny" and report["frames"]["displayed"] == 6
+    assert (tmp_path / "report.html").read_text().startswith("<!doctype html>")
+    assert (tmp_path / "reconstruction.mp4").read_bytes()[4:8] == b"ftyp"
+    version = server.client.keep_model(job.id, "tiny")
+    assert server.client.checked("tiny", version.version).state == "ready"
+    with pytest.raises(Refused, match="no recording"):
+        server.client.start_replay("nobody")
+
+
+def test_a_replay_that_fails_says_why(server):
+    job = server.client.ended_replay(server.client.start_replay("tiny", {"scale": 0.01}).id, within_s=WITHIN_S)
+    assert job.state == "failed" and "scale" in job.reason and job.results == []
+
+
+def test_a_recording_in_use_stays_and_a_cancelled_replay_leaves_nothing(server):
+    job = server.client.start_replay("tiny", LONG)
+    attempt = running(server, job.id)
+    with pytest.raises(Refused, match="has not ended uses"):
+        server.client.delete_recording("tiny")
+    server.client.cancel_replay(job.id)
+    cancelled = server.client.ended_replay(job.id, within_s=WITHIN_S)
+    assert cancelled.state == "cancelled" and "admin" in cancelled.reason
+    server.until(lambda: not Path(f"/proc/{attempt}").exists())
+    assert job.id not in results(server)
+
+
+@pytest.mark.parametrize("who", ["attempt", "pool", "server"])
+def test_a_replay_whose_process_is_killed_is_made_once(server, who):
+    job = server.client.start_replay("tiny", LONG)
+    attempt = running(server, job.id)
+    os.kill({"attempt": attempt, "pool": server.pool(), "server": server.process.pid}[who], signal.SIGKILL)
+    server.until(lambda: not Path(f"/proc/{attempt}").exists())
+    if who == "server":
+        server.process.wait()
+        server.client.close()
+        server.start()
+    done = server.client.ended_replay(job.id, within_s=WITHIN_S)
+    assert (done.state, done.frames_done, done.reason) == ("done", 6, None) and done.attempts >= 1
+    assert results(server)[job.id]["frames"]["displayed"] == 6
+
+
+def test_it_ends_with_its_pool(server):
+    pool = server.pool()
+    server.process.send_signal(signal.SIGTERM)
+    assert server.process.wait(30) == 0, server.log.read_text()
+    assert pool is None or not Path(f"/proc/{pool}").exists()
+    assert len(results(server)) == 4
