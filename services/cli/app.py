@@ -9,11 +9,13 @@ import typer
 
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
+    BatchOutOption,
     DeviceOption,
     EvaluatedArgument,
     EvaluateOptions,
     EvaluationOutOption,
     ExportedFileArgument,
+    FolderArgument,
     JsonOption,
     LiveOptions,
     LiveOutOption,
@@ -125,6 +127,30 @@ def replay(
         **options.settings(),
     )
     return replay_command(settings, as_json=json)
+
+
+@app.command()
+@takes_run_options
+def batch(
+    folder: FolderArgument,
+    options: RunOptions,
+    out: BatchOutOption = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=256, help="Replays at one time.", show_default="half of the cores")
+    ] = None,
+    steps_per_frame: Annotated[
+        int | None, typer.Option(help="Optimiser steps per frame.", show_default="the field's")
+    ] = None,
+    heldout: Annotated[
+        bool, typer.Option("--heldout/--no-heldout", help="As for replay: score frames that were not trained on.")
+    ] = False,
+    json: JsonOption = False,
+) -> int:
+    """Replay every recording of a folder; called again, it goes on where it was ended, however that was."""
+    from services.cli.batch import batch_command
+
+    chosen = {**options.settings(), "steps_per_frame": steps_per_frame, "heldout": heldout}
+    return batch_command(folder, out, workers, chosen, as_json=json)
 
 
 @app.command()

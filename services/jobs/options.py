@@ -14,6 +14,7 @@ class ReplayOptions(BaseModel):
 
     device: Literal["cpu", "cuda"] = Field(default="cpu", description="Where it is computed.")
     field: Literal["auto", "basis", "hexplane"] = Field(default="auto", description="Deformation field.")
+    renderer: Literal["alpha"] = Field(default="alpha", description="How Gaussians become a picture.")
     seed: int = Field(default=0, ge=0, le=2**31 - 1, description="The same seed gives the same bytes.")
     steps_per_frame: int | None = Field(
         default=None, ge=1, le=10_000, description="Optimiser steps per frame; null: the field's."

@@ -150,6 +150,28 @@ def test_a_recording_in_use_stays_and_a_cancelled_replay_leaves_nothing(server):
     assert job.id not in results(server)
 
 
+def test_the_same_from_a_shell(server, tiny, tmp_path, monkeypatch, intrasplat):
+    monkeypatch.setenv("INTRASPLAT_URL", server.url)
+    monkeypatch.setenv("INTRASPLAT_KEY", server.client._key)
+    added = intrasplat("ctl", "add-recording", "from-a-folder", tiny)
+    assert (added.code, "ready" in added.out) == (0, True), added.err
+    (tmp_path / "x.mp4").write_bytes(b"no video")
+    assert "neither a video" in intrasplat("ctl", "add-recording", "x", tmp_path / "x.mp4").err
+    options = ("--option", "steps-per-frame=2", "--option", "heldout=true")
+    done = intrasplat("ctl", "replay", "from-a-folder", *options, "--wait")
+    assert (done.code, "done" in done.out) == (0, True), done.err
+    job_id = done.out.split()[0]
+    assert server.client.replay(job_id).options == {"steps_per_frame": 2, "heldout": True}
+    assert intrasplat("ctl", "result", job_id, "report.html", "--out", tmp_path / "report.html").code == 0
+    assert "from-a-folder" in (tmp_path / "report.html").read_text()
+    assert intrasplat("ctl", "keep", job_id, "kept").code == 0
+    assert job_id in intrasplat("ctl", "replays").out
+    refused = intrasplat("ctl", "cancel", job_id)
+    assert (refused.code, "cannot be cancelled" in refused.err) == (2, True)
+    assert intrasplat("ctl", "remove-recording", "from-a-folder").code == 0
+    assert "from-a-folder" not in intrasplat("ctl", "recordings").out
+
+
 @pytest.mark.parametrize("who", ["attempt", "pool", "server"])
 def test_a_replay_whose_process_is_killed_is_made_once(server, who):
     job = server.client.start_replay("tiny", LONG)
@@ -170,4 +192,4 @@ def test_it_ends_with_its_pool(server):
     server.process.send_signal(signal.SIGTERM)
     assert server.process.wait(30) == 0, server.log.read_text()
     assert pool is None or not Path(f"/proc/{pool}").exists()
-    assert len(results(server)) == 4
+    assert len(results(server)) == 5

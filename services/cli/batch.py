@@ -1,0 +1,98 @@
+"""`intrasplat batch`."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import typer
+from pydantic import ValidationError
+
+from gsplat_core.errors import InvalidSetting
+from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK
+from services.cli.interrupt import ASKING
+from services.cli.streams import printable
+from services.jobs.batch import Batch, Counts, Summary
+from services.jobs.options import ReplayOptions
+from services.jobs.pool import PoolSettings
+from services.jobs.process import new_runner
+
+SAY_S = 5.0
+
+
+def batch_command(
+    folder: Path, out: Path | None, workers: int | None, options: Mapping[str, Any], *, as_json: bool
+) -> int:
+    """Replay the recordings of a folder and print a summary; returns the exit code."""
+    out = out or folder.absolute().with_name(f"{folder.absolute().name}-replays")
+    batch = Batch(folder, out, _checked(options))
+    cores = os.cpu_count() or 1
+    workers = workers or (1 if options["device"] == "cuda" else max(1, cores // 2))
+    settings = PoolSettings(workers, threads=max(1, cores // workers))
+    asked = _Asked()
+    summary = batch.run(new_runner(None), settings, _Teller(as_json), asked)
+    _print(summary, out, as_json)
+    if asked():
+        typer.echo("interrupted: the same command goes on with what is left", err=True)
+        return INTERRUPTED
+    return OK if summary.is_whole else BAD_INPUT
+
+
+def _checked(options: Mapping[str, Any]) -> ReplayOptions:
+    try:
+        return ReplayOptions(**options)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InvalidSetting(f"--{str(first['loc'][0]).replace('_', '-')}: {first['msg']}") from error
+
+
+class _Asked:
+    """Whether a signal has asked for the end. It is looked at between two steps of the pool, which starts no thread."""
+
+    def __init__(self) -> None:
+        self._number = 0
+        for number in ASKING:
+            signal.signal(number, self._take)
+
+    def __call__(self) -> bool:
+        return self._number != 0
+
+    def _take(self, number: int, frame: FrameType | None) -> None:
+        self._number = number
+
+
+class _Teller:
+    """Says how far a batch has come, every few seconds, on standard error."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._quiet, self._said_s, self._said = quiet, 0.0, ""
+
+    def __call__(self, counts: Counts) -> None:
+        ended, every = counts["done"] + counts["failed"] + counts["cancelled"], sum(counts.values())
+        said = f"{ended}/{every} recordings" + (f", {counts['failed']} failed" if counts["failed"] else "")
+        if self._quiet or said == self._said or (time.monotonic() - self._said_s < SAY_S and ended < every):
+            return
+        self._said_s, self._said = time.monotonic(), said
+        print(said, file=sys.stderr, flush=True)  # noqa: T201
+
+
+def _print(summary: Summary, out: Path, as_json: bool) -> None:
+    failed = [{"recording": job.recording, "reason": job.reason} for job in summary.failed]
+    if as_json:
+        told = {**summary.counts, "already": summary.already, "seconds": round(summary.seconds, 1), "failures": failed}
+        typer.echo(json.dumps(told, indent=2))
+        return
+    for each in failed:
+        typer.echo(f"failed: {printable(str(each['recording']))}: {printable(str(each['reason']))}", err=True)
+    done, new = summary.counts["done"], summary.counts["done"] - summary.already
+    typer.echo(
+        f"{done} of {sum(summary.counts.values())} recordings have their result, {new} of them new, in {summary.seconds:.1f} s"
+    )
+    typer.echo(str(out))

@@ -1,0 +1,170 @@
+"""Recordings and replays of a running service from a shell: commands of `intrasplat ctl`."""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gsplat_core.errors import InvalidSetting
+from services.cli.ctl_client import DEFAULT_URL, CaOption, KeyFileOption, UrlOption, print_found, with_client
+from services.cli.exit_codes import OK
+from services.cli.options import JsonOption
+
+RECORDING = ("name", "state", "kind", "kept_bytes", "uploaded_by", "reason")
+REPLAY = ("id", "recording", "state", "frames_done", "frames", "psnr_db", "reason")
+RecordingName = Annotated[str, typer.Argument(metavar="RECORDING", show_default=False)]
+ReplayId = Annotated[str, typer.Argument(metavar="REPLAY", help="As `ctl replays` shows it.", show_default=False)]
+
+
+def add_to(ctl: typer.Typer) -> None:
+    """Give `intrasplat ctl` these commands."""
+    for name, command in (
+        ("recordings", recordings), ("add-recording", add_recording), ("remove-recording", remove_recording),
+        ("replays", replays), ("replay", replay), ("cancel", cancel), ("result", result), ("keep", keep),
+    ):  # fmt: skip
+        ctl.command(name)(command)
+
+
+def recordings(
+    url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None, json: JsonOption = False
+) -> int:
+    """List the uploaded recordings."""
+    return print_found(with_client(url, key_file, ca, lambda client: client.recordings()), RECORDING, json)
+
+
+def add_recording(
+    name: RecordingName,
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="PATH", help="A video, a zip archive, or a recording's folder.", show_default=False),
+    ],
+    url: UrlOption = DEFAULT_URL,
+    key_file: KeyFileOption = None,
+    ca: CaOption = None,
+) -> int:
+    """Upload a recording, and wait until it was checked. A folder is packed first."""
+
+    def act(client: Any) -> Any:
+        with _packed(path) as file:
+            client.upload_recording(name, file)
+        return client.checked_recording(name)
+
+    found = with_client(url, key_file, ca, act)
+    print_found([found], RECORDING, False)
+    if found.state == "rejected":
+        raise InvalidSetting(f"{name} was rejected: {found.reason}")
+    return OK
+
+
+def remove_recording(
+    name: RecordingName, url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None
+) -> int:
+    """Delete a recording that no replay uses."""
+    with_client(url, key_file, ca, lambda client: client.delete_recording(name))
+    return OK
+
+
+def replays(
+    batch: Annotated[str | None, typer.Option(help="Of this batch alone.", show_default=False)] = None,
+    count: Annotated[int, typer.Option(min=1, max=500, help="So many, the newest first.")] = 20,
+    url: UrlOption = DEFAULT_URL,
+    key_file: KeyFileOption = None,
+    ca: CaOption = None,
+    json: JsonOption = False,
+) -> int:
+    """List the newest replays."""
+    found = with_client(url, key_file, ca, lambda client: client.replays(count=count, batch=batch))
+    return print_found(found, REPLAY, json)
+
+
+def replay(
+    names: Annotated[list[str], typer.Argument(metavar="RECORDING...", show_default=False)],
+    option: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--option", metavar="<name=value>", help="As `intrasplat replay` has it; more than once for several."
+        ),
+    ] = None,
+    wait: Annotated[bool, typer.Option("--wait", help="Wait until it has ended.")] = False,
+    url: UrlOption = DEFAULT_URL,
+    key_file: KeyFileOption = None,
+    ca: CaOption = None,
+) -> int:
+    """Start a replay of a recording, or one of each of several."""
+    options = dict(_assigned(each) for each in option or ())
+
+    def act(client: Any) -> Any:
+        made = client.start_replays(names, options)
+        return [client.ended_replay(one) if wait else client.replay(one) for one in made.ids]
+
+    found = with_client(url, key_file, ca, act)
+    print_found(found, REPLAY, False)
+    failed = [one for one in found if wait and one.state != "done"]
+    if failed:
+        raise InvalidSetting(f"{failed[0].recording}: the replay is {failed[0].state}: {failed[0].reason}")
+    return OK
+
+
+def cancel(job_id: ReplayId, url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None) -> int:
+    """Cancel a replay that has not ended."""
+    return print_found([with_client(url, key_file, ca, lambda client: client.cancel_replay(job_id))], REPLAY, False)
+
+
+def result(
+    job_id: ReplayId,
+    name: Annotated[str, typer.Argument(metavar="FILE", help="Such as report.html.", show_default=False)],
+    out: Annotated[Path | None, typer.Option(help="Where to put it.", show_default="its name, in this folder")] = None,
+    url: UrlOption = DEFAULT_URL,
+    key_file: KeyFileOption = None,
+    ca: CaOption = None,
+) -> int:
+    """Download what a replay has made: report.html, report.json, frames.jsonl, reconstruction.mp4, model.isplat."""
+    target = out or Path(Path(name).name)
+    with_client(url, key_file, ca, lambda client: client.result(job_id, name, target))
+    typer.echo(str(target))
+    return OK
+
+
+def keep(
+    job_id: ReplayId,
+    model: Annotated[str, typer.Argument(metavar="MODEL", show_default=False)],
+    url: UrlOption = DEFAULT_URL,
+    key_file: KeyFileOption = None,
+    ca: CaOption = None,
+) -> int:
+    """Keep a replay's model in the registry, as the next version of a model."""
+    found = with_client(url, key_file, ca, lambda client: client.keep_model(job_id, model))
+    return print_found([found], ("name", "version", "state"), False)
+
+
+@contextmanager
+def _packed(path: Path) -> Iterator[Path]:
+    """The file itself, or a folder's as an archive that is gone afterwards. Pictures are packed already: nothing is deflated."""
+    if not path.is_dir():
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        archive = Path(folder) / "recording.zip"
+        with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as opened:
+            for file in sorted(each for each in path.rglob("*") if each.is_file()):
+                opened.write(file, file.relative_to(path))
+        yield archive
+
+
+def _assigned(text: str) -> tuple[str, Any]:
+    """A name and its value, as YAML reads it: a number, true, a word."""
+    import yaml
+
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        raise InvalidSetting(f"--option {text!r:.80} has no value; write --option name=value")
+    try:
+        return name.replace("-", "_"), yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise InvalidSetting(f"--option {text!r:.80} is not YAML; quote its value") from error

@@ -1,0 +1,106 @@
+"""`intrasplat batch`: every recording of a folder once, whatever is killed meanwhile, and what it refuses."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+BENCHMARK = Path(__file__).resolve().parents[2] / "benchmarks" / "batch_kill.py"
+QUICK = ("--steps-per-frame", "2")
+
+
+@pytest.fixture(scope="module")
+def batch_kill():
+    """The benchmark of the same."""
+    spec = importlib.util.spec_from_file_location("batch_kill", BENCHMARK)
+    module = sys.modules["batch_kill"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def recordings(tiny, tmp_path):
+    """A folder with two recordings, a folder that is none, and a file that is none."""
+    folder = tmp_path / "recordings"
+    for name in ("a", "b"):
+        shutil.copytree(tiny, folder / name)
+    (folder / "empty").mkdir()
+    (folder / "notes.txt").write_text("x")
+    return folder
+
+
+def test_each_result_is_there_once_although_processes_are_killed(batch_kill, tmp_path):
+    recordings, out = tmp_path / "recordings", tmp_path / "out"
+    batch_kill.make_recordings(recordings, 6, frames=4)
+    kills = batch_kill.Kills(between_s=(0.1, 0.5), batch_share=0.34, most=4, seed=1)
+    killed = batch_kill.run_batch(recordings, out, 2, kills)
+    figures = batch_kill.check(recordings, out, killed)
+    assert figures["results"] == 6 and figures["killed_attempts"] + figures["killed_batches"] > 0
+    assert figures["attempts"] > 6
+
+
+def test_it_goes_on_where_it_was_ended_and_says_what_failed(start, recordings):
+    command = ("batch", recordings, "--workers", "1", *QUICK, "--json")
+    first = start(*command)
+    out, err = first.communicate(timeout=60)
+    told = json.loads(out)
+    assert (first.returncode, told["done"], told["failed"], told["already"]) == (2, 2, 1, 0), err
+    assert told["failures"][0]["recording"] == "empty" and "no images" in told["failures"][0]["reason"].replace(
+        "PNG or JPEG ", ""
+    )
+    results = recordings.with_name("recordings-replays")
+    made = {name: (results / name).stat().st_ino for name in "ab"}
+    shutil.rmtree(recordings / "empty")
+    shutil.copytree(recordings / "a", recordings / "empty")
+    out, err = start(*command).communicate(timeout=60)
+    told = json.loads(out)
+    assert (told["done"], told["already"], told["failed"]) == (3, 2, 0), err
+    assert {name: (results / name).stat().st_ino for name in "ab"} == made
+    assert (results / "empty" / "report.html").is_file() and (results / "a" / "model" / "manifest.json").is_file()
+    out, err = start(*command[:-1], "--seed", "1").communicate(timeout=60)
+    assert "was begun with steps_per_frame 2" in err and "seed 1" in err
+
+
+def test_a_signal_ends_it_and_leaves_nothing_half_made(start, recordings, tmp_path):
+    out = tmp_path / "out"
+    batch = start("batch", recordings, "--out", out, "--workers", "1", "--steps-per-frame", "3000")
+    until = time.monotonic() + 60
+    while not list((out / ".running").glob("*/*-1")) and time.monotonic() < until:
+        time.sleep(0.05)
+    batch.send_signal(signal.SIGTERM)
+    assert batch.wait(20) == 130
+    assert list((out / ".running").iterdir()) == [] and not (out / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("nowhere",), "is no folder"),
+        (("empty",), "no videos and no folders"),
+        (("recordings", "--out", "recordings/out"), "in, or around"),
+        (("recordings", "--out", "."), "in, or around"),
+        (("recordings", "--out", "other"), "no earlier batch's"),
+        (("recordings", "--out", "file"), "is a file"),
+        (("recordings", "--scale", "9"), "--scale"),
+        (("recordings", "--device", "tpu"), "--device"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_and_nothing_is_written(
+    intrasplat, recordings, tmp_path, monkeypatch, arguments, said
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine").write_text("x")
+    before = sorted(str(path) for path in tmp_path.rglob("*"))
+    done = intrasplat("batch", *arguments)
+    assert (done.code, said in done.err) == (2, True), done.err
+    assert sorted(str(path) for path in tmp_path.rglob("*")) == before
