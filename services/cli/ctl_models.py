@@ -8,20 +8,9 @@ from typing import Annotated, Any
 import typer
 
 from gsplat_core.io.exports.formats import format_of
-from services.cli.ctl import (
-    DEFAULT_URL,
-    VERSION,
-    CaOption,
-    KeyFileOption,
-    ModelName,
-    StreamName,
-    UrlOption,
-    _print,
-    _with_client,
-)
-from services.cli.ctl import (
-    ctl as ctl,
-)
+from services.cli.ctl import VERSION, ModelName, StreamName
+from services.cli.ctl import ctl as ctl
+from services.cli.ctl_client import DEFAULT_URL, CaOption, KeyFileOption, UrlOption, print_found, with_client
 from services.cli.exit_codes import OK
 from services.cli.options import ExportedFileArgument, JsonOption
 
@@ -57,7 +46,7 @@ def snapshot(
         taken = client.take_snapshot(stream, model)
         return taken if taken.version is None else client.checked(taken.version.name, taken.version.version)
 
-    return _print([_with_client(url, key_file, ca, act)], SNAPSHOT if model is None else VERSION, json)
+    return print_found([with_client(url, key_file, ca, act)], SNAPSHOT if model is None else VERSION, json)
 
 
 @ctl.command("snapshots")
@@ -69,7 +58,7 @@ def snapshots(
     json: JsonOption = False,
 ) -> int:
     """List the snapshots of a stream that are kept."""
-    return _print(_with_client(url, key_file, ca, lambda client: client.snapshots(stream)), SNAPSHOT, json)
+    return print_found(with_client(url, key_file, ca, lambda client: client.snapshots(stream)), SNAPSHOT, json)
 
 
 @ctl.command("export")
@@ -90,7 +79,7 @@ def export(
     def act(client: Any) -> int:
         return client.export_version(name, version, wanted, file, time_s=time, times=times)
 
-    _with_client(url, key_file, ca, act)
+    with_client(url, key_file, ca, act)
     typer.echo(str(file))
     return OK
 
@@ -113,7 +102,7 @@ def fetch(
     def act(client: Any) -> int:
         return client.export_snapshot(stream, snapshot_id, wanted, file, time_s=time, times=times)
 
-    _with_client(url, key_file, ca, act)
+    with_client(url, key_file, ca, act)
     typer.echo(str(file))
     return OK
 
@@ -129,5 +118,5 @@ def camera(
     ca: CaOption = None,
 ) -> int:
     """Turn the virtual camera of a stream, whose view is the picture `orbit`."""
-    _with_client(url, key_file, ca, lambda client: client.turn_camera(stream, azimuth, elevation, zoom))
+    with_client(url, key_file, ca, lambda client: client.turn_camera(stream, azimuth, elevation, zoom))
     return OK
