@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -16,6 +17,7 @@ import pytest
 
 from services.client import Client, Refused
 
+CHROMIUM = Path("/usr/bin/chromium")
 WITHIN_S = 60.0
 QUICK = {"steps_per_frame": 2}
 LONG = {"steps_per_frame": 300}
@@ -172,6 +174,92 @@ def test_the_same_from_a_shell(server, tiny, tmp_path, monkeypatch, intrasplat):
     assert "from-a-folder" not in intrasplat("ctl", "recordings").out
 
 
+@pytest.fixture(scope="module")
+def page(server):
+    """The console in Chromium, signed in."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright comes with the development packages")
+    if not CHROMIUM.exists():
+        pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(
+            executable_path=str(CHROMIUM), args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+        )
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.set_default_timeout(1000 * WITHIN_S)
+        said: list[str] = []
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+        own = (server.url, "data:", "blob:")
+        page.on("request", lambda asked: None if asked.url.startswith(own) else said.append(asked.url))
+        page.goto(f"{server.url}/#key={server.client._key}")
+        page.wait_for_selector("#stream", state="attached")
+        yield page
+        assert said == [], "the page failed, or asked for something from elsewhere"
+        browser.close()
+
+
+def test_a_recording_is_uploaded_and_replayed_from_the_page(server, page):
+    page.click("#tab-recordings")
+    page.fill("#recording-name", "by-hand")
+    page.set_input_files("#recording-file", server.folder / "tiny.zip")
+    page.click("#add-recording >> text=Upload")
+    mine = page.locator("#recording-rows tr", has_text="by-hand")
+    mine.get_by_text("ready").wait_for()
+    assert "6 frames of 64×48" in mine.inner_text()
+    mine.get_by_text("Replay").click()
+    page.wait_for_selector("#replays:not([hidden])")
+    assert page.input_value("#replay-recording") == "by-hand"
+    page.fill("[data-option=steps_per_frame]", "2")
+    page.click("text=Start a replay")
+    replay = page.locator("#replay-rows tr", has_text="by-hand")
+    replay.get_by_text("done").wait_for()  # over the WebSocket: nothing renews the page
+    assert "6 of 6 frames" in replay.inner_text() and "steps per frame 2" in replay.inner_text()
+
+
+def test_its_report_and_its_video_are_shown(server, page):
+    replay = page.locator("#replay-rows tr", has_text="by-hand")
+    with page.context.expect_page() as opened:
+        replay.get_by_text("Report", exact=True).click()
+    report = opened.value
+    report.wait_for_selector("h1 >> text=by-hand")
+    # Its own style and pictures are shown, and it is from nowhere.
+    assert report.evaluate("getComputedStyle(document.querySelector('main')).maxWidth") != "none"
+    assert report.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
+    assert report.evaluate("document.images.length") > 0 and report.evaluate("self.origin") == "null"
+    report.close()
+    replay.get_by_text("Video", exact=True).click()
+    page.wait_for_selector("#replay-player:not([hidden])")
+    end_s = time.monotonic() + WITHIN_S
+    while page.evaluate("document.getElementById('replay-video').readyState") < 2 and time.monotonic() < end_s:
+        time.sleep(0.1)
+    assert page.evaluate("document.getElementById('replay-video').videoWidth") >= 128
+
+
+def test_its_model_is_kept_from_the_page_by_the_keyboard(server, page):
+    replay = page.locator("#replay-rows tr", has_text="by-hand")
+    replay.get_by_text("Keep model").focus()
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#keep-model[open]")
+    page.fill("#keep-name", "from-a-replay")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#replay-said >> text=from-a-replay/1")
+    assert server.client.checked("from-a-replay", 1).state == "ready"
+
+
+def test_the_pages_digest_of_a_file_in_pieces_is_sha256(page):
+    content = bytes(range(256)) * 1001 + b"end"
+    found = page.evaluate(
+        """async (sizes) => { const { Sha256 } = await import("/console/sha256.js");
+        return sizes.map(([length, step]) => { const sum = new Sha256();
+          const bytes = Uint8Array.from({ length }, (_, index) => (index < 256256 ? index % 256 : [101, 110, 100][index - 256256]));
+          for (let at = 0; at < length; at += step) sum.add(bytes.subarray(at, at + step));
+          return [...sum.digest()].map((byte) => byte.toString(16).padStart(2, "0")).join(""); }); }""",
+        [[len(content), 1000], [0, 1], [55, 55], [56, 7], [64, 64], [119, 64], [128, 1]],
+    )
+    lengths = (len(content), 0, 55, 56, 64, 119, 128)
+    assert found == [hashlib.sha256(content[:length]).hexdigest() for length in lengths]
+
+
 @pytest.mark.parametrize("who", ["attempt", "pool", "server"])
 def test_a_replay_whose_process_is_killed_is_made_once(server, who):
     job = server.client.start_replay("tiny", LONG)
@@ -192,4 +280,4 @@ def test_it_ends_with_its_pool(server):
     server.process.send_signal(signal.SIGTERM)
     assert server.process.wait(30) == 0, server.log.read_text()
     assert pool is None or not Path(f"/proc/{pool}").exists()
-    assert len(results(server)) == 5
+    assert len(results(server)) == 6

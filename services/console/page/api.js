@@ -1,5 +1,7 @@
 // Requests to the API with the key of this tab. A key that is refused asks for another one.
 
+import { sha256 } from "./sha256.js";
+
 const STORED = "intrasplat-key";
 let key = sessionStorage.getItem(STORED) ?? "";
 let askForKey = async () => { throw new Error("nobody asks for a key yet"); };
@@ -43,6 +45,17 @@ export async function download(path) {
   setTimeout(() => URL.revokeObjectURL(address), 60_000);
 }
 
+/** Fetch a file; returns the answer. Throws as `call`. */
+export async function fetched(path) {
+  return ask("GET", path);
+}
+
+/** The address of a path with a ticket, for what cannot send a key. It is good once, and soon. */
+export async function useTicket(path) {
+  const { ticket } = await call("POST", "/v1/tickets", { path });
+  return `${path}?ticket=${encodeURIComponent(ticket)}`;
+}
+
 async function documentOf(answer) {
   return answer.headers.get("content-type")?.includes("json") ? answer.json() : null;
 }
@@ -65,14 +78,13 @@ async function ask(method, path, body, headers = {}) {
 
 /** Put a file, with its SHA-256 and a call of `progress(share)` now and then. Throws Problem. */
 export async function upload(path, file, progress) {
-  const digest = new Uint8Array(await crypto.subtle.digest("SHA-256", await file.arrayBuffer()));
-  const base64 = btoa(String.fromCharCode(...digest));
+  const digest = await sha256(file);
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest(); // fetch does not say how much was sent
     request.open("PUT", path);
     request.setRequestHeader("Authorization", `Bearer ${key}`);
     request.setRequestHeader("Content-Type", "application/octet-stream");
-    request.setRequestHeader("Content-Digest", `sha-256=:${base64}:`);
+    request.setRequestHeader("Content-Digest", `sha-256=:${digest}:`);
     request.responseType = "json";
     request.upload.onprogress = (event) => { if (event.lengthComputable) progress(event.loaded / event.total); };
     request.onload = () => (request.status < 300 ? resolve(request.response) : reject(new Problem(request.status, request.response)));

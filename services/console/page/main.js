@@ -7,6 +7,8 @@ import { snapshotsOf } from "./exports.js";
 import { layersOf } from "./layers.js";
 import { modelsPage } from "./models.js";
 import { Plot } from "./plot.js";
+import { recordingsPage } from "./recordings.js";
+import { replaysPage } from "./replays.js";
 import { streamsPage } from "./streams.js";
 import { Viewer } from "./viewer.js";
 
@@ -101,9 +103,12 @@ function chooseAmong(streams) {
   watch(choice.value);
 }
 
+const replays = replaysPage(report);
 const pages = {
   live: async () => {},
   models: modelsPage(report),
+  recordings: recordingsPage(report, async (name) => { await open("replays"); replays.choose(name); }),
+  replays: replays.renew,
   streams: streamsPage(report, chooseAmong),
   audit: auditPage(report),
 };
@@ -115,7 +120,7 @@ function open(page) {
     at(`tab-${name}`).setAttribute("aria-selected", String(chosen));
     at(`tab-${name}`).tabIndex = chosen ? 0 : -1;
   }
-  report(pages[page]);
+  return report(pages[page]);
 }
 
 const tabs = [...document.querySelectorAll("[role=tab]")];

@@ -1,0 +1,59 @@
+// The page of recordings: upload, what was found in each, delete.
+
+import { call, upload } from "./api.js";
+import { button, replaceRows, row, size } from "./table.js";
+
+const at = (id) => document.getElementById(id);
+
+/** Returns what renews the page. `replay(name)` opens the page of replays for a recording. */
+export function recordingsPage(report, replay) {
+  async function renew() {
+    replaceRows(at("recording-rows"), (await call("GET", "/v1/recordings")).map(line));
+  }
+
+  function line(recording) {
+    const actions = [];
+    if (recording.state === "ready") actions.push(button("Replay", async () => replay(recording.name), report));
+    actions.push(button("Delete", async () => { await call("DELETE", `/v1/recordings/${recording.name}`); await renew(); }, report));
+    const state = recording.reason ? `${recording.state}: ${recording.reason}` : recording.state;
+    const when = new Date(recording.uploaded_at).toLocaleString();
+    return row(recording.name, state, found(recording.description), size(recording.kept_bytes), `${when}, ${recording.uploaded_by}`, actions);
+  }
+
+  at("add-recording").addEventListener("submit", (event) => {
+    event.preventDefault();
+    report(async () => {
+      const bar = at("recording-sent"), name = at("recording-name").value;
+      bar.value = 0;
+      bar.hidden = false;
+      try {
+        await upload(`/v1/recordings/${name}`, at("recording-file").files[0], (share) => { bar.value = share; });
+        bar.removeAttribute("value"); // it was sent, and is being looked at
+        await checked(name);
+      } finally {
+        bar.hidden = true;
+        await renew();
+      }
+    });
+  });
+
+  /** Wait until the server has looked at a recording; it says itself what it found. */
+  async function checked(name) {
+    for (let wait_ms = 200; ; wait_ms = Math.min(2 * wait_ms, 2000)) {
+      await renew();
+      const now = await call("GET", `/v1/recordings/${name}`);
+      if (now.state === "rejected") throw new Error(`${name} was rejected: ${now.reason}`);
+      if (now.state === "ready") return;
+      await new Promise((resolve) => setTimeout(resolve, wait_ms));
+    }
+  }
+
+  return renew;
+}
+
+function found({ frames, width_px, height_px, fps, layout, frames_damaged, fields }) {
+  if (!frames) return "";
+  const said = [`${frames} frames of ${width_px}×${height_px}`, `${Number(fps.toFixed(2))} frames/s`, layout, ...fields];
+  if (frames_damaged) said.push(`${frames_damaged} damaged`);
+  return said.join(", ");
+}

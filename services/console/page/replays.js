@@ -1,0 +1,134 @@
+// The page of replays: started from an uploaded recording, watched as they run, their reports, videos and models.
+
+import { call, download, fetched, useTicket } from "./api.js";
+import { button, replaceRows, row } from "./table.js";
+
+const at = (id) => document.getElementById(id);
+const OPEN = ["queued", "running"];
+const MOST_WATCHED = 8;
+
+/** Returns `renew`, which renews the page, and `choose(name)`, which chooses a recording in its form. */
+export function replaysPage(report) {
+  let shown = [];
+  const watched = new Map();
+
+  async function renew() {
+    const [recordings, replays] = await Promise.all([call("GET", "/v1/recordings"), call("GET", "/v1/replays?count=50")]);
+    offer(recordings.filter((each) => each.state === "ready").map((each) => each.name));
+    shown = replays;
+    draw();
+    const open = shown.filter((each) => OPEN.includes(each.state)).slice(-MOST_WATCHED);
+    await Promise.all(open.map((each) => watch(each.id)));
+  }
+
+  function offer(names) {
+    const choice = at("replay-recording"), chosen = choice.value;
+    if ([...choice.options].map((option) => option.value).join() === names.join()) return;
+    choice.replaceChildren(...names.map((name) => new Option(name, name)));
+    if (names.includes(chosen)) choice.value = chosen;
+  }
+
+  function draw() {
+    replaceRows(at("replay-rows"), shown.map(line));
+  }
+
+  /** Follow a replay until it has ended or the connection has; opening the page again takes it up again. */
+  async function watch(id) {
+    if (watched.has(id)) return;
+    watched.set(id, null);
+    const path = `/v1/replays/${id}/progress`;
+    try {
+      const socket = new WebSocket(`${location.protocol === "https:" ? "wss:" : "ws:"}//${location.host}${await useTicket(path)}`);
+      watched.set(id, socket);
+      socket.onmessage = (message) => {
+        const now = JSON.parse(message.data);
+        shown = shown.map((each) => (each.id === id ? now : each));
+        draw();
+      };
+      socket.onclose = () => watched.delete(id);
+    } catch (error) {
+      watched.delete(id);
+      throw error;
+    }
+  }
+
+  function line(replay) {
+    const path = `/v1/replays/${replay.id}`;
+    const then = (act) => async () => { await act(); await renew(); };
+    const actions = [];
+    if (OPEN.includes(replay.state)) actions.push(button("Cancel", then(() => call("POST", `${path}/cancel`)), report));
+    else {
+      const has = (name) => replay.results.includes(name);
+      if (has("report.html")) actions.push(button("Report", () => openReport(`${path}/results/report.html`), report));
+      if (has("reconstruction.mp4")) actions.push(button("Video", () => play(replay), report));
+      if (has("model.isplat")) {
+        actions.push(button("Keep model", () => keep(replay), report));
+        actions.push(button("Download model", () => download(`${path}/results/model.isplat`), report));
+      }
+      actions.push(button("Delete", then(() => call("DELETE", path)), report));
+    }
+    const options = Object.entries(replay.options).map(([name, value]) => `${name.replaceAll("_", " ")} ${value}`).join(", ");
+    const state = replay.reason ? `${replay.state}: ${replay.reason}` : replay.state;
+    const quality = Number.isFinite(replay.psnr_db) ? `${replay.psnr_db.toFixed(1)} dB` : "";
+    return row(replay.recording, state, progress(replay), quality, options, new Date(replay.created_at).toLocaleString(), actions);
+  }
+
+  /** In a page of its own, which may do nothing but show itself. */
+  async function openReport(path) {
+    window.open(await useTicket(path), "_blank", "noopener");
+  }
+
+  async function play(replay) {
+    const player = at("replay-video");
+    URL.revokeObjectURL(player.src);
+    player.src = URL.createObjectURL(await (await fetched(`/v1/replays/${replay.id}/results/reconstruction.mp4`)).blob());
+    at("replay-player-name").textContent = `${replay.recording}: camera beside reconstruction`;
+    at("replay-player").hidden = false;
+    player.focus();
+  }
+
+  async function keep(replay) {
+    const dialog = at("keep-model");
+    at("keep-name").value = replay.recording;
+    dialog.returnValue = "";
+    dialog.showModal();
+    await new Promise((resolve) => dialog.addEventListener("close", resolve, { once: true }));
+    if (dialog.returnValue !== "keep") return;
+    const made = await call("POST", `/v1/replays/${replay.id}/keep`, { model: at("keep-name").value });
+    at("replay-said").value = `${made.name}/${made.version} is in the registry and is being checked`;
+  }
+
+  at("start-replay").addEventListener("submit", (event) => {
+    event.preventDefault();
+    report(async () => {
+      const wanted = { recording: at("replay-recording").value, options: chosen() };
+      await call("POST", "/v1/replays", wanted, { "Idempotency-Key": idempotencyKey() });
+      await renew();
+    });
+  });
+
+  return { renew, choose: (name) => { at("replay-recording").value = name; at("replay-recording").focus(); } };
+}
+
+/** The options of the form that were filled in. */
+function chosen() {
+  const options = {};
+  for (const field of at("start-replay").querySelectorAll("[data-option]")) {
+    if (field.type === "checkbox") { if (field.checked) options[field.dataset.option] = true; }
+    else if (field.value !== "") options[field.dataset.option] = field.type === "number" ? Number(field.value) : field.value;
+  }
+  return options;
+}
+
+function idempotencyKey() {
+  return [...crypto.getRandomValues(new Uint8Array(16))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+function progress({ state, frames, frames_done }) {
+  if (!frames) return state === "running" ? "starting" : "";
+  const bar = document.createElement("progress");
+  bar.max = frames;
+  bar.value = frames_done;
+  bar.setAttribute("aria-label", "Progress");
+  return [bar, ` ${frames_done} of ${frames} frames`];
+}
