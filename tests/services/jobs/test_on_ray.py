@@ -1,0 +1,56 @@
+"""The same attempts on a local Ray: made, killed, cancelled, published once."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+from services.jobs.pool import JobPool, PoolSettings
+from services.jobs.records import JobState, NewJob
+from services.jobs.results import RUNNING, Results
+from services.registry.errors import StoreUnavailable
+
+pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
+WITHIN_S = 120.0
+
+
+@pytest.mark.filterwarnings("ignore")  # of Ray's own
+def test_jobs_run_on_ray_as_they_do_here(store, recording, tmp_path):
+    from services.jobs.on_ray import OnRay
+
+    good = store.submit(
+        [NewJob("a", str(recording)), NewJob("b", str(recording))], {"steps_per_frame": 2}, "operator"
+    ).ids
+    (missing,) = store.submit([NewJob("c", str(tmp_path / "nothing"))], {}, "operator").ids
+    (long,) = store.submit([NewJob("d", str(recording))], {"steps_per_frame": 10_000}, "operator").ids
+    pool = JobPool(
+        store.database, Results(tmp_path / "results"), OnRay("local"), PoolSettings(workers=2, pack_models=True)
+    )
+    end_s = time.monotonic() + WITHIN_S
+
+    def is_over():
+        assert time.monotonic() < end_s, store.counts()
+        if store.get(long).state is JobState.RUNNING:
+            store.cancel(long, "nurse")
+        return not any(job.is_open for job in store.newest())
+
+    pool.run(is_over)
+    assert [store.get(job_id).state for job_id in (*good, missing, long)] == [
+        JobState.DONE, JobState.DONE, JobState.FAILED, JobState.CANCELLED,
+    ]  # fmt: skip
+    assert "no such file" in store.get(missing).reason
+    reports = [json.loads((tmp_path / "results" / job_id / "report.json").read_text()) for job_id in good]
+    assert reports[0]["frames_sha256"] == reports[1]["frames_sha256"]
+    assert sorted(path.name for path in (tmp_path / "results").iterdir()) == sorted([*good, RUNNING])
+    assert (tmp_path / "results" / good[0] / "model.isplat").is_file()
+
+
+@pytest.mark.parametrize("address", ["no address", "scheme://x"])
+@pytest.mark.filterwarnings("ignore")
+def test_an_address_without_ray_is_refused_with_a_sentence(address):
+    from services.jobs.on_ray import OnRay
+
+    with pytest.raises(StoreUnavailable, match=r"Ray at .* cannot be used"):
+        OnRay(address)
