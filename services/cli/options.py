@@ -44,7 +44,7 @@ ModelArgument = Annotated[Path, path_argument("MODEL", "A model folder that repl
 PackedFileArgument = Annotated[Path, path_argument("FILE", "The packed file, which ends in .isplat.")]
 ExportedFileArgument = Annotated[Path, path_argument("FILE", "The exported file.")]
 OutOption = Annotated[Path, path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
-FolderArgument = Annotated[Path, _path_argument("FOLDER", "A folder of recordings: videos, and folders of their own.")]
+FolderArgument = Annotated[Path, path_argument("FOLDER", "A folder of recordings: videos, and folders of their own.")]
 BatchOutOption = Annotated[
     Path | None,
     path_option("--out", "Folder for the results, one folder each. Default: FOLDER with -replays behind its name."),

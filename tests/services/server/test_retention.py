@@ -29,21 +29,31 @@ class FakeStore:
         self.closed = True
 
 
+class FakeEvents:
+    """Notes what it is told."""
+
+    def __init__(self):
+        self.told = []
+
+    def tell(self, event, subject, outcome="done", **detail):
+        self.told.append((event, subject, outcome, detail))
+
+
 def test_at_start_what_waits_is_checked_and_what_is_too_old_goes():
-    store, entries = FakeStore([Expired("case-1", "it is older than 2 days")]), []
-    kept = KeptRecordings(store, 2, 10**9)
-    kept.audit_to(lambda *entry: entries.append(entry))
+    store, events = FakeStore([Expired("case-1", "it is older than 2 days")]), FakeEvents()
+    kept = KeptRecordings(store, 2, 10**9, events)
 
     async def serve():
         async with kept.kept():
-            while not (store.asked and store.checked):
+            while not (events.told and store.checked):
                 await asyncio.sleep(0.01)
 
     asyncio.run(asyncio.wait_for(serve(), 20))
     assert store.asked == [(2 * DAY_S, 10**9)] and store.checked == ["waits"] and store.closed
-    assert entries == [("recording.expire", "case-1", {"why": "it is older than 2 days"})]
+    assert events.told == [("recording.expire", "case-1", "done", {"why": "it is older than 2 days"})]
 
 
 def test_without_bounds_nothing_goes():
     store = FakeStore([Expired("case-1", "")])
-    assert KeptRecordings(store, None, None).enforce() == 0 and store.asked == []
+    asyncio.run(KeptRecordings(store, None, None, FakeEvents()).enforce())
+    assert store.asked == []
