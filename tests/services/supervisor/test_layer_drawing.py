@@ -10,6 +10,7 @@ import torch
 
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.orbit import Orbit
+from gsplat_core.scene.snapshots import SnapshotSlots
 from operators.layer_pictures import UNOBSERVED, UNOBSERVED_LINE, DepthColours
 from operators.messages import PictureState
 from operators.rasterize import displayed
@@ -95,3 +96,19 @@ def test_a_virtual_view_never_says_live():
     depth = np.zeros((200, 300, 3), np.uint8)
     label(depth, "depth", PictureState.LIVE, 10)
     assert depth.any()
+
+
+@pytest.mark.parametrize("layer", ["depth", "confidence", "orbit"])
+def test_a_snapshot_on_any_device_is_drawn_as_its_model_is(layer, device):
+    model = wall_and_post(unseen=True)
+    here = model.to(device)
+    snapshot = SnapshotSlots(device).publish(
+        here.gaussians, None, version=3, camera=model.camera, time_window_s=model.time_window_s, unseen_s=here.unseen_s
+    )
+    drawing, scene = LayerDrawing(device.type), LayerScene(snapshot, model.camera, 1.0, {"state": "live"})
+    drawing.orbit = Orbit(20, -10)
+    image, said = drawing.draw(layer, scene)
+    expected, told = drawn(layer, model, Orbit(20, -10))
+    assert said.keys() == told.keys()
+    away = np.abs(image.astype(int) - expected)
+    assert (away > 3).mean() < 0.01, "beside the borders of what is marked"
