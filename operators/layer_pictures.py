@@ -13,8 +13,9 @@ from operators.remembered import COVERED
 
 STOPS = 9
 """Colours that a legend names, evenly spaced."""
-RANGE_QUANTILES = (0.02, 0.98)
-RANGE_FOLLOWS = 0.15
+QUANTILES = (0.02, 0.5, 0.98)
+"""Of the depths of a picture: the ends of the range, and the median."""
+RANGE_FOLLOWS = 0.3
 """How fast the range of depths follows the pictures: colours must not flicker."""
 HATCH_PX = 12
 UNOBSERVED, UNOBSERVED_LINE = (24, 18, 32), (150, 60, 170)
@@ -55,9 +56,7 @@ class DepthColours:
         values = depth[(alpha >= 0.5) & np.isfinite(depth) & (depth > 0)]
         if values.size == 0:
             return
-        low, middle, high = (
-            float(value) for value in np.quantile(values[:: 1 + values.size // 20_000], (0.02, 0.5, 0.98))
-        )
+        low, middle, high = (float(value) for value in np.quantile(values[:: 1 + values.size // 20_000], QUANTILES))
         if self._range is None or self.median is None or not 0.5 < middle / self.median < 2:
             self._range, self.median = (low, high), middle
             return

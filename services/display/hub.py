@@ -27,6 +27,8 @@ KINDS: tuple[Pictures, ...] = ("raw", "shown", *LAYERS)
 QUALITY = 80
 STALE_S, FROZEN_S = 0.5, 1.0
 """When no picture has come for so long, its process has died: the last one is shown once more, dimmed, and then again and again with its age."""
+LAYER_STALE_S, LAYER_FROZEN_S = 1.5, 3.0
+"""The same of pictures that are made in what time is left."""
 REPEAT_S = 1.0
 
 
@@ -73,6 +75,7 @@ class _Channel:
 
     def __init__(self, endpoint: str, kind: Pictures, encoders: ThreadPoolExecutor) -> None:
         self._endpoint, self._kind, self._encoders = endpoint, kind, encoders
+        self._stale_s, self._frozen_s = (LAYER_STALE_S, LAYER_FROZEN_S) if kind in LAYERS else (STALE_S, FROZEN_S)
         self.viewers: set[Viewer] = set()
         self.counts: Counter[str] = Counter()
         self.ages = Durations()
@@ -106,14 +109,14 @@ class _Channel:
         try:
             while True:
                 picture = await self._newest(
-                    socket, STALE_S if last is None or time.monotonic() - came_s < FROZEN_S else REPEAT_S
+                    socket, self._stale_s if last is None or time.monotonic() - came_s < self._frozen_s else REPEAT_S
                 )
                 now_s = time.monotonic()
                 if picture is not None:
                     last, came_s = picture, now_s
                     await self._hand_out(_header(picture, self._kind), picture)
                 elif last is not None:
-                    state = "stale" if now_s - came_s < FROZEN_S else "frozen"
+                    state = "stale" if now_s - came_s < self._frozen_s else "frozen"
                     again = Picture({**_header(last, self._kind), "state": state, "new": False}, dimmed(last.image))
                     await self._hand_out(dict(again.header), again)
         finally:

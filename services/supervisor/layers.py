@@ -26,7 +26,7 @@ NICENESS = 10
 """How far the thread steps back behind the reconstruction where both want the processor."""
 PERIOD_S = {"cpu": 0.1, "cuda": 1 / 30}
 """Pictures of one kind come no closer together."""
-MOST_SHARE = {"cpu": 0.25, "cuda": 0.25}
+MOST_SHARE = {"cpu": 1 / 6, "cuda": 1 / 4}
 """Of the time, what drawing takes at most: a slow picture is followed by a longer rest."""
 LOOK_S = 0.2
 

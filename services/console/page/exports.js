@@ -37,6 +37,7 @@ export function snapshotsOf(place, report) {
     const taken = await call("POST", `/v1/streams/${stream}/snapshots`, name.value ? { model: name.value } : {}, { "Idempotency-Key": key });
     const what = taken.version ? `version ${taken.version.version} of ${taken.version.name}` : "a file below";
     said.textContent = `Frame ${taken.seq}, ${taken.gaussians} Gaussians: ${what}. Training stood still for ${taken.pause_ms.toFixed(1)} ms.`;
+    if (taken.version) said.textContent += ` It is ${await checked(taken.version)}.`;
     await renew();
   }, report);
   take.id = "take-snapshot";
@@ -44,6 +45,15 @@ export function snapshotsOf(place, report) {
   row.className = "row";
   row.append(take, label);
   place.append(row, said, list);
+
+  /** The state of a new version once the server has looked at it. */
+  async function checked({ name: model, version }) {
+    for (let wait_ms = 200; ; wait_ms = Math.min(2 * wait_ms, 2000)) {
+      const now = await call("GET", `/v1/models/${model}/versions/${version}`);
+      if (now.state !== "uploaded" && now.state !== "validated") return now.reason ? `${now.state}: ${now.reason}` : now.state;
+      await new Promise((resolve) => setTimeout(resolve, wait_ms));
+    }
+  }
 
   async function renew() {
     const found = stream ? await call("GET", `/v1/streams/${stream}/snapshots`) : [];
