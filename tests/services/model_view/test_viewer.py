@@ -20,7 +20,10 @@ from services.registry.errors import Rejected
 from tests.gsplat_core.io.exports.test_exports import random_model
 from tests.services.supervisor.test_model_show import uniform
 
-viser = pytest.importorskip("viser", reason="pip install 'intrasplat[viser]'")
+viser = pytest.importorskip(
+    "viser",
+    reason="viser is not installed (extra viser): its releases ask for older rich and websockets than the lock has",
+)
 zstandard = pytest.importorskip("zstandard")
 sync_client = pytest.importorskip("websockets.sync.client")
 
