@@ -63,7 +63,7 @@ export function replaysPage(report) {
       if (has("reconstruction.mp4")) actions.push(button("Video", () => play(replay), report));
       if (has("model.isplat")) {
         actions.push(button("Keep model", () => keep(replay), report));
-        actions.push(button("Download model", () => download(`${path}/results/model.isplat`), report));
+        actions.push(button("Download", () => download(`${path}/results/model.isplat`), report));
       }
       actions.push(button("Delete", then(() => call("DELETE", path)), report));
     }

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.requests import HTTPConnection, Request
 
 from services.control.auth.guard import CallerOf, new_router, requires
-from services.control.problems import Missing
+from services.control.problems import PROBLEM_JSON, Missing
 from services.control.recorded import recorded
 from services.control.replay_parts import Jobs
 from services.control.state import part
@@ -20,6 +20,7 @@ from services.settings import ResourceName
 
 router = new_router("replays")
 MOST_RECORDINGS = 2000
+PROBLEM = {"$ref": "#/components/schemas/Problem"}
 JobId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["1f0c9a3b5d7e8f20"])]
 BatchId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["8f20c9a35d7e1f0b"])]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
@@ -96,7 +97,13 @@ def view_of(jobs: Jobs, job_id: str) -> ReplayView:
     return ReplayView.model_validate(job).model_copy(update={"results": list(jobs.files(job))})
 
 
-@router.post("/replays", status_code=202)
+@router.post(
+    "/replays",
+    status_code=202,
+    responses={
+        404: {"description": "There is no recording of that name.", "content": {PROBLEM_JSON: {"schema": PROBLEM}}}
+    },
+)
 @requires("operator")
 async def start_replays(
     request: Request,
