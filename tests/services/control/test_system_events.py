@@ -8,7 +8,8 @@ import time
 import pytest
 
 from services.audit import AuditLog, AuditUnwritable
-from services.control.system_events import MOST_WAITING, SystemEvents
+from services.control import system_events
+from services.control.system_events import SystemEvents
 
 
 @pytest.fixture
@@ -37,16 +38,18 @@ def test_events_are_written_while_the_server_runs_and_what_is_left_when_it_ends(
     assert (newest.actor, newest.detail) == ("system", {"reason": "killed by SIGKILL"})
 
 
-def test_more_than_may_wait_are_counted(audit):
+def test_more_than_may_wait_are_counted(audit, monkeypatch):
+    monkeypatch.setattr(system_events, "MOST_WAITING", 20)
+
     async def run() -> None:
         events = SystemEvents()
-        for _ in range(MOST_WAITING + 3):
+        for _ in range(23):
             events.tell("process.ended", "theatre/engine", "failed")
         async with events.written_to(audit):
             pass
 
     asyncio.run(run())
-    assert len(said(audit)) == MOST_WAITING + 1
+    assert len(said(audit)) == 21
     assert audit.newest(1)[0].event == "audit.missed" and audit.newest(1)[0].detail == {"events": 3}
 
 
