@@ -43,7 +43,7 @@ class Archive:
 
 def new_archive(settings: ServiceSettings, events: SystemEvents) -> Archive:
     """As the settings want it; the registry has made the folder of the database. Raises StoreUnavailable."""
-    data, wanted, jobs = settings.data_dir, settings.recordings, settings.jobs
+    data, wanted, jobs = settings.data_dir, settings.uploaded_recordings, settings.jobs
     database = settings.registry.database
     url = (
         f"sqlite:///{(data / 'registry' / DATABASE_FILE).absolute()}"

@@ -43,7 +43,7 @@ class ServiceSettings(BaseSettings):
     limits: LimitSettings = LimitSettings()
     sources: SourceRules = SourceRules()
     registry: RegistrySettings = RegistrySettings()
-    recordings: RecordingSettings = RecordingSettings()
+    uploaded_recordings: RecordingSettings = RecordingSettings()
     jobs: JobSettings = JobSettings()
     log: LogSettings = LogSettings()
     streams: dict[ResourceName, StreamSettings] = Field(

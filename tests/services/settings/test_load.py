@@ -135,3 +135,8 @@ def test_the_schema_names_every_key():
     for section in schema["$defs"].values():
         for key, value in section["properties"].items():
             assert "description" in value or section["title"] in ("LogSettings",), key
+
+
+def test_the_folder_of_recordings_that_tests_read_is_no_setting(monkeypatch):
+    monkeypatch.setenv("INTRASPLAT_RECORDINGS", "/somewhere/recordings")
+    assert load_settings(None, {}).uploaded_recordings == ServiceSettings().uploaded_recordings
