@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -75,7 +76,10 @@ def reconstruct(
         return worker.stop_requested() or screen.wanted != "live"
 
     worker.say("starting", "waits for the source to be opened by the capture process")
-    source = CapturedSource(worker.folder, stop_requested, lambda width, height: engine_scale_for(spec, width, height))
+    cores = len(os.sched_getaffinity(0))
+    source = CapturedSource(
+        worker.folder, stop_requested, lambda width, height: engine_scale_for(spec, width, height, cores)
+    )
     check_picture(source.description.camera, 1.0)
     with TemporaryDirectory(prefix="intrasplat-engine-") as folder, low_latency():
         settings = live_settings(spec, Path(folder), source.description.name)

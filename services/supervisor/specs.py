@@ -48,17 +48,20 @@ class EngineSpec(_Strict):
 
 
 CPU_PIXELS = 320 * 256
-"""Two cores keep up with so many at 30 frames/s (docs/live.md)."""
+"""Cores beyond two keep up with so many at 30 frames/s while others take what a crowd of viewers does."""
+FEW_CORES, FEW_CORES_PIXELS = 2, 200 * 160
+"""Two cores keep up with `CPU_PIXELS` only while nobody watches (benchmarks/RESULTS.md)."""
 SCALE_STEPS = 16
 
 
-def engine_scale_for(spec: EngineSpec, width_px: int, height_px: int) -> float:
+def engine_scale_for(spec: EngineSpec, width_px: int, height_px: int, cores: int) -> float:
     """What a stream's pictures are scaled by before they are reconstructed; viewers of the raw picture see all of it in any case."""
     if spec.engine_scale is not None:
         return spec.engine_scale
     if spec.device != "cpu":
         return 1.0
-    fits = math.floor(SCALE_STEPS * math.sqrt(CPU_PIXELS / (width_px * height_px))) / SCALE_STEPS
+    pixels = FEW_CORES_PIXELS if cores <= FEW_CORES else CPU_PIXELS
+    fits = math.floor(SCALE_STEPS * math.sqrt(pixels / (width_px * height_px))) / SCALE_STEPS
     return min(1.0, max(1 / SCALE_STEPS, fits))
 
 
