@@ -89,7 +89,9 @@ def tree_cpu_s() -> float:
 
 def served(options: argparse.Namespace) -> dict[str, Any]:
     """The same as a service."""
-    wanted = {} if options.budget_ms is None else {"budget_ms": options.budget_ms}
+    wanted = {"engine_scale": 1.0}  # bare `live` reconstructs the whole picture
+    if options.budget_ms is not None:
+        wanted["budget_ms"] = options.budget_ms
     with Server(options.source, device=options.device, options=wanted) as server:
         server.until_live()
         time.sleep(options.settle)
