@@ -28,7 +28,7 @@ def unpack(archive: Path, folder: Path, limits: RecordingLimits) -> None:
             zipfile.LargeZipFile,
             zlib.error,
             EOFError,
-            NotImplementedError,
+            NotImplementedError,  # what zipfile raises for a way of packing that it does not know
             ValueError,
         ) as error:
             raise ArchiveInvalid("the archive is damaged; pack and upload it again") from error

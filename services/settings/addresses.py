@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 _CREDENTIALS = re.compile(r"(?<=://)[^/?#|]*@")
-_SECRET_OPTION = re.compile(r"(?i)(?<=[?&#])([^=&#|]*(?:pass|secret|token|key|auth|sig)[^=&#|]*)=[^&#|]*")
+_SECRET_OPTION = re.compile(r"(?i)(?<=[?&#])([^=&#|]*(?:pass|secret|token|ticket|key|auth|sig)[^=&#|]*)=[^&#|]*")
 MASK = "**********"
 
 

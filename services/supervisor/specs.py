@@ -48,9 +48,9 @@ class EngineSpec(_Strict):
 
 
 CPU_PIXELS = 320 * 256
-"""Cores beyond two keep up with so many at 30 frames/s while others take what a crowd of viewers does."""
+"""Two cores keep up with so many at 30 frames/s while nobody watches (docs/live.md). With more cores it was not measured."""
 FEW_CORES, FEW_CORES_PIXELS = 2, 200 * 160
-"""Two cores keep up with `CPU_PIXELS` only while nobody watches (benchmarks/RESULTS.md)."""
+"""So many two cores keep up with beside 50 viewers and 200 requests/s, too (benchmarks/RESULTS.md)."""
 SCALE_STEPS = 16
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
 
+import pytest
 from websockets.sync.client import ClientConnection, connect
 
 START_S = 60
@@ -22,6 +24,29 @@ PROGRAMS = {"chromium": ("chromium", "chromium-browser", "google-chrome"), "fire
 def find(browser: str) -> str | None:
     """Where a browser's program is; None where it is not installed."""
     return next((path for name in PROGRAMS[browser] if (path := shutil.which(name))), None)
+
+
+def required(browser: str) -> str:
+    """Where a browser's program is. Where it is not installed the test is skipped; in CI it fails."""
+    path = find(browser)
+    if path is None:
+        message = f"{browser} is not installed (Debian: apt-get install chromium firefox-esr)"
+        if os.environ.get("CI"):
+            pytest.fail(message)
+        pytest.skip(message)
+    return path
+
+
+@contextmanager
+def chromium_by_playwright() -> Iterator[Any]:
+    """Chromium, driven by Playwright."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright comes with the development packages")
+    path = required("chromium")
+    options = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=path, args=options)
+        yield browser
+        browser.close()
 
 
 class Page:

@@ -9,31 +9,25 @@ from typing import Any
 
 import pytest
 
+from tests.system.browsers import chromium_by_playwright
 from tests.system.servers import serving
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright comes with the development packages")
 axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="it comes with the development packages")
-CHROMIUM = Path("/usr/bin/chromium")
 STATES = ("live", "stale", "frozen", "source lost", "no connection", "no picture", "virtual")
 
 
 @pytest.fixture(scope="module")
 def page() -> Iterator[Any]:
     """The page of a server with a stream that does not run, after signing in."""
-    if not CHROMIUM.exists():
-        pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
-    options = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
     with (
+        chromium_by_playwright() as browser,
         tempfile.TemporaryDirectory(prefix="isa-") as folder,
         serving(Path(folder)) as (url, key),
-        playwright.sync_playwright() as started,
     ):
-        browser = started.chromium.launch(executable_path=str(CHROMIUM), args=options)
         page = browser.new_page(viewport={"width": 1920, "height": 1080})
         page.goto(f"{url}/")
         page.wait_for_selector("#sign-in[open]")
         yield page, key
-        browser.close()
 
 
 def violations(page: Any, rules: list[str] | None = None, within: str | None = None) -> list[str]:

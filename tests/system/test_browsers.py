@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ import av
 import numpy as np
 import pytest
 
-from tests.system.browsers import PROGRAMS, Page, find, page
+from tests.system.browsers import PROGRAMS, Page, page, required
 
 STATE = "(() => { const v = document.querySelector('video'); return [v.readyState, v.currentTime, v.videoWidth, v.error && v.error.message]; })()"
 PIXELS = """(async () => {
@@ -29,11 +28,7 @@ PIXELS = """(async () => {
 @pytest.fixture(scope="module", params=sorted(PROGRAMS))
 def browser(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """A running browser. Where it is not installed the test is skipped; in CI it fails."""
-    if find(request.param) is None:
-        message = f"{request.param} is not installed (Debian: apt-get install chromium firefox-esr)"
-        if os.environ.get("CI"):
-            pytest.fail(message)
-        pytest.skip(message)
+    required(request.param)
     with page(request.param, tmp_path_factory.mktemp(request.param)) as opened:
         yield opened
 

@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from services.client import Client, Refused
+from tests.system.browsers import chromium_by_playwright
 
-CHROMIUM = Path("/usr/bin/chromium")
 WITHIN_S = 60.0
 QUICK = {"steps_per_frame": 2}
 LONG = {"steps_per_frame": 300}
@@ -177,13 +177,7 @@ def test_the_same_from_a_shell(server, tiny, tmp_path, monkeypatch, intrasplat):
 @pytest.fixture(scope="module")
 def page(server):
     """The console in Chromium, signed in."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright comes with the development packages")
-    if not CHROMIUM.exists():
-        pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(
-            executable_path=str(CHROMIUM), args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-        )
+    with chromium_by_playwright() as browser:
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.set_default_timeout(1000 * WITHIN_S)
         said: list[str] = []
@@ -195,7 +189,6 @@ def page(server):
         page.wait_for_selector("#stream", state="attached")
         yield page
         assert said == [], "the page failed, or asked for something from elsewhere"
-        browser.close()
 
 
 def test_a_recording_is_uploaded_and_replayed_from_the_page(server, page):

@@ -19,9 +19,9 @@ from gsplat_core.io.bundle import save_bundle
 from services.client import Client, Refused
 from services.registry.bundle_file import pack
 from tests.services.supervisor.test_model_show import uniform
+from tests.system.browsers import chromium_by_playwright
 
 SOURCE = "synthetic:?width=160&height=128&frames=12&fps=15"
-CHROMIUM = Path("/usr/bin/chromium")
 WITHIN_S = 60.0
 
 
@@ -165,14 +165,8 @@ def test_what_is_not_there_is_refused_with_a_sentence(served):
 
 @pytest.fixture(scope="module")
 def page(served):
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright comes with the development packages")
-    if not CHROMIUM.exists():
-        pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
     client, url, _ = served
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(
-            executable_path=str(CHROMIUM), args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-        )
+    with chromium_by_playwright() as browser:
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.set_default_timeout(1000 * WITHIN_S)
         said: list[str] = []
@@ -187,7 +181,6 @@ def page(served):
         page.wait_for_selector("#state[data-state=live]")
         yield page
         assert said == [], "the page failed, or asked for something from elsewhere"
-        browser.close()
 
 
 def brightness(page, canvas):

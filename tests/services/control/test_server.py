@@ -19,6 +19,8 @@ from pathlib import Path
 
 import pytest
 from fastapi import FastAPI
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from services.cli.serve import serve_command
 from services.client import Client, Unreachable
@@ -183,6 +185,19 @@ def test_logs_are_json_with_the_request_and_without_the_query(served):
         time.sleep(0.02)
     assert lines[0]["route"] == "/v1/streams/{name}/mjpeg" and lines[0]["status"] == answer.status
     assert "s3cret" not in "".join(process.lines)
+
+
+@pytest.mark.parametrize("form", ["json", "text"])
+def test_logs_do_not_have_the_ticket_of_a_websocket(tmp_path, form):
+    with serving(tmp_path, "--set", f"log.format={form}") as (process, port, _):
+        with pytest.raises(InvalidStatus):
+            connect(f"ws://127.0.0.1:{port}/v1/streams/a/display?ticket=s3cret")
+        for _ in range(100):
+            said = [line for line in process.lines if "ticket=" in line]
+            if said:
+                break
+            time.sleep(0.02)
+        assert said and "s3cret" not in "".join(process.lines)
 
 
 def test_sigterm_ends_it_with_0_and_the_log_has_it(tmp_path):
