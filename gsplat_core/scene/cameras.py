@@ -123,6 +123,18 @@ class Camera:
         """The same camera somewhere else."""
         return replace(self, world_to_camera=np.asarray(world_to_camera, dtype=np.float64))
 
+    def right_eye(self, baseline: float) -> Camera:
+        """The right eye's camera of a rectified pair of which this is the left one: same intrinsics, and a pose that leads from this camera's
+        coordinates to its own (`Frame.right_camera`).
+
+        baseline: distance between the eyes in the scene's unit. Raises InvalidInput unless it is positive.
+        """
+        if not 0 < baseline < float("inf"):
+            raise InvalidInput(f"camera: the distance between the eyes must be positive, got {baseline}")
+        pose = np.eye(4)
+        pose[0, 3] = -baseline
+        return self.with_pose(pose)
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Camera):
             return NotImplemented

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.cameras import Camera
 
 
 class FrameStatus(Enum):
@@ -21,6 +22,19 @@ class FrameStatus(Enum):
     STALE = "stale"
     DAMAGED = "damaged"
     """Some of it may be the decoder's guess: it is shown, and neither trained on nor scored."""
+
+
+class DepthOrigin(Enum):
+    """Where a frame's depth comes from, and with that what it may be used for."""
+
+    MEASURED = "measured"
+    """By a sensor, or given with the recording."""
+    STEREO = "stereo"
+    """Matched between the two eyes: metric where the baseline is."""
+    PARALLAX = "parallax"
+    """Matched between times at which the scope was elsewhere: in the unit of its poses."""
+    LIGHT = "light"
+    """From how bright tissue is in the scope's own light: relative, never metric."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +49,14 @@ class Frame:
     """RGB uint8 [H, W, 3]."""
     right_image: NDArray[np.uint8] | None = None
     """The right eye of a rectified stereo pair, RGB uint8 [H, W, 3]."""
+    right_camera: Camera | None = None
+    """The camera of `right_image`; its pose leads from the left camera's coordinates to its own. None: not known, or there is no right eye."""
     depth: NDArray[np.float32] | None = None
     """z in millimetres [H, W]; 0 = unknown."""
+    depth_confidence: NDArray[np.float32] | None = None
+    """[H, W], 0 to 1: how far each pixel's depth is to be believed. None: all of it that is known."""
+    depth_origin: DepthOrigin | None = None
+    """Where `depth` comes from; None where there is none."""
     mask: NDArray[np.uint8] | None = None
     """[H, W]; 1 = tissue (keep), 0 = tool."""
     pose: NDArray[np.float64] | None = None
@@ -70,7 +90,14 @@ class Frame:
             raise InvalidInput(
                 f"frame {self.seq}: right image {list(self.right_image.shape)} differs from left {list(image.shape)}"
             )
-        planes = {name: getattr(self, name) for name in ("depth", "mask", "loss_mask", "rehearsal_mask")}
+        right = self.right_camera
+        if right is not None and (right.height_px, right.width_px) != size:
+            raise InvalidInput(
+                f"frame {self.seq}: its right camera is {right.width_px}x{right.height_px}, the image {size[1]}x{size[0]}"
+            )
+        planes = {
+            name: getattr(self, name) for name in ("depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask")
+        }
         for name, plane in planes.items():
             if plane is not None and plane.shape != size:
                 raise InvalidInput(f"frame {self.seq}: {name} is {list(plane.shape)}, the image is {list(size)}")

@@ -7,6 +7,7 @@ import os
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -21,7 +22,8 @@ from gsplat_core.io.recordings.decoded import Picture
 from gsplat_core.io.recordings.findings import Findings, printable
 from gsplat_core.io.recordings.frame_files import DepthFiles, MaskFiles
 from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 
 
 class FrameImages(Protocol):
@@ -81,6 +83,13 @@ class Contents:
         }
         return frozenset(name for name, there in has.items() if there)
 
+    @cached_property
+    def right_camera(self) -> Camera | None:
+        """The right eye's, as in `Frame`; None where there is no right eye, or its distance from the left one is not known."""
+        if self.right is None or self.stereo_baseline_mm is None:
+            return None
+        return self.calibration.camera.right_eye(self.stereo_baseline_mm)
+
     def frames(self, findings: Findings, limit: int | None = None) -> Iterator[Frame | None]:
         """Frame after frame at full size, decoded when asked for; None where one has a problem.
 
@@ -131,7 +140,9 @@ class Contents:
             pts_ns=round((index if times is None else times[index]) * 1e9 / self.fps),
             image=picture.image,
             right_image=None if right is None else right.image,
+            right_camera=self.right_camera,
             depth=depth,
+            depth_origin=None if depth is None else DepthOrigin.MEASURED,
             mask=mask,
             pose=None if poses is None else poses[index],
             status=FrameStatus.REPLAY if damage is None else FrameStatus.DAMAGED,

@@ -249,10 +249,13 @@ def resized_frame(frame: Frame, width_px: int, height_px: int) -> Frame:
     """A frame at another size: images by the mean over areas, masks and depth by the nearest pixel."""
     if (width_px, height_px) == (frame.width_px, frame.height_px):
         return frame
-    planes = {name: getattr(frame, name) for name in ("depth", "mask", "loss_mask", "rehearsal_mask")}
-    right = frame.right_image
+    planes = {
+        name: getattr(frame, name) for name in ("depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask")
+    }
+    right, right_camera = frame.right_image, frame.right_camera
     return frame.with_fields(
         image=resize_area(frame.image, width_px, height_px),
         right_image=None if right is None else resize_area(right, width_px, height_px),
+        right_camera=None if right_camera is None else right_camera.resized(width_px, height_px),
         **{name: resize_nearest(plane, width_px, height_px) for name, plane in planes.items() if plane is not None},
     )

@@ -111,4 +111,6 @@ def test_a_snapshot_on_any_device_is_drawn_as_its_model_is(layer, device):
     expected, told = drawn(layer, model, Orbit(20, -10))
     assert said.keys() == told.keys()
     away = np.abs(image.astype(int) - expected)
-    assert (away > 3).mean() < 0.01, "beside the borders of what is marked"
+    palette_step = {"depth": 9}.get(layer, 3)
+    """Depth is coloured in 256 steps, up to 8 levels of a channel apart: another device's rounding may fall on either side of one."""
+    assert (away > palette_step).mean() < 0.01, "beside the borders of what is marked"

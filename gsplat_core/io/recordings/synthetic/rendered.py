@@ -19,7 +19,7 @@ from gsplat_core.io.recordings.synthetic.synthesize import (
     threads_that_fit,
 )
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DepthOrigin, Frame
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,13 @@ class RenderedRecording:
     notes: tuple[str, ...] = ()
 
     def __init__(self, frames: list[Frame], asked: Asked) -> None:
-        self._frames = frames
         self.name = "synthetic"
         self.width_px, self.height_px = asked.width_px, asked.height_px
         self.camera = Camera.from_focal(
             DEFAULT_FOCAL_FACTOR * max(asked.width_px, asked.height_px), asked.width_px, asked.height_px
         )
+        right = self.camera.right_eye(BASELINE_MM) if asked.stereo else None
+        self._frames = [frame.with_fields(depth_origin=DepthOrigin.MEASURED, right_camera=right) for frame in frames]
         self.frame_count, self.fps = len(frames), asked.fps
         self.digest = hashlib.sha256(json.dumps(astuple(asked)).encode()).hexdigest()
         self.fields = frozenset({"mask", "depth", "pose", *(["right_image"] if asked.stereo else [])})
