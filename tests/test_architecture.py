@@ -70,6 +70,15 @@ def test_every_way_to_import_the_reference_is_seen(tmp_path, line):
     assert imports_reference(tmp_path / "module.py")
 
 
+def test_geometry_knows_nothing_of_training():
+    files = sorted((ROOT / "gsplat_core/geometry").rglob("*.py"))
+    assert files
+    wrong = [
+        path.name for path in files if any(each.startswith("gsplat_core.training") for each in imported_modules(path))
+    ]
+    assert not wrong
+
+
 PROGRAM = """
 import socket, subprocess, sys
 import torch  # runs ldconfig on its own account

@@ -112,6 +112,15 @@ class Frame:
         return self.pts_ns * 1e-9
 
     @property
+    def depth_is_metric(self) -> bool:
+        """Whether the unit of `depth` is known. What is matched between the eyes has the unit of the distance between them, if that is known; what
+        follows from poses has theirs, whatever it is. Of a frame whose depth was dropped to save memory, `depth_origin` still says it."""
+        if self.depth_origin is None:
+            return self.depth is not None
+        matched = self.depth_origin is DepthOrigin.STEREO and self.right_camera is not None
+        return self.depth_origin is DepthOrigin.MEASURED or matched
+
+    @property
     def height_px(self) -> int:
         """Height of the image."""
         return int(self.image.shape[0])

@@ -26,6 +26,7 @@ from operators.applications.result import RunOutcome
 from operators.applications.session import Session
 from operators.applications.trial_run import trial_run
 from operators.deform import DeformOp
+from operators.depth import DepthOp
 from operators.display import DisplayOp
 from operators.frame_clock import FrameClock
 from operators.frame_log import FRAMES_FILE, FrameLog
@@ -70,8 +71,9 @@ class LiveApplication(Application):
             self, name="source", source=self.frame_source, stop_requested=self._stop_requested, seconds=settings.seconds
         )
         recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
+        depth = DepthOp(self, name="depth", choice=settings.depth, camera=self.frame_source.description.camera)
         analysis = analysis_operator(
-            self, settings.tool_mask, settings.out_of_body, recording.behind_gate(), recording.behind_analysis()
+            self, settings.tool_mask, settings.out_of_body, depth, recording.behind_gate(), recording.behind_analysis()
         )
         self.add_flow(self.source_op, analysis, {("frame", "frame")})
         self.reconstruct = LiveReconstructOp(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import get_args
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.registry import check_depth
 from gsplat_core.io.sessions import WriterOptions
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.image_motion import Detail
@@ -81,6 +82,8 @@ class LiveSettings:
     """Write a line of figures for each frame; a run without an end leaves it out, since the file grows."""
     tool_mask: str = "builtin"
     """How tools are found in frames that come without a mask (`operators.tool_mask.TOOL_MASKS`)."""
+    depth: str = "auto"
+    """Where depth comes from: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
     out_of_body: Policy = "withhold"
     """What happens to pictures from outside of the body: nothing of them goes on, or (`off`) they are not looked for."""
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
@@ -100,6 +103,7 @@ class LiveSettings:
         if self.out_of_body not in get_args(Policy):
             raise InvalidSetting(f"out-of-body is {self.out_of_body!r}; choose {' or '.join(get_args(Policy))}")
         check_tool_mask(self.tool_mask)
+        check_depth(self.depth)
 
     @property
     def chosen_clock(self) -> ClockSettings:

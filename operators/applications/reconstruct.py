@@ -12,6 +12,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.registry import DepthFinder
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
@@ -117,6 +118,7 @@ def _fit(
             raise _StopFitting
 
     frames = FirstFrames(source, description.frame_count)
+    finder = DepthFinder(settings.depth, description.camera)
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
-        learning.fit((frame for frame in frames if _trains(frame)), steps, after_step)
+        learning.fit((finder.with_depth(frame) for frame in frames if _trains(frame)), steps, after_step)
     return learning.snapshot(), done

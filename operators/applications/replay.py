@@ -1,8 +1,8 @@
 """Replay: a recording, or another source with an end, is reconstructed, shown and measured frame by frame.
 
-    source → tool_mask → reconstruct → deform → rasterize → video
-                                                          → metrics → keyframes
-                                                                    → progress
+    source → tool_mask → depth → reconstruct → deform → rasterize → video
+                                                                  → metrics → keyframes
+                                                                            → progress
 
 `video` and `keyframes` are the sinks that `ReplaySettings.sinks` names.
 
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.registry import check_depth
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.frames import Frame
@@ -34,6 +35,7 @@ from operators.applications.result import RunOutcome, RunSettings
 from operators.applications.session import Session
 from operators.applications.session_replay import FollowedSession, followed_session
 from operators.deform import DeformOp
+from operators.depth import DepthOp, without_depth
 from operators.frame_log import FRAMES_FILE, FrameLog
 from operators.graph import Application, Engine
 from operators.ingest import SourceOp
@@ -74,6 +76,8 @@ class ReplaySettings:
     scale: float = 1.0
     ignore_schedule: bool = False
     """Replay a recorded session like any other recording, and not with the calls that it made."""
+    depth: str = "auto"
+    """Where depth comes from: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
     heldout: bool = False
     """Show the protocol's held-out frames without training on them, and score them apart."""
 
@@ -85,6 +89,7 @@ class ReplaySettings:
         if self.steps_per_frame is not None:
             check_steps("steps_per_frame", self.steps_per_frame)
         check_max_frames(self.max_frames)
+        check_depth(self.depth)
         for name in self.sinks:
             SINKS.check(name)
 
@@ -151,12 +156,16 @@ class ReplayApplication(Application):
         reserve = StorageReserve(out, self.room_to_finish)
         source = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
         tool_mask = RecordedToolMaskOp(self, name="tool_mask")
+        # A session that is followed has its depth already, as training was given it.
+        choice = "recorded" if self._followed is not None else settings.depth
+        depth = DepthOp(self, name="depth", choice=choice, camera=self.frame_source.description.camera)
         self.reconstruct = self._reconstruct_op()
         deform = DeformOp(self, name="deform")
         rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
         self.metrics = MetricsOp(self, name="metrics", log=FrameLog(out / FRAMES_FILE, reserve))
         self.add_flow(source, tool_mask, {("frame", "frame")})
-        self.add_flow(tool_mask, self.reconstruct, {("frame", "frame")})
+        self.add_flow(tool_mask, depth, {("frame", "frame")})
+        self.add_flow(depth, self.reconstruct, {("frame", "frame")})
         self.add_flow(self.reconstruct, deform, {("reconstruction", "reconstruction")})
         self.add_flow(deform, rasterize, {("scene", "scene")})
         options = SinkOptions(out, self.frame_source.description, reserve)
@@ -266,13 +275,8 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
             "give a smaller --scale or --max-frames",
         )
     notes.extend(description.notes)
-    if "depth" not in description.fields:
-        finds_depth = config.depth_from_motion and "pose" in description.fields
-        found = "unless the given poses show how far away it is, " if finds_depth else ""
-        notes.append(
-            f"the recording has no depth: {found}the scene starts on a plane {config.default_depth_mm:g} mm away, and its"
-            " depth has no measured scale"
-        )
+    if (note := without_depth(settings.depth, description.fields, config)) is not None:
+        notes.append(note)
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
     return source
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 from operators.sources.options import SourceOptions
 from operators.sources.shared_memory import PLANES, BadHeader
 from operators.sources.source import SourceDescription
@@ -49,22 +49,26 @@ def options_from(content: dict[str, Any]) -> SourceOptions:
 
 def description_to(about: SourceDescription) -> dict[str, Any]:
     """A description as JSON."""
-    camera = about.camera
     return {
         "name": about.name,
         "width_px": about.width_px,
         "height_px": about.height_px,
         "fps": about.fps,
-        "camera": {
-            "K": camera.K.tolist(),
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "world_to_camera": camera.world_to_camera.tolist(),
-            "model": camera.model,
-        },
+        "camera": camera_to(about.camera),
         "fields": sorted(about.fields),
         "frame_count": about.frame_count,
         "notes": list(about.notes),
+    }
+
+
+def camera_to(camera: Camera) -> dict[str, Any]:
+    """A camera as JSON."""
+    return {
+        "K": camera.K.tolist(),
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "world_to_camera": camera.world_to_camera.tolist(),
+        "model": camera.model,
     }
 
 
@@ -92,6 +96,8 @@ def frame_header(frame: Frame) -> dict[str, Any]:
         "arrived_ns": frame.arrived_ns,
         "status": frame.status.value,
         "damage": frame.damage,
+        "depth_origin": None if frame.depth_origin is None else frame.depth_origin.value,
+        "right_camera": None if frame.right_camera is None else camera_to(frame.right_camera),
     }
 
 
@@ -102,12 +108,15 @@ def frame_from(header: Mapping[str, Any], planes: Mapping[str, Any]) -> Frame:
         whole = all(type(value) is int and abs(value) < 2**62 for value in (seq, pts_ns))
         if not whole or not isinstance(damage, str | None) or type(arrived_ns) not in (int, type(None)):
             raise BadHeader(f"a frame cannot have the number {seq!r:.30} and the time {pts_ns!r:.30}")
+        origin, right_camera = header.get("depth_origin"), header.get("right_camera")
         return Frame(
             seq=seq,
             pts_ns=pts_ns,
             arrived_ns=arrived_ns,
             status=FrameStatus(header["status"]),
             damage=damage,
+            depth_origin=None if origin is None else DepthOrigin(origin),
+            right_camera=None if right_camera is None else Camera(**right_camera),
             **planes,
         )
     except (KeyError, TypeError, ValueError) as error:

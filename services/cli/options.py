@@ -79,6 +79,9 @@ RenderOutOption = Annotated[Path, path_option("--out", "A video (name.mp4) or a 
 DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
 RendererOption = Annotated[str, typer.Option(help="How Gaussians become a picture: alpha.")]
 FieldOption = Annotated[str, typer.Option(help="Deformation field: auto, basis or hexplane.")]
+DepthOption = Annotated[
+    str, typer.Option(help="Depth of the frames: auto, recorded, stereo (from the two eyes) or none.")
+]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
 ScaleOption = Annotated[float, typer.Option(help="Resize the frames by this factor.")]
 MaxFramesOption = Annotated[int | None, typer.Option(help="Stop after this many frames.", show_default=False)]
@@ -95,6 +98,7 @@ class RunOptions:
     seed: SeedOption = 0
     max_frames: MaxFramesOption = None
     scale: ScaleOption = 1.0
+    depth: DepthOption = "auto"
 
     def settings(self) -> dict[str, Any]:
         """By name."""

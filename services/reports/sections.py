@@ -88,7 +88,7 @@ def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | Non
             tags += '<span class="tag worst">lowest PSNR</span>'
         near_far = pictures.depth_range
         # A recording without depth gives no scale: what the model has then is shape, not millimetres.
-        unit = " mm" if rendered.frame.depth is not None else ", scale not known"
+        unit = " mm" if rendered.frame.depth_is_metric else ", scale not known"
         depth = f"depth {near_far[0]:.1f} to {near_far[1]:.1f}{unit}" if near_far else "no depth"
         cells.append(
             f'<div class="row"><b>Frame {seq}</b><span>{rendered.frame.time_s:.2f} s</span><span>model {rendered.model_version}</span>'

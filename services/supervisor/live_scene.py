@@ -18,4 +18,4 @@ def scene_of(shown: ShownPicture, newest: Model | Snapshot | None) -> LayerScene
     camera = newest.camera if frame.pose is None else newest.camera.with_pose(frame.pose)
     header = {**header_of(shown), "show": "live", "model_version": newest.version}
     planes = rendered.depth, rendered.alpha
-    return LayerScene(newest, camera, frame.time_s, header, metric=frame.depth is not None, planes=planes)
+    return LayerScene(newest, camera, frame.time_s, header, metric=frame.depth_is_metric, planes=planes)

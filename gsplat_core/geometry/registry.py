@@ -1,0 +1,113 @@
+"""Where the depth of frames comes from, by name."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.depth_map import DepthMap
+from gsplat_core.registry import Registry
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
+
+
+class Estimator(Protocol):
+    """Finds the depth of one frame after another of one stream, in order; it may remember what it has seen. The same frames give the same bytes."""
+
+    def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
+        """The frame's depth, seen from `camera` (with the frame's pose, where that is known); None: there is nothing in it to find depth from.
+
+        A frame with `new_scene` has nothing to do with those before it.
+        """
+        ...
+
+
+class RecordedDepth:
+    """The depth that a frame came with."""
+
+    def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
+        """See `Estimator`."""
+        if frame.depth is None:
+            return None
+        confidence = frame.depth_confidence
+        if confidence is None:
+            confidence = (frame.depth > 0).astype(np.float32)
+        return DepthMap(frame.depth, confidence, frame.depth_origin or DepthOrigin.MEASURED, frame.depth_is_metric)
+
+
+class NoDepth:
+    """None, whatever a frame came with."""
+
+    def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
+        """See `Estimator`."""
+        return None
+
+
+DEPTHS: Registry[Callable[[], Estimator]] = Registry(
+    "depth",
+    {
+        "recorded": RecordedDepth,
+        "stereo": "gsplat_core.geometry.stereo:StereoDepth",
+        "none": NoDepth,
+    },
+)
+"""Estimators by name: what makes one for a stream."""
+
+
+def _always(frame: Frame) -> bool:
+    return True
+
+
+def _has_calibrated_eyes(frame: Frame) -> bool:
+    return frame.right_camera is not None
+
+
+AUTO: dict[str, Callable[[Frame], bool]] = {"recorded": _always, "stereo": _has_calibrated_eyes}
+"""What `auto` asks, in this order and for such frames, until one of them answers."""
+
+
+def check_depth(choice: str) -> None:
+    """Raises InvalidSetting for what is neither `auto` nor in `DEPTHS`."""
+    if choice != "auto" and choice not in DEPTHS:
+        raise InvalidSetting(f"depth is {choice!r}; choose auto, {', '.join(DEPTHS)}")
+
+
+class DepthFinder:
+    """Gives the frames of one stream the depth that a setting asks for."""
+
+    def __init__(self, choice: str, camera: Camera) -> None:
+        """choice: `auto` or a name in `DEPTHS`. camera: that of the frames. Raises as `check_depth`."""
+        check_depth(choice)
+        self._camera = camera
+        asked = AUTO if choice == "auto" else {choice: _always}
+        self._asked = [(DEPTHS[name](), suits) for name, suits in asked.items()]
+        self.doubts: Counter[str] = Counter()
+        """What spoke against a frame's depth as a whole, and of how many frames."""
+
+    def find(self, frame: Frame) -> DepthMap | None:
+        """The first answer that is not doubted; None where there is none."""
+        camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)
+        # What is not learned from needs no depth; what it came with costs nothing.
+        shown_only = frame.status is FrameStatus.DAMAGED or frame.withheld is not None
+        for estimator, suits in self._asked:
+            if not suits(frame) or (shown_only and not isinstance(estimator, RecordedDepth)):
+                continue
+            found = estimator.estimate(frame, camera)
+            if found is not None and found.doubt is None:
+                return found
+            if found is not None:
+                self.doubts[str(found.doubt)] += 1
+        return None
+
+    def with_depth(self, frame: Frame) -> Frame:
+        """The frame with what was found, and without the depth that it came with where that is not it."""
+        found = self.find(frame)
+        if found is None:
+            return frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
+        if found.depth is frame.depth:
+            return frame
+        return frame.with_fields(depth=found.believed, depth_confidence=found.confidence, depth_origin=found.origin)

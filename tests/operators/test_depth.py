@@ -1,0 +1,133 @@
+"""Frames get the depth that was asked for, and the report says where it comes from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.depth_map import DepthMap, doubted
+from gsplat_core.geometry.registry import DEPTHS
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin, FrameStatus
+from gsplat_core.training.config import ReconstructorConfig
+from operators.depth import DepthOp, FoundDepth, without_depth
+from operators.outcome import OutcomeBuilder
+
+CAMERA = Camera.from_focal(20.0, 24, 16)
+PLANE = np.full((16, 24), 50, np.float32)
+
+
+class Fixed:
+    """Answers every frame in the same way, and keeps what it was asked."""
+
+    def __init__(self, answer: DepthMap | None) -> None:
+        self.answer, self.asked = answer, []
+
+    def estimate(self, frame, camera):
+        self.asked.append((frame, camera))
+        return self.answer
+
+
+@pytest.fixture
+def registered():
+    """Registers estimators for a test."""
+    names = []
+
+    def add(name, answer):
+        estimator = Fixed(answer)
+        DEPTHS.add(name, lambda: estimator)
+        names.append(name)
+        return estimator
+
+    yield add
+    for name in names:
+        DEPTHS.remove(name)
+
+
+def started(choice):
+    operator = DepthOp(None, choice=choice, camera=CAMERA)
+    operator.start()
+    return operator
+
+
+def outcome_of(operator):
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    return outcome
+
+
+@pytest.mark.parametrize("choice", ["auto", "recorded"])
+def test_recorded_depth_goes_through_as_it_is(frame, compute, choice):
+    given = frame(0, depth=PLANE, depth_origin=DepthOrigin.MEASURED)
+    operator = started(choice)
+    (passed,) = compute(operator, frame=given)
+    assert passed is given
+    outcome = outcome_of(operator)
+    assert outcome.find(FoundDepth) == FoundDepth({"measured": 1}, 1.0, True, {})
+    assert outcome.notes == ()
+
+
+def test_none_drops_recorded_depth_and_says_so(frame, compute):
+    operator = started("none")
+    (passed,) = compute(operator, frame=frame(0, depth=PLANE, depth_origin=DepthOrigin.MEASURED))
+    assert (passed.depth, passed.depth_confidence, passed.depth_origin) == (None, None, None)
+    assert outcome_of(operator).notes == ("the depth that 1 frames came with was not used (depth is 'none')",)
+
+
+@pytest.mark.parametrize("choice", ["auto", "recorded", "stereo"])
+def test_a_frame_with_nothing_to_find_depth_from_has_none(frame, compute, choice):
+    given = frame(0)
+    (passed,) = compute(started(choice), frame=given)
+    assert passed.depth is None
+
+
+def test_what_is_found_counts_where_it_is_believed(frame, compute, registered):
+    confidence = np.ones((16, 24), np.float32)
+    confidence[:8] = 0.4
+    registered("half", DepthMap(PLANE, confidence, DepthOrigin.LIGHT, metric=False))
+    operator = started("half")
+    (passed,) = compute(operator, frame=frame(0))
+    assert (passed.depth[:8] == 0).all() and (passed.depth[8:] == 50).all()
+    assert passed.depth_confidence is confidence and passed.depth_origin is DepthOrigin.LIGHT
+    outcome = outcome_of(operator)
+    assert outcome.find(FoundDepth) == FoundDepth({"light": 1}, 0.5, False, {})
+    assert outcome.notes == (
+        "the depth of 1 frames was found in them, of 50% of their pixels; it is relative: its unit is not known",
+    )
+
+
+def test_a_doubted_depth_is_not_used_and_the_doubt_is_said(frame, compute, registered):
+    registered("wrong", doubted((16, 24), DepthOrigin.STEREO, "the eyes are swapped"))
+    operator = started("wrong")
+    for seq in range(3):
+        (passed,) = compute(operator, frame=frame(seq))
+        assert passed.depth is None
+    assert outcome_of(operator).notes == ("3 frames were given no depth: the eyes are swapped",)
+
+
+def test_an_estimator_gets_the_camera_where_the_frame_was_taken(frame, compute, registered):
+    pose = np.eye(4)
+    pose[2, 3] = 7
+    asked = registered("asked", None).asked
+    compute(started("asked"), frame=frame(0, pose=pose))
+    assert asked[0][1] == CAMERA.with_pose(pose)
+
+
+@pytest.mark.parametrize("fields", [{"status": FrameStatus.DAMAGED}, {"withheld": "blur"}])
+def test_nothing_is_sought_in_a_frame_that_is_not_learned_from(frame, compute, registered, fields):
+    asked = registered("asked", None).asked
+    compute(started("asked"), frame=frame(0, **fields))
+    assert asked == []
+
+
+def test_another_name_is_refused():
+    with pytest.raises(InvalidSetting, match="depth is 'sonar'; choose auto, recorded, stereo"):
+        DepthOp(None, choice="sonar", camera=CAMERA)
+
+
+def test_it_is_said_what_a_model_without_depth_means():
+    config = ReconstructorConfig()
+    assert without_depth("auto", frozenset({"depth"}), config) is None
+    assert "the scene starts on a plane" in without_depth("none", frozenset({"depth"}), config)
+    assert "unless the two eyes show" in without_depth("auto", frozenset({"right_image"}), config)
