@@ -1,14 +1,16 @@
-"""The service's API from a model's upload to its rollback, through the typed client.
+"""The service's whole life cycle through the typed client: models, streams, snapshots, recordings and their replays, keys.
 
 Needs a running service (`intrasplat serve`) and its administrator's key. Makes two models of one colour each, uploads them as versions of one
 model, shows it as a stream, and changes what is shown: activate, roll back, stop, start. It exports the model, and a snapshot of a live
-reconstruction. Then it rotates an API key, and reads the audit log and the metrics. What it has made it deletes, but for the version of the
-model that is active.
+reconstruction. It uploads a small recording, replays it as a job, follows its progress and reads its report. Then it rotates an API key, and
+reads the audit log and the metrics. What it has made it deletes, but for the version of the model that is active.
 
 Usage: python examples/06_service_life_cycle.py --key-file ~/.local/share/intrasplat/admin.key [--url http://127.0.0.1:8000]
 """
 
 import argparse
+import json
+import shutil
 import tempfile
 import time
 from pathlib import Path
@@ -17,11 +19,12 @@ import torch
 
 from gsplat_core import Camera, Gaussians
 from gsplat_core.io.bundle import save_bundle
+from gsplat_core.io.recordings import synthesize
 from gsplat_core.scene.model import Model
 from services.client import Client, Refused
 from services.registry.bundle_file import pack
 
-MODEL = STREAM = "life-cycle"
+MODEL = STREAM = RECORDING = "life-cycle"
 SOURCE = "synthetic:?width=64&height=48&frames=4&fps=10"
 WITHIN_S = 60.0
 
@@ -100,6 +103,25 @@ def snapshot_is_taken(client: Client, folder: Path) -> None:
     client.delete_stream(STREAM)
 
 
+def recording_is_replayed(client: Client, folder: Path) -> None:
+    """Upload a recording and replay it as a job; its report tells how well it was reconstructed."""
+    synthesize(folder / RECORDING, frames=6, width_px=64, height_px=48, stereo=False)
+    archive = shutil.make_archive(str(folder / RECORDING), "zip", folder, RECORDING)
+    client.upload_recording(RECORDING, Path(archive))
+    print(f"{RECORDING} is {client.checked_recording(RECORDING).state}")
+    replay = client.start_replay(RECORDING, {"steps_per_frame": 4, "device": "cpu"})
+    while replay.state in ("queued", "running"):
+        print(f"replay: {replay.state}, {replay.frames_done} of {replay.frames or '?'} frames")
+        time.sleep(0.5)
+        replay = client.replay(replay.id)
+    print(f"replay: {replay.state}, {replay.frames_done} of {replay.frames} frames")
+    client.result(replay.id, "report.json", folder / "report.json")
+    displayed = json.loads((folder / "report.json").read_text())["frames"]["displayed"]
+    print(f"report.json: {displayed} frames displayed, the newest at {replay.psnr_db:.1f} dB")
+    client.delete_replay(replay.id)
+    client.delete_recording(RECORDING)
+
+
 def keys_change(client: Client) -> None:
     """A second key of the same name, the caller changes over, the first one goes."""
     old = client.make_key("life-cycle", "viewer")
@@ -123,6 +145,7 @@ def main() -> None:
         print(f"IntraSplat {client.about()['version']}")
         models_change(client, Path(folder))
         snapshot_is_taken(client, Path(folder))
+        recording_is_replayed(client, Path(folder))
         keys_change(client)
         for entry in client.audit(count=5).entries:
             print(f"audit {entry.seq}: {entry.event} {entry.subject} by {entry.actor}: {entry.outcome}")

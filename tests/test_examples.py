@@ -31,7 +31,8 @@ RUNS = {
     "06_service_life_cycle.py": (
         ["--url", "URL", "--key-file", "KEY_FILE"],
         r"(?s)red is life-cycle/1: ready.*a picture of version 1.*refused \(409\).*a picture of version 2.*rolled back to 1.*"
-        r"a picture of version 1.*red.glb: \d+ bytes.*live.ply: \d+ bytes.*the old key: 401.*audit \d+: key.revoke .* done\n.*intrasplat_upload_bytes_total [1-9]",
+        r"a picture of version 1.*red.glb: \d+ bytes.*live.ply: \d+ bytes.*life-cycle is ready.*"
+        r"replay: (?:queued|running), .*replay: done, 6 of 6 frames\nreport.json: 6 frames displayed, the newest at \d+\.\d dB\n.*the old key: 401.*audit \d+: key.revoke .* done\n.*intrasplat_upload_bytes_total [1-9]",
         [],
     ),
 }
