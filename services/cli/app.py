@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from services.cli import recording_commands, service
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
     BatchOutOption,
@@ -32,7 +33,6 @@ from services.cli.options import (
     SourceArgument,
     takes_run_options,
 )
-from services.cli.service import add_to
 from services.cli.streams import printable
 
 # Wrong options and their like. Where the class lives has changed between releases of typer; what derives from it has not.
@@ -282,14 +282,6 @@ def export(
 
 
 @app.command()
-def validate(recording: RecordingArgument, json: JsonOption = False) -> int:
-    """Read a recording from the first frame to the last and say what is wrong with it."""
-    from services.cli.validate import validate_command
-
-    return validate_command(recording, as_json=json)
-
-
-@app.command()
 def doctor(json: JsonOption = False) -> int:
     """Say what this machine has, what is missing, and what to do about it."""
     from services.cli.doctor import doctor_command
@@ -297,4 +289,5 @@ def doctor(json: JsonOption = False) -> int:
     return doctor_command(as_json=json)
 
 
-add_to(app)
+recording_commands.add_to(app)
+service.add_to(app)

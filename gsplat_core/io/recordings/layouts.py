@@ -27,6 +27,7 @@ from gsplat_core.io.recordings.frame_files import ImageFiles, check_sizes
 from gsplat_core.io.recordings.image_files import list_images
 from gsplat_core.io.recordings.numbering import frame_times
 from gsplat_core.io.recordings.plain_files import all_stay_inside, stays_inside
+from gsplat_core.io.recordings.poses_file import POSES_FILE
 from gsplat_core.io.recordings.sidecars import Beside
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES, open_video
 
@@ -112,6 +113,7 @@ def _with_sidecars(
     described = beside.description()
     if calibration is None:
         calibration = beside.poses()
+    poses = beside.poses_alone()
     right, masks, depth = beside.right(), beside.masks(), beside.depth(described.get("depth_unit_mm"))
     tool_share = masks.check_polarity(findings) if masks else None
     valid_mask = beside.valid_mask()
@@ -121,6 +123,9 @@ def _with_sidecars(
         calibration = default_calibration(root, *size, findings)
     if camera := described.get("camera"):
         calibration = replace(calibration, camera=camera.with_pose(calibration.camera.world_to_camera))
+    if poses is not None:
+        camera = calibration.camera.with_pose(poses[0])
+        calibration = Calibration(camera, poses, f"{POSES_FILE}, and the camera of {calibration.source}")
     fps = described.get("fps") or images.fps
     if fps is None:
         findings.warn(root, "the frame rate is not stated", f"{DEFAULT_FPS:g} frames/s are assumed")

@@ -20,10 +20,11 @@ from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.frame_files import DepthFiles, ImageFiles, MaskFiles, check_pairing, check_sizes
 from gsplat_core.io.recordings.image_files import decode_plane, list_images
 from gsplat_core.io.recordings.plain_files import UnreadableFile, all_stay_inside, stays_inside
+from gsplat_core.io.recordings.poses_file import POSES_FILE, read_poses
 
 RECORDING_FORMAT = "intrasplat-recording"
 RECORDING_VERSION = 1
-_FILES = ("recording.json", "poses_bounds.npy", "cameras.json", "valid_mask.png")
+_FILES = ("recording.json", POSES_FILE, "poses_bounds.npy", "cameras.json", "valid_mask.png")
 
 
 class Beside:
@@ -49,6 +50,11 @@ class Beside:
         """The cameras of `poses_bounds.npy`."""
         path = self._file("poses_bounds.npy")
         return read_poses_bounds(path, self._images.frame_count, *self._size, self._findings) if path else None
+
+    def poses_alone(self) -> NDArray[np.float64] | None:
+        """Those of `poses.npy`, world-to-camera [N, 4, 4]."""
+        path = self._file(POSES_FILE)
+        return read_poses(path, self._images.frame_count, self._findings) if path else None
 
     def right(self) -> ImageFiles | None:
         """The right eye."""

@@ -1,0 +1,90 @@
+"""Poses from pictures alone, against those that a recording came with.
+
+    python benchmarks/geometry_poses.py RECORDING... [--synthetic FRAMES] [--rigid]
+
+One JSON line a recording: ATE (root mean square of the distance between both ways after the best similarity) as a share of the given way, errors in
+pixels, and seconds. `--synthetic 150` adds a rendered recording of so many frames at 15 frames/s, 320x256, with a moving scope before tissue that
+breathes and is pulled; `--rigid` the same before tissue that stands still.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gsplat_core.geometry.odometry import trajectory_of
+from gsplat_core.io.recordings import open_recording
+from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+
+
+def ate_share(poses: np.ndarray, given: np.ndarray) -> tuple[float, float]:
+    """Root mean square error of the camera's centres after the best similarity (Umeyama 1991), as a share of the given way; and that way's length."""
+    ours, theirs = (np.linalg.inv(each)[:, :3, 3] for each in (poses, given))
+    way = float(np.linalg.norm(np.diff(theirs, axis=0), axis=1).sum())
+    ours, theirs = ours - ours.mean(0), theirs - theirs.mean(0)
+    left, values, right = np.linalg.svd(theirs.T @ ours)
+    signs = np.array([1, 1, np.sign(np.linalg.det(left @ right))])
+    scale = float((values * signs).sum() / np.square(ours).sum())
+    error = scale * ours @ (left * signs @ right).T - theirs
+    return float(np.sqrt(np.square(error).sum(1).mean())) / way, way
+
+
+def measured(name: str, frames: Sequence[Frame], camera: Camera) -> dict[str, Any]:
+    """One recording's figures."""
+    began_s = time.monotonic()
+    found = trajectory_of(frames, camera)
+    figures: dict[str, Any] = {
+        "recording": name,
+        "frames": len(frames),
+        "s": round(time.monotonic() - began_s, 1),
+        "error_px": round(found.error_px, 3),
+        "still_error_px": round(found.still_error_px, 3),
+        "explained": round(found.explained, 3),
+        "not_placed": len(found.lost),
+    }
+    given = [frame.pose for frame in frames if frame.pose is not None]
+    if len(given) == len(frames) and np.ptp(np.stack(given), axis=0).max() > 1e-9:
+        share, way = ate_share(found.poses, np.stack(given))
+        figures |= {"ate_percent": round(100 * share, 3), "way": round(way, 4)}
+    return figures
+
+
+def synthetic(count: int, rigid: bool) -> Any:
+    """A rendered recording with a moving scope."""
+    asked, moving, still = Asked(count, 320, 256, fps=15, camera="moving"), Tissue.points, Tug((0.0, 0.0), (0.0,) * 3)
+    if not rigid:
+        return render_recording(asked)
+    Tissue.points = lambda self, u, v, time_s, tug: moving(self, u, v, 0.0, still)  # type: ignore[method-assign]
+    try:
+        return render_recording(asked)
+    finally:
+        Tissue.points = moving  # type: ignore[method-assign]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", nargs="*")
+    parser.add_argument("--synthetic", type=int, default=0)
+    parser.add_argument("--rigid", action="store_true")
+    parser.add_argument("--scale", type=float, default=1.0)
+    arguments = parser.parse_args()
+    for path in arguments.recordings:
+        recording = open_recording(path, scale=arguments.scale)
+        print(json.dumps(measured(recording.name, list(recording), recording.camera)), flush=True)
+    if arguments.synthetic:
+        rendered = synthetic(arguments.synthetic, arguments.rigid)
+        name = "synthetic, rigid" if arguments.rigid else "synthetic"
+        print(json.dumps(measured(name, list(rendered), rendered.camera)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

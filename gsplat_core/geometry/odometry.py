@@ -1,0 +1,219 @@
+"""Where the scope was at each frame of a recording, from the pictures alone: visual odometry with bundle adjustment over key frames.
+
+Corners of the tissue are followed (`tracks`), tools left out. The scene starts as a plane seen by a camera that stands still; each frame's
+camera starts where the one before was and is moved until the points fit, and bundle adjustment over the key frames so far improves cameras and
+points together, at frame 3 and whenever their number has grown by a third. Small motions of a near-planar scene, as a scope shows them, need no
+other start (Yu and Gallup, "3D Reconstruction from Accidental Motion", 2014); an essential matrix of two frames is ill-conditioned there.
+
+Tissue that moves by itself looks like motion of the scope as far as it moves as a whole. What is left of it counts little (a robust loss).
+Lengths have no scale: the median depth of the first frame's points is taken to be `DISTANCE`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsplat_core.endoscope.highlights import without_highlights
+from gsplat_core.errors import InvalidInput
+from gsplat_core.geometry.bundle import Bundle, adjust, errors_px
+from gsplat_core.geometry.tracks import FeatureTracks, Observations
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+
+LEAST_SEEN = 4
+"""Frames in which a point has to be seen."""
+LEAST_POINTS = 24
+"""That a frame has to share with the ones before."""
+MOST_FRAMES = 3000
+KEY_FRAMES = 60
+"""Of a short recording; a longer one has one in ten frames at least."""
+FARTHEST_APART = 10
+NEIGHBOURS = 5
+"""Known points around a new one, whose depth it starts with."""
+POSE_ROUNDS, ROUNDS = 10, 25
+DISTANCE = 60.0
+"""Of the tissue in the first frame: where a scene without depth starts (`ReconstructorConfig.default_depth_mm`), so that both agree."""
+GROWTH = 1.3
+"""Of the number of key frames, from one bundle adjustment to the next."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The scope's way through a recording."""
+
+    poses: NDArray[np.float64]
+    """World to camera [N, 4, 4]; the first one is the identity."""
+    points: NDArray[np.float64]
+    """Tissue [P, 3] in the world."""
+    error_px: float
+    """Median distance between where a point was seen and where these poses and points have it."""
+    still_error_px: float
+    """The same for a scope that had not moved at all."""
+    lost: tuple[int, ...]
+    """Frames that share too few points with the others, or none; each stands where the frame before it stood."""
+
+    @property
+    def path(self) -> float:
+        """Length of the scope's way, in the unit in which the first frame's tissue is `DISTANCE` away."""
+        centres = -np.einsum("nji,nj->ni", self.poses[:, :3, :3], self.poses[:, :3, 3])
+        return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
+
+    @property
+    def explained(self) -> float:
+        """Share of the pictures' motion, as a typical square, that the scope's motion explains; the rest moves by itself."""
+        return 1 - (self.error_px / max(self.still_error_px, 1e-9)) ** 2
+
+
+def trajectory_of(frames: Iterable[Frame], camera: Camera) -> Trajectory:
+    """Estimate the poses of a recording's frames, which are read once.
+
+    camera: their intrinsics; a pinhole. Raises InvalidInput for another camera model, fewer than three frames, more than `MOST_FRAMES`, and
+    where too few points can be followed to say anything.
+    """
+    if camera.model != "pinhole":
+        raise InvalidInput(
+            f"poses are estimated for pinhole cameras, this one is {camera.model}: undistort the pictures"
+        )
+    tracks, count = FeatureTracks(), 0
+    for count, frame in enumerate(frames, start=1):
+        if count > MOST_FRAMES:
+            raise InvalidInput(f"poses are estimated for at most {MOST_FRAMES} frames at once: read fewer of them")
+        tracks.follow(frame.image, _followed(frame))
+    if count < 3:
+        raise InvalidInput(f"poses are estimated from at least 3 frames, got {count}")
+    seen = tracks.observations(LEAST_SEEN if count > LEAST_SEEN else 3)
+    if len(seen.frame) < LEAST_POINTS * 3:
+        raise InvalidInput(
+            f"only {len(seen.frame)} observations of tissue could be followed over {count} frames: the pictures show too little that can be recognised"
+        )
+    return _Odometry(seen, camera, count).run()
+
+
+def _followed(frame: Frame) -> NDArray[np.uint8] | None:
+    """[H, W]; 0 where nothing is followed: tools, what is outside of the field of view, reflections of the lamp."""
+    masks = [each for each in (frame.mask, frame.loss_mask, without_highlights(frame.image)) if each is not None]
+    return np.logical_and.reduce([mask != 0 for mask in masks]).astype(np.uint8) if masks else None
+
+
+class _Odometry:
+    """One recording's estimate, while it is made. Everything float64 on the CPU; the same observations give the same bytes."""
+
+    def __init__(self, seen: Observations, camera: Camera, count: int) -> None:
+        K = camera.K
+        self._count = count
+        self._frame, self._point = torch.from_numpy(seen.frame), torch.from_numpy(seen.point)
+        self._rays = torch.from_numpy((seen.pixels - K[:2, 2]) / [K[0, 0], K[1, 1]])
+        self._focal = float(K[0, 0])
+        number = int(self._point.max()) + 1
+        self._poses = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+        self._points = torch.zeros(number, 3, dtype=torch.float64)
+        self._known = torch.zeros(number, dtype=torch.bool)
+        self._bounds = torch.searchsorted(self._frame, torch.arange(count + 1))
+        apart = min(FARTHEST_APART, max(1, -(-count // KEY_FRAMES)))
+        self._is_key = torch.zeros(count, dtype=torch.bool)
+        self._is_key[::apart] = True
+        self._is_key[-1] = True
+        self._lost: list[int] = []
+
+    def run(self) -> Trajectory:
+        """Frame after frame, then all of them once more with the final points."""
+        self._take_up(0)
+        keys, next_adjustment = 1, 3
+        for frame in range(1, self._count):
+            self._poses[frame] = self._poses[frame - 1]
+            if not self._place(frame):
+                self._lost.append(frame)
+            if not self._is_key[frame]:
+                continue
+            self._take_up(frame)
+            keys += 1
+            if keys >= next_adjustment or frame == self._count - 1:
+                self._adjust(frame)
+                next_adjustment = max(keys + 1, int(keys * GROWTH) + 1)
+        for frame in range(1, self._count):
+            if not self._is_key[frame]:
+                self._place(frame)
+        for frame in self._lost:
+            self._poses[frame] = self._poses[frame - 1]
+        return self._result()
+
+    def _of(self, frame: int) -> slice:
+        return slice(int(self._bounds[frame]), int(self._bounds[frame + 1]))
+
+    def _place(self, frame: int) -> bool:
+        """Move a frame's camera to where the known points fit; False where there are too few of them."""
+        here = self._of(frame)
+        known = self._known[self._point[here]]
+        if int(known.sum()) < LEAST_POINTS:
+            return False
+        pose, point = self._poses[frame : frame + 1], self._point[here][known]
+        bundle = Bundle(
+            pose, self._points[point], torch.zeros(len(point), dtype=torch.int64), torch.arange(len(point)),
+            self._rays[here][known], self._focal,
+        )  # fmt: skip
+        fixed = torch.zeros(1, dtype=torch.bool)
+        self._poses[frame] = adjust(bundle, fixed=fixed, rounds=POSE_ROUNDS, points_move=False).poses[0]
+        return True
+
+    def _take_up(self, frame: int) -> None:
+        """Give the points that a frame shows and nobody knows yet the depth of the known ones around them."""
+        here = self._of(frame)
+        point, rays = self._point[here], self._rays[here]
+        known = self._known[point]
+        new = ~known
+        depth = torch.ones(int(new.sum()), dtype=torch.float64)
+        pose = self._poses[frame]
+        if known.any() and new.any():
+            local = self._points[point[known]] @ pose[:3, :3].T + pose[:3, 3]
+            apart = torch.cdist(rays[new], rays[known])
+            nearest = apart.topk(min(NEIGHBOURS, int(known.sum())), largest=False).indices
+            depth = local[:, 2][nearest].median(1).values
+        local = torch.cat([rays[new], torch.ones_like(rays[new][:, :1])], 1) * depth[:, None]
+        self._points[point[new]] = (local - pose[:3, 3]) @ pose[:3, :3]
+        self._known[point[new]] = True
+
+    def _adjust(self, last: int) -> None:
+        """Bundle adjustment over the key frames up to `last`; the whole is brought back to its unit of length."""
+        keys = torch.nonzero(self._is_key[: last + 1])[:, 0]
+        chosen = self._is_key[self._frame] & (self._frame <= last)
+        # A point that two cameras see says something about them.
+        times = torch.bincount(self._point[chosen], minlength=len(self._points))
+        chosen &= times[self._point] >= 2
+        used, point = torch.unique(self._point[chosen], return_inverse=True)
+        camera = torch.searchsorted(keys, self._frame[chosen])
+        bundle = Bundle(self._poses[keys], self._points[used], camera, point, self._rays[chosen], self._focal)
+        fixed = torch.zeros(len(keys), dtype=torch.bool)
+        fixed[0] = True
+        bundle = adjust(bundle, fixed=fixed, rounds=ROUNDS)
+        self._poses[keys], self._points[used] = bundle.poses, bundle.points
+        first = self._points[self._point[self._of(0)]]
+        unit = float(first[:, 2].median())
+        if unit > 0:
+            self._points /= unit
+            self._poses[:, :3, 3] /= unit
+
+    def _result(self) -> Trajectory:
+        chosen = self._known[self._point]
+        points, poses = self._points * DISTANCE, self._poses.clone()
+        poses[:, :3, 3] *= DISTANCE
+        whole = Bundle(poses, points, self._frame[chosen], self._point[chosen], self._rays[chosen], self._focal)
+        return Trajectory(
+            poses.numpy(),
+            points[self._known].numpy(),
+            float(errors_px(whole).median()),
+            float(self._still_errors_px().median()),
+            tuple(self._lost),
+        )
+
+    def _still_errors_px(self) -> Tensor:
+        """How far each point was seen from the middle of where it was seen [M]."""
+        order = torch.argsort(self._point, stable=True)
+        point, rays = self._point[order], self._rays[order]
+        middles = torch.stack([group.median(0).values for group in rays.split(torch.bincount(point).tolist())])
+        return self._focal * (rays - middles[point]).norm(dim=1)

@@ -1,0 +1,39 @@
+"""The commands about a recording by itself: what is wrong with it, and where the scope was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from services.cli.options import JsonOption, RecordingArgument, path_option
+
+PosesOutOption = Annotated[Path, path_option("--out", "The file: poses.npy, to be put beside the recording's images.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Give the program these commands."""
+    app.command()(validate)
+    app.command()(poses)
+
+
+def validate(recording: RecordingArgument, json: JsonOption = False) -> int:
+    """Read a recording from the first frame to the last and say what is wrong with it."""
+    from services.cli.validate import validate_command
+
+    return validate_command(recording, as_json=json)
+
+
+def poses(
+    recording: RecordingArgument,
+    out: PosesOutOption,
+    max_frames: Annotated[int | None, typer.Option(help="Read only so many frames.", show_default="all")] = None,
+    overwrite: OverwriteOption = False,
+    json: JsonOption = False,
+) -> int:
+    """Estimate where a moving scope was at each frame, from the pictures alone."""
+    from services.cli.poses import poses_command
+
+    return poses_command(recording, out, max_frames, overwrite=overwrite, as_json=json)

@@ -1,0 +1,134 @@
+"""The scope's way from pictures alone, against that of a rendered scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.geometry.odometry import DISTANCE, Trajectory, trajectory_of
+from gsplat_core.geometry.tracks import FeatureTracks
+from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
+from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+
+COUNT = 16
+
+
+@pytest.fixture(scope="module")
+def rigid() -> RenderedRecording:
+    """A moving scope before tissue that stands still."""
+    moving, at_rest = Tissue.points, Tug((0.0, 0.0), (0.0, 0.0, 0.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Tissue, "points", lambda self, u, v, time_s, tug: moving(self, u, v, 0.0, at_rest))
+        return render_recording(Asked(COUNT, 256, 192, fps=10, seed=3, camera="moving"))
+
+
+@pytest.fixture(scope="module")
+def found(rigid: RenderedRecording) -> Trajectory:
+    return trajectory_of(rigid, rigid.camera)
+
+
+def off_share(found: Trajectory, frames: list[Frame]) -> float:
+    """Root mean square of the distance between both ways, after rotation and scale, as a share of the true way's length."""
+    ours, theirs = (np.linalg.inv(np.stack(list(poses)))[:, :3, 3] for poses in (found.poses, [f.pose for f in frames]))
+    path = np.linalg.norm(np.diff(theirs, axis=0), axis=1).sum()
+    ours, theirs = ours - ours.mean(0), theirs - theirs.mean(0)
+    left, values, right = np.linalg.svd(theirs.T @ ours)
+    turned = ours @ (left @ right).T * (values.sum() / np.square(ours).sum())
+    return float(np.sqrt(np.square(turned - theirs).sum(1).mean()) / path)
+
+
+def test_the_way_of_a_moving_scope_is_found(rigid, found):
+    assert off_share(found, list(rigid)) < 0.03
+    assert found.error_px < 0.4 < found.still_error_px and found.explained > 0.9
+    assert found.lost == () and found.path > 1
+    assert np.array_equal(found.poses[0], np.eye(4))
+
+
+def test_the_first_frames_tissue_is_at_the_stated_distance(found):
+    assert np.median(found.points[:, 2]) == pytest.approx(DISTANCE, rel=0.1)
+
+
+def test_depth_of_the_points_follows_the_true_depth(rigid, found):
+    first = next(iter(rigid))
+    K = rigid.camera.K
+    pixels = found.points[:, :2] / found.points[:, 2:] * K[0, 0] + K[:2, 2]
+    inside = ((pixels > 2) & (pixels < [253, 189])).all(1)
+    column, row = pixels[inside].astype(int).T
+    true, ours = first.depth[row, column], found.points[inside, 2]
+    assert np.corrcoef(true, ours)[0, 1] > 0.8
+
+
+def test_the_same_frames_give_the_same_bytes(rigid, found):
+    again = trajectory_of(rigid, rigid.camera)
+    assert again.poses.tobytes() == found.poses.tobytes() and again.points.tobytes() == found.points.tobytes()
+
+
+def test_a_frame_that_shows_nothing_is_said(rigid):
+    frames = list(rigid)
+    blank = np.full_like(frames[6].image, 90)
+    frames[6] = frames[6].with_fields(image=blank)
+    found = trajectory_of(frames, rigid.camera)
+    assert found.lost == (6,)
+    assert np.array_equal(found.poses[6], found.poses[5])
+    others = [index for index in range(COUNT) if index != 6]
+    whole = replace(found, poses=found.poses[others])
+    assert off_share(whole, [frames[index] for index in others]) < 0.03, "points are found again behind it"
+
+
+def test_after_another_scene_nothing_is_placed_by_the_old_points(rigid):
+    frames = list(rigid)[:4] + [Frame(4 + i, 0, textured(9)[:192, :256].copy()) for i in range(20)]
+    tracks = FeatureTracks()
+    for frame in frames:
+        tracks.follow(frame.image, frame.mask)
+    seen = tracks.observations(3)
+    before, after = (set(seen.point[chosen]) for chosen in (seen.frame < 4, seen.frame >= 4))
+    assert before and after and len(before & after) < 0.2 * len(before)
+
+
+@pytest.mark.parametrize(
+    ("count", "model", "said"),
+    [
+        (2, "pinhole", "at least 3 frames, got 2"),
+        (8, "pinhole", "too little that can be recognised"),
+        (8, "fisheye", "this one is fisheye"),
+    ],
+)
+def test_what_says_too_little_is_refused(count, model, said):
+    camera = Camera(np.array([[100.0, 0, 40], [0, 100, 32], [0, 0, 1]]), 80, 64, model=model)
+    grey = np.full((64, 80, 3), 128, np.uint8)
+    with pytest.raises(InvalidInput, match=said):
+        trajectory_of([Frame(index, index, grey) for index in range(count)], camera)
+
+
+def textured(seed: int = 0) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    return np.kron(random.integers(30, 220, (32, 40, 3)), np.ones((7, 7, 1))).astype(np.uint8)
+
+
+def test_points_follow_a_shifted_picture_and_stay_off_the_tool():
+    whole, tracks = textured(), FeatureTracks()
+    mask = np.ones((120, 160), np.uint8)
+    mask[:, 100:] = 0
+    for step in range(5):
+        tracks.follow(np.ascontiguousarray(whole[10:130, 20 - 2 * step : 180 - 2 * step]), mask)
+    seen = tracks.observations(5)
+    assert len(np.unique(seen.point)) > 10
+    assert seen.pixels[:, 0].max() < 100
+    for point in np.unique(seen.point):
+        moved = np.diff(seen.pixels[seen.point == point], axis=0)
+        np.testing.assert_allclose(moved, np.tile([2.0, 0.0], (4, 1)), atol=0.2)
+
+
+def test_observations_are_numbered_without_gaps():
+    tracks = FeatureTracks()
+    for _ in range(4):
+        tracks.follow(textured()[:120, :160].copy(), None)
+    seen = tracks.observations(3)
+    assert np.array_equal(np.unique(seen.point), np.arange(seen.point.max() + 1))
+    assert (np.diff(seen.frame) >= 0).all() and torch.from_numpy(seen.point).dtype == torch.int64
