@@ -23,6 +23,7 @@ from gsplat_core.rendering.renderer import (
     checked_outputs,
     standard_outputs,
 )
+from gsplat_core.rendering.surface import SURFACE_OUTPUTS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
@@ -33,11 +34,12 @@ class AlphaRenderer:
 
     On a GPU a frame is one CUDA graph. A snapshot is rendered where it lies, by a graph that is captured once for its slot; a `Model` has a
     graph of its own, which is captured when it is prepared. On the CPU, and for a field that has no fused frame path, the model is deformed
-    by the field's own function and rendered by `gsplat_core.render`.
+    by the field's own function and rendered by `gsplat_core.render`. Outputs of `Surface` beyond the standard ones (`ray_depth`, `normals`,
+    `median_depth`, `spread`, `confidence`) take much longer than a picture, on either.
     """
 
     capabilities = Capabilities(
-        outputs=STANDARD_OUTPUTS,
+        outputs=(*STANDARD_OUTPUTS, *SURFACE_OUTPUTS),
         precisions={"cpu": ("fp32",), "cuda": ("fp32", "fp16")},
         differentiable=False,
         deterministic=True,
@@ -74,6 +76,8 @@ class AlphaRenderer:
         model = self._model
         if model is None:
             raise InvalidInput("no model was prepared; call prepare(model) before render()")
+        if not {*asked} <= {*STANDARD_OUTPUTS}:
+            return FinishedFrame(_with_surface(model.as_model(), camera, time_s, self._background, asked))
         if self._frames is None:
             with torch.no_grad():
                 output = render(model.at(time_s), camera, self._background, depth="depth" in asked)
@@ -133,6 +137,14 @@ class _FrameInFlight:
     def result(self) -> RenderOutput:
         """See `PendingFrame.result`."""
         return standard_outputs(self.outputs())
+
+
+def _with_surface(
+    model: Model, camera: Camera, time_s: float, background: Tensor | None, asked: tuple[str, ...]
+) -> dict[str, Tensor]:
+    """By single launches on a GPU, too: these outputs are for looking closely, not for every frame of a stream."""
+    outputs = {**model.surface(time_s, camera)._asdict(), **model.render(time_s, camera, background)._asdict()}
+    return {name: outputs[name] for name in asked}
 
 
 def _chosen(output: RenderOutput, asked: tuple[str, ...]) -> dict[str, Tensor]:

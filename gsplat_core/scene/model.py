@@ -15,6 +15,7 @@ from torch import Tensor
 from gsplat_core.deformation.field import DeformationField, checked_window, continued_window
 from gsplat_core.errors import InvalidInput
 from gsplat_core.rendering.rasterization import RenderOutput, render
+from gsplat_core.rendering.surface import Surface, certainty, render_surface
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 
@@ -128,6 +129,12 @@ class Model:
         """The scene at `time_s` from `camera` (the recording's own when None), without an autograd graph."""
         with torch.no_grad():
             return render(self.at(time_s), camera or self.camera, background, depth)
+
+    def surface(self, time_s: float, camera: Camera | None = None) -> Surface:
+        """Depth, normals, spread and confidence at `time_s` from `camera` (the recording's own when None); see `Surface`."""
+        gaussians = self.at(time_s)
+        certain = None if self.unseen_s is None else certainty(self.unseen_s)
+        return render_surface(gaussians, camera or self.camera, certain)
 
     def description(self) -> dict[str, Any]:
         """All of the model but its tensors and version, as JSON-able values."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.remembered import share_of
+from gsplat_core.rendering.surface import certainty
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.scene.model import Model
@@ -25,9 +26,6 @@ from operators.messages import PictureState
 from operators.rasterize import displayed
 from operators.remembered import RememberedTissue
 from services.bus.runtime import Layer
-
-HALVED_AFTER_S = 5.0
-"""Confidence in tissue that nobody sees is halved after so long, a third after twice that, and so on."""
 
 Picture = tuple[NDArray[np.uint8], dict[str, Any]]
 """RGB uint8 [H, W, 3], and what is said about it beside the scene's header."""
@@ -134,7 +132,7 @@ def _weighted(gaussians: Gaussians, unseen_s: torch.Tensor | None) -> Gaussians:
     """The Gaussians with confidence as their colour: 1 for what is seen or of which nothing is known, less the longer it was not seen."""
     weight = gaussians.means.new_ones(gaussians.count)
     if unseen_s is not None:
-        weight = (1 / (1 + unseen_s / HALVED_AFTER_S)).to(gaussians.dtype)
+        weight = certainty(unseen_s).to(gaussians.dtype)
     colours = ((weight - 0.5) / SH_C0)[:, None, None].expand(-1, 1, 3).contiguous()
     return replace(gaussians, sh=colours)
 

@@ -58,14 +58,25 @@ def test_the_newest_prepared_model_is_shown(moving, make_gaussians):
         assert_equal(renderer.render(CAMERA, 2.0).result(), render(model.at(2.0), CAMERA))
 
 
+def test_the_surface_is_among_the_outputs_where_it_is_asked_for(moving):
+    renderer = new_renderer("alpha", CAMERA)
+    renderer.prepare(moving)
+    outputs = renderer.render(CAMERA, 2.0, outputs=["depth", "normals", "median_depth"]).outputs()
+    assert list(outputs) == ["image", "depth", "normals", "median_depth"]
+    surface = moving.surface(2.0)
+    assert torch.equal(outputs["normals"], surface.normals)
+    assert torch.equal(outputs["median_depth"], surface.median_depth)
+    assert torch.equal(outputs["depth"], moving.render(2.0).depth)
+
+
 def test_outputs_are_asked_for_by_name(moving):
     renderer = new_renderer("alpha", CAMERA)
     renderer.prepare(moving)
     frame = renderer.render(CAMERA, 2.0, outputs=["alpha"])
     assert list(frame.outputs()) == ["image", "alpha"]
     assert not frame.result().depth.any() and frame.result().alpha.any()
-    with pytest.raises(InvalidSetting, match="'alpha' has no output 'normals'; it has image, alpha, depth"):
-        renderer.render(CAMERA, 2.0, outputs=["depth", "normals"])
+    with pytest.raises(InvalidSetting, match="'alpha' has no output 'flow'; it has image, alpha, depth, ray_depth"):
+        renderer.render(CAMERA, 2.0, outputs=["depth", "flow"])
 
 
 def test_a_renderer_has_outputs_of_its_own():
@@ -106,5 +117,6 @@ def test_misuse_is_refused(moving):
 
 def test_the_registry_says_what_a_renderer_can_do_without_making_one():
     capabilities = RENDERERS["alpha"].capabilities
-    assert capabilities.outputs == ("image", "alpha", "depth") and capabilities.devices == ("cpu", "cuda")
+    assert capabilities.outputs[:3] == ("image", "alpha", "depth") and "normals" in capabilities.outputs
+    assert capabilities.devices == ("cpu", "cuda")
     assert capabilities.precisions["cuda"] == ("fp32", "fp16") and capabilities.deterministic

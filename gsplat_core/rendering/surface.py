@@ -1,0 +1,91 @@
+"""The surface that a camera sees: how far it is along each ray, which way it faces, and how sure that is."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_shape
+from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
+from gsplat_core.rendering.settings import TILE_SIZE
+from gsplat_core.rendering.splat_planes import SplatPlanes, TileLists, splat_planes, tile_lists
+from gsplat_core.rendering.tile_blending import along_rays
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
+
+COVERED = 0.1
+"""Opacity from which on a pixel shows something; below it nothing was observed."""
+HALVED_AFTER_S = 5.0
+"""Confidence in tissue that nobody sees is halved after so long, a third after twice that, and so on."""
+
+
+class Surface(NamedTuple):
+    """What one camera sees of the scene's surface; all of the scene's unit, in the camera's axes (x right, y down, z forward)."""
+
+    alpha: Tensor
+    """Opacity [H, W]."""
+    ray_depth: Tensor
+    """Expected z [H, W] where the ray meets the splats, weighted by their contribution; 0 where nothing was observed."""
+    normals: Tensor
+    """[H, W, 3], of unit length and towards the camera: the splats' shortest axes, blended; 0 where nothing was observed."""
+    median_depth: Tensor
+    """z [H, W] of the splat with which half of the light is blocked; 0 where never half of it is."""
+    spread: Tensor
+    """Standard deviation of z along the ray [H, W]: the error that the model itself shows. It does not know by how much all of it is off."""
+    confidence: Tensor
+    """[H, W], 0 to 1: opacity, less where what is seen was not seen for long (`certainty`)."""
+
+    @property
+    def observed(self) -> Tensor:
+        """bool [H, W]: whether anything was ever seen there."""
+        return self.alpha >= COVERED
+
+
+def certainty(unseen_s: Tensor) -> Tensor:
+    """How sure Gaussians are, 0 to 1, by the time [N] in seconds for which nobody has seen them; 1 for those that are seen."""
+    return 1 / (1 + unseen_s / HALVED_AFTER_S)
+
+
+SURFACE_OUTPUTS = tuple(name for name in Surface._fields if name != "alpha")
+"""What a renderer may be asked for beyond a picture, its opacity and the depth of the splats' centres."""
+
+
+@torch.no_grad()
+def render_surface(gaussians: Gaussians, camera: Camera, certain: Tensor | None = None) -> Surface:
+    """The surface as `camera` sees it, on the Gaussians' device, float32.
+
+    certain: [N], 0 to 1, how sure each Gaussian is; None: all are. Beside a picture this takes long: see `tile_blending`.
+    """
+    if certain is not None:
+        require_shape("certain", certain, (gaussians.count,), "[N]")
+    planes = splat_planes(gaussians, camera)
+    lists = tile_lists(planes, camera)
+    blended, alpha = _blended(planes, lists, camera, certain)
+    observed = alpha >= COVERED
+    offset, slope_x, slope_y = (blended[..., k] / alpha.clamp(min=1e-10) for k in range(3))
+    x = torch.arange(camera.width_px, device=alpha.device) + 0.5
+    y = torch.arange(camera.height_px, device=alpha.device)[:, None] + 0.5
+    depth = torch.where(observed, offset + slope_x * x + slope_y * y, 0)
+    normals = torch.nn.functional.normalize(blended[..., 3:6], dim=-1)
+    normals = torch.where(observed[..., None], normals, 0)
+    rays = along_rays(planes, lists, camera)
+    median, spread = (torch.where(observed, plane, 0) for plane in rays)
+    return Surface(alpha, depth, normals, median, spread, alpha if certain is None else blended[..., 6])
+
+
+def _blended(
+    planes: SplatPlanes, lists: TileLists, camera: Camera, certain: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Sums over the splats [H, W, 6 or 7]: depth at the picture's corner, slopes, normals, certainty; and the opacity [H, W]."""
+    columns = [planes.depths_at_origin()[:, None], planes.slopes, planes.normals]
+    if certain is not None:
+        columns.append(certain.to(planes.opacities.dtype)[:, None])
+    channels = torch.cat(columns, 1)
+    rows = planes.rows
+    image, alpha = rasterize_to_pixels(
+        rows.means2d[None], rows.conics[None], channels[None], planes.opacities[None], camera.width_px,
+        camera.height_px, TILE_SIZE, lists.starts[None], lists.ids,
+    )  # fmt: skip
+    return image[0], alpha[0, ..., 0]
