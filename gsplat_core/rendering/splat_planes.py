@@ -20,7 +20,6 @@ from gsplat_core.rendering.settings import TILE_SIZE
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 
-
 LEAST_VARIANCE = 0.01
 """Added to a splat's extent in the picture, in pixels², before depth is continued along it: a needle that points at the camera has no plane. The
 blur of the picture (`EPS2D`) is no part of the surface: with it, tilted ones came out several times as far off."""

@@ -75,9 +75,7 @@ def render_surface(gaussians: Gaussians, camera: Camera, certain: Tensor | None 
     return Surface(alpha, depth, normals, median, spread, alpha if certain is None else blended[..., 6])
 
 
-def _blended(
-    planes: SplatPlanes, lists: TileLists, camera: Camera, certain: Tensor | None
-) -> tuple[Tensor, Tensor]:
+def _blended(planes: SplatPlanes, lists: TileLists, camera: Camera, certain: Tensor | None) -> tuple[Tensor, Tensor]:
     """Sums over the splats [H, W, 6 or 7]: depth at the picture's corner, slopes, normals, certainty; and the opacity [H, W]."""
     columns = [planes.depths_at_origin()[:, None], planes.slopes, planes.normals]
     if certain is not None:

@@ -1,0 +1,93 @@
+"""A depth map as a piece of surface: its points, its normals, and where it is torn."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.cameras import Camera
+
+Array = NDArray[np.floating]
+
+TORN_DEGREES = 80.0
+"""Between neighbouring pixels a surface that is tilted further against the line of sight is taken for two surfaces, one behind the other."""
+MOST_ANGLE_RAD = 1.5
+"""Of a fisheye's ray to its axis: at a right angle no z leads anywhere."""
+
+
+def rays_of(camera: Camera, pixels: Array) -> tuple[Array, Array]:
+    """Points at z = 0 and steps to z = 1 [..., 3] of the rays through pixel coordinates [..., 2], in the camera's axes."""
+    plane = (np.asarray(pixels, np.float64) - camera.K[:2, 2]) / np.diag(camera.K)[:2]
+    zero, one = np.zeros_like(plane[..., :1]), np.ones_like(plane[..., :1])
+    if camera.model == "ortho":
+        return np.concatenate([plane, zero], -1), np.concatenate([zero, zero, one], -1)
+    if camera.model == "fisheye":
+        angle = np.linalg.norm(plane, axis=-1, keepdims=True)
+        plane = plane * np.tan(np.minimum(angle, MOST_ANGLE_RAD)) / np.maximum(angle, 1e-9)
+    return np.zeros((*plane.shape[:-1], 3)), np.concatenate([plane, one], -1)
+
+
+def points_of(depth: Array, camera: Camera) -> NDArray[np.float64]:
+    """Points [H, W, 3] in the camera's axes at the pixels' centres; where depth z [H, W] is unknown (0) they mean nothing."""
+    if depth.shape != (camera.height_px, camera.width_px):
+        raise InvalidInput(
+            f"the depth is {list(depth.shape)}; the camera's picture is [{camera.height_px}, {camera.width_px}]"
+        )
+    column, row = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
+    start, step = rays_of(camera, np.stack([column, row], -1))
+    return np.asarray(start + step * np.nan_to_num(depth, posinf=0, neginf=0)[..., None], np.float64)
+
+
+def in_world(points: Array, camera: Camera) -> NDArray[np.float64]:
+    """Points [..., 3] of the camera's axes in the world's."""
+    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    return np.asarray((points - translation) @ rotation, np.float64)
+
+
+def known(depth: Array) -> NDArray[np.bool_]:
+    """Where a depth map says something, bool."""
+    return np.asarray(np.isfinite(depth) & (depth > 0))
+
+
+def joined(depth: Array, camera: Camera, axis: int) -> NDArray[np.bool_]:
+    """Between which neighbours along `axis` (0: down, 1: across) the surface goes on; one shorter than [H, W] there.
+
+    It does where both depths are known and the piece between them is tilted by less than `TORN_DEGREES` against the line of sight.
+    """
+    points = points_of(depth, camera)
+    there = known(depth)
+    before, after = _pair(points, axis)
+    both = np.logical_and(*_pair(there, axis))
+    z = 0.5 * (before[..., 2] + after[..., 2])
+    pixel = 1 / camera.K[1 - axis, 1 - axis] * (1 if camera.model == "ortho" else z)
+    return np.asarray(both & (np.abs(after[..., 2] - before[..., 2]) < np.tan(np.radians(TORN_DEGREES)) * pixel))
+
+
+def normals_of(depth: Array, camera: Camera) -> NDArray[np.float32]:
+    """Normals [H, W, 3] in the camera's axes, of unit length and towards the camera, from the differences of neighbouring points on the same
+    surface; 0 where a pixel has no neighbour on its surface across or down."""
+    points = points_of(depth, camera)
+    (across, has_across), (down, has_down) = (_tangent(points, joined(depth, camera, axis), axis) for axis in (1, 0))
+    normals = np.cross(down, across)  # x right, y down: towards the camera, where z is negative
+    length = np.linalg.norm(normals, axis=-1)
+    good = has_across & has_down & (length > 0)
+    normals = np.where(good[..., None], normals / np.where(length > 0, length, 1)[..., None], 0)
+    towards = normals[..., 2] if camera.model == "ortho" else np.einsum("...i,...i->...", normals, points)
+    return np.where((towards > 0)[..., None], -normals, normals).astype(np.float32)
+
+
+def _pair(values: NDArray, axis: int) -> tuple[NDArray, NDArray]:
+    return (values[:-1], values[1:]) if axis == 0 else (values[:, :-1], values[:, 1:])
+
+
+def _tangent(points: Array, joins: NDArray[np.bool_], axis: int) -> tuple[Array, NDArray[np.bool_]]:
+    """How the point changes along `axis` [H, W, 3]: from both neighbours where there are both, else from the one there is."""
+    before, after = _pair(points, axis)
+    step = np.where(joins[..., None], after - before, 0)
+    padding = [(0, 0), (0, 0), (0, 0)]
+    padding[axis] = (1, 0)
+    backward, has_backward = np.pad(step, padding), np.pad(joins, padding[:2])
+    padding[axis] = (0, 1)
+    forward, has_forward = np.pad(step, padding), np.pad(joins, padding[:2])
+    return backward + forward, has_backward | has_forward
