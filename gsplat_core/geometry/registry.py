@@ -91,6 +91,8 @@ class DepthFinder:
     def find(self, frame: Frame) -> DepthMap | None:
         """The first answer that is not doubted; None where there is none."""
         camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)
+        if (camera.width_px, camera.height_px) != (frame.width_px, frame.height_px):  # a stream may change its size
+            camera = camera.resized(frame.width_px, frame.height_px)
         # What is not learned from needs no depth; what it came with costs nothing.
         shown_only = frame.status is FrameStatus.DAMAGED or frame.withheld is not None
         for estimator, suits in self._asked:

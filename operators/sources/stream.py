@@ -10,7 +10,7 @@ import numpy as np
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
-from gsplat_core.io.recordings.frame_files import resize_area, resize_nearest
+from gsplat_core.io.recordings.frame_files import resized_frame
 from gsplat_core.io.recordings.image_files import MAX_PIXELS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
@@ -101,10 +101,4 @@ def resized(frame: Frame, scale: float) -> Frame:
     if scale == 1:
         return frame
     size = max(1, round(frame.width_px * scale)), max(1, round(frame.height_px * scale))
-    return replace(
-        frame,
-        image=resize_area(frame.image, *size),
-        right_image=None if frame.right_image is None else resize_area(frame.right_image, *size),
-        depth=None if frame.depth is None else resize_nearest(frame.depth, *size),
-        mask=None if frame.mask is None else resize_nearest(frame.mask, *size),
-    )
+    return resized_frame(frame, *size)

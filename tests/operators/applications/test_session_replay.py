@@ -60,7 +60,7 @@ def eventful(frame: Frame) -> Frame:
     if frame.seq >= 10:
         image = np.ascontiguousarray(frame.image[:40, :56])
         mask = None if frame.mask is None else np.ascontiguousarray(frame.mask[:40, :56])
-        return frame.with_fields(image=image, mask=mask, depth=None, right_image=None)
+        return frame.with_fields(image=image, mask=mask, depth=None, right_image=None, right_camera=None)
     loss_mask = np.ones(frame.image.shape[:2], np.uint8)
     loss_mask[:5, frame.seq] = 0
     return frame.with_fields(exposure=(1.0 + frame.seq / 50, 0.9, 1.0), loss_mask=loss_mask)
