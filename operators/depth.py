@@ -79,7 +79,7 @@ class DepthOp(Operator):
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
         total = sum(self._frames.values())
-        doubts = dict(sorted(self._finder.doubts.items())) if self._finder else {}
+        doubts = self._finder.doubts.counted() if self._finder else {}
         share = self._known / total if total else 0.0
         outcome.add(FoundDepth(dict(sorted(self._frames.items())), share, self._relative == 0, doubts))
         found = total - self._frames[DepthOrigin.MEASURED.value]
@@ -88,6 +88,8 @@ class DepthOp(Operator):
                 "its unit is that of the calibration" if not self._relative else "it is relative: its unit is not known"
             )
             outcome.note(f"the depth of {found} frames was found in them, of {share:.0%} of their pixels; {unit}")
+        for remark in self._finder.remarks.counted() if self._finder else ():
+            outcome.note(remark)
         for doubt, frames in doubts.items():
             outcome.note(f"{frames} frames were given no depth: {doubt}")
         if self._dropped:

@@ -28,6 +28,9 @@ class DepthMap:
     doubt: str | None = None
     """What speaks against the whole of it, in a sentence; the confidence is 0 everywhere then."""
 
+    remark: str | None = None
+    """What whoever uses it should know, in a sentence. Like `doubt` it says the same up to its first colon, whatever the numbers behind it."""
+
     def __post_init__(self) -> None:
         for name in ("depth", "confidence"):
             plane = getattr(self, name)

@@ -76,6 +76,25 @@ def check_depth(choice: str) -> None:
         raise InvalidSetting(f"depth is {choice!r}; choose auto, {', '.join(DEPTHS)}")
 
 
+class Sentences:
+    """Sentences that were said of frames, each kind once: what is the same up to the first colon differs in its numbers alone."""
+
+    def __init__(self) -> None:
+        self._first: dict[str, str] = {}
+        self._frames: Counter[str] = Counter()
+
+    def add(self, sentence: str | None) -> None:
+        """Take what was said of one frame; None: nothing."""
+        if sentence is not None:
+            kind = sentence.partition(":")[0]
+            self._first.setdefault(kind, sentence)
+            self._frames[kind] += 1
+
+    def counted(self) -> dict[str, int]:
+        """The first sentence of each kind, and of how many frames it was said, or one like it."""
+        return {self._first[kind]: frames for kind, frames in sorted(self._frames.items())}
+
+
 class DepthFinder:
     """Gives the frames of one stream the depth that a setting asks for."""
 
@@ -85,8 +104,8 @@ class DepthFinder:
         self._camera = camera
         asked = AUTO if choice == "auto" else {choice: _always}
         self._asked = [(DEPTHS[name](), suits) for name, suits in asked.items()]
-        self.doubts: Counter[str] = Counter()
-        """What spoke against a frame's depth as a whole, and of how many frames."""
+        self.doubts, self.remarks = Sentences(), Sentences()
+        """What spoke against a frame's depth as a whole, and what else was said about it."""
 
     def find(self, frame: Frame) -> DepthMap | None:
         """The first answer that is not doubted; None where there is none."""
@@ -99,10 +118,12 @@ class DepthFinder:
             if not suits(frame) or (shown_only and not isinstance(estimator, RecordedDepth)):
                 continue
             found = estimator.estimate(frame, camera)
-            if found is not None and found.doubt is None:
+            if found is None:
+                continue
+            self.remarks.add(found.remark)
+            self.doubts.add(found.doubt)
+            if found.doubt is None:
                 return found
-            if found is not None:
-                self.doubts[str(found.doubt)] += 1
         return None
 
     def with_depth(self, frame: Frame) -> Frame:

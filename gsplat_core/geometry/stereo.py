@@ -1,26 +1,177 @@
-"""Depth from the two eyes of a stereo scope, by semi-global matching."""
+"""Depth from the two eyes of a stereo scope: rectified pairs, matched frame by frame, doubted where the pictures speak against them."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from gsplat_core.geometry.depth_map import DepthMap
+from gsplat_core.geometry.depth_map import DepthMap, doubted
+from gsplat_core.geometry.disparity import Disparity, Span, find_disparity, smoothed
+from gsplat_core.geometry.eye_pair import LEAST_DISPARITY_PX, PairLook, look_at
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 
+LOOK_EVERY = 30
+"""Frames after which the pair is looked at again: eyes do not move against each other, and what they look at comes nearer."""
+KEPT_LOOKS = 15
+"""Of the looks whose rows are averaged."""
+SHRINK_FROM_PX = 800
+"""Wider pictures are matched at half size, and fitted at their own."""
+MARGIN_SHARE, MARGIN_PX = 0.2, 4
+"""What is looked for beyond the disparities that were seen."""
+HALF_BELIEVED_PX = 0.5
+"""Standard deviation of a disparity that is believed with a confidence of a half."""
+LEAST_BELIEVED = 0.05
+"""Share of the pixels that must be believed."""
+ROWS_FROM_PX = 0.05
+"""Rows that are off by less are left as they are: taking it out costs sharpness."""
+SAID_FROM_PX = 1.0
+"""Rows that are off by more are remarked on."""
+PLAUSIBLE_MM = (2.0, 1000.0)
+"""Median distance of what a scope in the body can be looking at."""
+SAME_FOCAL, SAME_ROW_PX, SAME_AXES = 1e-3, 0.1, 1e-6
+"""How far the cameras of a rectified pair may differ: focal lengths as a share, principal points in a row, turned axes."""
+
 
 class StereoDepth:
-    """Estimates the depth of rectified pairs; without the right eye's camera it is relative, in units of the distance between the eyes."""
+    """Estimates the depth of rectified pairs.
+
+    Without the right eye's camera depth is relative, in units of the distance between the eyes; the pictures are then taken as those of parallel cameras
+    with one principal point.
+    """
+
+    def __init__(self) -> None:
+        self._forget((0, 0))
+
+    def _forget(self, size: tuple[int, int]) -> None:
+        self._size = size
+        self._rows: list[NDArray[np.float64]] = []
+        self._span: tuple[float, float] | None = None
+        self._look_in = 0
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """See `Estimator`."""
         if frame.right_image is None:
             return None
-        left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.image, frame.right_image))
-        matcher = cv2.StereoSGBM.create(0, 128, 5, 8 * 25, 32 * 25, 1, 0, 10, 100, 2, cv2.STEREO_SGBM_MODE_HH)
-        disparity = matcher.compute(left, right).astype(np.float32) / 16
+        shape = frame.image.shape[:2]
+        if frame.new_scene is not None or shape != self._size:
+            self._forget(shape)
+        why = _unlike_eyes(camera, frame.right_camera)
+        if why is not None:
+            return doubted(shape, DepthOrigin.STEREO, why)
+        left, right = grey(frame.image), grey(frame.right_image)
+        # What parallel rays have: principal points may differ.
+        parallel_px = 0.0 if frame.right_camera is None else float(camera.K[0, 2] - frame.right_camera.K[0, 2])
+        if self._look_in == 0:
+            why = self._look(left, right, frame, parallel_px)
+            if why is not None:
+                return doubted(shape, DepthOrigin.STEREO, why)
+        self._look_in -= 1
+        found = self._matched(left, right, frame.image)
+        return self._as_depth(found, frame, camera, parallel_px)
+
+    def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], frame: Frame, parallel_px: float) -> str | None:
+        """Learn rows and disparities of the pair; why it cannot be used, in a sentence, or None."""
+        look = look_at(left, right, frame.loss_mask)
+        why = look.doubt or _unlike_distances(look, parallel_px, calibrated=frame.right_camera is not None)
+        if why is not None:
+            return why
+        self._rows = [*self._rows, look.rows][-KEPT_LOOKS:]
+        low, high = (float(value) for value in np.percentile(look.disparities, (1, 99)))
+        known = self._span or (low, high)
+        self._span = min(low, known[0]), max(high, known[1])
+        self._look_in = LOOK_EVERY
+        return None
+
+    def _matched(self, left: NDArray[np.uint8], right: NDArray[np.uint8], guide: NDArray[np.uint8]) -> Disparity:
+        assert self._span is not None
+        low, high = self._span
+        margin = MARGIN_PX + MARGIN_SHARE * (high - low)
+        shrink = 2 if left.shape[1] > SHRINK_FROM_PX else 1
+        aligned = _with_rows_of_left(right, np.median(self._rows, axis=0), (low + high) / 2)
+        return smoothed(find_disparity(left, aligned, Span.around(low - margin, high + margin), shrink=shrink), guide)
+
+    def _as_depth(self, found: Disparity, frame: Frame, camera: Camera, parallel_px: float) -> DepthMap:
+        shift = found.px - np.float32(parallel_px)
+        known = found.known & (shift > LEAST_DISPARITY_PX)
+        confidence = np.where(known, 1 / (1 + (found.error_px / HALF_BELIEVED_PX) ** 2), 0).astype(np.float32)
+        believed = confidence >= 0.5
+        if believed.mean() < LEAST_BELIEVED:
+            self._look_in = 0
+            why = f"too little of the picture could be matched between the eyes: {believed.mean():.1%} of its pixels, {LEAST_BELIEVED:.0%} are needed"
+            return doubted(found.px.shape, DepthOrigin.STEREO, why)
+        low, high = (float(value) for value in np.percentile(found.px[believed], (0.5, 99.5)))
+        self._span = low, high
         baseline = 1.0 if frame.right_camera is None else -float(frame.right_camera.world_to_camera[0, 3])
-        known = disparity > 0
-        depth = np.where(known, float(camera.K[0, 0]) * baseline / np.where(known, disparity, 1), 0).astype(np.float32)
-        return DepthMap(depth, known.astype(np.float32), DepthOrigin.STEREO, frame.right_camera is not None)
+        reach = float(camera.K[0, 0] * baseline)
+        depth = np.where(known, np.float32(reach) / np.where(known, shift, 1), 0).astype(np.float32)
+        middle = float(np.median(depth[believed]))
+        if frame.right_camera is not None and not PLAUSIBLE_MM[0] <= middle <= PLAUSIBLE_MM[1]:
+            why = f"the distances cannot be those of a scope: {middle:.3g} mm in the middle; check the distance between the eyes and its unit"
+            return doubted(found.px.shape, DepthOrigin.STEREO, why)
+        return DepthMap(
+            depth, confidence, DepthOrigin.STEREO, frame.right_camera is not None, remark=self._remark(middle, reach)
+        )
+
+    def _remark(self, middle: float, reach: float) -> str | None:
+        """What is to be said of rows that are off: taken out they are, but whatever moved them may have moved columns, too."""
+        off = float(np.median(self._rows, axis=0)[0])
+        if abs(off) < SAID_FROM_PX:
+            return None
+        return (
+            f"the rows of the two eyes are not the same: those of the right one were moved by {off:.1f} px; if its columns are off by as much,"
+            f" depth is off by {abs(off) * middle / reach:.1%}, so check the calibration"
+        )
+
+
+def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Brightness [H, W] of an RGB picture."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def _unlike_eyes(left: Camera, right: Camera | None) -> str | None:
+    """Why two cameras are not those of a rectified pair, in a sentence; None where they are."""
+    if right is None:
+        return None
+    pose = right.world_to_camera
+    if np.abs(pose[:3, :3] - np.eye(3)).max() > SAME_AXES or np.abs(pose[1:3, 3]).max() > SAME_AXES * abs(pose[0, 3]):
+        return "the cameras are not those of a rectified pair: their axes or heights differ; rectify the pictures first"
+    if abs(left.K[0, 0] / right.K[0, 0] - 1) > SAME_FOCAL or abs(left.K[1, 1] / right.K[1, 1] - 1) > SAME_FOCAL:
+        return f"the cameras are not those of a rectified pair: their focal lengths are {left.K[0, 0]:.1f} and {right.K[0, 0]:.1f} px"
+    if abs(left.K[1, 2] - right.K[1, 2]) > SAME_ROW_PX:
+        return f"the cameras are not those of a rectified pair: their principal points are in rows {left.K[1, 2]:.1f} and {right.K[1, 2]:.1f}"
+    if pose[0, 3] >= 0:
+        return "the eyes are swapped in the calibration: its right camera is to the left of the left one"
+    return None
+
+
+def _unlike_distances(look: PairLook, parallel_px: float, *, calibrated: bool) -> str | None:
+    """Why points of the two eyes cannot be at the distances that they have, in a sentence; None where they can."""
+    shift = look.disparities - parallel_px
+    middle = float(np.median(shift))
+    if abs(middle) < LEAST_DISPARITY_PX and float(np.ptp(shift)) < 4 * LEAST_DISPARITY_PX:
+        return f"the two eyes show one and the same picture: points are {middle:.1f} px apart in them"
+    behind = float((shift < LEAST_DISPARITY_PX).mean())
+    if behind > 0.5:
+        return (
+            f"the eyes are swapped: points lie {-middle:.1f} px further to the right in the right eye's picture than cameras side by side could see"
+            " them; swap the pictures, or check the calibration"
+        )
+    if behind > 0.02:
+        what = "wrong calibration" if calibrated else "eyes that are not parallel, and no calibration that says how"
+        return f"some of the tissue would be behind the scope: {behind:.0%} of the points, by a {what}"
+    return None
+
+
+def _with_rows_of_left(right: NDArray[np.uint8], rows: NDArray[np.float64], disparity_px: float) -> NDArray[np.uint8]:
+    """The right picture with each point in the row in which the left eye has it; `rows` as in `PairLook`."""
+    if np.abs(rows).sum() < ROWS_FROM_PX:
+        return right
+    height, width = right.shape
+    across, down = 2 * rows[1] / width, 2 * rows[2] / height
+    move = np.array([[1, 0, 0], [across, 1 + down, rows[0] - rows[1] - rows[2] + across * disparity_px]], np.float64)
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    return np.asarray(
+        cv2.warpAffine(right, move, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE), np.uint8
+    )

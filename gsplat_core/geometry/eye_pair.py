@@ -1,0 +1,164 @@
+"""What two pictures say of the pair of eyes that took them: how far apart points lie in them, and what speaks against a rectified pair.
+
+Corners of the left picture are found in the right one, first along the row at low resolution over the whole range, then by Lucas and Kanade's method
+in both directions at full size. In a rectified pair a point is in the same row in both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.geometry.disparity import Span, match
+
+Points = NDArray[np.float32]
+
+COARSE_WIDTH_PX = 200
+"""Width at which the whole range is looked through."""
+COARSE_RANGE = (-0.3, 0.5)
+"""That range, as shares of the width: even what no pair of eyes has, so that a swapped pair is seen as one."""
+CORNERS, CORNER_QUALITY, CORNER_APART_PX = 400, 0.01, 7
+SATURATED = 250
+"""Grey value from which a pixel shows the light and not the tissue."""
+BACK_PX = 0.5
+"""How far a point may come back from where it started."""
+LEAST_POINTS = 24
+"""Fewer of them say nothing about a pair."""
+LEAST_SHARE = 0.2
+"""Share of the corners that must be found in the other eye, and of those found that must lie on the fitted rows. Pictures of two moments give 0.14."""
+ROW_ERROR_PX = 1.5
+"""A point further from its row counts as wrongly matched."""
+MOST_SLOPE_PX = 1.0
+"""How far rows may be off at the edge of the picture, beside an offset that all of them share."""
+MOST_OFFSET = 0.03
+"""Largest such offset, as a share of the picture's height."""
+LEAST_DISPARITY_PX = 0.5
+"""A median below it, beside the calibration's, is no pair of eyes: the same picture twice, or tissue at infinity."""
+
+
+@dataclass(frozen=True)
+class PairLook:
+    """What was found in one pair. `doubt` says why it cannot be used, and then the rest means nothing."""
+
+    disparities: Points
+    """[N] of points that were found in both eyes, in pixels."""
+    rows: NDArray[np.float64]
+    """[3]: by how much the right eye's rows are lower, in pixels: in the middle of the picture, and what is added at its right and at its lower edge."""
+    row_error_px: float
+    """Median distance of the points from these rows."""
+    doubt: str | None = None
+
+
+def look_at(left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[np.uint8] | None = None) -> PairLook:
+    """Look at two grey pictures [H, W]. usable: [H, W], 0 where nothing is to be compared."""
+    here, there, corners = _points_in_both(left, right, usable)
+    dim, bright = (float(np.mean(each)) for each in (left < SATURATED, left >= SATURATED))
+    if corners < LEAST_POINTS:
+        why = "is overexposed" if bright > dim else "has too little texture"
+        return _doubt(
+            f"the picture {why}: {corners} points could be compared between the eyes, {LEAST_POINTS} are needed"
+        )
+    if len(here) < max(LEAST_POINTS, LEAST_SHARE * corners):
+        return _doubt(
+            f"the eyes do not show the same: {len(here)} of {corners} points of the left picture were found in the right one; "
+            "check that both are of one moment and of one scene, and that the left one is the left one"
+        )
+    height, width = left.shape
+    rows, agree = _fitted_rows(here, there[:, 1] - here[:, 1], width, height)
+    if agree.mean() < LEAST_SHARE or agree.sum() < LEAST_POINTS:
+        return _doubt(
+            "the points of the two eyes lie in no common rows; check the calibration that the pair was rectified with"
+        )
+    error_px = float(np.median(np.abs(_off_rows(rows, here, there[:, 1] - here[:, 1], width, height)[agree])))
+    look = PairLook((here - there)[agree, 0], rows, error_px)
+    slope, offset = float(np.abs(rows[1:]).sum()), float(abs(rows[0]))
+    if slope > MOST_SLOPE_PX:
+        return _doubt(
+            f"the pair is not rectified: rows of the two eyes are apart by up to {offset + slope:.1f} px, and differently across the picture; "
+            "check the calibration"
+        )
+    if offset > MOST_OFFSET * height:
+        return _doubt(
+            f"the pair is not rectified: the right eye's rows are off by {rows[0]:.1f} px; check the calibration"
+        )
+    return look
+
+
+def _doubt(text: str) -> PairLook:
+    return PairLook(np.zeros(0, np.float32), np.zeros(3), 0.0, text)
+
+
+def _points_in_both(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[np.uint8] | None
+) -> tuple[Points, Points, int]:
+    """Points [N, 2] (x, y) of the left picture, where they are in the right one, and how many corners there were."""
+    shown = (left < SATURATED).astype(np.uint8) if usable is None else usable * (left < SATURATED)
+    shown = np.asarray(cv2.erode(shown, np.ones((7, 7), np.uint8)), np.uint8)
+    corners = cv2.goodFeaturesToTrack(_levelled(left), CORNERS, CORNER_QUALITY, CORNER_APART_PX, mask=shown)
+    none = np.zeros((0, 2), np.float32)
+    if corners is None:
+        return none, none, 0
+    start = np.ascontiguousarray(corners[:, 0], np.float32)
+    guess = start.copy()
+    guess[:, 0] -= _coarse_disparity(left, right, start)
+    window: dict[str, Any] = {"winSize": (21, 21), "maxLevel": 2, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    found, ok, _ = cv2.calcOpticalFlowPyrLK(left, right, start, guess, **window)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(right, left, found, start.copy(), **window)
+    kept = (ok[:, 0] > 0) & (again[:, 0] > 0) & (np.linalg.norm(back - start, axis=1) < BACK_PX)
+    return start[kept], np.asarray(found[kept], np.float32), len(start)
+
+
+def _levelled(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """With noise of a grey value or two taken out: a black picture must have no corners."""
+    return np.where(cv2.GaussianBlur(cv2.absdiff(grey, cv2.blur(grey, (9, 9))), (0, 0), 2) > 1, grey, 0).astype(
+        np.uint8
+    )
+
+
+def _coarse_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], at: Points) -> NDArray[np.float32]:
+    """[N]: disparity at points [N, 2], to a few pixels; where none was found, the median of those that were."""
+    factor = max(1.0, left.shape[1] / COARSE_WIDTH_PX)
+    size = max(1, round(left.shape[1] / factor)), max(1, round(left.shape[0] / factor))
+    small = [np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8) for each in (left, right)]
+    low, high = COARSE_RANGE
+    found, known = match(small[0], small[1], Span.around(low * size[0], high * size[0]))
+    factor = left.shape[1] / size[0]
+    found, known = _within_both(found, known)
+    if not known.any():
+        return np.zeros(len(at), np.float32)
+    columns = np.clip((at[:, 0] / factor).astype(int), 0, size[0] - 1)
+    lines = np.clip((at[:, 1] / factor).astype(int), 0, size[1] - 1)
+    typical = np.float32(np.median(found[known]))
+    return np.asarray(np.where(known[lines, columns], found[lines, columns], typical) * np.float32(factor), np.float32)
+
+
+def _within_both(found: NDArray[np.float32], known: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    there = np.arange(found.shape[1], dtype=np.float32) - found
+    return found, known & (there >= 0) & (there <= found.shape[1] - 1)
+
+
+def _off_rows(rows: NDArray[np.float64], here: Points, lower: Points, width: int, height: int) -> NDArray[np.float64]:
+    return np.asarray(lower - _basis(here, width, height) @ rows)
+
+
+def _basis(here: Points, width: int, height: int) -> NDArray[np.float64]:
+    x, y = 2 * here[:, 0] / width - 1, 2 * here[:, 1] / height - 1
+    return np.stack([np.ones(len(here)), x, y], axis=1).astype(np.float64)
+
+
+def _fitted_rows(here: Points, lower: Points, width: int, height: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """By how much the right eye's rows are lower [3], and which points [N] lie on them: reweighted least squares from the median on."""
+    basis = _basis(here, width, height)
+    rows = np.array([float(np.median(lower)), 0.0, 0.0])
+    scale = 4 * ROW_ERROR_PX
+    for _ in range(12):
+        off = lower - basis @ rows
+        weight = 1 / (1 + (off / scale) ** 2) ** 2
+        normal = (basis * weight[:, None]).T @ basis + np.diag([0.0, 1e-3, 1e-3])
+        rows = np.linalg.solve(normal, (basis * weight[:, None]).T @ lower)
+        scale = max(ROW_ERROR_PX / 3, scale / 1.5)
+    return rows, np.abs(lower - basis @ rows) < ROW_ERROR_PX

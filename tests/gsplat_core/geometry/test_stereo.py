@@ -1,0 +1,183 @@
+"""Depth of known pairs, and doubts about pairs that are none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.geometry.stereo import StereoDepth
+from gsplat_core.scene.frames import DepthOrigin
+from tests.gsplat_core.geometry.pairs import BASELINE_MM, FOCAL_PX, bowl, camera, frame, right_of, texture
+
+
+@pytest.fixture
+def left(rng):
+    return texture(rng)
+
+
+@pytest.fixture
+def right(left):
+    return right_of(left, bowl())
+
+
+def estimate(given):
+    return StereoDepth().estimate(given, camera())
+
+
+def off_by(found, disparity):
+    """Root mean square of the error where depth is believed, as a share of the median; and the share that is believed."""
+    depth = FOCAL_PX * BASELINE_MM / disparity
+    seen = found.confidence >= 0.5
+    return np.sqrt(np.mean((found.depth - depth)[seen] ** 2)) / np.median(depth), seen.mean()
+
+
+def test_a_known_surface_comes_out_in_millimetres(left, right):
+    found = estimate(frame(left, right))
+    error, believed = off_by(found, bowl())
+    assert error < 0.005 and believed > 0.8
+    assert found.metric and found.origin is DepthOrigin.STEREO and found.doubt is None and found.remark is None
+    assert found.believed.dtype == np.float32 and (found.believed[found.confidence < 0.5] == 0).all()
+
+
+def test_the_range_is_found_wherever_it_is(left):
+    for low, high in ((3, 8), (60, 75)):
+        disparity = bowl(low, high)
+        error, believed = off_by(estimate(frame(left, right_of(left, disparity))), disparity)
+        assert error < 0.02 and believed > 0.5, (low, high)
+
+
+def test_without_a_calibration_depth_is_in_units_of_the_eyes_distance(left, right):
+    found = estimate(frame(left, right, calibrated=False))
+    assert not found.metric
+    assert off_by(replace(found, depth=found.depth * np.float32(BASELINE_MM)), bowl())[0] < 0.005
+
+
+def test_principal_points_may_differ_between_the_eyes(left, right):
+    shifted = np.roll(right, -30, axis=1)
+    given = frame(left, shifted)
+    K = given.right_camera.K.copy()
+    K[0, 2] -= 30
+    found = estimate(given.with_fields(right_camera=replace(given.right_camera, K=K)))
+    assert off_by(found, bowl())[0] < 0.01
+
+
+def test_the_same_frames_give_the_same_bytes_with_any_number_of_threads(left, right):
+    threads = cv2.getNumThreads()
+    results = []
+    try:
+        for count in (1, 2, 4):
+            cv2.setNumThreads(count)
+            estimator = StereoDepth()
+            results.append([estimator.estimate(frame(left, right, seq=k), camera()) for k in range(2)])
+    finally:
+        cv2.setNumThreads(threads)
+    for other in results[1:]:
+        for one, two in zip(results[0], other, strict=True):
+            assert one.depth.tobytes() == two.depth.tobytes() and one.confidence.tobytes() == two.confidence.tobytes()
+
+
+@pytest.mark.parametrize("off_px", [-0.5, 0.7, 3.0])
+def test_rows_that_are_off_by_one_offset_are_moved_and_remarked_on(left, off_px):
+    found = estimate(frame(left, right_of(left, bowl(), lower_px=off_px)))
+    assert off_by(found, bowl())[0] < 0.01
+    if abs(off_px) < 1:
+        assert found.remark is None
+    else:
+        assert f"moved by {off_px:.1f} px" in found.remark and "check the calibration" in found.remark
+
+
+def rotated(picture, degrees, scale=1.0):
+    height, width = picture.shape
+    turn = cv2.getRotationMatrix2D((width / 2, height / 2), degrees, scale)
+    return cv2.warpAffine(picture, turn, (width, height), borderMode=cv2.BORDER_REFLECT)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda left, right: (right, left), "the eyes are swapped"),
+        (lambda left, right: (left, left), "one and the same picture"),
+        (lambda left, right: (left, rotated(right, 1.0)), "the pair is not rectified"),
+        (lambda left, right: (left, rotated(right, 0, 1.03)), "the pair is not rectified"),
+        (lambda left, right: (left, np.roll(right, 12, axis=0)), "the pair is not rectified"),
+        (lambda left, right: (left, right[::-1]), "the eyes do not show the same"),
+        (lambda left, right: (left * 0 + 80, right * 0 + 80), "too little texture"),
+        (lambda left, right: (left * 0, right * 0), "too little texture"),
+        (lambda left, right: (left + 250, right + 250), "overexposed"),
+    ],
+)
+def test_a_pair_that_is_none_is_doubted_and_nothing_of_it_believed(left, right, spoil, sentence):
+    found = estimate(frame(*spoil(left, right)))
+    assert sentence in found.doubt
+    assert not found.confidence.any() and not found.believed.any()
+
+
+def test_noise_of_a_dark_picture_is_no_texture(rng):
+    left, right = rng.integers(0, 4, (2, 240, 320)).astype(np.float32)
+    assert "too little texture" in estimate(frame(left, right)).doubt
+
+
+def test_swapped_eyes_are_seen_without_a_calibration_too(left, right):
+    assert "the eyes are swapped" in estimate(frame(right, left, calibrated=False)).doubt
+
+
+def wrong_camera(kind):
+    right = camera().right_eye(BASELINE_MM)
+    K, pose = right.K.copy(), right.world_to_camera.copy()
+    if kind == "metres":
+        pose[0, 3] = -0.004
+    elif kind == "turned":
+        pose[:3, :3] = cv2.Rodrigues(np.array([0, 0.05, 0]))[0]
+    elif kind == "focal":
+        K[0, 0] *= 1.1
+    elif kind == "swapped":
+        pose[0, 3] = 4
+    elif kind == "columns":
+        K[0, 2] -= 28
+    return replace(right, K=K, world_to_camera=pose)
+
+
+@pytest.mark.parametrize(
+    ("kind", "sentence"),
+    [
+        ("metres", "check the distance between the eyes and its unit"),
+        ("turned", "not those of a rectified pair"),
+        ("focal", "not those of a rectified pair"),
+        ("swapped", "the eyes are swapped in the calibration"),
+        ("columns", "some of the tissue would be behind the scope"),
+    ],
+)
+def test_a_wrong_calibration_is_doubted(left, right, kind, sentence):
+    found = estimate(frame(left, right).with_fields(right_camera=wrong_camera(kind)))
+    assert sentence in found.doubt and not found.confidence.any()
+
+
+def test_what_is_overexposed_is_not_believed(left, right):
+    left, right = left.copy(), right.copy()
+    left[60:180, 100:220] = 255
+    right[60:180, 75:195] = 255
+    found = estimate(frame(left, right))
+    assert found.doubt is None
+    assert (found.confidence[75:165, 115:205] >= 0.5).mean() < 0.1
+    assert off_by(found, bowl())[1] > 0.4
+
+
+def test_a_doubtful_frame_does_not_spoil_the_next_one(left, right):
+    estimator = StereoDepth()
+    assert "too little texture" in estimator.estimate(frame(left * 0, right * 0), camera()).doubt
+    assert off_by(estimator.estimate(frame(left, right, seq=1), camera()), bowl())[0] < 0.005
+
+
+def test_another_scene_is_looked_at_anew(left, right):
+    estimator = StereoDepth()
+    estimator.estimate(frame(left, right), camera())
+    near = bowl(70, 90)
+    found = estimator.estimate(frame(left, right_of(left, near), seq=1, new_scene="cut"), camera())
+    assert off_by(found, near)[0] < 0.02
+
+
+def test_a_frame_with_one_eye_has_nothing_to_match(left, right):
+    assert estimate(frame(left, right).with_fields(right_image=None, right_camera=None)) is None
