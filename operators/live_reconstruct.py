@@ -14,13 +14,14 @@ import torch
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
+from gsplat_core.training.config import Eyes
 from gsplat_core.training.live import LiveReconstructor
 from operators.frame_clock import FrameClock
 from operators.graph import Operator, OperatorSpec
 from operators.messages import Reconstruction
 from operators.model_request import ModelRequest
 from operators.outcome import OutcomeBuilder
-from operators.reconstruct import ModelResult
+from operators.reconstruct import ModelResult, TrainedEyes
 from operators.schedule import ScheduleEvent, ScheduleListener
 
 log = logging.getLogger(__name__)
@@ -93,6 +94,7 @@ class LiveReconstructOp(Operator):
         self._scene = 0
         """Number of the scene that the model shows."""
         self._requests: deque[ModelRequest] = deque()
+        self._eyes: Eyes = "left"
         self._since_grown = 0
         """Frames that were trained on since the scene was last looked at for tissue that it does not cover."""
         super().__init__(fragment, *args, **kwargs)
@@ -130,6 +132,8 @@ class LiveReconstructOp(Operator):
     def stop(self) -> None:
         if self.newest is not None and self._reconstructor is not None:
             self.model = self._reconstructor.whole_model(self.newest)
+        if self._reconstructor is not None:
+            self._eyes = self._reconstructor.eyes.trained
         self.newest = self.model
         self._reconstructor = self._learned = None
         while self._requests:
@@ -252,6 +256,7 @@ class LiveReconstructOp(Operator):
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
         counts = self.counts
+        outcome.add(TrainedEyes(self._eyes))
         outcome.add(replace(counts, withheld=dict(counts.withheld), scenes=dict(counts.scenes)))
         if self.model is not None:
             outcome.add(ModelResult(self.model))

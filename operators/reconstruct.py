@@ -9,6 +9,7 @@ from typing import Any
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
+from gsplat_core.training.config import Eyes
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.graph import Operator, OperatorSpec
 from operators.messages import Reconstruction
@@ -21,6 +22,13 @@ class ModelResult:
 
     model: Model
     """The newest one, in memory of its own."""
+
+
+@dataclass(frozen=True)
+class TrainedEyes:
+    """Which pictures of a stereo scope the model was trained on."""
+
+    eyes: Eyes
 
 
 def never_held_out(frame: Frame) -> bool:
@@ -55,6 +63,7 @@ class ReconstructOp(Operator):
         self.newest: Model | Snapshot | None = None
         """What was published last."""
         self._reconstructor: Reconstructor | None = None
+        self._eyes: Eyes = "left"
         super().__init__(fragment, *args, **kwargs)
 
     @property
@@ -73,6 +82,8 @@ class ReconstructOp(Operator):
     def stop(self) -> None:
         # The optimiser's state and the slots go; the last model stays for whoever saves it.
         self.newest = self.model
+        if self._reconstructor is not None:
+            self._eyes = self._reconstructor.eyes.trained
         self._reconstructor = None
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
@@ -91,6 +102,7 @@ class ReconstructOp(Operator):
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
+        outcome.add(TrainedEyes(self._eyes))
         model = self.model
         if model is not None:
             outcome.add(ModelResult(model))

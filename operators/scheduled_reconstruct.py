@@ -48,6 +48,8 @@ class ScheduledReconstructOp(ReconstructOp):
         if self.newest is not None and self._live is not None:
             self.newest = self._live.whole_model(self.newest)
         super().stop()
+        if self._live is not None:
+            self._eyes = self._live.eyes.trained
         self._live = self._observed = None
         self._lines = iter(())
 

@@ -5,13 +5,22 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import get_args
+from typing import Literal, get_args
 
 from gsplat_core.deformation.rates import FieldRates, check_rates
 from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.motion_priors import MOTION_PRIORS
+
+Eyes = Literal["left", "both"]
+"""Which pictures of a stereo scope are trained on."""
+
+
+def check_eyes(eyes: str) -> None:
+    """Raises InvalidSetting for something else than the name of a choice."""
+    if eyes not in get_args(Eyes):
+        raise InvalidSetting(f"eyes is {eyes!r}; choose {' or '.join(get_args(Eyes))}")
 
 
 @dataclass(frozen=True)
@@ -71,6 +80,8 @@ class ReconstructorConfig:
     """Weight of the inverse-depth term where the recording has depth."""
     default_depth_mm: float = 60.0
     """Distance of the plane on which a recording without depth starts."""
+    eyes: Eyes = "both"
+    """Whether the right eye's pictures are trained on, too, where frames have one and its camera is known."""
     motion_prior: str = "bumps"
     """What is assumed about motion after the newest frame: a name in `MOTION_PRIORS`."""
     motion_detail: Detail = "full"
@@ -94,6 +105,7 @@ class ReconstructorConfig:
         MOTION_PRIORS.check(self.motion_prior)
         if self.motion_detail not in get_args(Detail):
             raise InvalidSetting(f"motion_detail is {self.motion_detail!r}; choose {' or '.join(get_args(Detail))}")
+        check_eyes(self.eyes)
         if not 0 <= self.sh_degree <= 4:
             raise InvalidSetting(f"sh_degree is {self.sh_degree}; it must be 0 to 4")
         if self.max_gaussians < self.gaussians:

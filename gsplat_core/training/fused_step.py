@@ -54,7 +54,8 @@ class FusedStep:
         """Among them the learning rates: of the Gaussians in the frame's backward pass, of the positions after it, of the field; and how
         much of the residual colours take."""
         self._target: ResidualTarget | None = None
-        """If colours are corrected."""
+        """Once colours were corrected."""
+        self._corrects = False
         self._step = torch.full((1,), adam.steps, dtype=torch.int64, device=device)
         self._skipped = torch.zeros(len(GAUSSIAN_TENSORS), dtype=torch.int64, device=device)
         self._totals = torch.zeros(4, dtype=torch.int32, device=device)
@@ -63,7 +64,8 @@ class FusedStep:
         self._status = FrameStatusCopy()
         self._memory = GraphMemory(device)
         self._capacity = capacity_for(4 * gaussians.count)
-        self._captured: CapturedSequence[Tensor] | None = None
+        self._captured: dict[bool, CapturedSequence[Tensor]] = {}
+        """By whether colours are corrected. One never runs beside the other, and neither reads what the other left in the memory that they share."""
         self._warm = False
 
     def __call__(
@@ -83,11 +85,11 @@ class FusedStep:
             time: the field's own, of `DeformationField.frame_time`.
             gaussian_rates: Adam's learning rates of the Gaussians' tensors, by name.
             field_rates: those of the field, as many as it takes.
-            colour_relaxation: above 0 colours are corrected (`colour_correction`), which an observation with depth and a field that takes no
-                colours do not allow.
+            colour_relaxation: above 0 colours are corrected (`colour_correction`), which a field that takes no colours does not allow, and depth
+                is not compared: the channel of its gradient is taken by what the correction needs.
         """
-        self._correct(colour_relaxation > 0)
-        self._take(observation)
+        corrects = colour_relaxation > 0
+        self._take(observation, corrects)
         rates = [gaussian_rates[name] for name in GAUSSIAN_TENSORS]
         in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
         self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates, colour_relaxation])
@@ -96,31 +98,27 @@ class FusedStep:
         if not self._warm:  # kernels are loaded by their first launch, which is not possible during a capture
             self._warm = True
             return self._sequence()
-        if self._was_replaced() or self._captured is None:
-            self._captured = None  # its memory serves the next capture
-            self._captured = CapturedSequence(self._sequence, self._image.device, self._memory, warm_up=False)
-        return self._captured.replay().clone()
+        if self._was_replaced():
+            self._captured.clear()  # their memory serves the next captures
+        if corrects not in self._captured:
+            self._captured[corrects] = CapturedSequence(self._sequence, self._image.device, self._memory, warm_up=False)
+        return self._captured[corrects].replay().clone()
 
     def restart(self) -> None:
         """The tensors hold another scene and Adam counts its steps from 1 again; nothing is captured anew."""
         self._step.fill_(self._adam.steps)
 
-    def _correct(self, corrects: bool) -> None:
-        """Whether the steps from now on correct colours. A change captures a new graph."""
-        if corrects == (self._target is not None):
+    def _take(self, observation: Observation, corrects: bool) -> None:
+        """Copy an observation to where the graph of this kind reads it."""
+        if corrects and self._target is None:
+            self._target = ResidualTarget(self._image)
+        if observation is self._taken and corrects == self._corrects:
             return
-        self._target = ResidualTarget(self._image) if corrects else None
-        self._taken = self._captured = None
-
-    def _take(self, observation: Observation) -> None:
-        """Copy an observation to where the graph reads it."""
-        if observation is self._taken:
-            return
-        self._taken = observation
+        self._taken, self._corrects = observation, corrects
         copy_each([self._image, self._mask], [observation.image, observation.mask])
-        if self._target is not None:
+        if corrects and self._target is not None:
             self._target.take(self._image, self._mask)
-        if self._depth is not None:
+        elif self._depth is not None:
             if observation.depth is None:
                 self._depth.zero_()  # unknown everywhere: the term is 0
             else:
@@ -138,7 +136,7 @@ class FusedStep:
         if needs.overflowed:
             self._adam.steps -= needs.overflowed
             self._capacity = capacity_for(needs.instances)
-            self._captured = None
+            self._captured.clear()
         return needs.overflowed
 
     def _was_replaced(self) -> bool:
@@ -161,15 +159,16 @@ class FusedStep:
         camera = self._camera
         view = View(controls.viewmat, controls.intrinsics, camera.width_px, camera.height_px, camera_model=camera.model)
         frame = render_frame(gaussians, deltas, view, self._capacity, FrameMode.TRAINING)
+        target = self._target if self._corrects else None
         loss = frame_loss(
-            frame.image, frame.alphas, self._image, self._mask, self._depth,
+            frame.image, frame.alphas, self._image, self._mask, None if target is not None else self._depth,
             self._weights.ssim, self._weights.depth, self._weights.squared,
         )  # fmt: skip
         fits = accumulate_status_(frame.status, self._totals, self._step)
         adam = GaussianAdam(
             *self._moments(), in_frame, self._step, self._skipped, betas=self._adam.betas, epsilon=self._adam.epsilon
         )
-        correction = None if self._target is None else self._target.correction(frame.image, relaxation)
+        correction = None if target is None else target.correction(frame.image, relaxation)
         gradient = render_frame_backward_adam_(
             gaussians, adam, deltas, view, frame, loss.grad_image, loss.grad_alphas, correction
         )

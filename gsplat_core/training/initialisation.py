@@ -19,6 +19,8 @@ THICKNESS = 0.3
 """Depth of a fresh Gaussian relative to its width: tissue is a surface."""
 
 FIRST_OPACITY = 0.9
+LEAST_CONFIDENCE = 0.5
+"""Depth that is believed less counts as unknown: where it is wrong, a scene is better off without it."""
 TOOL_MARGIN_PX = 2
 """So much around a tool is painted over with it: masks end a little early."""
 
@@ -155,12 +157,22 @@ def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> N
     return np.where(hole[..., None] > 0, large, image).astype(np.uint8)
 
 
+def believed_depth(frame: Frame) -> NDArray[np.float32]:
+    """The frame's depth [H, W] where it is to be believed, 0 elsewhere and where the frame has none."""
+    if frame.depth is None:
+        return np.zeros(frame.image.shape[:2], np.float32)
+    if frame.depth_confidence is None:
+        return frame.depth
+    return np.where(frame.depth_confidence >= LEAST_CONFIDENCE, frame.depth, np.float32(0))
+
+
 def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
     """z in millimetres for every pixel [H, W]: measured where known and not a tool, the nearest measured one elsewhere, else the default."""
     height, width = frame.image.shape[:2]
     if frame.depth is None:
         return np.full((height, width), default_depth_mm, np.float32)
-    known = np.isfinite(frame.depth) & (frame.depth > 0)
+    measured = believed_depth(frame)
+    known = np.isfinite(measured) & (measured > 0)
     if frame.mask is not None:
         known &= frame.mask > 0
     if not known.any():
@@ -169,5 +181,5 @@ def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
         (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
     nearest = np.zeros(int(label.max()) + 1, np.float32)
-    nearest[label[known]] = frame.depth[known]
+    nearest[label[known]] = measured[known]
     return nearest[label]

@@ -31,6 +31,9 @@ REHEARSED_IN_FLIGHT = 2
 """Rehearsal steps that may be queued on a GPU and not finished: the next frame's first step waits for them."""
 REHEARSED_CORRECTION = 0.5
 """Share of `colour_relaxation` in a rehearsal step: what is corrected at one time shows at the times around it, which had their turn."""
+DEPTH_EVERY = 4
+"""On a GPU every so many-th rehearsal step, of the left eye's, looks at depth where a frame has it, and trains colours in place of correcting them. Steps
+of `observe` do not: what they change last is what is shown."""
 REVEALED_SHARE = 0.01
 """Of the picture's width: when so wide a strip has come into view, new tissue is looked for before the first step."""
 LONGER_STEP_DECAY = 0.1
@@ -67,6 +70,7 @@ class LiveReconstructor(Reconstructor):
         self._kept: TrainingStep | None = None
         """That of the scene before, whose memory the next scene takes over."""
         self._rehearsing = StepsInFlight(self.device, most=REHEARSED_IN_FLIGHT)
+        self._rehearsed = 0
         self._places = Places()
         self._taken_up: tuple[int, Place] | None = None
         """The number of a frame and the place that it shows, from which its scene starts."""
@@ -114,10 +118,19 @@ class LiveReconstructor(Reconstructor):
         if self._step is None:
             raise InvalidInput("there is nothing to rehearse yet: observe a frame first")
         for _ in range(steps):
-            observation = self._window.draw(self._live.recent_share)
-            self._step(observation, self._live.last_rate, REHEARSED_CORRECTION * self._live.colour_relaxation)
+            # The right eye first: steps on the newest frame begin with the left one.
+            self._rehearsed += 1
+            observation = self._window.draw(self._live.recent_share).by_turns(self._rehearsed)
+            self._step(observation, self._live.last_rate, self._rehearsed_correction(observation))
             self._unsettled = observation
             self._rehearsing.queued()
+
+    def _rehearsed_correction(self, observation: Observation) -> float:
+        """How much colours are corrected in a rehearsal step. A captured step that corrects them does not look at depth: some do not correct."""
+        looks_at_depth = (
+            self.device.type == "cuda" and observation.depth is not None and self._rehearsed % DEPTH_EVERY == 0
+        )
+        return 0.0 if looks_at_depth else REHEARSED_CORRECTION * self._live.colour_relaxation
 
     def rehearsal_ns(self, steps: int) -> float:
         """How long so many rehearsal steps usually take, together with those that are still under way; 0 before anything was timed."""
@@ -171,7 +184,9 @@ class LiveReconstructor(Reconstructor):
                 self._follow(frame, observation)
         self._to_follow.clear()
 
-    def _grow(self, frame: Frame, observation: Observation) -> None:
+    def _grow(self, frame: Frame, observation: Observation, first: bool = False) -> None:
+        if first:
+            return
         # `grow` adds what is missing to the picture, later.
         if not self._follows_at_once:
             self._to_follow.append((frame, observation))
@@ -193,8 +208,9 @@ class LiveReconstructor(Reconstructor):
         self._kept = self._step or self._kept
         self._step = self._taken_up = self._camera_before = None
         self._to_follow.clear()
+        self.eyes.forget()
         self._places = Places()
-        self._version = 0
+        self._version = self._rehearsed = 0
         self._window = ObservationWindow(self.config.window_frames, self.config.newest_share, self._seed)
 
     def begin_scene(self, frame: Frame) -> bool:
@@ -266,7 +282,7 @@ class LiveReconstructor(Reconstructor):
         loss = None
         while spending.allows_step():
             rate = 1.0 if first else self._live.rate_at(spending.made)
-            loss = self._step(observation, rate, self._live.colour_relaxation)
+            loss = self._step(observation.by_turns(spending.made), rate, self._live.colour_relaxation)
             spending.step_made(self._in_flight.queued() if budget.is_timed else 0)
         if loss is None:
             return ObserveReport(observation.seq, 0, None, self.gaussians, spending.ending)

@@ -13,7 +13,8 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.transfers import tensor_of
+from gsplat_core.training.initialisation import believed_depth
+from gsplat_core.transfers import HostCopy, tensor_of
 
 
 @dataclass(frozen=True)
@@ -31,12 +32,24 @@ class Observation:
     """float32 [H, W] in millimetres; 0 = unknown."""
     rehearsal_mask: Tensor | None = None
     """uint8 [H, W]; 0 = left out when the frame is trained on again later."""
+    right: Observation | None = None
+    """What the right eye saw at the same time, where it is trained on as well (`BothEyes`)."""
 
     def to_rehearse(self) -> Observation:
         """The frame as it is trained on again later."""
+        right = None if self.right is None else self.right.to_rehearse()
         if self.rehearsal_mask is None:
-            return self
-        return replace(self, mask=self.mask & self.rehearsal_mask, rehearsal_mask=None)
+            return self if right is self.right else replace(self, right=right)
+        return replace(self, mask=self.mask & self.rehearsal_mask, rehearsal_mask=None, right=right)
+
+    def by_turns(self, turn: int) -> Observation:
+        """The eye whose turn it is: the left one at even turns, the right one, if there is one, at odd ones."""
+        return self if self.right is None or turn % 2 == 0 else self.right
+
+    def as_frame(self) -> Frame:
+        """The frame as training sees it. Waits for the device."""
+        image, mask = HostCopy(self.image).numpy(), HostCopy(self.mask).numpy()
+        return Frame(self.seq, round(self.time_s * 1e9), image, mask=mask, pose=self.camera.world_to_camera)
 
     @staticmethod
     def of(frame: Frame, camera: Camera, device: torch.device | str = "cpu") -> Observation:
@@ -52,18 +65,22 @@ class Observation:
         mask = np.ones(frame.image.shape[:2], np.uint8) if frame.mask is None else frame.mask
         if frame.loss_mask is not None:
             mask = mask & frame.loss_mask
-        image = frame.image
-        if frame.exposure != (1.0, 1.0, 1.0):
-            image = np.rint(np.clip(image / np.array(frame.exposure, np.float32), 0, 255)).astype(np.uint8)
         return Observation(
             seq=frame.seq,
             time_s=frame.time_s,
             camera=camera if frame.pose is None else camera.with_pose(frame.pose),
-            image=tensor_of(image, device),
+            image=tensor_of(scene_colours(frame.image, frame.exposure), device),
             mask=tensor_of(mask.astype(np.uint8, copy=False), device),
-            depth=None if frame.depth is None else known_depth(frame.depth, device),
+            depth=None if frame.depth is None else known_depth(believed_depth(frame), device),
             rehearsal_mask=None if frame.rehearsal_mask is None else tensor_of(frame.rehearsal_mask, device),
         )
+
+
+def scene_colours(image: NDArray[np.uint8], exposure: tuple[float, float, float]) -> NDArray[np.uint8]:
+    """The picture without its exposure."""
+    if exposure == (1.0, 1.0, 1.0):
+        return image
+    return np.rint(np.clip(image / np.array(exposure, np.float32), 0, 255)).astype(np.uint8)
 
 
 def known_depth(depth_mm: NDArray[np.floating], device: torch.device | str = "cpu") -> Tensor:

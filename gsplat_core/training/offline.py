@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.densification import densify, shares_of
 from gsplat_core.training.observations import Observation
@@ -64,8 +63,8 @@ class FitSettings:
         return [round(steps * self.densify_until * (k + 1) / self.densify_rounds) for k in range(self.densify_rounds)]
 
 
-def observed(frames: Sequence[Frame], camera: Camera, device: torch.device) -> list[Observation]:
-    """The frames in the types of training. Raises InvalidInput when there are none, or when they are not in order."""
+def observed(frames: Sequence[Frame], observation_of: Callable[[Frame], Observation]) -> list[Observation]:
+    """The frames in the types of training, in order. Raises InvalidInput when there are none, or when they are not in order."""
     if not frames:
         raise InvalidInput("there are no frames to train on")
     for before, frame in pairwise(frames):
@@ -74,7 +73,7 @@ def observed(frames: Sequence[Frame], camera: Camera, device: torch.device) -> l
                 f"frame {frame.seq} is at {frame.time_s:.3f} s, before the last one at {before.time_s:.3f} s;"
                 " frames must come in order"
             )
-    return [Observation.of(frame, camera, device) for frame in frames]
+    return [observation_of(frame) for frame in frames]
 
 
 def with_depth(frames: Sequence[Frame], observations: Sequence[Observation]) -> Frame:
@@ -95,7 +94,10 @@ class OfflineTraining:
         most_gaussians: int,
         seed: int,
     ) -> None:
-        self._step, self._observations, self._settings = step, observations, settings
+        self._step, self._settings = step, settings
+        rights = [one.right for one in observations if one.right is not None]
+        self._observations = [*observations, *rights]
+        """Of both eyes."""
         self._first_count, self._most = step.gaussians.count, most_gaussians
         self._smoothing = settings.smoothing and settings.smoothing * steadiness(observations)
         self._random = np.random.default_rng(seed)

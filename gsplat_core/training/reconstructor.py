@@ -26,6 +26,7 @@ from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
 from gsplat_core.training.offline import FitSettings, OfflineTraining, observed, with_depth
+from gsplat_core.training.right_eye import BothEyes
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
@@ -60,6 +61,7 @@ class Reconstructor:
         self._seed = seed
         self._recording_digest = recording_digest
         self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
+        self.eyes = BothEyes(config.eyes, self.device)
         self._step: TrainingStep | None = None
         self._prior: MotionPrior | None = None
         self._coverage: CapturedCoverage | None = None
@@ -109,7 +111,7 @@ class Reconstructor:
             if budget is not None:
                 raise InvalidInput("budget and steps are both given; steps is short for Budget.of_steps(steps)")
             budget = Budget.of_steps(steps)
-        observation = Observation.of(frame, self.camera, self.device)
+        observation = self.eyes.observation(frame, self.camera, trains=train)
         first = self._step is None
         if first:
             if not train:
@@ -131,8 +133,7 @@ class Reconstructor:
         if self._follows_at_once:
             self._follow(frame, observation)
         self._window.add(observation)
-        if not first:
-            self._grow(frame, observation)
+        self._grow(frame, observation, first)
         if budget is None:
             budget = Budget.of_steps(self.config.first_frame_steps if first else self.config.steps_per_frame)
         return self._train_on(observation, budget, first)
@@ -150,7 +151,7 @@ class Reconstructor:
                     jump = self._is_jump(first_loss, first)
                 count = spending.planned()
                 plan = [observation] * count if jump else self._window.schedule(count)[::-1]
-            loss = self._step(plan.pop())
+            loss = self._step(plan.pop().by_turns(spending.made))
             first_loss = first_loss or HostCopy(loss)
             spending.step_made(self._in_flight.queued() if budget.is_timed else 0)
         if first_loss is None:
@@ -159,8 +160,8 @@ class Reconstructor:
         # Asked for only now, so that a GPU need not be waited for before its queue is filled.
         if not budget.is_timed and self._is_jump(first_loss, first):
             extra = spending.made * self.config.jump_extra
-        for _ in range(extra):
-            loss = self._step(observation)
+        for turn in range(extra):
+            loss = self._step(observation.by_turns(turn))
         self._unsettled = observation
         if budget.is_timed or first:
             self._settle()
@@ -204,15 +205,15 @@ class Reconstructor:
         frames are held in the device's memory (1 byte per channel).
         """
         frames = list(frames)
-        seen = observed(frames, self.camera, self.device)
+        seen = observed(frames, lambda frame: self.eyes.observation(frame, self.camera))
         if steps < 1:
             raise InvalidInput(f"steps is {steps}; it must be at least 1")
         start = with_depth(frames, seen) if self.config.depth_from_motion else frames[0]
         self._start(start, seen[0], end_s=seen[-1].time_s)
         assert self._step is not None
         self._last_time_s = seen[-1].time_s
-        for frame, observation in zip(frames[1:], seen[1:], strict=True):
-            self._grow(frame, observation)
+        for number, (frame, observation) in enumerate(zip(frames, seen, strict=True)):
+            self._grow(frame, observation, number == 0)
         most = self.config.max_gaussians
         training = OfflineTraining(self._step, seen, settings or FitSettings(), most_gaussians=most, seed=self._seed)
         loss = training(steps, progress)
@@ -273,8 +274,16 @@ class Reconstructor:
         if self._prior is not None and self._step is not None:
             self._prior.observe(frame, observation.time_s, observation.camera, self._step)
 
-    def _grow(self, frame: Frame, observation: Observation) -> None:
-        """Add Gaussians where the frame shows tissue that the model does not cover."""
+    def _grow(self, frame: Frame, observation: Observation, first: bool = False) -> None:
+        """Add Gaussians where the frame shows tissue that the model does not cover, each eye in turn; the first left picture is what they were
+        made from."""
+        if not first:
+            self._cover(observation, lambda: frame)
+        if observation.right is not None:
+            self._cover(observation.right, observation.right.as_frame)
+
+    def _cover(self, observation: Observation, frame: Callable[[], Frame]) -> None:
+        """Add Gaussians where one eye sees tissue that the model does not cover."""
         assert self._step is not None
         step = self._step
         most = self.config.max_gaussians - step.gaussians.count
@@ -284,6 +293,6 @@ class Reconstructor:
             step.gaussians, step.field, observation
         ):
             return
-        added = gaussians_for_uncovered_tissue(frame, observation, step.at(observation.time_s), self.config, most)
+        added = gaussians_for_uncovered_tissue(frame(), observation, step.at(observation.time_s), self.config, most)
         if added is not None:
             step.append(added)

@@ -85,12 +85,11 @@ class TrainingStep:
         """Train on one observation; returns its loss before the update, [] on the Gaussians' device.
 
         With a `colour_relaxation` above 0 colours are not trained but corrected (`colour_correction`) at the observation's time, if the field
-        takes colours; a captured step trains them where the observation has depth. A captured step only queues: ask for the loss's value, or
-        `settle`, to wait for it.
+        takes colours; a captured step does not look at depth then. A captured step only queues: ask for the loss's value, or `settle`, to wait for
+        it.
         """
         if self._captured is not None:
-            corrects = self.field.takes_colours and observation.depth is None
-            self._relaxation = colour_relaxation if corrects else 0.0
+            self._relaxation = colour_relaxation if self.field.takes_colours else 0.0
             return self._captured_step(self._captured, observation, rate_scale)
         deformed = self._training.deform(self.gaussians, observation.time_s)
         relaxation = colour_relaxation if self.field.takes_colours else 0.0

@@ -10,7 +10,7 @@ from typing import get_args
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.registry import check_depth
 from gsplat_core.io.sessions import WriterOptions
-from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.config import Eyes, ReconstructorConfig, check_eyes
 from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.live_training import LiveTraining
 from operators.applications.limits import check_max_frames, check_scale, check_seed
@@ -66,6 +66,8 @@ class LiveSettings:
     field: str = "auto"
     renderer: str = "alpha"
     seed: int = 0
+    eyes: Eyes = "both"
+    """Which pictures of a stereo scope are trained on; `both` where the right one's camera is known."""
     scale: float = 1.0
     max_frames: int | None = None
     seconds: float | None = None
@@ -93,6 +95,7 @@ class LiveSettings:
 
     def __post_init__(self) -> None:
         check_seed(self.seed)
+        check_eyes(self.eyes)
         check_scale(self.scale)
         check_max_frames(self.max_frames)
         if self.seconds is not None and not 0 < self.seconds < 1e9:
@@ -151,6 +154,7 @@ class LiveSettings:
             motion_prior="flow",
             motion_detail=LIVE_MOTION_DETAIL,
             start_from_motion=LIVE_STARTS_FROM_MOTION[device],
+            eyes=self.eyes,
             ssim_weight=LIVE_SSIM_WEIGHT[device],
             squared_error=LIVE_SQUARED_ERROR[device],
         )

@@ -17,6 +17,7 @@ from gsplat_core.io.recordings import is_heldout
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.training.observe_report import ObserveReport
+from gsplat_core.training.right_eye import BothEyes
 from operators.applications.delivery import Report, delivered
 from operators.applications.device import seeded
 from operators.applications.finishing import FirstFrames, measures_baselines, saves_model
@@ -31,8 +32,8 @@ from operators.sources.source import FrameSource
 class FittedModel:
     """A finished model where the graph expects a reconstructor: it observes without learning."""
 
-    def __init__(self, model: Model) -> None:
-        self.model = model
+    def __init__(self, model: Model, eyes: BothEyes) -> None:
+        self.model, self.eyes = model, eyes
 
     def observe(self, frame: Frame, *, steps: int | None = None, train: bool = True) -> ObserveReport:
         """Learn nothing."""
@@ -65,7 +66,7 @@ def reconstruct(
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
         source = prepare(inside, notes, offline=True)
         start = Start.now()
-        model, done = _fit(source, inside, steps, progress, stop_requested)
+        model, eyes, done = _fit(source, inside, steps, progress, stop_requested)
         if done < steps:
             notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
         graph = ReplayApplication(
@@ -73,7 +74,7 @@ def reconstruct(
             inside,
             progress=progress,
             stop_requested=stop_requested,
-            make_reconstructor=lambda: FittedModel(model),
+            make_reconstructor=lambda: FittedModel(model, eyes),
             stage="evaluate",
         )
         graph.announce()
@@ -101,8 +102,8 @@ def _fit(
     steps: int,
     progress: ProgressCallback | None,
     stop_requested: Callable[[], bool],
-) -> tuple[Model, int]:
-    """Train; returns the model and how many steps were made."""
+) -> tuple[Model, BothEyes, int]:
+    """Train; returns the model, the eyes that it was trained on, and how many steps were made."""
     description = source.description
     if description.digest is None or description.frame_count is None:
         raise InvalidSetting(f"{description.name} can be read only once; reconstruct needs a recording, or use replay")
@@ -121,4 +122,4 @@ def _fit(
     finder = DepthFinder(settings.depth, description.camera)
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
         learning.fit((finder.with_depth(frame) for frame in frames if _trains(frame)), steps, after_step)
-    return learning.snapshot(), done
+    return learning.snapshot(), learning.eyes, done

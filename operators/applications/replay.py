@@ -23,7 +23,7 @@ from gsplat_core.geometry.registry import check_depth
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.config import Eyes, ReconstructorConfig, check_eyes
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.delivery import Report, delivered
 from operators.applications.device import check_device, scheduler_for
@@ -78,6 +78,8 @@ class ReplaySettings:
     """Replay a recorded session like any other recording, and not with the calls that it made."""
     depth: str = "auto"
     """Where depth comes from: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
+    eyes: Eyes = "both"
+    """Which pictures of a stereo scope are trained on; `both` where the right one's camera is known."""
     heldout: bool = False
     """Show the protocol's held-out frames without training on them, and score them apart."""
 
@@ -90,6 +92,7 @@ class ReplaySettings:
             check_steps("steps_per_frame", self.steps_per_frame)
         check_max_frames(self.max_frames)
         check_depth(self.depth)
+        check_eyes(self.eyes)
         for name in self.sinks:
             SINKS.check(name)
 
@@ -101,6 +104,7 @@ class ReplaySettings:
     def reconstructor_config(self, pixels: int | None = None, *, offline: bool = False) -> ReconstructorConfig:
         """The reconstructor's settings for frames of so many pixels. offline: for `Reconstructor.fit`. Raises InvalidSetting."""
         config = ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig(field=self.field)
+        config = replace(config, eyes=self.eyes)
         if pixels is not None:
             # More Gaussians than a quarter of the pixels have nothing to show.
             most = max(64, pixels // PIXELS_PER_GAUSSIAN)

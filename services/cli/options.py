@@ -83,6 +83,7 @@ DepthOption = Annotated[
     str, typer.Option(help="Depth of the frames: auto, recorded, stereo (from the two eyes) or none.")
 ]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
+EyesOption = Annotated[str, typer.Option(help="Pictures of a stereo scope that are trained on: left or both.")]
 ScaleOption = Annotated[float, typer.Option(help="Resize the frames by this factor.")]
 MaxFramesOption = Annotated[int | None, typer.Option(help="Stop after this many frames.", show_default=False)]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout, and nothing else.")]
@@ -99,6 +100,7 @@ class RunOptions:
     max_frames: MaxFramesOption = None
     scale: ScaleOption = 1.0
     depth: DepthOption = "auto"
+    eyes: EyesOption = "both"
 
     def settings(self) -> dict[str, Any]:
         """By name."""

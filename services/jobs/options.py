@@ -21,6 +21,7 @@ class ReplayOptions(BaseModel):
     )
     max_frames: int | None = Field(default=None, ge=1, le=10_000_000, description="Stop after this many frames.")
     scale: float = Field(default=1.0, gt=0, le=4, allow_inf_nan=False, description="Resize the frames by this factor.")
+    eyes: Literal["left", "both"] = Field(default="both", description="Pictures of a stereo scope that are trained on.")
     heldout: bool = Field(
         default=False, description="Show every eighth frame without training on it, and score it apart."
     )

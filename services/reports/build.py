@@ -16,7 +16,7 @@ from operators.ingest import SourceResult
 from operators.live_reconstruct import TrainingCounts
 from operators.metrics import QualityResult
 from operators.on_screen import OnScreenResult
-from operators.reconstruct import ModelResult
+from operators.reconstruct import ModelResult, TrainedEyes
 from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult
 from operators.sources.source import SourceDescription
@@ -106,7 +106,7 @@ def _recording(description: SourceDescription) -> RecordingFacts:
 
 
 def _run(outcome: RunOutcome) -> RunFacts:
-    settings = outcome.settings
+    settings, eyes = outcome.settings, outcome.find(TrainedEyes)
     return RunFacts(
         device=settings.device,
         engine=settings.engine,
@@ -118,6 +118,7 @@ def _run(outcome: RunOutcome) -> RunFacts:
         field=settings.field,
         renderer=settings.renderer,
         steps_per_frame=settings.steps_per_frame,
+        eyes="left" if eyes is None else eyes.eyes,
         scale=settings.scale,
         started_at=outcome.started_at.isoformat(timespec="seconds"),
         stop_reason=outcome.stop_reason,

@@ -52,6 +52,8 @@ class RunFacts(Part):
     """Deformation field in use: `basis` or `hexplane`, never `auto`."""
     renderer: str = "alpha"
     steps_per_frame: int | None = None
+    eyes: Literal["left", "both"] = "left"
+    """Which pictures of a stereo scope the model was trained on."""
     scale: float = 1.0
     started_at: str
     """UTC, ISO 8601."""

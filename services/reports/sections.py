@@ -273,6 +273,7 @@ def facts_section(report: RunReport) -> str:
         "Seed": str(run.seed),
         "Field, renderer": f"{run.field}, {run.renderer}",
         "Steps per frame": "default" if run.steps_per_frame is None else str(run.steps_per_frame),
+        "Eyes trained on": run.eyes,
         "Peak memory": "–" if run.peak_memory_bytes is None else f"{run.peak_memory_bytes / 2**30:.2f} GiB",
         "Ended by": run.stop_reason,
         **run.machine,

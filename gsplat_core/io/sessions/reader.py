@@ -17,7 +17,7 @@ from gsplat_core.io.sessions.log import Line
 from gsplat_core.io.sessions.records import FrameLine, PreparedLine, ShownLine
 from gsplat_core.io.sessions.schedule import SCHEDULE_LINES, ReconstructorMade, ScheduleLine
 from gsplat_core.io.sessions.segment_reader import FIELDS, SegmentPictures, SegmentReader, mask_of_nothing
-from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SESSION_FILE, read_session_file
+from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SESSION_FILE, camera_of, read_session_file
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 MOST_ARRIVED = 64
@@ -190,6 +190,7 @@ def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], dama
             pts_ns=line.pts_ns,
             image=image,
             right_image=planes.get("right_image"),
+            right_camera=None if line.right_camera is None else camera_of(line.right_camera),
             depth=planes.get("depth"),
             mask=planes.get("mask"),
             loss_mask=planes.get("loss_mask"),

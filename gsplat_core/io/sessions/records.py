@@ -89,6 +89,8 @@ class _FrameLine(Record):
     damage: Text | None = None
     pose: Pose | None = None
     """World-to-camera."""
+    right_camera: CameraRecord | None = None
+    """The right eye's; its pose leads from the left camera's coordinates to its own."""
     arrived_ns: Nanoseconds | None = None
     exposure: tuple[Positive, Positive, Positive] | None = None
     withheld: Text | None = None

@@ -28,7 +28,7 @@ from gsplat_core.io.sessions.records import (
 )
 from gsplat_core.io.sessions.retention import KeptPart, Retention, earlier_sessions, finish_removals
 from gsplat_core.io.sessions.segment_writer import SegmentWriter, Stage
-from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SessionInfo, write_session_file
+from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SessionInfo, camera_record, write_session_file
 from gsplat_core.scene.frames import Frame
 
 _PLANES: tuple[TrackName, ...] = ("image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth")
@@ -240,6 +240,7 @@ def _said(frame: Frame) -> dict[str, Any]:
         "status": frame.status.value,
         "damage": _short(frame.damage),
         "pose": None if frame.pose is None else tuple(frame.pose.ravel().tolist()),
+        "right_camera": None if frame.right_camera is None else camera_record(frame.right_camera),
         "arrived_ns": frame.arrived_ns,
         "exposure": None if frame.exposure == (1.0, 1.0, 1.0) else tuple(map(float, frame.exposure)),
         "withheld": _short(frame.withheld),

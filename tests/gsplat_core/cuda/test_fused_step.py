@@ -101,6 +101,59 @@ def test_steps_that_correct_colours_and_steps_that_train_them_can_alternate(make
     assert losses[-1] < 0.95 * losses[0]
 
 
+def test_steps_that_correct_colours_do_not_look_at_depth_and_others_between_them_do(make_gaussians, observation):
+    """Two graphs, each captured once: depth and colours take turns in one step's memory."""
+    start, rates, depths = make_gaussians(600, sh_degree=0), RATES | {"sh": 0.0}, {}
+    seen = dataclasses.replace(observation, depth=1.5 * observation.depth)
+    for with_depth in (True, False):
+        gaussians = start.clone().to("cuda")
+        step = FusedStep(gaussians, NoField(), FusedAdam(gaussians.tensors()), LossWeights(depth=50.0), seen.camera)
+        one = seen if with_depth else dataclasses.replace(seen, depth=None)
+        for turn in range(40):
+            step(gaussians, one, 0.0, rates, [], 0.0 if turn % 2 else 1.5)
+        assert step.settle() == 0
+        assert sorted(step._captured) == [False, True]
+        depths[with_depth] = float(gaussians.means[:, 2].median())
+    assert depths[True] > depths[False] + 0.01
+    corrected = []
+    for one in (seen, dataclasses.replace(seen, depth=None)):
+        gaussians = start.clone().to("cuda")
+        step = FusedStep(gaussians, NoField(), FusedAdam(gaussians.tensors()), LossWeights(depth=50.0), seen.camera)
+        for _ in range(3):
+            step(gaussians, one, 0.0, RATES, [], 1.5)
+        corrected.append(gaussians)
+    for name, tensor in corrected[0].tensors().items():
+        assert torch.equal(tensor, corrected[1].tensors()[name]), name
+
+
+def test_one_captured_step_serves_two_cameras_by_turns(make_gaussians, observation):
+    """Pose and intrinsics of each observation are those that its step renders with: the same as two eyes trained on the CPU."""
+    from gsplat_core.training.photometric import loss_and_gradients
+
+    left = dataclasses.replace(observation, depth=None)
+    eye = left.camera.right_eye(0.3)
+    K = eye.K.copy()
+    K[0, 0], K[1, 2] = 1.02 * K[0, 0], K[1, 2] + 0.5
+    eye = dataclasses.replace(eye, K=K)
+    with torch.no_grad():
+        picture = render(make_gaussians(600, seed=4), eye).image
+    image = (picture.clamp(0, 1) * 255).round().to(torch.uint8)
+    right = dataclasses.replace(left, camera=eye, image=image, mask=torch.ones_like(left.mask))
+    pair = dataclasses.replace(left, right=right)
+    weights, start = LossWeights(squared=True), make_gaussians(800, sh_degree=0)
+    gaussians = start.clone().to("cuda")
+    step = FusedStep(gaussians, NoField(), FusedAdam(gaussians.tensors()), weights, left.camera)
+    losses = [float(step(gaussians, pair.by_turns(turn), 0.0, RATES, [])) for turn in range(12)]
+    assert step.settle() == 0
+    on_cpu, adam, expected = start.clone(), FusedAdam(start.tensors(), RATES), []
+    for turn in range(12):
+        loss, gradients, _ = loss_and_gradients(on_cpu, pair.by_turns(turn), weights)
+        expected.append(float(loss))
+        adam.step(on_cpu.tensors(), gradients)
+    assert losses == pytest.approx(expected, rel=2e-3)
+    assert abs(expected[1] - expected[0]) > 0.01 * expected[0], "the eyes see different pictures"
+
+
 @pytest.mark.parametrize("weights", [LossWeights(), LossWeights(ssim=0.2, depth=0.5), LossWeights(squared=True)])
 def test_it_learns_as_the_cpu_does(make_gaussians, observation, weights):
     from gsplat_core.training.photometric import loss_and_gradients

@@ -1,0 +1,111 @@
+"""How the colours of a stereo scope's two eyes differ: a straight line for each channel, taken out of the right picture.
+
+Two sensors, two light paths: one eye is brighter or redder than the other, by a little that changes slowly. Trained on as they come, the two pictures
+would pull every colour to and fro.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.scene.frames import Frame
+
+LOOKED_AT_PX = 80
+"""Width of the pictures that are compared."""
+LOOK_EVERY = 10
+"""Frames from one comparison to the next."""
+FOLLOWS = 0.2
+"""How fast the line follows a new comparison."""
+LEAST_OVERLAP = 0.4
+"""Of the picture's width, which both eyes see at least."""
+QUANTILES = (10, 50, 90)
+"""Per cent; highlights and shadows, which the eyes see at different places, lie beyond."""
+FLAT_LEVELS = 8.0
+"""A channel whose outer quantiles are less far apart says nothing about a factor."""
+MOST_GAIN = 2.0
+NOISE_LEVELS = 1.5
+"""A line that changes no level between the outer quantiles by more is left out: that is as exactly as it is known."""
+
+
+class EyeColours:
+    """Of one stream, frame after frame."""
+
+    def __init__(self) -> None:
+        self._gain, self._offset = np.ones(3), np.zeros(3)
+        self._table: NDArray[np.uint8] | None = None
+        """What becomes of each level of each channel, [1, 256, 3]; None: nothing is changed."""
+        self._frames = 0
+        self.shift: float | None = None
+        """By how much of its width the right picture shows the scene farther to the left, at the newest look; None before it."""
+
+    def corrected(self, frame: Frame) -> NDArray[np.uint8]:
+        """The right picture of a frame that has one, in the colours of the left one."""
+        assert frame.right_image is not None
+        if self._frames % LOOK_EVERY == 0:
+            self._look(frame.image, frame.right_image, frame.mask)
+        self._frames += 1
+        if self._table is None:
+            return frame.right_image
+        return np.asarray(cv2.LUT(frame.right_image, self._table), np.uint8)
+
+    def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> None:
+        height, width = left.shape[:2]
+        size = min(LOOKED_AT_PX, width), max(1, round(height * min(1.0, LOOKED_AT_PX / width)))
+        first, second = (
+            cv2.resize(eye, size, interpolation=cv2.INTER_AREA).astype(np.float32) for eye in (left, right)
+        )
+        tissue = (
+            np.ones(size[::-1], bool) if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0
+        )
+        shift = best_shift(first.mean(-1), second.mean(-1))
+        self.shift = shift / size[0]
+        ours, theirs = overlap(first, second, shift)
+        kept = overlap(tissue, tissue, shift)[0]
+        if np.count_nonzero(kept) < 16:
+            return
+        gain, offset, off = line_between(ours[kept], theirs[kept])
+        share = 1.0 if self._frames == 0 else FOLLOWS
+        self._gain += share * (gain - self._gain)
+        self._offset += share * (offset - self._offset)
+        off = np.abs(self._gain * off + self._offset - off).max()
+        self._table = _table(self._gain, self._offset) if off > NOISE_LEVELS else None
+
+
+def best_shift(left: NDArray[np.float32], right: NDArray[np.float32]) -> int:
+    """By how many pixels the right picture [h, w] shows the same farther to the left: where the two correlate best."""
+    width = left.shape[1]
+    most = int((1 - LEAST_OVERLAP) * width)
+    return max(range(-most, most + 1), key=lambda shift: _correlation(*overlap(left, right, shift)))
+
+
+def overlap(left: NDArray, right: NDArray, shift: int) -> tuple[NDArray, NDArray]:
+    """What both pictures show, where the right one shows it `shift` pixels farther to the left."""
+    width = left.shape[1]
+    if shift >= 0:
+        return left[:, shift:], right[:, : width - shift]
+    return left[:, :shift], right[:, -shift:]
+
+
+def line_between(left: NDArray[np.float32], right: NDArray[np.float32]) -> tuple[NDArray, NDArray, NDArray]:
+    """Factor and offset [3] that bring the quantiles of the right colours [N, 3] to those of the left ones, and those quantiles [3, 3].
+
+    Quantiles need no pixel that matches another one exactly, and the ratio of their distances is not made smaller by noise, as a slope fitted by
+    least squares would be.
+    """
+    ours, theirs = (np.percentile(colours, QUANTILES, axis=0) for colours in (left, right))
+    spread_left, spread_right = ours[2] - ours[0], theirs[2] - theirs[0]
+    says_something = (spread_left >= FLAT_LEVELS) & (spread_right >= FLAT_LEVELS)
+    gain = np.where(says_something, spread_left / np.maximum(spread_right, 1e-6), 1.0).clip(1 / MOST_GAIN, MOST_GAIN)
+    return gain, ours[1] - gain * theirs[1], theirs
+
+
+def _correlation(left: NDArray, right: NDArray) -> float:
+    a, b = left - left.mean(), right - right.mean()
+    return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum() + 1e-6))
+
+
+def _table(gain: NDArray, offset: NDArray) -> NDArray[np.uint8]:
+    levels = np.arange(256.0)[:, None] * gain + offset
+    return np.rint(levels.clip(0, 255)).astype(np.uint8)[None]

@@ -1,0 +1,131 @@
+"""The second eye of a stereo scope as an observation of its own: its camera, its colours, and what of it may be learned from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsplat_core.endoscope.highlights import HighlightFinder
+from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.config import Eyes
+from gsplat_core.training.eye_colours import EyeColours
+from gsplat_core.training.initialisation import believed_depth, unprojected
+from gsplat_core.training.observations import Observation, scene_colours
+from gsplat_core.training.unseen import pixels_of
+from gsplat_core.transfers import tensor_of
+
+CELL_PX = 4
+"""Tools are looked for in the right picture by cells of so many pixels."""
+NEAREST, FARTHEST = 2.0, 0.75
+"""Where a tool's depth is not known, its disparity is between these multiples of what is typical of the picture: tools are nearer than tissue."""
+
+
+class BothEyes:
+    """What is trained on of each frame of one stream: the left eye's picture, and beside it the right one's, where that is wanted and can be."""
+
+    def __init__(self, eyes: Eyes, device: torch.device | str = "cpu") -> None:
+        self._with_right, self._device = eyes == "both", device
+        self._highlights = HighlightFinder()
+        self.trained: Eyes = "left"
+        """Which eyes there was something of so far."""
+        self.forget()
+
+    def forget(self) -> None:
+        """Another stream begins."""
+        self._colours = EyeColours()
+
+    def observation(self, frame: Frame, camera: Camera, *, trains: bool = True) -> Observation:
+        """As `Observation.of`, with the right eye's unless nothing is trained."""
+        left = Observation.of(frame, camera, self._device)
+        return self.beside(left, frame) if self._with_right and trains else left
+
+    def beside(self, left: Observation, frame: Frame) -> Observation:
+        """`left`, which is what `frame` shows the left eye, with the right one's observation; as it is where the frame has no right picture
+        or nobody knows where its camera is. Raises InvalidInput for a camera of another model than the left one."""
+        right = frame.right_camera
+        if frame.right_image is None or right is None:
+            return left
+        if right.model != left.camera.model:
+            raise InvalidInput(
+                f"frame {frame.seq}: the right camera is {right.model}, the left one {left.camera.model}; training takes two of one model"
+            )
+        self.trained = "both"
+        image = scene_colours(self._colours.corrected(frame), frame.exposure)
+        mask = self._tissue(frame, left.camera, right)
+        if frame.loss_mask is not None:
+            mask = mask & frame.loss_mask
+        steady = None if frame.rehearsal_mask is None else self._highlights.without(image)
+        return replace(
+            left,
+            right=Observation(
+                seq=frame.seq,
+                time_s=left.time_s,
+                camera=right.with_pose(right.world_to_camera @ left.camera.world_to_camera),
+                image=tensor_of(image, self._device),
+                mask=tensor_of(mask, self._device),
+                depth=None,
+                rehearsal_mask=None if steady is None else tensor_of(steady, self._device),
+            ),
+        )
+
+    def _tissue(self, frame: Frame, camera: Camera, right: Camera) -> NDArray[np.uint8]:
+        shift = self._colours.shift or 0.0
+        return right_tissue(frame, camera, right, shift * frame.width_px)
+
+
+def right_tissue(frame: Frame, camera: Camera, right: Camera, shift_px: float) -> NDArray[np.uint8]:
+    """Which pixels of the right picture show tissue, uint8 [H, W]: those at which the left eye's tools do not appear.
+
+    A tool's pixel goes to where its depth puts it. Where depth is unknown it takes everything from `FARTHEST` to `NEAREST` times the typical
+    disparity: that of the known depth, or else `shift_px`, by how much the right picture as a whole is shifted to the left. A tool that only the right
+    eye sees is not found.
+    """
+    height, width = frame.image.shape[:2]
+    if frame.mask is None or frame.mask.all():
+        return np.ones((height, width), np.uint8)
+    rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
+    tool = cv2.resize((frame.mask == 0).astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA) > 0
+    depth = cv2.resize(believed_depth(frame), (columns, rows), interpolation=cv2.INTER_NEAREST)
+    known = np.isfinite(depth) & (depth > 0)
+    centres = (np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1) + 0.5) * (width / columns, height / rows)
+    hidden = np.zeros((rows, columns), np.uint8)
+    if known.any():
+        places = _seen_by_right(centres[known], depth[known], replace(camera, world_to_camera=np.eye(4)), right)
+        shift_px = float(np.median(centres[known][:, 0] - places[:, 0]))
+        of_tools = np.floor(places[tool[known]] * (columns / width, rows / height)).astype(np.int64)
+        inside = ((of_tools >= 0) & (of_tools < (columns, rows))).all(1)
+        hidden[of_tools[inside, 1], of_tools[inside, 0]] = 1
+    hidden |= _smeared(
+        tool & ~known, sorted((FARTHEST * shift_px * columns / width, NEAREST * shift_px * columns / width))
+    )
+    # Cells around, as what was one cell wide may fall between two, and masks end a little early.
+    hidden = np.asarray(cv2.dilate(hidden, np.ones((3, 3), np.uint8)), np.uint8)
+    return np.asarray(cv2.resize(1 - hidden, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
+
+
+def _seen_by_right(pixels: NDArray[np.float64], z: NDArray, camera: Camera, right: Camera) -> NDArray[np.float64]:
+    """Where the right eye sees what the left one sees at `pixels` [N, 2] in depth `z` [N]."""
+    points, _ = unprojected(pixels, z.astype(np.float64), camera)
+    return np.asarray(pixels_of(torch.from_numpy(points), right)[0].numpy())
+
+
+def _smeared(cells: NDArray[np.bool_], shifts: list[float]) -> NDArray[np.uint8]:
+    """The cells [rows, columns], moved to the left by everything between two shifts."""
+    found = np.zeros(cells.shape, np.uint8)
+    if not cells.any():
+        return found
+    columns = cells.shape[1]
+    for shift in range(int(np.floor(shifts[0])), int(np.ceil(shifts[1])) + 1):
+        if abs(shift) >= columns:
+            continue
+        if shift >= 0:
+            found[:, : columns - shift] |= cells[:, shift:]
+        else:
+            found[:, -shift:] |= cells[:, :shift]
+    return found

@@ -1,0 +1,224 @@
+"""The second eye in training: its camera, its mask, what it is good for."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.live_training import LiveTraining
+from gsplat_core.training.offline import FitSettings
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.right_eye import BothEyes, right_tissue
+from tests.gsplat_core.training.two_eyes import HEIGHT, LEFT, RIGHT, THIRD, WIDTH, seen, stereo_frame
+
+CONFIG = ReconstructorConfig(
+    gaussians=700, max_gaussians=1400, default_depth_mm=56.0, first_frame_steps=80, steps_per_frame=20
+)
+DISPARITY_PX = 60 * 5 / 56
+
+
+def psnr(a, b):
+    return float(-10 * np.log10(np.mean((a.astype(float) - b.astype(float)) ** 2) / 255**2))
+
+
+def inner(picture):
+    return picture[8:-8, 12:-12]
+
+
+def test_the_right_eye_is_where_the_frame_says_from_wherever_the_left_one_is():
+    pose = np.eye(4)
+    pose[:3, 3] = [1, -2, 3]
+    left = BothEyes("both").observation(stereo_frame(pose=pose), LEFT)
+    right = left.right
+    assert right is not None and right.right is None
+    assert np.allclose(right.camera.world_to_camera, RIGHT.world_to_camera @ pose)
+    assert (right.seq, right.time_s, right.depth) == (left.seq, left.time_s, None)
+    assert np.array_equal(right.image.numpy(), seen(RIGHT)[0]), "the eyes have the same colours: nothing is changed"
+    assert left.by_turns(0) is left and left.by_turns(1) is right and left.by_turns(2) is left
+
+
+def test_its_intrinsics_are_its_own():
+    K = RIGHT.K.copy()
+    K[1, 2] += 0.5
+    own = dataclasses.replace(RIGHT, K=K)
+    right = BothEyes("both").observation(stereo_frame(right_camera=own), LEFT).right
+    assert right is not None and np.array_equal(right.camera.K, K)
+
+
+@pytest.mark.parametrize("missing", ["right_image", "right_camera"])
+def test_without_a_right_eye_there_is_the_left_one_at_every_turn(missing):
+    eyes = BothEyes("both")
+    left = eyes.observation(stereo_frame(**{missing: None}), LEFT)
+    assert left.right is None and left.by_turns(1) is left
+    assert eyes.trained == "left"
+
+
+def test_the_right_eye_is_left_out_where_it_is_not_wanted_and_where_nothing_is_trained():
+    assert BothEyes("left").observation(stereo_frame(), LEFT).right is None
+    eyes = BothEyes("both")
+    assert eyes.observation(stereo_frame(), LEFT, trains=False).right is None
+    assert eyes.trained == "left"
+    assert eyes.observation(stereo_frame(), LEFT).right is not None
+    assert eyes.trained == "both"
+
+
+def test_cameras_of_two_models_are_refused():
+    with pytest.raises(InvalidInput, match="right camera is fisheye, the left one pinhole"):
+        BothEyes("both").observation(stereo_frame(right_camera=dataclasses.replace(RIGHT, model="fisheye")), LEFT)
+
+
+def test_exposure_is_taken_out_of_both_pictures():
+    frame = stereo_frame(exposure=(0.5, 0.5, 0.5))
+    left = BothEyes("both").observation(frame, LEFT)
+    for eye, picture in ((left, frame.image), (left.right, frame.right_image)):
+        assert np.abs(eye.image.numpy().astype(int) - (2 * picture.astype(int)).clip(0, 255)).max() <= 1
+
+
+def test_what_is_left_out_of_rehearsal_is_looked_for_in_the_right_picture_itself():
+    right_image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    right_image[20:24, 30:34] = 255
+    everything = np.ones((HEIGHT, WIDTH), np.uint8)
+    frame = stereo_frame(right_image=right_image, rehearsal_mask=everything)
+    right = BothEyes("both").observation(frame, LEFT).right
+    assert right is not None and not right.rehearsal_mask[20:24, 30:34].any() and right.rehearsal_mask[:10].all()
+    rehearsed = BothEyes("both").observation(frame, LEFT).to_rehearse().right
+    assert not rehearsed.mask[20:24, 30:34].any() and rehearsed.rehearsal_mask is None
+
+
+def tool_mask():
+    mask = np.ones((HEIGHT, WIDTH), np.uint8)
+    mask[16:32, 28:40] = 0
+    return mask
+
+
+def test_a_tool_is_left_out_where_its_depth_puts_it_in_the_right_picture():
+    mask = tool_mask()
+    depth = np.full((HEIGHT, WIDTH), 56.0, np.float32)
+    depth[mask == 0] = 20.0  # 15 px of disparity
+    found = right_tissue(stereo_frame(mask=mask, depth=depth), LEFT, RIGHT, 0.0)
+    assert not found[16:32, 13:25].any(), "there it is"
+    assert found[:, 34:].all() and found[:8].all() and found[40:].all()
+    assert found[16:32, 29:].all(), "where the left eye sees it the right one sees tissue"
+
+
+def test_a_tool_of_unknown_depth_hides_all_that_it_may_hide():
+    mask = tool_mask()
+    depth = np.where(mask == 1, np.float32(56), np.float32(0))
+    found = right_tissue(stereo_frame(mask=mask, depth=depth), LEFT, RIGHT, 0.0)
+    for nearer in (0.75, 1.0, 2.0):
+        begin, end = round(28 - nearer * DISPARITY_PX), round(40 - nearer * DISPARITY_PX)
+        assert not found[16:32, begin:end].any()
+    assert found[:, 44:].all() and found[:, :8].all()
+    without_any = right_tissue(stereo_frame(mask=mask), LEFT, RIGHT, DISPARITY_PX)
+    assert np.array_equal(without_any, found), "the shift of the whole picture says as much"
+
+
+def test_depth_that_is_not_believed_says_nothing_about_a_tool():
+    mask = tool_mask()
+    depth = np.full((HEIGHT, WIDTH), 56.0, np.float32)
+    depth[mask == 0] = 20.0
+    confidence = mask.astype(np.float32)
+    doubted = right_tissue(stereo_frame(mask=mask, depth=depth, depth_confidence=confidence), LEFT, RIGHT, 0.0)
+    unknown = np.where(mask == 1, depth, np.float32(0))
+    assert np.array_equal(doubted, right_tissue(stereo_frame(mask=mask, depth=unknown), LEFT, RIGHT, 0.0))
+
+
+@pytest.mark.parametrize("mask", [None, np.ones((HEIGHT, WIDTH), np.uint8)])
+def test_without_a_tool_all_of_the_right_picture_is_tissue(mask):
+    assert right_tissue(stereo_frame(mask=mask), LEFT, RIGHT, 5.0).all()
+
+
+def test_where_all_is_tool_nothing_is_learned_of_what_may_be_it():
+    nothing = right_tissue(stereo_frame(mask=np.zeros((HEIGHT, WIDTH), np.uint8)), LEFT, RIGHT, 5.0)
+    assert not nothing[:, : WIDTH - 16].any()
+
+
+def test_a_tool_that_leaves_the_right_picture_hides_nothing_there():
+    mask = np.ones((HEIGHT, WIDTH), np.uint8)
+    mask[:, :6] = 0
+    depth = np.full((HEIGHT, WIDTH), 15.0, np.float32)
+    assert right_tissue(stereo_frame(mask=mask, depth=depth), LEFT, RIGHT, 0.0).all()
+
+
+def trained(eyes, frames=2, **fields):
+    learning = Reconstructor(dataclasses.replace(CONFIG, eyes=eyes), LEFT)
+    for seq in range(frames):
+        learning.observe(stereo_frame(seq, **fields))
+    return learning
+
+
+def test_both_eyes_meet_in_one_surface():
+    """Nothing says how far away the surface is but that two eyes see it: the third view, and depth, are better with both."""
+    views, depths = {}, {}
+    for eyes in ("left", "both"):
+        learning = trained(eyes)
+        assert learning.eyes.trained == eyes
+        model = learning.snapshot()
+        scene = model.at(0.0)
+        views[eyes] = psnr(inner(seen(THIRD, scene)[0]), inner(seen(THIRD)[0]))
+        depths[eyes] = np.abs(inner(seen(LEFT, scene)[1]) - inner(seen(LEFT)[1])).mean()
+        assert psnr(inner(seen(LEFT, scene)[0]), inner(seen(LEFT)[0])) > 25
+    assert views["both"] > views["left"] + 2
+    assert depths["both"] < 0.7 * depths["left"]
+
+
+def test_tissue_that_only_the_right_eye_sees_gets_gaussians():
+    covered = trained("both", frames=1, with_depth=True).snapshot().at(0.0)
+    picture, _ = seen(RIGHT, covered)
+    alone = trained("left", frames=1, with_depth=True).snapshot().at(0.0)
+    strip = np.s_[8:-8, -4:]
+    assert psnr(picture[strip], seen(RIGHT)[0][strip]) > psnr(seen(RIGHT, alone)[0][strip], seen(RIGHT)[0][strip]) + 5
+
+
+def test_offline_training_takes_both_eyes():
+    config = dataclasses.replace(CONFIG, depth_from_motion=False)
+    views = {}
+    for eyes in ("left", "both"):
+        learning = Reconstructor(dataclasses.replace(config, eyes=eyes), LEFT)
+        learning.fit([stereo_frame(seq) for seq in range(3)], 200, settings=FitSettings(densify_rounds=1))
+        views[eyes] = psnr(inner(seen(RIGHT, learning.snapshot().at(0.0))[0]), inner(seen(RIGHT)[0]))
+    assert views["both"] > views["left"] + 3
+
+
+def test_the_same_frames_give_the_same_bytes():
+    first, second = (trained("both", frames=3).snapshot() for _ in range(2))
+    assert first.sha256() == second.sha256()
+    assert first.sha256() != trained("left", frames=3).snapshot().sha256()
+
+
+def test_a_frame_without_a_right_eye_trains_as_ever():
+    alone = trained("both", frames=3, right_image=None).snapshot()
+    assert alone.sha256() == trained("left", frames=3, right_image=None).snapshot().sha256()
+
+
+def test_live_the_eyes_take_turns_and_the_left_one_begins(monkeypatch):
+    learning = LiveReconstructor(
+        dataclasses.replace(CONFIG, squared_error=True), LEFT, live=LiveTraining(colour_relaxation=1.0)
+    )
+    learning.observe(stereo_frame(), steps=2)
+    taken = []
+    step = learning._step
+    monkeypatch.setattr(type(step), "__call__", lambda self, one, *rest: taken.append(one.camera) or torch.zeros(()))
+    learning.observe(stereo_frame(1), steps=3)
+    learning.rehearse(4)
+    left, right = LEFT, RIGHT
+    assert taken == [left, right, left, right, left, right, left]
+
+
+def test_live_makes_both_eyes_better():
+    learning = LiveReconstructor(
+        dataclasses.replace(CONFIG, squared_error=True, history_s=2.0, preallocate=True),
+        LEFT,
+        live=LiveTraining(colour_relaxation=1.5),
+    )
+    for seq in range(4):
+        learning.observe(stereo_frame(seq, with_depth=True), steps=20)
+        learning.grow(stereo_frame(seq, with_depth=True))
+        learning.rehearse(10)
+    scene = learning.snapshot().at(0.1)
+    for camera in (LEFT, RIGHT):
+        assert psnr(inner(seen(camera, scene)[0]), inner(seen(camera)[0])) > 24, camera
