@@ -155,14 +155,14 @@ def test_both_eyes_meet_in_one_surface():
     """Nothing says how far away the surface is but that two eyes see it: the third view, and depth, are better with both."""
     views, depths = {}, {}
     for eyes in ("left", "both"):
-        learning = trained(eyes)
+        learning = trained(eyes, frames=4)
         assert learning.eyes.trained == eyes
         model = learning.snapshot()
         scene = model.at(0.0)
         views[eyes] = psnr(inner(seen(THIRD, scene)[0]), inner(seen(THIRD)[0]))
         depths[eyes] = np.abs(inner(seen(LEFT, scene)[1]) - inner(seen(LEFT)[1])).mean()
         assert psnr(inner(seen(LEFT, scene)[0]), inner(seen(LEFT)[0])) > 25
-    assert views["both"] > views["left"] + 2
+    assert views["both"] > views["left"] + 1.5
     assert depths["both"] < 0.7 * depths["left"]
 
 

@@ -17,7 +17,7 @@ WIDTH, HEIGHT, MARGIN = 64, 48, 16
 LEFT = Camera.from_focal(60.0, WIDTH, HEIGHT)
 BASELINE_MM = 5.0
 RIGHT = LEFT.right_eye(BASELINE_MM)
-THIRD = LEFT.with_pose([[1, 0, 0, 4.0], [0, 1, 0, 3.0], [0, 0, 1, 0], [0, 0, 0, 1]])
+THIRD = LEFT.with_pose([[1, 0, 0, 8.0], [0, 1, 0, 6.0], [0, 0, 1, 0], [0, 0, 0, 1]])
 """To the left and above: no eye of the scope."""
 
 
