@@ -29,8 +29,8 @@ from services.cli.options import (
     RenderOutOption,
     RunOptions,
     ScaleOption,
-    SeedOption,
     SourceArgument,
+    SynthesizeOptions,
     takes_run_options,
 )
 from services.cli.streams import printable
@@ -230,20 +230,12 @@ def evaluate(
 
 
 @app.command()
-def synthesize(
-    out: OutOption,
-    frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
-    width: Annotated[int, typer.Option(help="Width in pixels.")] = 320,
-    height: Annotated[int, typer.Option(help="Height in pixels.")] = 256,
-    fps: Annotated[float, typer.Option(help="Frames per second.")] = 30.0,
-    seed: SeedOption = 0,
-    moving_camera: Annotated[bool, typer.Option("--moving-camera/--fixed-camera", help="Let the scope move.")] = False,
-    json: JsonOption = False,
-) -> int:
-    """Make a recording with exact ground truth: tissue, tool, stereo, depth, masks, poses."""
+@takes_run_options
+def synthesize(out: OutOption, options: SynthesizeOptions, json: JsonOption = False) -> int:
+    """Make a recording with exact ground truth: tissue, tool, stereo, depth, masks, poses; and more of it where it is asked for."""
     from services.cli.synthesize import synthesize_command
 
-    return synthesize_command(out, frames, width, height, fps, seed, moving_camera, as_json=json)
+    return synthesize_command(out, options, as_json=json)
 
 
 @app.command()

@@ -134,6 +134,33 @@ class EvaluateOptions:
 
 
 @dataclass(frozen=True)
+class SynthesizeOptions:
+    """Those of `synthesize`."""
+
+    frames: Annotated[int, typer.Option(help="Number of frames.")] = 60
+    width: Annotated[int, typer.Option(help="Width in pixels.")] = 320
+    height: Annotated[int, typer.Option(help="Height in pixels.")] = 256
+    fps: Annotated[float, typer.Option(help="Frames per second.")] = 30.0
+    seed: SeedOption = 0
+    moving_camera: Annotated[bool, typer.Option("--moving-camera/--fixed-camera", help="Let the scope move.")] = False
+    scene: Annotated[
+        str, typer.Option(help="open (a sheet of tissue with a tool) or colon (a tube along its axis).")
+    ] = "open"
+    third: Annotated[
+        bool, typer.Option("--third", help="A third camera in views/third, which training never gets.")
+    ] = False
+    flow: Annotated[bool, typer.Option("--flow", help="Optical flow and scene flow to the next frame.")] = False
+    tracks: Annotated[bool, typer.Option("--tracks", help="Which of the followed points each frame sees.")] = False
+    smoke: Annotated[float, typer.Option(help="Smoke that comes and goes: 0 none, 1 dense.")] = 0.0
+    depth_noise: Annotated[
+        float, typer.Option(metavar="MM", help="Noise of the depth at 74 mm; the true one is kept in true_depth.")
+    ] = 0.0
+    exposure_changes: Annotated[bool, typer.Option("--exposure-changes", help="Let the exposure go up and down.")] = (
+        False
+    )
+
+
+@dataclass(frozen=True)
 class LiveOptions(RunOptions):
     """What `live` takes besides; the names are those of `LiveSettings`."""
 

@@ -8,18 +8,27 @@ from pathlib import Path
 import typer
 
 from gsplat_core.io.recordings import open_recording, synthesize
+from gsplat_core.io.recordings.synthetic.extras import Extras
 from operators.applications.progress import Progress
 from operators.output_paths import check_folder_path
 from operators.storage import storage_errors
 from services.cli.exit_codes import OK
 from services.cli.interrupt import InterruptRequest
+from services.cli.options import SynthesizeOptions
 from services.cli.progress import ProgressPrinter
 
 
-def synthesize_command(
-    out: Path, frames: int, width_px: int, height_px: int, fps: float, seed: int, moving_camera: bool, *, as_json: bool
-) -> int:
+def synthesize_command(out: Path, options: SynthesizeOptions, *, as_json: bool) -> int:
     """Write a synthetic recording and print where it is. An interrupt leaves what was there before."""
+    extras = Extras(
+        scene=options.scene,
+        third=options.third,
+        flow=options.flow,
+        tracks=options.tracks,
+        smoke=options.smoke,
+        depth_noise_mm=options.depth_noise,
+        exposure_changes=options.exposure_changes,
+    )
     with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as show:
 
         def progress(done: int, total: int) -> None:
@@ -31,12 +40,13 @@ def synthesize_command(
             check_folder_path(out)
             synthesize(
                 out,
-                frames=frames,
-                width_px=width_px,
-                height_px=height_px,
-                fps=fps,
-                seed=seed,
-                camera="moving" if moving_camera else "fixed",
+                frames=options.frames,
+                width_px=options.width,
+                height_px=options.height,
+                fps=options.fps,
+                seed=options.seed,
+                camera="moving" if options.moving_camera else "fixed",
+                extras=extras,
                 progress=progress,
             )
     recording = open_recording(out)

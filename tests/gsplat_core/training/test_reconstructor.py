@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsplat_core.deformation import FIELDS, BasisField, HexPlaneField
-from gsplat_core.io.recordings.synthetic.synthesize import SyntheticScene
+from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import LearningRates, ReconstructorConfig

@@ -12,12 +12,8 @@ from typing import Literal
 import numpy as np
 
 from gsplat_core.io.recordings.calibration import DEFAULT_FOCAL_FACTOR
-from gsplat_core.io.recordings.synthetic.synthesize import (
-    BASELINE_MM,
-    SyntheticScene,
-    check_arguments,
-    threads_that_fit,
-)
+from gsplat_core.io.recordings.synthetic.scene import BASELINE_MM, SyntheticScene
+from gsplat_core.io.recordings.synthetic.synthesize import check_arguments, threads_that_fit
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 

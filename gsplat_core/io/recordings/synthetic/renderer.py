@@ -1,6 +1,6 @@
-"""Ray casting of tissue and tool, lit from the scope's tip: image, depth and tool mask of one eye.
+"""Ray casting of tissue and tool, lit from the scope's tip: image, depth and tool mask of one camera.
 
-Each pixel's ray is cut with the deformed sheet by Newton's method on the material coordinates (u, v), so depth is that
+Each pixel's ray is cut with the deformed tissue by Newton's method on the material coordinates (u, v), so depth is that
 of the surface itself, not of a mesh. A pixel (column i, row j) has its centre at (i + 0.5, j + 0.5).
 """
 
@@ -11,22 +11,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM, SurfacePoints, Tissue, Tug
-from gsplat_core.io.recordings.synthetic.tool import RING, SHAFT, Part, distance, trace
+from gsplat_core.io.recordings.synthetic.air import Air
+from gsplat_core.io.recordings.synthetic.lamp import Lamp
+from gsplat_core.io.recordings.synthetic.shading import develop, shade_tissue, shade_tool
+from gsplat_core.io.recordings.synthetic.tissue import SurfacePoints, Tissue, Tug
+from gsplat_core.io.recordings.synthetic.tool import Part, trace
 from gsplat_core.scene.cameras import Camera
 
 Array = NDArray[np.floating]
 
 NEWTON_STEPS = 6
-LIGHTS_MM = ((-3.2, -2.2, 0.0), (3.2, -2.2, 0.0))
-"""Two light fibres at the scope's tip, around its middle."""
-REFERENCE_MM = 66.0
-"""A white surface facing the scope at this distance is exposed as 1."""
 
 
 @dataclass(frozen=True)
 class Eye:
-    """What one eye sees, and the material point behind each pixel."""
+    """What one camera sees, and the material point behind each pixel."""
 
     image: NDArray[np.uint8]
     """sRGB [H, W, 3]."""
@@ -41,13 +40,13 @@ class Eye:
 
 
 def render_eye(
-    tissue: Tissue, tug: Tug, parts: list[Part], camera: Camera, time_s: float, scope_x_mm: float = 0.0
+    tissue: Tissue, tug: Tug, parts: list[Part], camera: Camera, time_s: float, lamp: Lamp, air: Air | None = None
 ) -> Eye:
-    """One eye's view of the scene at a time.
+    """One camera's view of the scene at a time.
 
-    scope_x_mm: where the middle of the scope's tip is on the eye's x axis; both eyes see by the same lights.
+    lamp: in the camera's coordinates; all cameras see by the same light. air: what is between the scope and the tissue, and how the picture
+    is exposed; None: clear, and exposed as usual.
     """
-    lights = np.array(LIGHTS_MM, np.float32) + np.array([scope_x_mm, 0, 0], np.float32)
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     ray_x, ray_y = pixel_rays(camera)
     u, v, points = cast_tissue(tissue, tug, camera, ray_x, ray_y, time_s)
@@ -63,23 +62,19 @@ def render_eye(
     tool_depth = hits.distance_mm.reshape(shape) / length
     cover = hits.cover.reshape(shape)
 
-    radiance = _shade_tissue(tissue, u, v, points, local, rays, rotation, parts, camera, lights)
+    radiance = shade_tissue(tissue, u, v, points, local, rays, parts, camera, lamp)
     touched = cover > 0
     if touched.any():
         normal = hits.normal.reshape(*shape, 3)[touched] @ rotation.T.astype(np.float32)
         reach = np.where(np.isfinite(tool_depth), tool_depth, tissue_depth * np.float32(0.9))[touched]
         at = rays[touched] * (reach * length[touched])[:, None]
-        steel = _shade_tool(at, normal, rays[touched], hits.material.reshape(shape)[touched], lights)
+        steel = shade_tool(at, normal, rays[touched], hits.material.reshape(shape)[touched], lamp)
         share = cover[touched][:, None]
         radiance[touched] = (1 - share) * radiance[touched] + share * steel
-    return Eye(
-        image=_develop(radiance),
-        depth=np.minimum(tissue_depth, tool_depth).astype(np.float32),
-        tool=touched,
-        tissue_depth=tissue_depth,
-        u=u,
-        v=v,
-    )
+    depth = np.minimum(tissue_depth, tool_depth).astype(np.float32)
+    if air is not None:
+        radiance = air.through(radiance, camera, ray_x, ray_y, depth, lamp, time_s)
+    return Eye(image=develop(radiance), depth=depth, tool=touched, tissue_depth=tissue_depth, u=u, v=v)
 
 
 def pixel_rays(camera: Camera) -> tuple[Array, Array]:
@@ -96,11 +91,8 @@ def cast_tissue(
     """The material point (u, v) that each ray meets: Newton's method on X - ray_x Z = 0, Y - ray_y Z = 0."""
     r = camera.world_to_camera[:3, :3].astype(np.float32)
     t = camera.world_to_camera[:3, 3].astype(np.float32)
-    # Start on the plane at the mean distance.
     directions = np.stack([ray_x, ray_y, np.ones_like(ray_x)], axis=-1) @ r
-    origin = camera.position.astype(np.float32)
-    s = (np.float32(TISSUE_DISTANCE_MM) - origin[2]) / directions[..., 2]
-    u, v = origin[0] + s * directions[..., 0], origin[1] + s * directions[..., 1]
+    u, v = tissue.first_guess(camera.position.astype(np.float32), directions)
     for _ in range(NEWTON_STEPS):
         points = tissue.points(u, v, time_s, tug)
         # Rows of the camera's rotation minus the ray: what a displacement does to the two residuals.
@@ -123,106 +115,3 @@ def cast_tissue(
 
 def _dot(row: Array, vector: tuple[Array, Array, Array]) -> Array:
     return np.asarray(row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2])
-
-
-def _shade_tissue(
-    tissue: Tissue,
-    u: Array,
-    v: Array,
-    points: SurfacePoints,
-    local: Array,
-    rays: Array,
-    rotation: NDArray[np.float64],
-    parts: list[Part],
-    camera: Camera,
-    lights: Array,
-) -> Array:
-    """Linear radiance [H, W, 3] of the tissue: scattering that bleeds red, and a wet film over a fine relief."""
-    reflectance, slope = tissue.texture.sample(u, v)
-    turn = rotation.T.astype(np.float32)
-    along_u = np.stack(points.along_u, axis=-1) @ turn
-    along_v = np.stack(points.along_v, axis=-1) @ turn
-    # The sheet lies across the view, u to the right and v down: u x v points away from the scope.
-    smooth = _unit(np.cross(along_v, along_u))
-    bumpy = _unit(np.cross(along_v - slope[..., 1:] * -smooth, along_u - slope[..., :1] * -smooth).astype(np.float32))
-    light_diffuse = np.zeros(u.shape, np.float32)
-    light_wet = np.zeros(u.shape, np.float32)
-    for light in lights:
-        to_light = light - local
-        distance2 = np.einsum("hwi,hwi->hw", to_light, to_light)
-        to_light /= np.sqrt(distance2)[..., None]
-        # Fibres shine in a cone about the view axis.
-        power = np.float32(0.5 * REFERENCE_MM**2) / distance2 * np.clip(-to_light[..., 2], 0, 1) ** 2
-        facing = np.einsum("hwi,hwi->hw", bumpy, to_light)
-        half = _unit(to_light - rays)
-        shine = np.clip(np.einsum("hwi,hwi->hw", bumpy, half), 0, 1)
-        light_diffuse += power * np.clip((facing + np.float32(0.12)) / np.float32(1.12), 0, 1)
-        light_wet += power * (np.float32(9.0) * shine ** np.float32(900) + np.float32(0.20) * shine ** np.float32(40))
-    shade = _tool_shade(parts, camera, local, lights.mean(axis=0))
-    diffuse = (light_diffuse * shade)[..., None]
-    # Light that has wandered through tissue comes out red: lift red where little arrives directly.
-    bleed = np.array([0.060, 0.014, 0.010], np.float32) * np.sqrt(np.maximum(diffuse, 0))
-    wet = (light_wet * shade * reflectance[..., 3])[..., None] * np.array([1.0, 0.97, 0.93], np.float32)
-    return np.asarray(reflectance[..., :3] * diffuse + bleed + wet, np.float32)
-
-
-def _tool_shade(parts: list[Part], camera: Camera, local: Array, light: Array) -> Array:
-    """How much light reaches the tissue past the tool: sampled on a coarse grid, along the way to the scope."""
-    step = 3
-    rotation = camera.world_to_camera[:3, :3].astype(np.float32)
-    coarse = local[::step, ::step].reshape(-1, 3)
-    # From a little above the lights, so that the shadow does not hide behind the tool.
-    to_light = light + np.array([0.0, -7.0, 0.0], np.float32) - coarse
-    shade = np.ones(len(coarse), np.float32)
-    for reach in (0.015, 0.05, 0.10, 0.17, 0.26, 0.37):
-        at = (coarse + np.float32(reach) * to_light) @ rotation + camera.position.astype(np.float32)
-        gap, _ = distance(parts, at)
-        blur = np.float32(1.0 + 22 * reach)
-        shade = np.minimum(shade, np.clip(0.5 + gap / blur, 0, 1))
-    rows, columns = local[::step, ::step].shape[:2]
-    return _upsample(0.30 + 0.70 * shade.reshape(rows, columns), local.shape[0], local.shape[1], step)
-
-
-def _upsample(coarse: Array, rows: int, columns: int, step: int) -> Array:
-    row, column = np.arange(rows) / step, np.arange(columns) / step
-    known_rows, known_columns = np.arange(coarse.shape[0]), np.arange(coarse.shape[1])
-    wide = np.stack([np.interp(column, known_columns, line) for line in coarse])
-    low = np.minimum(row.astype(int), len(known_rows) - 1)
-    high = np.minimum(low + 1, len(known_rows) - 1)
-    weight = (row - low)[:, None]
-    return np.asarray((1 - weight) * wide[low] + weight * wide[high], np.float32)
-
-
-def _shade_tool(at: Array, normal: Array, rays: Array, material: NDArray[np.int8], lights: Array) -> Array:
-    """Linear radiance [N, 3] of the tool: dark polymer shaft, brushed steel that mirrors the pink surroundings."""
-    metal = (material != SHAFT)[:, None]
-    base = np.where(metal, np.array([0.26, 0.265, 0.28], np.float32), np.array([0.085, 0.093, 0.108], np.float32))
-    base = np.where((material == RING)[:, None], np.array([0.10, 0.105, 0.12], np.float32), base)
-    gloss = np.where(metal[:, 0], np.float32(64), np.float32(14))
-    glint = np.where(metal[:, 0], np.float32(2.6), np.float32(0.16))
-    total = np.zeros((len(at), 3), np.float32)
-    for light in lights:
-        to_light = light - at
-        distance2 = np.einsum("ni,ni->n", to_light, to_light)
-        to_light /= np.sqrt(distance2)[:, None]
-        power = np.float32(0.5 * REFERENCE_MM**2) / np.maximum(distance2, 400) * np.clip(-to_light[:, 2], 0, 1) ** 2
-        facing = np.clip(np.einsum("ni,ni->n", normal, to_light), 0, 1)
-        shine = np.clip(np.einsum("ni,ni->n", normal, _unit(to_light - rays)), 0, 1)
-        total += (power * facing)[:, None] * base + (power * glint * shine**gloss)[:, None]
-    mirrored = rays - 2 * np.einsum("ni,ni->n", rays, normal)[:, None] * normal
-    tissue_seen = (np.clip(0.45 + 0.65 * mirrored[:, 2], 0, 1) ** 2)[:, None]
-    fresnel = (1 - np.clip(-np.einsum("ni,ni->n", rays, normal), 0, 1))[:, None] ** 3
-    reflected = np.where(metal, 0.60 + 0.40 * fresnel, 0.05 + 0.45 * fresnel)
-    surroundings = np.array([0.250, 0.130, 0.110], np.float32)
-    return np.asarray(total + reflected * tissue_seen * surroundings, np.float32)
-
-
-def _unit(vector: Array) -> Array:
-    return np.asarray(vector / np.sqrt(np.einsum("...i,...i->...", vector, vector))[..., None], np.float32)
-
-
-def _develop(radiance: Array) -> NDArray[np.uint8]:
-    """Exposure with a soft shoulder, then the sRGB curve (IEC 61966-2-1)."""
-    exposed = 1 - np.exp(np.float32(-1.45) * radiance)
-    curve = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * np.maximum(exposed, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.asarray(np.clip(np.round(255 * curve), 0, 255), np.uint8)

@@ -11,16 +11,21 @@ from pathlib import Path
 from gsplat_core.errors import InvalidSetting
 
 GENERATOR = "intrasplat synthesize"
-_WRITTEN = {
-    "images": r"frame-\d{6}\.color\.png",
-    "images_right": r"frame-\d{6}\.color\.png",
-    "masks": r"frame-\d{6}\.mask\.png",
-    "depth": r"frame-\d{6}\.depth\.png",
-    "poses_bounds.npy": "",
-    "tracks.npy": "",
-    "recording.json": "",
+_FRAME = r"frame-\d{6}\."
+_WRITTEN = re.compile(
+    rf"(views/third/)?(images/{_FRAME}color|masks/{_FRAME}mask|depth/{_FRAME}depth)\.png"
+    rf"|images_right/{_FRAME}color\.png|true_depth/{_FRAME}depth\.png|(scene_)?flow/\d{{6}}\.npy"
+    r"|poses_bounds\.npy|tracks\.npy|tracks_seen\.npy|recording\.json|views\.json"
+)
+"""The files that this module writes."""
+_FOLDERS = frozenset(f"{inside}{name}" for inside in ("", "views/third/") for name in ("images", "masks", "depth")) | {
+    "images_right",
+    "true_depth",
+    "flow",
+    "scene_flow",
+    "views",
+    "views/third",
 }
-"""What this module writes: a folder with the names of its files, or a file."""
 
 
 def check_target(target: Path) -> None:
@@ -47,21 +52,16 @@ def _foreign(target: Path) -> Iterator[str]:
     """What is in the folder and not of an earlier `synthesize`: everything, unless its description lies there."""
     description = target / "recording.json"
     ours = description.is_file() and _made_here(description)
-    for entry in target.iterdir():
-        pattern = _WRITTEN.get(entry.name)
-        if not ours or pattern is None or entry.is_symlink():
-            yield entry.name
-        elif pattern == "":
-            if not entry.is_file():
-                yield entry.name
-        elif not entry.is_dir() or os.path.ismount(entry):
-            yield entry.name
-        else:
-            yield from (
-                f"{entry.name}/{part.name}"
-                for part in entry.iterdir()
-                if not re.fullmatch(pattern, part.name) or part.is_symlink() or not part.is_file()
-            )
+    folders = [target]
+    for folder in folders:
+        for entry in folder.iterdir():
+            name = entry.relative_to(target).as_posix()
+            if not ours or entry.is_symlink():
+                yield name
+            elif name in _FOLDERS and entry.is_dir() and not os.path.ismount(entry):
+                folders.append(entry)
+            elif not (_WRITTEN.fullmatch(name) and entry.is_file()):
+                yield name
 
 
 def _made_here(description: Path) -> bool:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.io.recordings.calibration import DEFAULT_FOCAL_FACTOR
+from gsplat_core.io.recordings.synthetic.lamp import REFERENCE_MM
 from gsplat_core.io.recordings.synthetic.texture import TissueTexture
 
 Array = NDArray[np.floating]
@@ -29,6 +31,9 @@ class Tug:
     pull: tuple[float, float, float]
 
 
+NO_TUG = Tug((0.0, 0.0), (0.0, 0.0, 0.0))
+
+
 @dataclass(frozen=True)
 class SurfacePoints:
     """Positions and tangents of material points: each a tuple of x, y and z arrays."""
@@ -39,7 +44,19 @@ class SurfacePoints:
 
 
 class Tissue:
-    """One patient's sheet of tissue: shape, breathing and pulse, colour. Deterministic by the generator it is given."""
+    """One patient's sheet of tissue at the bottom of an open cavity: shape, breathing and pulse, colour. Deterministic by the generator it
+    is given. Another scene overrides its shape at rest."""
+
+    focal_factor = DEFAULT_FOCAL_FACTOR
+    """Focal length of the scene's camera over the longer side of its pictures."""
+    exposed_mm = REFERENCE_MM
+    """As `lamp.REFERENCE_MM`: how pictures of the scene are exposed."""
+    looked_at_mm = TISSUE_DISTANCE_MM
+    """How far ahead a moving scope keeps its eye on one point."""
+    sway_mm = (7.0, 4.5, 6.0)
+    """How far a moving scope sways along x, y and z."""
+    tools = True
+    """Whether a tool works there."""
 
     def __init__(self, rng: np.random.Generator, texel_mm: float) -> None:
         wavelengths = np.array([74.0, 58.0, 43.0, 33.0, 26.0, 21.0])
@@ -55,8 +72,14 @@ class Tissue:
         self._breath_angle = float(rng.uniform(0, 2 * np.pi))
         self.texture = TissueTexture(rng, texel_mm)
 
-    def points(self, u: Array, v: Array, time_s: float, tug: Tug) -> SurfacePoints:
-        """Where the material points (u, v) are at a time, and the derivatives by u and v."""
+    def first_guess(self, origin: Array, directions: Array) -> tuple[Array, Array]:
+        """Material points near those that rays from `origin` [3] along `directions` [H, W, 3] meet, for Newton's method: on the plane at
+        the mean distance."""
+        s = (np.float32(TISSUE_DISTANCE_MM) - origin[2]) / directions[..., 2]
+        return origin[0] + s * directions[..., 0], origin[1] + s * directions[..., 1]
+
+    def _at_rest(self, u: Array, v: Array) -> SurfacePoints:
+        """Where the material points (u, v) are when nothing moves, and the derivatives by u and v."""
         one, zero = np.ones_like(u), np.zeros_like(u)
         bowl = np.float32(-0.0022)
         tilt_u, tilt_v = (np.float32(tilt) for tilt in self._tilt)
@@ -67,8 +90,12 @@ class Tissue:
             z = z + np.float32(amplitude) * np.sin(angle)
             slope = np.float32(amplitude) * np.cos(angle)
             z_u, z_v = z_u + np.float32(k_u) * slope, z_v + np.float32(k_v) * slope
-        x, y, x_u, y_v = u, v, one, one
-        x_v, y_u = zero, zero
+        return SurfacePoints((u, v, z), (one, zero, z_u), (zero, one, z_v))
+
+    def points(self, u: Array, v: Array, time_s: float, tug: Tug) -> SurfacePoints:
+        """Where the material points (u, v) are at a time, and the derivatives by u and v."""
+        rest = self._at_rest(u, v)
+        (x, y, z), (x_u, y_u, z_u), (x_v, y_v, z_v) = rest.position, rest.along_u, rest.along_v
 
         # Breathing: a long wave that lifts and shears; pulse: a short one that runs across.
         breath = 2 * np.pi * time_s / BREATH_PERIOD_S + self._breath_phase

@@ -143,6 +143,9 @@ def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm:
     J. C. Hart, "Sphere tracing", The Visual Computer 12 (1996). `pixel_rad` is a pixel's angle, for the cover.
     """
     count = len(rays)
+    if not parts:
+        nothing, far = np.zeros(count, np.float32), np.full(count, np.inf, np.float32)
+        return ToolHits(far, nothing, np.zeros((count, 3), np.float32), np.zeros(count, np.int8))
     start = origin.astype(np.float32)
     travelled = np.full(count, np.inf, np.float32)
     closest = np.full(count, np.inf, np.float32)

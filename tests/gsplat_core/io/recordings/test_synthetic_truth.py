@@ -10,7 +10,7 @@ import pytest
 
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.renderer import cast_tissue, pixel_rays
-from gsplat_core.io.recordings.synthetic.synthesize import BASELINE_MM, SyntheticScene
+from gsplat_core.io.recordings.synthetic.scene import BASELINE_MM, SyntheticScene
 from gsplat_core.io.recordings.synthetic.tool import distance
 from gsplat_core.scene.cameras import Camera
 

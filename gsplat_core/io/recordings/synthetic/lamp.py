@@ -1,0 +1,66 @@
+"""The scope's own light: two fibres at its tip, in the coordinates of the eye that looks.
+
+What arrives falls with the square of the distance to a fibre, with the cosine between surface and light, and away from the middle of the
+beam. Nothing else shines, so near tissue is bright and far tissue dark.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+
+LIGHTS_MM = ((-3.2, -2.2, 0.0), (3.2, -2.2, 0.0))
+"""Two light fibres at the scope's tip, around its middle."""
+REFERENCE_MM = 66.0
+"""A white surface facing the scope at this distance is exposed as 1."""
+SHADOW_MM = (0.0, -7.0, 0.0)
+"""From where shadows are cast: a little above the fibres, so that a shadow does not hide behind the tool."""
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """Where the light comes from; lengths in millimetres, in the coordinates of the eye that looks."""
+
+    fibres: Array
+    """[2, 3]."""
+    axis: Array
+    """The middle of the beam, a unit vector [3]."""
+    shadow_from: Array
+    """[3]."""
+    reference_mm: float = REFERENCE_MM
+    """As REFERENCE_MM: how the picture is exposed."""
+
+    @classmethod
+    def of_eye(cls, scope_x_mm: float, reference_mm: float = REFERENCE_MM) -> Lamp:
+        """The light seen from an eye that looks where the scope does; `scope_x_mm` is where the middle of the scope's tip is on its x axis."""
+        fibres = np.array(LIGHTS_MM, np.float32) + np.array([scope_x_mm, 0, 0], np.float32)
+        above = fibres.mean(axis=0) + np.array(SHADOW_MM, np.float32)
+        return cls(fibres, np.array([0, 0, 1], np.float32), above, reference_mm)
+
+    def seen_from(self, eye_to_view: NDArray[np.float64]) -> Lamp:
+        """The same light in the coordinates of another camera."""
+        rotation, translation = eye_to_view[:3, :3], eye_to_view[:3, 3]
+        moved = lambda points: (points @ rotation.T + translation).astype(np.float32)
+        axis = (rotation @ self.axis).astype(np.float32)
+        return replace(self, fibres=moved(self.fibres), axis=axis, shadow_from=moved(self.shadow_from))
+
+    def rays_to(self, points: Array, nearest_mm2: float = 0.0) -> list[tuple[Array, Array]]:
+        """For each fibre: unit vectors from points [..., 3] to it, and how much of its light arrives there, before the surface's cosine.
+
+        nearest_mm2: the square of a distance below which nothing becomes brighter.
+        """
+        found = []
+        for fibre in self.fibres:
+            to_light = fibre - points
+            distance2 = np.einsum("...i,...i->...", to_light, to_light)
+            to_light /= np.sqrt(distance2)[..., None]
+            if nearest_mm2:
+                distance2 = np.maximum(distance2, np.float32(nearest_mm2))
+            along = np.clip(-(to_light @ self.axis), 0, 1)
+            # Fibres shine in a cone about the beam's middle.
+            found.append((to_light, np.float32(0.5 * self.reference_mm**2) / distance2 * along**2))
+        return found

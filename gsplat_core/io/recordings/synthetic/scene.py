@@ -1,0 +1,110 @@
+"""A synthetic scene as functions of time: tissue, tool, air and cameras; each frame can be rendered on its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.io.recordings.synthetic.air import Air
+from gsplat_core.io.recordings.synthetic.colon import Colon
+from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
+from gsplat_core.io.recordings.synthetic.lamp import Lamp
+from gsplat_core.io.recordings.synthetic.renderer import Eye, render_eye
+from gsplat_core.io.recordings.synthetic.tissue import NO_TUG, TISSUE_DISTANCE_MM, Tissue, Tug
+from gsplat_core.io.recordings.synthetic.tool import CYCLE_S, Part, ToolMotion
+from gsplat_core.scene.cameras import Camera
+
+BASELINE_MM = 4.4
+THIRD_MM = (-7.0, -5.0, 3.0)
+"""Where the third camera is, in the left one's coordinates."""
+View = Literal["left", "right", "third"]
+SCENES: dict[str, type[Tissue]] = {"open": Tissue, "colon": Colon}
+
+
+@dataclass(frozen=True)
+class SyntheticScene:
+    """Tissue, tool and cameras as functions of time."""
+
+    tissue: Tissue
+    motion: ToolMotion
+    camera: Camera
+    moving: bool
+    air: Air | None = None
+
+    @classmethod
+    def from_seed(
+        cls, seed: int, width_px: int, height_px: int, duration_s: float, moving: bool, extras: Extras = CLEAR
+    ) -> SyntheticScene:
+        """The scene of a seed; another size shows the same scene."""
+        kind = SCENES[extras.scene]
+        camera = Camera.from_focal(kind.focal_factor * max(width_px, height_px), width_px, height_px)
+        seeds = np.random.SeedSequence(seed).spawn(3)
+        shape, tool = (np.random.default_rng(child) for child in seeds[:2])
+        tissue = kind(shape, texel_mm=min(0.6 * TISSUE_DISTANCE_MM / float(camera.K[0, 0]), 0.3))
+        air = Air.from_seed(seeds[2], extras.smoke, extras.exposure_changes) if extras.changes_pictures else None
+        return cls(tissue, ToolMotion(tool, cycles=int(duration_s // CYCLE_S) + 1), camera, moving, air)
+
+    def camera_at(self, time_s: float, view: View = "left") -> Camera:
+        """A camera's intrinsics and where it is; the left one at time 0 is at the world's origin."""
+        left = self._left_at(time_s)
+        return left if view == "left" else left.with_pose(self.left_to(view) @ left.world_to_camera)
+
+    def _left_at(self, time_s: float) -> Camera:
+        """At rest, or swaying around a point on the tissue."""
+        if not self.moving:
+            return self.camera
+        sway = 2 * np.pi * time_s
+        x, y, z = self.tissue.sway_mm
+        centre = np.array([x * np.sin(sway / 4.1), y * np.sin(sway / 5.3), z * np.sin(sway / 6.7)])
+        rotation = _looking(np.array([0, 0, self.tissue.looked_at_mm]) - centre, 0.05 * np.sin(sway / 4.7))
+        return self.camera.with_pose(_pose(rotation, centre))
+
+    def left_to(self, view: View) -> NDArray[np.float64]:
+        """From the left camera's coordinates to those of another one, which is fixed to the same scope [4, 4]."""
+        if view == "left":
+            return np.eye(4)
+        if view == "right":
+            return self.camera.right_eye(BASELINE_MM).world_to_camera
+        centre = np.array(THIRD_MM)
+        return _pose(_looking(np.array([0, 0, self.tissue.looked_at_mm]) - centre, 0.0), centre)
+
+    def render(self, time_s: float, view: View = "left") -> Eye:
+        """What a camera sees at a time."""
+        reference_mm = self.tissue.exposed_mm
+        if view == "third":
+            lamp = Lamp.of_eye(BASELINE_MM / 2, reference_mm).seen_from(self.left_to(view))
+        else:
+            lamp = Lamp.of_eye(BASELINE_MM / 2 if view == "left" else -BASELINE_MM / 2, reference_mm)
+        camera = self.camera_at(time_s, view)
+        return render_eye(self.tissue, self.tug(time_s), self.parts(time_s), camera, time_s, lamp, self.air)
+
+    def tug(self, time_s: float) -> Tug:
+        """How a tool pulls at a time."""
+        return self.motion.tug(time_s) if self.tissue.tools else NO_TUG
+
+    def parts(self, time_s: float) -> list[Part]:
+        """The tool at a time; none where no tool works."""
+        return self.motion.parts(self.tissue, time_s) if self.tissue.tools else []
+
+    def track(self, time_s: float) -> NDArray[np.float32]:
+        """A grid of material points in the world [63, 3], mm."""
+        u, v = np.meshgrid(np.linspace(-32, 32, 9, dtype=np.float32), np.linspace(-24, 24, 7, dtype=np.float32))
+        points = self.tissue.points(u.ravel(), v.ravel(), time_s, self.tug(time_s))
+        return np.stack(points.position, axis=1)
+
+
+def _looking(towards: NDArray[np.float64], roll: float) -> NDArray[np.float64]:
+    """The rotation of a camera that looks along a direction: its axes as rows."""
+    forward = towards / np.linalg.norm(towards)
+    right = np.cross([-np.sin(roll), np.cos(roll), 0], forward)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def _pose(rotation: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
+    return pose
