@@ -1,0 +1,190 @@
+"""How true reconstructions of synthetic recordings are in three dimensions, for each thing that a recording may lack.
+
+One line for each case: depth error as a share of the median depth (as it is, after one scale; each frame's median depth everywhere; its
+best tilted plane), how far normals are off (and those of that plane), PSNR of the third camera, which training never gets (the model, after one scale; the left picture as it is, and shifted), and how far followed points of
+the tissue end up (the model, after one scale; no motion). `--json` for all figures. The recording is made once; training gets a copy without
+what the case lacks, so that nothing that is left out can be used.
+
+    fixed       one eye at rest, pictures and tool masks alone
+    stereo      both eyes at rest
+    poses       one moving eye whose poses are given
+    no-poses    one moving eye
+    depth       one eye at rest, with depth
+
+Usage: python benchmarks/geometry_synthetic.py [CASE...] [--scene open|colon] [--steps 400] [--frames 36] [--width 160] [--height 128]
+       [--device cuda] [--work FOLDER] [--depth-noise MM] [--smoke S] [--exposure-changes] [--json]
+On two CPU cores a case takes one to three minutes with these defaults. On a GPU: --device cuda --width 640 --height 512 --steps 3000.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsplat_core.evaluation.geometry import Geometry, evaluate_geometry
+from gsplat_core.evaluation.pictures import PictureMaker
+from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.recordings import open_recording, synthesize
+from gsplat_core.io.recordings.synthetic.extras import Extras
+from gsplat_core.io.recordings.truth import open_truth
+from gsplat_core.scene.frames import Frame
+from operators.applications.reconstruct import reconstruct
+from operators.applications.replay import ReplaySettings
+
+
+@dataclass(frozen=True)
+class Case:
+    """What training gets besides pictures, tool masks and intrinsics."""
+
+    camera: str
+    stereo: bool = False
+    poses: bool = False
+    depth: bool = False
+
+
+CASES = {
+    "fixed": Case("fixed"),
+    "stereo": Case("fixed", stereo=True),
+    "poses": Case("moving", poses=True),
+    "no-poses": Case("moving"),
+    "depth": Case("fixed", depth=True),
+}
+
+
+def main() -> int:
+    arguments = parsed()
+    work = arguments.work or Path(tempfile.mkdtemp(prefix="geometry-"))
+    try:
+        if not arguments.json:
+            print(HEADER)
+        for name in arguments.cases or CASES:
+            geometry, seconds = measured(name, CASES[name], arguments, work)
+            if arguments.json:
+                print(json.dumps({"case": name, "train_s": round(seconds, 1), **asdict(geometry)}), flush=True)
+            else:
+                print(line(name, geometry, seconds), flush=True)
+    finally:
+        if arguments.work is None:
+            shutil.rmtree(work)
+    return 0
+
+
+def parsed() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", nargs="*", metavar="CASE", choices=[[], *CASES])
+    parser.add_argument("--scene", default="open", choices=["open", "colon"])
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--frames", type=int, default=36)
+    parser.add_argument("--fps", type=float, default=15.0)
+    parser.add_argument("--width", type=int, default=160)
+    parser.add_argument("--height", type=int, default=128)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--work", type=Path, help="keep recordings and runs here, and take recordings from here")
+    parser.add_argument("--depth-noise", type=float, default=0.0)
+    parser.add_argument("--smoke", type=float, default=0.0)
+    parser.add_argument("--exposure-changes", action="store_true")
+    parser.add_argument("--json", action="store_true")
+    return parser.parse_args()
+
+
+def measured(name: str, case: Case, arguments: argparse.Namespace, work: Path) -> tuple[Geometry, float]:
+    """Train on what the case has, and measure against all that is known; with the seconds that training and its report took."""
+    whole = recording_of(case, arguments, work)
+    given = work / f"{name}-given"
+    copy_of(whole, given, case)
+    begun = time.perf_counter()
+    settings = ReplaySettings(given, work / f"{name}-run", device=arguments.device, sinks=(), seed=arguments.seed)
+    reconstruct(settings, arguments.steps)
+    seconds = time.perf_counter() - begun
+    model = load_bundle(work / f"{name}-run" / "model").to(arguments.device)
+    recording = open_recording(whole)
+    makers: dict[Any, PictureMaker] = {}
+
+    def shown(camera: Any, frame: Frame) -> Any:
+        key = camera.with_pose(np.eye(4))
+        maker = makers.setdefault(key, PictureMaker(key, arguments.device))
+        return maker(model, frame.with_fields(pose=camera.world_to_camera))
+
+    own: Callable[[Frame], Any] = lambda frame: frame.pose if case.poses else None
+    truth = open_truth(whole, recording.frame_count)
+    return evaluate_geometry(recording, recording.frame_count, recording.camera, model, shown, truth, own), seconds
+
+
+def recording_of(case: Case, arguments: argparse.Namespace, work: Path) -> Path:
+    """The recording with all that is known; made once for all cases with the same camera."""
+    extras = Extras(
+        scene=arguments.scene,
+        third=True,
+        tracks=True,
+        smoke=arguments.smoke,
+        depth_noise_mm=arguments.depth_noise,
+        exposure_changes=arguments.exposure_changes,
+    )
+    made = {
+        "frames": arguments.frames,
+        "width_px": arguments.width,
+        "height_px": arguments.height,
+        "fps": arguments.fps,
+        "seed": arguments.seed,
+        "camera": case.camera,
+    }
+    folder, note = work / f"recording-{case.camera}", work / f"recording-{case.camera}.json"
+    wanted = json.dumps({**made, **asdict(extras)}, sort_keys=True)
+    if not (folder.is_dir() and note.is_file() and note.read_text() == wanted):
+        synthesize(folder, **made, extras=extras)
+        note.write_text(wanted)
+    return folder
+
+
+def copy_of(whole: Path, given: Path, case: Case) -> None:
+    """What training may have of a recording."""
+    if given.exists():
+        shutil.rmtree(given)
+    given.mkdir()
+    folders = ["images", "masks", *(["images_right"] if case.stereo else []), *(["depth"] if case.depth else [])]
+    for name in folders:
+        shutil.copytree(whole / name, given / name)
+    if case.poses:
+        shutil.copy(whole / "poses_bounds.npy", given)
+    description = json.loads((whole / "recording.json").read_text())
+    kept = ["format", "version", "fps", "camera", "depth_unit_mm", *(["stereo_baseline_mm"] if case.stereo else [])]
+    (given / "recording.json").write_text(json.dumps({key: description[key] for key in kept}))
+
+
+HEADER = (
+    f"{'case':<9} {'depth':>7} {'scaled':>7} {'level':>7} {'plane':>7} {'normals':>8} {'plane':>6}  {'third':>6} {'scaled':>6} {'left':>6}"
+    f" {'shifted':>7}  {'points':>7} {'scaled':>7} {'still':>7}   {'px':>5} {'still':>5}  {'time':>5}"
+)
+
+
+def line(name: str, geometry: Geometry, seconds: float) -> str:
+    """One case's figures: shares of the median depth, degrees, dB, median mm, median px, seconds."""
+    depth, normals, tracking = geometry.depth, geometry.normals, geometry.tracking
+    assert depth is not None and normals is not None and tracking is not None
+    third, scaled = (
+        next(view for view in views if view.name == "third") for views in (geometry.views, geometry.scaled_views)
+    )
+    return (
+        f"{name:<9} {depth.rmse_share:7.2%} {depth.scaled_rmse_share:7.2%} {depth.level_rmse_share:7.2%}"
+        f" {depth.plane_rmse_share:7.2%}"
+        f" {normals.mean_deg:7.1f}° {normals.plane_mean_deg:5.1f}°"
+        f"  {third.model.psnr_tissue_db:6.2f} {scaled.model.psnr_tissue_db:6.2f} {third.left.psnr_tissue_db:6.2f}"
+        f" {third.shifted.psnr_tissue_db:7.2f}"
+        f"  {tracking.model.median_mm:7.2f} {tracking.scaled.median_mm:7.2f} {tracking.still.median_mm:7.2f}"
+        f"   {tracking.model.median_px:5.2f} {tracking.still.median_px:5.2f}  {seconds:4.0f}s"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

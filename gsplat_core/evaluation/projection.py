@@ -1,0 +1,52 @@
+"""From depth to points and back, for the cameras whose views are compared; pinhole, in a camera's own coordinates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.scene.cameras import Camera
+
+Points = NDArray[np.float64]
+
+
+def pixel_rays(camera: Camera) -> Points:
+    """(x/z, y/z, 1) of the rays through the pixels' centres [H, W, 3]."""
+    column = (np.arange(camera.width_px) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
+    row = (np.arange(camera.height_px) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
+    x, y = np.meshgrid(column, row)
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def points_of(camera: Camera, depth: NDArray[Any]) -> Points:
+    """Where the pixels with a depth z [H, W] are [H, W, 3]."""
+    return pixel_rays(camera) * np.asarray(depth, np.float64)[..., None]
+
+
+def inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The pose [4, 4] that leads back."""
+    return np.asarray(np.linalg.inv(pose), np.float64)
+
+
+def moved(pose: NDArray[np.float64], points: Points) -> Points:
+    """Points [..., 3] in the coordinates that `pose` [4, 4] leads to."""
+    return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
+
+
+def pixels_of(camera: Camera, points: Points) -> Points:
+    """Where points [..., 3] appear [..., 2]; not finite, or far away, where they are not in front of the camera."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = points[..., :2] / np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
+    return np.asarray(slopes * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2])
+
+
+def at_pixels(plane: NDArray[Any], pixels: Points) -> NDArray[Any]:
+    """The values of the pixels [...] that positions [..., 2] are in; 0 outside of the picture."""
+    height, width = plane.shape[:2]
+    inside = np.isfinite(pixels).all(axis=-1)
+    column, row = (np.floor(np.where(inside, pixels[..., k], -1)).astype(np.int64) for k in (0, 1))
+    inside &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    found = plane[row.clip(0, height - 1), column.clip(0, width - 1)]
+    return np.where(inside, found, np.zeros((), plane.dtype))
