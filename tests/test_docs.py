@@ -18,6 +18,7 @@ import typer
 from gsplat_core import Camera, Frame, Gaussians
 from gsplat_core.io.manifest import manifest_bytes, parse_manifest
 from gsplat_core.io.recordings import open_recording
+from gsplat_core.io.recordings.views import open_views
 from gsplat_core.scene.model import Model
 from operators.graph import Application, Operator, OperatorSpec
 from operators.ingest import SourceOp
@@ -181,7 +182,7 @@ def json_examples(name: str) -> list[dict]:
 
 
 def test_the_calibration_files_in_the_guide_are_read_as_it_says(tmp_path):
-    cameras, described = json_examples("recordings.md")
+    cameras, described, views = json_examples("recordings.md")
     (tmp_path / "cameras" / "images").mkdir(parents=True)
     cv2.imwrite(
         str(tmp_path / "cameras" / "images" / "000000.png"),
@@ -201,6 +202,17 @@ def test_the_calibration_files_in_the_guide_are_read_as_it_says(tmp_path):
     assert frame.depth is not None
     assert frame.depth.min() == pytest.approx(6000 * described["depth_unit_mm"])
     assert recording.camera.K[0, 0] == described["camera"]["fx"]
+
+    view = views["views"][0]
+    pictures = tmp_path / "described" / view["folder"] / "images"
+    pictures.mkdir(parents=True)
+    cv2.imwrite(
+        str(pictures / "000000.png"), np.full((view["camera"]["height"], view["camera"]["width"], 3), 90, np.uint8)
+    )
+    (tmp_path / "described" / "views.json").write_text(json.dumps(views))
+    (opened,) = open_views(tmp_path / "described", 1)
+    assert (opened.name, opened.camera.K[0, 0]) == (view["name"], view["camera"]["fx"])
+    assert opened.camera.world_to_camera.tolist() == view["left_to_view"]
 
 
 def test_the_manifest_in_the_guide_is_one():
