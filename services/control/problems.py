@@ -54,6 +54,11 @@ class Problem(Exception):
         return body
 
 
+def problem_answer(description: str) -> dict[str, Any]:
+    """For the document of a route that answers with a problem which its kind does not have anyway."""
+    return {"description": description, "content": {PROBLEM_JSON: {"schema": {"$ref": "#/components/schemas/Problem"}}}}
+
+
 class BadRequest(Problem):
     """The request makes no sense."""
 

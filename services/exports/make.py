@@ -1,6 +1,6 @@
 """Makes an export of an unpacked model, as a program of its own: `python -m services.exports.make FOLDER FILE --format glb`.
 
-Nothing else of the service imports this module: it loads torch. Exit code 0: the file is there; 2: it cannot be had like that, and standard error
+Nothing else of the service imports this module: it loads torch, but for `isplat`. Exit code 0: the file is there; 2: it cannot be had like that, and standard error
 says why in one sentence.
 """
 
@@ -13,8 +13,6 @@ import sys
 from pathlib import Path
 
 from gsplat_core.errors import UserError
-from gsplat_core.io.bundle import load_bundle
-from gsplat_core.io.exports.export import export_model
 from gsplat_core.io.exports.formats import ExportWish
 from services.exports.formats import ALL, ISPLAT
 from services.registry.bundle_file import pack
@@ -39,11 +37,19 @@ def main(arguments: list[str] | None = None) -> int:
         if given.format == ISPLAT.name:
             pack(given.folder, given.file)
         else:
-            export_model(load_bundle(given.folder), given.file, ExportWish(ALL[given.format], given.time, given.times))
+            export(given.folder, given.file, ExportWish(ALL[given.format], given.time, given.times))
     except UserError as error:
         sys.stderr.write(f"{str(error).replace(f'{given.folder}/', '')}\n")
         return REFUSED
     return 0
+
+
+def export(folder: Path, file: Path, wish: ExportWish) -> None:
+    """For other programs. What it needs takes seconds to load, and packing does not need it."""
+    from gsplat_core.io.bundle import load_bundle
+    from gsplat_core.io.exports.export import export_model
+
+    export_model(load_bundle(folder), file, wish)
 
 
 if __name__ == "__main__":

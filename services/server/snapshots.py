@@ -7,9 +7,10 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
 
+from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import ExportWish
 from services.bus.errors import CommandRefused
-from services.control.problems import Conflicting
+from services.control.problems import Conflicting, Unprocessable
 from services.exports.cache import ExportCache, Exported
 from services.exports.snapshots import Snapshot, SnapshotStore, described
 from services.registry.bundle_file import SUFFIX, pack
@@ -29,8 +30,8 @@ class StreamSnapshots:
         self._streams, self._registry, self._store = streams, registry, store
 
     async def take(self, stream: str, model: str | None, by: str) -> tuple[Snapshot, VersionRecord | None]:
-        """See `Snapshots`. Raises Missing, Conflicting, BusError, ExportFailed, RegistryError."""
-        supervisor = self._streams.supervisor(stream)
+        """See `Snapshots`. Raises Missing, Conflicting (a stream that is stopped or just starting), BusError, ExportFailed, RegistryError."""
+        supervisor = self._streams.with_engine(stream)
         with self._store.new() as new:
             folder = new / "model"
             try:
@@ -58,6 +59,15 @@ class StreamSnapshots:
         self._store.delete(stream, number)
 
 
+def refuse_outside(wish: ExportWish, window_s: Sequence[float]) -> None:
+    """Before a process is started for it. Raises Unprocessable for a time that the model has not seen."""
+    start_s, end_s = window_s
+    try:
+        wish.times_in((start_s, end_s))
+    except InvalidSetting as error:
+        raise Unprocessable(str(error)) from error
+
+
 class ModelExports:
     """See `services.control.snapshot_parts.Exports`."""
 
@@ -77,9 +87,11 @@ class ModelExports:
         version: Any = self._registry.version(name, number)
         if version.state not in CHECKED:
             raise Conflicting(f"{name}/{number} is {version.state}; only a version that passed its check is exported")
+        refuse_outside(wish, version.description["time_window_s"])
         return self._cache.get(version.digest, lambda: self._registry.folder_of(name, number), wish)
 
     def of_snapshot(self, stream: str, number: str, wish: ExportWish) -> Exported:
         """See `Exports`. Raises NoSnapshot, ExportsError."""
-        digest = self._store.get(stream, number).digest
-        return self._cache.get(digest, lambda: self._store.folder_of(stream, number), wish)
+        snapshot = self._store.get(stream, number)
+        refuse_outside(wish, snapshot.time_window_s)
+        return self._cache.get(snapshot.digest, lambda: self._store.folder_of(stream, number), wish)

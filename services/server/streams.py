@@ -172,14 +172,24 @@ class SupervisedStreams:
         self._streams.pop(name, None)
 
     async def set_camera(self, name: str, camera: Mapping[str, float]) -> Mapping[str, float]:
-        """See `Streams`. Raises Missing, Conflicting for a stream that does not run, BusError."""
-        return await self.supervisor(name).command("engine", "camera", **camera)
+        """See `Streams`. Raises Missing, Conflicting for a stream that does not run or is just starting, BusError."""
+        return await self.with_engine(name).command("engine", "camera", **camera)
 
     def supervisor(self, name: str) -> StreamSupervisor:
         """Of a stream that runs. Raises Missing, Conflicting."""
         supervisor = self._stream(name).supervisor
         if supervisor is None:
             raise Conflicting(f"the stream {name} is stopped; start it first")
+        return supervisor
+
+    def with_engine(self, name: str) -> StreamSupervisor:
+        """Of a stream whose engine runs, for a command to it. Raises Missing, Conflicting."""
+        supervisor = self.supervisor(name)
+        engine = supervisor.state().engine
+        if engine.state != "running":
+            raise Conflicting(
+                f"the engine of {name} is {engine.state}: {engine.reason}; ask again when the stream is live"
+            )
         return supervisor
 
     async def _stop(self, stream: Stream, reason: str) -> None:

@@ -15,6 +15,7 @@ from starlette.websockets import WebSocket, WebSocketState
 
 from services.control.auth.guard import CallerOf, new_router, requires
 from services.control.parts import BOUNDARY, EncodedPicture, PictureKind
+from services.control.problems import problem_answer
 from services.control.viewers import ViewerStalled, in_time, until_ended, viewing
 from services.settings import ResourceName
 
@@ -63,7 +64,10 @@ async def _left(socket: WebSocket) -> None:
 @router.get(
     "/streams/{name}/mjpeg",
     response_class=Response,
-    responses={200: {"content": {f"multipart/x-mixed-replace; boundary={BOUNDARY}": {}}}},
+    responses={
+        200: {"content": {f"multipart/x-mixed-replace; boundary={BOUNDARY}": {}}},
+        409: problem_answer("The stream is stopped."),
+    },
 )
 @requires("viewer", ticket=True)
 async def mjpeg(

@@ -14,7 +14,7 @@ from starlette.responses import Response, StreamingResponse
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import MOST_TIMES, ExportWish
 from services.control.auth.guard import CallerOf, new_router, requires
-from services.control.problems import Unprocessable
+from services.control.problems import Unprocessable, problem_answer
 from services.control.recorded import recorded
 from services.control.routes.models import Number
 from services.control.routes.snapshots import SnapshotId
@@ -53,7 +53,11 @@ ANSWER: dict[int | str, dict[str, object]] = {
 }
 
 
-@router.get("/models/{name}/versions/{number}/exports/{format}", response_class=Response, responses=ANSWER)
+@router.get(
+    "/models/{name}/versions/{number}/exports/{format}",
+    response_class=Response,
+    responses={**ANSWER, 409: problem_answer("The version was not checked yet, or was rejected.")},
+)
 @requires("operator")
 async def export_model(
     request: Request,

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.requests import HTTPConnection, Request
 
 from services.control.auth.guard import CallerOf, new_router, requires
-from services.control.problems import PROBLEM_JSON, Missing
+from services.control.problems import Missing, problem_answer
 from services.control.recorded import recorded
 from services.control.replay_parts import Jobs
 from services.control.state import part
@@ -20,7 +20,6 @@ from services.settings import ResourceName
 
 router = new_router("replays")
 MOST_RECORDINGS = 2000
-PROBLEM = {"$ref": "#/components/schemas/Problem"}
 JobId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["1f0c9a3b5d7e8f20"])]
 BatchId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["8f20c9a35d7e1f0b"])]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
@@ -100,9 +99,7 @@ def view_of(jobs: Jobs, job_id: str) -> ReplayView:
 @router.post(
     "/replays",
     status_code=202,
-    responses={
-        404: {"description": "There is no recording of that name.", "content": {PROBLEM_JSON: {"schema": PROBLEM}}}
-    },
+    responses={404: problem_answer("There is no recording of that name.")},
 )
 @requires("operator")
 async def start_replays(

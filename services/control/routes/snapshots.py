@@ -68,8 +68,8 @@ async def take_snapshot(
     wanted: SnapshotWanted,
     idempotency_key: IdempotencyKey = None,
 ) -> SnapshotView:
-    """Write the live model as it stands after the next frame. The picture does not wait. 409 where the stream is stopped, or shows a finished
-    model. The newest 20 of a stream are kept."""
+    """Write the live model as it stands after the next frame. The picture does not wait. 409 where the stream is stopped, just starting, or shows
+    a finished model. The newest 20 of a stream are kept."""
 
     async def take() -> SnapshotView:
         async with recorded(request, caller, "snapshot.take", name, {"model": wanted.model}) as said:

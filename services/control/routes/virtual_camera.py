@@ -27,5 +27,5 @@ class VirtualCamera(BaseModel):
 @requires("viewer")
 async def turn_virtual_camera(request: Request, name: ResourceName, wanted: VirtualCamera) -> VirtualCamera:
     """Turn the stream's virtual camera. There is one for all who watch, and the last one to turn it wins. It changes nothing else, and is not
-    in the audit log."""
+    in the audit log. 409 where the stream is stopped or just starting."""
     return VirtualCamera.model_validate(await streams_of(request).set_camera(name, wanted.model_dump()))
