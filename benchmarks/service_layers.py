@@ -1,8 +1,8 @@
 """What further pictures (depth, confidence, the virtual view) and snapshots cost a live stream: age, rate and PSNR of what is shown, with and without them.
 
-    python benchmarks/service_layers.py --seconds 20
+    python benchmarks/service_layers.py --seconds 20 [--snapshots 5]
 
-A capture and an engine process as `intrasplat serve` runs them; the watchers only read. Prints one line of JSON for each part.
+With 0 seconds only the snapshots are measured. A capture and an engine process as `intrasplat serve` runs them; the watchers only read. Prints one line of JSON for each part.
 """
 
 from __future__ import annotations
@@ -92,6 +92,7 @@ async def main() -> None:
     parser.add_argument("--source", default="synthetic:?width=320&height=256&frames=90&fps=30&moving=1")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--snapshots", type=int, default=5)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="isp-") as folder:
         spec = StreamSpec(name="a", source=SourceSpec(address=given.source), engine=EngineSpec(device=given.device))
@@ -102,12 +103,13 @@ async def main() -> None:
                 while (stream.state().engine.figures.get("picture") or {}).get("state") != "live":
                     await asyncio.sleep(0.1)
             await asyncio.sleep(5)
-            await part(stream, "nobody watches", (), given.seconds)
-            for layer in LAYERS:
-                await part(stream, layer, (layer,), given.seconds)
-            await part(stream, "all three", LAYERS, given.seconds)
-            await part(stream, "nobody watches any more", (), given.seconds)
-            await snapshots(stream, 5, Path(folder))
+            if given.seconds > 0:
+                await part(stream, "nobody watches", (), given.seconds)
+                for layer in LAYERS:
+                    await part(stream, layer, (layer,), given.seconds)
+                await part(stream, "all three", LAYERS, given.seconds)
+                await part(stream, "nobody watches any more", (), given.seconds)
+            await snapshots(stream, given.snapshots, Path(folder))
         finally:
             with contextlib.suppress(TimeoutError):
                 await stream.stop()

@@ -29,6 +29,36 @@ def _torch_type(dtype: np.dtype[Any]) -> torch.dtype:
     return torch.from_numpy(np.empty(0, dtype)).dtype
 
 
+class StagedCopies:
+    """Copies of a GPU's tensors in host memory, piece by piece through a little page-locked memory, on a stream of their own: neither the GPU's other
+    work nor other threads wait for a large tensor. For one thread at a time."""
+
+    PIECE_BYTES = 1 << 22
+
+    def __init__(self, device: torch.device) -> None:
+        self.stream = torch.cuda.Stream(device)
+        """What is to be copied must be ready on it."""
+        self._staged = torch.empty(self.PIECE_BYTES, dtype=torch.uint8, pin_memory=True)
+        self._arrived = torch.cuda.Event()
+
+    def to_host(self, tensor: Tensor) -> Tensor:
+        """A copy in host memory; of a tensor that is there, itself."""
+        if not tensor.is_cuda:
+            return tensor
+        with torch.cuda.stream(self.stream):
+            values = tensor.contiguous()
+            copied = torch.empty(values.shape, dtype=values.dtype)
+            source, target = (each.view(-1).view(torch.uint8) for each in (values, copied))
+            for first in range(0, source.numel(), self.PIECE_BYTES):
+                piece = source[first : first + self.PIECE_BYTES]
+                staged = self._staged[: piece.numel()]
+                staged.copy_(piece, non_blocking=True)
+                self._arrived.record(self.stream)
+                self._arrived.synchronize()
+                target[first : first + self.PIECE_BYTES].copy_(staged)
+        return copied
+
+
 class HostCopy:
     """A tensor's values on their way to the host: queued behind what computes them, waited for when they are asked for."""
 

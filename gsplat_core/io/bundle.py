@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import safetensors
@@ -25,6 +26,7 @@ from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
 from gsplat_core.io.atomic_files import replace_durably, write_durably
 from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, Manifest, manifest_bytes, parse_manifest
 from gsplat_core.io.model_files import check_memory, open_model_file
+from gsplat_core.io.safetensors_pieces import safetensors_pieces
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 
@@ -33,21 +35,24 @@ MANIFEST, NEXT_MANIFEST = "manifest.json", "manifest.next.json"
 MAX_HEADER_BYTES = 1 << 20
 
 
-def save_bundle(model: Model, folder: str | Path) -> None:
-    """Write `model` into `folder` (made when missing), replacing the bundle there in one step.
+def save_bundle(model: Model, folder: str | Path, *, to_host: Callable[[Tensor], Tensor] = Tensor.cpu) -> None:
+    """Write `model` into `folder` (made when missing), replacing the bundle there in one step. It is written in pieces, between which other threads
+    run. to_host: how a tensor of a GPU comes into host memory.
 
     Raises BundleCorrupt when a tensor holds NaN or infinity, BundleError when the model is beyond the ranges of `docs/bundle.md` or the
     files cannot be written (a full disk, a missing right); the bundle that was there before is then still whole.
     """
     folder = Path(folder)
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.tensors().items()}
+    tensors = {name: to_host(tensor.detach()).contiguous() for name, tensor in model.tensors().items()}
     for name, tensor in tensors.items():
         if tensor.dtype != torch.float32:
             raise InvalidInput(f"a bundle holds float32, but {name} is {tensor.dtype}; convert the model first")
     _check_finite(tensors, f"the model was not saved to {folder}")
-    payload = safetensors.torch.save(tensors)
-    digest = hashlib.sha256(payload).hexdigest()
-    manifest = manifest_bytes(model, len(payload), digest)
+    digest, size = hashlib.sha256(), 0
+    for piece in safetensors_pieces(tensors):
+        digest.update(piece)
+        size += len(piece)
+    manifest = manifest_bytes(model, size, digest.hexdigest())
     try:
         parse_manifest(manifest, MANIFEST)  # what could not be read again is not written
     except BundleCorrupt as error:
@@ -56,7 +61,7 @@ def save_bundle(model: Model, folder: str | Path) -> None:
         ) from error
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_durably(folder / NEXT_TENSORS, [payload])
+        write_durably(folder / NEXT_TENSORS, safetensors_pieces(tensors))
         write_durably(folder / NEXT_MANIFEST, [manifest])
         replace_durably(folder / NEXT_TENSORS, folder / TENSORS)
         replace_durably(folder / NEXT_MANIFEST, folder / MANIFEST)

@@ -13,6 +13,7 @@ import torch
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
+from gsplat_core.transfers import StagedCopies
 from operators.applications.live import LiveApplication
 from operators.live_reconstruct import LiveReconstructOp
 from services.bus.commands import text_of
@@ -24,10 +25,11 @@ WAIT_S = 5.0
 
 class LiveSnapshots:
     """Writes the model of the reconstruction that runs now. The picture does not wait: the model is copied after a frame's picture is on its way,
-    and written in the thread of the commands."""
+    and written in the thread of the commands, in pieces, so that the engine's other threads run."""
 
     def __init__(self) -> None:
         self._graph: LiveApplication | None = None
+        self._copies: StagedCopies | None = None
 
     @contextmanager
     def of(self, graph: LiveApplication) -> Iterator[None]:
@@ -44,32 +46,43 @@ class LiveSnapshots:
         running: LiveReconstructOp | None = getattr(self._graph, "reconstruct", None)
         if running is None:
             raise CommandRefused("no live reconstruction runs; what is shown is a finished model, or nothing yet")
+        model, seq, pause_ns = self._asked(running)
+        began_s = time.monotonic()
+        self._write(model, folder)
+        return {
+            "seq": seq,
+            "model_version": model.version,
+            "gaussians": model.gaussians.count,
+            "time_window_s": list(model.time_window_s),
+            "pause_ms": round(pause_ns * 1e-6, 3),
+            "written_ms": round((time.monotonic() - began_s) * 1e3, 3),
+        }
+
+    def _asked(self, running: LiveReconstructOp) -> tuple[Model, int, int]:
+        """The model in memory of its own, the frame's number, the pause. A snapshot on a GPU is let go of here: while it is held, training needs
+        another slot."""
         request = running.request_model()
         answer = request.wait(WAIT_S)
         if answer is None:
             why = request.refused or f"no frame has come for {WAIT_S:g} s"
             raise CommandRefused(f"there is no model to write: {why}")
-        began_s = time.monotonic()
-        model = on_host(answer.model)
-        save_bundle(model, folder)
-        return {
-            "seq": answer.frame.seq,
-            "model_version": model.version,
-            "gaussians": model.gaussians.count,
-            "time_window_s": list(model.time_window_s),
-            "pause_ms": round(answer.pause_ns * 1e-6, 3),
-            "written_ms": round((time.monotonic() - began_s) * 1e3, 3),
-        }
+        return self._copied(answer.model), answer.frame.seq, answer.pause_ns
 
+    def _copied(self, model: Model | Snapshot) -> Model:
+        """On a GPU it is copied there, on a stream of its own, which waits for what the model is made of and for nothing else."""
+        if model.device.type != "cuda":
+            return model.as_model()
+        if self._copies is None:
+            self._copies = StagedCopies(model.device)
+        stream = self._copies.stream
+        with torch.cuda.stream(stream):
+            if isinstance(model, Model):
+                stream.wait_stream(torch.cuda.default_stream(model.device))
+            return model.as_model()
 
-def on_host(model: Model | Snapshot) -> Model:
-    """In host memory. On a GPU it is copied on a stream of its own, and training is not waited for beyond what the model is made of."""
-    if model.device.type != "cuda":
-        return model.as_model()
-    stream = torch.cuda.Stream(model.device)
-    with torch.cuda.stream(stream):
-        if isinstance(model, Model):
-            stream.wait_stream(torch.cuda.default_stream(model.device))
-        copied = model.as_model().to("cpu")
-    stream.synchronize()
-    return copied
+    def _write(self, model: Model, folder: Path) -> None:
+        if self._copies is None:
+            save_bundle(model, folder)
+        else:
+            with torch.cuda.stream(self._copies.stream):
+                save_bundle(model, folder, to_host=self._copies.to_host)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.transfers import HostCopy, tensor_of
+from gsplat_core.transfers import HostCopy, StagedCopies, tensor_of
 
 
 def test_on_the_cpu_nothing_is_copied():
@@ -54,3 +54,26 @@ def test_later_changes_on_either_side_are_not_seen(gpu):
     there += 2
     assert not seen.numpy().any()
     assert (HostCopy(there).numpy() == 2).all()
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("shape", [(), (0, 3), (5, 7), (3, StagedCopies.PIECE_BYTES // 4 + 1)])
+def test_a_copy_in_pieces_is_the_tensor(gpu, shape):
+    values = torch.arange(int(np.prod(shape)), dtype=torch.float32).reshape(shape)
+    there = values.to(gpu)
+    copies = StagedCopies(gpu)
+    copies.stream.wait_stream(torch.cuda.default_stream(gpu))
+    assert torch.equal(copies.to_host(there), values)
+    assert copies.to_host(values) is values
+
+
+@pytest.mark.cuda
+def test_a_copy_in_pieces_waits_for_no_other_stream(gpu):
+    values = torch.ones(3 * StagedCopies.PIECE_BYTES // 4, device=gpu)
+    copies = StagedCopies(gpu)
+    copies.stream.wait_stream(torch.cuda.default_stream(gpu))
+    torch.cuda._sleep(3_000_000_000)  # a second or two on the default stream
+    busy = torch.cuda.Event()
+    busy.record(torch.cuda.default_stream(gpu))
+    assert (copies.to_host(values) == 1).all()
+    assert not busy.query()

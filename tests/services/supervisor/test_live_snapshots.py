@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 from types import SimpleNamespace
 
 import pytest
@@ -12,7 +13,7 @@ from gsplat_core.scene.snapshots import SnapshotSlots
 from operators.model_request import ModelRequest
 from services.bus.errors import BadMessage, CommandRefused
 from services.supervisor import live_snapshots
-from services.supervisor.live_snapshots import LiveSnapshots, on_host
+from services.supervisor.live_snapshots import LiveSnapshots
 from tests.services.supervisor.test_model_show import uniform
 
 
@@ -42,15 +43,30 @@ def test_the_model_is_written_as_it_was_given(tmp_path):
     assert load_bundle(tmp_path / "model").sha256() == model.sha256()
 
 
-def test_a_snapshot_on_any_device_is_written_as_its_model(device):
+def test_a_snapshot_on_any_device_is_written_as_its_model(device, tmp_path):
     model = uniform((0.1, 0.9, 0.1))
     slots = SnapshotSlots(device)
     snapshot = slots.publish(
         model.gaussians.to(device), None, version=1, camera=model.camera, time_window_s=model.time_window_s
     )
-    host = on_host(snapshot)
-    assert host.device.type == "cpu" and host.sha256() == model.sha256()
-    assert on_host(model.to(device)).sha256() == model.sha256()
+    for number, given in enumerate((snapshot, model.to(device))):
+        folder = tmp_path / str(number)
+        take(lambda request, given=given: request.answer(given, SimpleNamespace(seq=1), 0), folder)
+        assert load_bundle(folder).sha256() == model.sha256()
+
+
+def test_a_snapshot_is_let_go_of_before_it_is_written(tmp_path, monkeypatch):
+    model = uniform((0.1, 0.9, 0.1))
+    snapshot = SnapshotSlots("cpu").publish(
+        model.gaussians, None, version=1, camera=model.camera, time_window_s=model.time_window_s
+    )
+    held = weakref.ref(snapshot)
+    waiting = [snapshot]
+    del snapshot
+    kept = []
+    monkeypatch.setattr(live_snapshots, "save_bundle", lambda *_: kept.append(held() is not None))
+    take(lambda request: request.answer(waiting.pop(), SimpleNamespace(seq=1), 0), tmp_path)
+    assert kept == [False]
 
 
 def test_what_cannot_be_written_is_refused_with_its_reason(tmp_path, monkeypatch):
