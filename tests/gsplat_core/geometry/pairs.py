@@ -29,7 +29,9 @@ def right_of(left, disparity, lower_px=0.0):
     rows, columns = np.indices(left.shape[:2], dtype=np.float32)
     there = columns.copy()
     for _ in range(30):  # the column of the left picture that lands here
-        there = columns + cv2.remap(disparity, there, rows - lower_px, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        there = columns + cv2.remap(
+            disparity, there, rows - lower_px, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
     return cv2.remap(left, there, rows - np.float32(lower_px), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
 
 
