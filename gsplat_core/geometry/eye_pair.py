@@ -75,7 +75,7 @@ def look_at(left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[n
         )
     error_px = float(np.median(np.abs(_off_rows(rows, here, there[:, 1] - here[:, 1], width, height)[agree])))
     look = PairLook((here - there)[agree, 0], rows, error_px)
-    slope, offset = float(np.abs(rows[1:]).sum()), float(abs(rows[0]))
+    slope, offset = float(np.abs(rows[1:]).max()), float(abs(rows[0]))
     if slope > MOST_SLOPE_PX:
         return _doubt(
             f"the pair is not rectified: rows of the two eyes are apart by up to {offset + slope:.1f} px, and differently across the picture; "

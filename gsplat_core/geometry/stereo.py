@@ -95,7 +95,8 @@ class StereoDepth:
     def _as_depth(self, found: Disparity, frame: Frame, camera: Camera, parallel_px: float) -> DepthMap:
         shift = found.px - np.float32(parallel_px)
         known = found.known & (shift > LEAST_DISPARITY_PX)
-        confidence = np.where(known, 1 / (1 + (found.error_px / HALF_BELIEVED_PX) ** 2), 0).astype(np.float32)
+        error_px = np.hypot(found.error_px, _off_along_rows(np.median(self._rows, axis=0), found.px.shape))
+        confidence = np.where(known, 1 / (1 + (error_px / HALF_BELIEVED_PX) ** 2), 0).astype(np.float32)
         believed = confidence >= 0.5
         if believed.mean() < LEAST_BELIEVED:
             self._look_in = 0
@@ -162,6 +163,13 @@ def _unlike_distances(look: PairLook, parallel_px: float, *, calibrated: bool) -
         what = "wrong calibration" if calibrated else "eyes that are not parallel, and no calibration that says how"
         return f"some of the tissue would be behind the scope: {behind:.0%} of the points, by a {what}"
     return None
+
+
+def _off_along_rows(rows: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """How far disparities may be off, in pixels [H, W]: an eye that is turned or nearer moves points along its rows as it moves them across."""
+    height, width = shape
+    y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width)
+    return np.asarray(np.hypot(rows[1] * y * height / width, rows[2] * x * width / height))
 
 
 def _with_rows_of_left(right: NDArray[np.uint8], rows: NDArray[np.float64], disparity_px: float) -> NDArray[np.uint8]:

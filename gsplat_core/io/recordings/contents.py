@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import RecordingInvalid
+from gsplat_core.geometry.rectification import Rectification
 from gsplat_core.io.recordings.ahead import read_ahead
 from gsplat_core.io.recordings.calibration import Calibration
 from gsplat_core.io.recordings.decoded import Picture
@@ -69,6 +70,8 @@ class Contents:
     depth: DepthFiles | None = None
     tool_share: float | None = None
     stereo_baseline_mm: float | None = None
+    rectification: Rectification | None = None
+    """Makes both eyes' pictures a rectified pair; `calibration` is that of the left one then."""
     other_files: tuple[Path, ...] = ()
     """Calibration and description files."""
 
@@ -88,6 +91,8 @@ class Contents:
         """The right eye's, as in `Frame`; None where there is no right eye, or its distance from the left one is not known."""
         if self.right is None or self.stereo_baseline_mm is None:
             return None
+        if self.rectification is not None:
+            return self.rectification.right_camera
         return self.calibration.camera.right_eye(self.stereo_baseline_mm)
 
     def frames(self, findings: Findings, limit: int | None = None) -> Iterator[Frame | None]:
@@ -135,15 +140,21 @@ class Contents:
         elif self.valid_mask is not None:
             mask = self.valid_mask if mask is None else mask & self.valid_mask
         poses, times = self.calibration.poses, self.images.times
+        image, other, outside = picture.image, None if right is None else right.image, None
+        if self.rectification is not None:
+            image, outside = self.rectification.left(image), self.rectification.inside
+            other = None if other is None else self.rectification.right(other)
+            mask = None if mask is None else self.rectification.plane(mask)
         return Frame(
             seq=index,
             pts_ns=round((index if times is None else times[index]) * 1e9 / self.fps),
-            image=picture.image,
-            right_image=None if right is None else right.image,
+            image=image,
+            right_image=other,
             right_camera=self.right_camera,
             depth=depth,
             depth_origin=None if depth is None else DepthOrigin.MEASURED,
             mask=mask,
+            loss_mask=outside,
             pose=None if poses is None else poses[index],
             status=FrameStatus.REPLAY if damage is None else FrameStatus.DAMAGED,
             damage=damage,

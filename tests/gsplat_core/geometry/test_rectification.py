@@ -1,0 +1,85 @@
+"""Pairs from distorted cameras that are turned against each other become rectified ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.geometry.rectification import Rectification, StereoCalibration
+
+SIZE = (320, 256)
+CALIBRATION = StereoCalibration(
+    left_K=np.array([[300.0, 0, 150], [0, 302, 130], [0, 0, 1]]),
+    left_distortion=np.array([-0.1, 0.05, 0.001, -0.002]),
+    right_K=np.array([[305.0, 0, 170], [0, 304, 126], [0, 0, 1]]),
+    right_distortion=np.array([-0.08, 0.02, 0.0, 0.001, 0.01]),
+    rotation=cv2.Rodrigues(np.array([0.01, 0.03, -0.02]))[0],
+    translation_mm=np.array([-4.0, 0.1, 0.2]),
+    source="a test",
+)
+
+
+def seen(points, K, distortion, size=SIZE):
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
+
+
+def picture_of(points):
+    """Dots where points are, wide enough to be found again with a fraction of a pixel."""
+    y, x = np.indices(SIZE[::-1])
+    dots = sum(np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8) for u, v in points)
+    return np.clip(250 * dots, 0, 255).astype(np.uint8)
+
+
+def found(picture):
+    y, x = np.indices(picture.shape)
+    weight = picture.astype(np.float64)
+    return (weight * x).sum() / weight.sum(), (weight * y).sum() / weight.sum()
+
+
+@pytest.mark.parametrize("point", [(0.0, 0.0, 60.0), (15, -12, 70), (-14, 10, 50)])
+def test_a_point_lands_where_the_rectified_cameras_see_it(point):
+    point = np.array([point], np.float64)
+    rectification = Rectification(CALIBRATION, *SIZE)
+    other = point @ CALIBRATION.rotation.T + CALIBRATION.translation_mm
+    left = rectification.left(picture_of(seen(point, CALIBRATION.left_K, CALIBRATION.left_distortion)))
+    right = rectification.right(picture_of(seen(other, CALIBRATION.right_K, CALIBRATION.right_distortion)))
+    turned = rectification.turn[:3, :3] @ point[0]
+    for picture, camera in ((left, rectification.left_camera), (right, rectification.right_camera)):
+        x, y, z = camera.world_to_camera[:3, :3] @ turned + camera.world_to_camera[:3, 3]
+        expected = camera.K[0, 0] * x / z + camera.K[0, 2], camera.K[1, 1] * y / z + camera.K[1, 2]
+        assert np.allclose(np.array(found(picture)) + 0.5, expected, atol=0.15)
+
+
+def test_the_distance_between_the_eyes_stays():
+    away = Rectification(CALIBRATION, *SIZE).right_camera.world_to_camera[:3, 3]
+    assert np.allclose(away, [-np.linalg.norm(CALIBRATION.translation_mm), 0, 0])
+
+
+def test_what_neither_pixel_shows_is_marked():
+    rectification = Rectification(CALIBRATION, *SIZE)
+    white = rectification.left(np.full((256, 320, 3), 255, np.uint8))
+    assert not rectification.inside.all()
+    assert (white[rectification.inside == 0] < 255).mean() > 0.5
+    assert set(np.unique(rectification.inside)) == {0, 1}
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"translation_mm": np.array([4.0, 0, 0])}, "swap the eyes"),
+        ({"translation_mm": np.array([-1.0, 4, 0])}, "not to the right"),
+        ({"translation_mm": np.zeros(3)}, "the eyes are 0 mm apart"),
+        ({"rotation": np.diag([1.0, 1, -1])}, "is no rotation"),
+        ({"left_K": np.diag([0.0, 300, 1])}, "not those of a camera"),
+        ({"right_distortion": np.array([np.nan, 0, 0, 0])}, "that of no lens"),
+        ({"size": (640, 512)}, "is for pictures of"),
+        ({"left_K": np.array([[300.0, 0, 500], [0, 300, 128], [0, 0, 1]])}, "lies outside of its picture"),
+    ],
+)
+def test_a_calibration_that_cannot_be_is_refused(fields, sentence):
+    with pytest.raises(InvalidInput, match=sentence):
+        Rectification(replace(CALIBRATION, **fields), *SIZE)

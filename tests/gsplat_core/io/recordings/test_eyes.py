@@ -1,0 +1,116 @@
+"""Files of two eyes beside each other are read as a pair."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.errors import RecordingInvalid
+from gsplat_core.io.recordings import open_recording
+from gsplat_core.io.recordings.eyes import split_eyes
+from tests.gsplat_core.io.recordings.test_stereo_calibration import scared_json
+
+
+def names(*texts):
+    return [Path(text) for text in texts]
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        ("left.png", "right.png"),
+        ("Left_Image.png", "Right_Image.png"),
+        ("f7_dynamic_L_0100.png", "f7_dynamic_R_0100.png"),
+        ("000001_left.jpg", "000001_right.jpg"),
+    ],
+)
+def test_names_say_which_eye(files):
+    eyes = split_eyes(names(*files, "notes.png"))
+    assert (eyes.left, eyes.right, eyes.others) == ((Path(files[0]),), (Path(files[1]),), (Path("notes.png"),))
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        ("0001.png", "0002.png"),
+        ("left.png",),
+        ("left.png", "right.jpg"),
+        ("L_1.png", "L_2.png", "R_1.png"),
+        ("bladder.png", "colr.png"),
+    ],
+)
+def test_what_is_no_pair_is_none(files):
+    assert split_eyes(names(*files)) is None
+
+
+def picture(path, value=120, size=(320, 256)):
+    image = np.full((size[1], size[0], 3), value, np.uint8)
+    image[40:50, 60:70] = 255
+    cv2.imwrite(str(path), image)
+
+
+def test_images_of_two_eyes_are_a_stereo_recording(tmp_path):
+    for k in range(2):
+        picture(tmp_path / f"{k}_left.png", 100 + k)
+        picture(tmp_path / f"{k}_right.png", 200 + k)
+    recording = open_recording(tmp_path)
+    frames = list(recording)
+    assert recording.frame_count == 2 and "right_image" in recording.fields
+    assert [frame.image[0, 0, 0] for frame in frames] == [100, 101]
+    assert [frame.right_image[0, 0, 0] for frame in frames] == [200, 201]
+    assert frames[0].right_camera is None
+    assert any("the two eyes have no calibration" in note for note in recording.notes)
+
+
+def test_a_calibration_rectifies_them_and_gives_the_right_eyes_camera(tmp_path):
+    picture(tmp_path / "left.png")
+    picture(tmp_path / "right.png")
+    without = open_recording(tmp_path).digest
+    scared_json(tmp_path)
+    recording = open_recording(tmp_path, scale=0.5)
+    frame = next(iter(recording))
+    assert frame.right_camera is not None and (frame.right_camera.K == recording.camera.K).all()
+    assert np.isclose(recording.stereo_baseline_mm, np.linalg.norm([4.0, 0.1, 0.2]))
+    assert frame.loss_mask is not None and frame.loss_mask.shape == (128, 160)
+    assert not any("no calibration" in note for note in recording.notes)
+    assert recording.digest != without
+
+
+def test_depth_of_pictures_that_are_not_rectified_is_refused(tmp_path):
+    picture(tmp_path / "left.png")
+    picture(tmp_path / "right.png")
+    scared_json(tmp_path)
+    (tmp_path / "depth").mkdir()
+    cv2.imwrite(str(tmp_path / "depth" / "0.png"), np.ones((256, 320), np.uint8))
+    with pytest.raises(RecordingInvalid, match="depth for pictures that are not rectified"):
+        open_recording(tmp_path)
+
+
+def test_a_calibration_for_another_size_is_refused(tmp_path):
+    picture(tmp_path / "left.png", size=(100, 80))
+    picture(tmp_path / "right.png", size=(100, 80))
+    scared_json(tmp_path)
+    with pytest.raises(RecordingInvalid, match=r"principal point .* lies outside"):
+        open_recording(tmp_path)
+
+
+@pytest.mark.recordings
+def test_videos_of_two_eyes_are_a_stereo_recording(recordings_dir):
+    recording = open_recording(recordings_dir / "heart", max_frames=2)
+    frames = list(recording)
+    assert len(frames) == 2 and all(frame.right_image is not None for frame in frames)
+    assert (frames[0].image != frames[0].right_image).any()
+
+
+@pytest.mark.recordings
+def test_scared_raw_is_rectified_to_half_a_pixel(recordings_dir):
+    frame = next(iter(open_recording(recordings_dir / "scared_raw")))
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.image, frame.right_image)]
+    finder = cv2.SIFT.create(2000)
+    (here, left), (there, right) = (finder.detectAndCompute(each, None) for each in grey)
+    pairs = [a for a, b in cv2.BFMatcher().knnMatch(left, right, k=2) if a.distance < 0.75 * b.distance]
+    lower = np.array([there[pair.trainIdx].pt[1] - here[pair.queryIdx].pt[1] for pair in pairs])
+    assert len(lower) > 300 and np.median(np.abs(lower)) <= 0.5
