@@ -1,14 +1,19 @@
 """How true reconstructions of synthetic recordings are in three dimensions, for each thing that a recording may lack.
 
-One line for each case: depth error as a share of the median depth (as it is, after one scale; each frame's median depth everywhere; its
-best tilted plane), how far normals are off (and those of that plane), PSNR of the third camera, which training never gets (the model, after one scale; the left picture as it is, and shifted), and how far followed points of
-the tissue end up (the model, after one scale; no motion). `--json` for all figures. The recording is made once; training gets a copy without
-what the case lacks, so that nothing that is left out can be used.
+One line for each case:
+* depth: root mean squared error as a share of the median depth, as it is and after one scale; of each frame's median depth everywhere
+  (level), of its best tilted plane; the mean angle of normals, and of that plane's;
+* third: PSNR of the third camera, which training never gets, as it is and after one scale; of the left picture as it is, and shifted;
+* points: median error of followed points of the tissue in mm, as it is, after one scale, and of no motion; in px, and of no motion;
+* which shares of the pictures' change motion, colour and size explain; the trajectory's error after similarity, as a share of the path.
+
+`--json` for all figures. The recording is made once; training gets a copy without what the case lacks, so that nothing that is left out
+can be used.
 
     fixed       one eye at rest, pictures and tool masks alone
     stereo      both eyes at rest
     poses       one moving eye whose poses are given
-    no-poses    one moving eye
+    no-poses    one moving eye, whose poses are estimated first, as `intrasplat poses` does it
     depth       one eye at rest, with depth
 
 Usage: python benchmarks/geometry_synthetic.py [CASE...] [--scene open|colon] [--steps 400] [--frames 36] [--width 160] [--height 128]
@@ -24,20 +29,19 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from gsplat_core.evaluation.geometry import Geometry, evaluate_geometry
-from gsplat_core.evaluation.pictures import PictureMaker
+from gsplat_core.evaluation.geometry import Geometry
+from gsplat_core.geometry.odometry import trajectory_of
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
+from gsplat_core.io.recordings.poses_file import POSES_FILE, write_poses
 from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.io.recordings.truth import open_truth
-from gsplat_core.scene.frames import Frame
+from operators.applications.geometry import SeenFromAnywhere, measure_geometry
 from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings
 
@@ -104,21 +108,20 @@ def measured(name: str, case: Case, arguments: argparse.Namespace, work: Path) -
     given = work / f"{name}-given"
     copy_of(whole, given, case)
     begun = time.perf_counter()
+    if case.camera == "moving" and not case.poses:
+        blind = open_recording(given)
+        write_poses(given / POSES_FILE, trajectory_of(blind, blind.camera).poses)
     settings = ReplaySettings(given, work / f"{name}-run", device=arguments.device, sinks=(), seed=arguments.seed)
     reconstruct(settings, arguments.steps)
     seconds = time.perf_counter() - begun
     model = load_bundle(work / f"{name}-run" / "model").to(arguments.device)
     recording = open_recording(whole)
-    makers: dict[Any, PictureMaker] = {}
-
-    def shown(camera: Any, frame: Frame) -> Any:
-        key = camera.with_pose(np.eye(4))
-        maker = makers.setdefault(key, PictureMaker(key, arguments.device))
-        return maker(model, frame.with_fields(pose=camera.world_to_camera))
-
-    own: Callable[[Frame], Any] = lambda frame: frame.pose if case.poses else None
     truth = open_truth(whole, recording.frame_count)
-    return evaluate_geometry(recording, recording.frame_count, recording.camera, model, shown, truth, own), seconds
+    trained_on = open_recording(given)
+    poses = work / f"{name}-poses.npy"
+    write_poses(poses, np.stack([trained_on.camera_at(k).world_to_camera for k in range(recording.frame_count)]))
+    pictures = SeenFromAnywhere(arguments.device)
+    return measure_geometry(recording, recording.frame_count, recording.camera, model, pictures, truth, poses), seconds
 
 
 def recording_of(case: Case, arguments: argparse.Namespace, work: Path) -> Path:
@@ -164,14 +167,17 @@ def copy_of(whole: Path, given: Path, case: Case) -> None:
 
 HEADER = (
     f"{'case':<9} {'depth':>7} {'scaled':>7} {'level':>7} {'plane':>7} {'normals':>8} {'plane':>6}  {'third':>6} {'scaled':>6} {'left':>6}"
-    f" {'shifted':>7}  {'points':>7} {'scaled':>7} {'still':>7}   {'px':>5} {'still':>5}  {'time':>5}"
+    f" {'shifted':>7}  {'points':>7} {'scaled':>7} {'still':>7}   {'px':>5} {'still':>5}  {'motion':>6} {'colour':>6}"
+    f" {'size':>6}  {'ATE':>6}  {'time':>5}"
 )
 
 
 def line(name: str, geometry: Geometry, seconds: float) -> str:
     """One case's figures: shares of the median depth, degrees, dB, median mm, median px, seconds."""
     depth, normals, tracking = geometry.depth, geometry.normals, geometry.tracking
-    assert depth is not None and normals is not None and tracking is not None
+    parts = geometry.parts
+    assert depth is not None and normals is not None and tracking is not None and parts is not None
+    way = "-" if geometry.trajectory is None else f"{geometry.trajectory.similarity_share:.2%}"
     third, scaled = (
         next(view for view in views if view.name == "third") for views in (geometry.views, geometry.scaled_views)
     )
@@ -182,7 +188,8 @@ def line(name: str, geometry: Geometry, seconds: float) -> str:
         f"  {third.model.psnr_tissue_db:6.2f} {scaled.model.psnr_tissue_db:6.2f} {third.left.psnr_tissue_db:6.2f}"
         f" {third.shifted.psnr_tissue_db:7.2f}"
         f"  {tracking.model.median_mm:7.2f} {tracking.scaled.median_mm:7.2f} {tracking.still.median_mm:7.2f}"
-        f"   {tracking.model.median_px:5.2f} {tracking.still.median_px:5.2f}  {seconds:4.0f}s"
+        f"   {tracking.model.median_px:5.2f} {tracking.still.median_px:5.2f}"
+        f"  {parts.motion:6.1%} {parts.colour:6.1%} {parts.size:6.1%}  {way:>6}  {seconds:4.0f}s"
     )
 
 

@@ -13,17 +13,20 @@ from time import perf_counter
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.baselines import AGES, measure_baselines
 from gsplat_core.evaluation.causal import evaluate_causal
+from gsplat_core.evaluation.geometry import Geometry
 from gsplat_core.evaluation.heldout import HeldOut, evaluate_heldout
 from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.pictures import PictureMaker
 from gsplat_core.evaluation.retention import Retention, Return, evaluate_retention, find_places, returns
 from gsplat_core.evaluation.scores import Record
+from gsplat_core.io.recordings.truth import open_truth
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.model import Model
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded
 from operators.applications.evaluated import EvaluatedRun, Playback, SeenFrames, fitting_source, frame_tolerance_s
 from operators.applications.evaluation import PROTOCOLS, WITHOUT_LEARNING, CausalRun, Evaluation, EvaluationSettings
+from operators.applications.geometry import SeenFromAnywhere, measure_geometry
 from operators.applications.limits import check_picture
 from operators.applications.live_log import is_live_log, read_live_log
 from operators.applications.memory import render_bytes, replay_bytes, require_memory
@@ -132,6 +135,8 @@ class _Work:
                 return "it needs the folder of a live run, not a model alone"
             if not is_live_log(self.run.folder / FRAMES_FILE):
                 return f"{self.run.folder} has no log of when pictures were shown; it was not a live run"
+        if name == "geometry" and self.camera.model != "pinhole":
+            return f"it compares what pinhole cameras see, and this one is {self.camera.model}"
         return None
 
     def _heldout(self) -> HeldOut:
@@ -197,6 +202,20 @@ class _Work:
             scale=self.scale,
         )
 
+    def _geometry(self) -> Geometry:
+        settings, count = self.settings, self.source.description.frame_count
+        assert count is not None  # a source without an end is not evaluated
+        self._require_memory_of_picture()
+        return measure_geometry(
+            self._frames("geometry"),
+            count,
+            self.camera,
+            self.model.to(settings.device),
+            SeenFromAnywhere(settings.device, settings.renderer),
+            open_truth(Path(settings.recording), count, self.scale),
+            settings.poses,
+        )
+
     def _live(self) -> Live:
         assert self.run is not None
         with self._log("live") as record:
@@ -215,12 +234,17 @@ class _Work:
     def _of_final_model(self):  # type: ignore[no-untyped-def]
         """What the final model shows for a frame."""
         settings, camera = self.settings, self.camera
-        if settings.device == "cpu":
-            needed = render_bytes(camera.width_px, camera.height_px, self.model.parameter_count)
-            require_memory(needed, f"a picture of {camera.width_px}x{camera.height_px} px", "give a smaller --scale")
+        self._require_memory_of_picture()
         model = self.model.to(settings.device)
         pictures = PictureMaker(camera, settings.device, settings.renderer)
         return lambda frame: pictures(model, frame)
+
+    def _require_memory_of_picture(self) -> None:
+        """Raises MemoryTooSmall where no picture of the model fits into memory."""
+        camera = self.camera
+        if self.settings.device == "cpu":
+            needed = render_bytes(camera.width_px, camera.height_px, self.model.parameter_count)
+            require_memory(needed, f"a picture of {camera.width_px}x{camera.height_px} px", "give a smaller --scale")
 
     def _frames(self, stage: str, from_s: float = -math.inf) -> SeenFrames:
         """The frames that the model has seen; of a looped recording one round, or all of them from a time on."""

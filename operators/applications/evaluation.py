@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.baselines import Baselines
+from gsplat_core.evaluation.geometry import Geometry
 from gsplat_core.evaluation.heldout import HeldOut
 from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.places import Visits
@@ -18,8 +19,8 @@ from gsplat_core.training.motion_priors import MOTION_PRIORS
 from operators.applications.limits import check_max_frames, check_scale, check_steps
 from operators.sources.source import SourceDescription
 
-PROTOCOLS = ("heldout", "live", "retention", "causal")
-WITHOUT_LEARNING = ("heldout", "live", "retention")
+PROTOCOLS = ("heldout", "live", "retention", "geometry", "causal")
+WITHOUT_LEARNING = ("heldout", "live", "retention", "geometry")
 """What is measured unless protocols are named: `causal` learns from the whole recording again."""
 
 
@@ -43,6 +44,8 @@ class EvaluationSettings:
     """How much of the stream's end retention renders again."""
     places: tuple[Visits, ...] | None = None
     """Stays at places, for retention; None finds them by the poses."""
+    poses: Path | None = None
+    """Of geometry: a `poses.npy` with the poses that the model was made with; None: those of the recording."""
 
     def __post_init__(self) -> None:
         for name in self.protocols:
@@ -85,6 +88,7 @@ class Evaluation:
     causal: CausalRun | None = None
     live: Live | None = None
     retention: Retention | None = None
+    geometry: Geometry | None = None
     returns: Mapping[str, tuple[Return, ...]] = field(default_factory=dict)
     """How soon places were found again, by protocol."""
     logs: Mapping[str, Path] = field(default_factory=dict)

@@ -20,6 +20,7 @@ from services.cli.progress import ProgressPrinter
 from services.cli.streams import printable
 from services.reports.evaluated import load_evaluated
 from services.reports.evaluation_build import build_evaluation, write_evaluation
+from services.reports.evaluation_geometry import geometry_lines
 from services.reports.evaluation_rows import decibels, future, measured
 from services.reports.evaluation_schema import EvaluationReport
 
@@ -35,6 +36,7 @@ def evaluation_settings(recording: Path, options: EvaluateOptions) -> Evaluation
         max_frames=options.max_frames,
         steps_per_frame=options.steps_per_frame,
         motion_prior=options.motion_prior,
+        poses=options.poses,
         places=None if options.place is None else tuple(_place(text) for text in options.place),
     )
 
@@ -80,7 +82,7 @@ def print_evaluation(report: EvaluationReport, out: Path | None, *, as_json: boo
         return
     for note in report.notes:
         typer.echo(f"note: {printable(note)}", err=True)
-    typer.echo("\n".join(table(report)))
+    typer.echo("\n".join([*table(report), *geometry_lines(report)]))
     if out is not None:
         typer.echo(str(out / "evaluation.html"))
 

@@ -57,6 +57,12 @@ EvaluationOutOption = Annotated[
     Path | None,
     path_option("--out", "Folder for evaluation.json and evaluation.html: new, empty, or left by an earlier run."),
 ]
+PosesOption = Annotated[
+    Path | None,
+    path_option(
+        "--poses", "For geometry: a poses.npy that the model was made with. Default: the recording's own poses."
+    ),
+]
 PlaceOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -114,7 +120,7 @@ class EvaluateOptions:
     protocol: Annotated[
         list[str] | None,
         typer.Option(
-            help="heldout, live, retention or causal (which learns from the recording again); more than once for several.",
+            help="heldout, live, retention, geometry or causal (which learns from the recording again); more than once for several.",
             show_default="all but causal",
         ),
     ] = None
@@ -131,6 +137,7 @@ class EvaluateOptions:
         str | None, typer.Option(help="What causal assumes about motion: bumps, flow or learned.", show_default="bumps")
     ] = None
     place: PlaceOption = None
+    poses: PosesOption = None
 
 
 @dataclass(frozen=True)

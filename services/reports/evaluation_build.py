@@ -27,6 +27,7 @@ from services.reports.evaluation_schema import (
     CausalFacts,
     EvaluatedFacts,
     EvaluationReport,
+    GeometryFacts,
     HeldOutFacts,
     OnScreenFacts,
     PlaceFacts,
@@ -74,6 +75,7 @@ def build_evaluation(
             last_range_s=retention.last_range_s,
             places=[_place(place) for place in retention.places],
         ),
+        geometry=None if evaluation.geometry is None else GeometryFacts.model_validate(asdict(evaluation.geometry)),
         returns={
             name: [
                 ReturnFacts(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from operators.storage import write_whole
 from services.reports.evaluation_charts import charts_section, hold_section
+from services.reports.evaluation_geometry import geometry_section
 from services.reports.evaluation_schema import EvaluationReport
 from services.reports.evaluation_tables import (
     ages_section,
@@ -32,6 +33,7 @@ def render_evaluation(report: EvaluationReport) -> str:
     sections = [
         tiles_section(report),
         table_section(report),
+        geometry_section(report),
         charts_section(report),
         places_section(report),
         f'<div class="two">{"".join(small)}</div>',

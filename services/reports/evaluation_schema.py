@@ -106,6 +106,104 @@ class RetentionFacts(Part):
     places: list[PlaceFacts]
 
 
+class DepthShareFacts(Part):
+    """Over all compared frames; shares are of the median true depth."""
+
+    rmse_share: float
+    scaled_rmse_share: float
+    """After the model's depth was multiplied by `scale`: of its shape alone, relative."""
+    plane_rmse_share: float
+    """Of each frame's best flat plane."""
+    level_rmse_share: float
+    """Of each frame's median true depth, shown everywhere."""
+    median_share: float
+    rmse: float
+    """In the unit of the recording's depth, mm where it has a scale."""
+    scale: float
+    median_depth: float
+    covered: float
+    frames: Count
+
+
+class NormalFacts(Part):
+    mean_deg: float
+    median_deg: float
+    plane_mean_deg: float
+    frames: Count
+
+
+class ViewFacts(Part):
+    """A view from where training did not look; over the pixels of tissue that training saw from its own camera."""
+
+    name: str
+    model: ScoreFacts
+    left: ScoreFacts
+    """The left picture, shown as it is."""
+    shifted: ScoreFacts
+    """The left picture, shifted by the median disparity."""
+    seen: float
+
+
+class TrackFacts(Part):
+    median_mm: float
+    mean_mm: float
+    median_px: float
+    mean_px: float
+    within_mm: float
+    within_px: float
+
+
+class TrackingFacts(Part):
+    """Points of the tissue, followed: errors in the left camera's coordinates, and in pixels of the evaluated pictures."""
+
+    model: TrackFacts
+    scaled: TrackFacts
+    """After the one factor of the sequence's depth: relative."""
+    still: TrackFacts
+    """No motion."""
+    points: Count
+    compared: Count
+
+
+class TrajectoryFacts(Part):
+    """Absolute trajectory error, as a share of the true path."""
+
+    rigid_share: float
+    similarity_share: float
+    """After the best scale: relative."""
+    still_share: float
+    rigid_rmse: float
+    rotation_deg: float
+    scale: float
+    path: float
+    frames: Count
+
+
+class PartFacts(Part):
+    """Shares of the squared change of the pictures that each part of the deformation explains."""
+
+    motion: float
+    colour: float
+    size: float
+    explained: float
+    reference_s: float
+    frames: Count
+
+
+class GeometryFacts(Part):
+    """How true the model is in three dimensions; null or empty where the recording does not know the truth."""
+
+    frames: Count
+    depth: DepthShareFacts | None
+    normals: NormalFacts | None
+    views: list[ViewFacts]
+    scaled_views: list[ViewFacts]
+    """After the one factor of the sequence's depth: relative."""
+    tracking: TrackingFacts | None
+    trajectory: TrajectoryFacts | None
+    parts: PartFacts | None
+
+
 class ReturnFacts(Part):
     """How soon a place was found again."""
 
@@ -144,6 +242,7 @@ class EvaluationReport(Part):
     causal: CausalFacts | None
     live: OnScreenFacts | None
     retention: RetentionFacts | None
+    geometry: GeometryFacts | None = None
     returns: dict[str, list[ReturnFacts]]
     """By protocol."""
     baselines: list[BaselineFacts]

@@ -83,7 +83,12 @@ def open_views(folder: Path, frame_count: int, scale: float = 1.0) -> tuple[Reco
         )
     if len(views) > MOST_VIEWS:
         raise RecordingInvalid(f"{path} has {len(views)} views. Give at most {MOST_VIEWS}")
-    found = tuple(_view(folder, path, view, number(content.get("depth_unit_mm")), findings) for view in views)
+    unit = number(content.get("depth_unit_mm", 1.0))
+    if unit is None or not 1e-6 <= unit <= 1e3:
+        raise RecordingInvalid(
+            f"{path}: depth_unit_mm is {content['depth_unit_mm']!r:.40}. Give a number from 1e-6 to 1000"
+        )
+    found = tuple(_view(folder, path, view, unit, findings) for view in views)
     for view in found:
         if len(view.files) < frame_count:
             raise RecordingInvalid(
@@ -92,7 +97,7 @@ def open_views(folder: Path, frame_count: int, scale: float = 1.0) -> tuple[Reco
     return tuple(replace(view, camera=view.camera.scaled(scale)) for view in found)
 
 
-def _view(root: Path, path: Path, described: Any, unit_mm: float | None, findings: Findings) -> RecordedView:
+def _view(root: Path, path: Path, described: Any, unit_mm: float, findings: Findings) -> RecordedView:
     if not isinstance(described, dict) or not isinstance(described.get("camera"), dict):
         raise RecordingInvalid(f"{path}: a view is {described!r:.60}. Give name, folder, camera and left_to_view")
     name, inside = described.get("name"), described.get("folder")

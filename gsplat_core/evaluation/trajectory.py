@@ -1,0 +1,88 @@
+"""How far an estimated way of the scope is from the true one: the absolute trajectory error (ATE), beside a scope that is said to stand still.
+
+Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems" (2012); alignment after Umeyama, "Least-squares estimation of
+transformation parameters between two point patterns" (1991).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidInput
+
+LEAST_PATH_SHARE = 1e-6
+"""A path shorter than this share of its distance from the origin, or than this, is that of a scope at rest."""
+
+Poses = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """Root mean square of the distances between true and estimated positions, divided by the length of the true path."""
+
+    rigid_share: float
+    """After the best rotation and shift: of estimates that claim to have a scale."""
+    similarity_share: float
+    """After the best rotation, shift and scale: of the shape of the way alone."""
+    still_share: float
+    """Of a scope that stands still in the middle of the true way."""
+    rigid_rmse: float
+    """`rigid_share` in the unit of the true path."""
+    rotation_deg: float
+    """Mean angle between true and estimated orientations, after the same rotation."""
+    scale: float
+    """The best factor of the estimated lengths."""
+    path: float
+    """Length of the true path, in its unit."""
+    frames: int
+
+
+def evaluate_trajectory(estimated: Poses, true: Poses) -> TrajectoryErrors | None:
+    """Compare world-to-camera poses [N, 4, 4] of the same frames; None where the true scope does not move.
+
+    Raises InvalidInput for fewer than three poses, or two numbers of them.
+    """
+    if estimated.shape != true.shape or len(true) < 3:
+        raise InvalidInput(
+            f"there are {list(estimated.shape)} estimated and {list(true.shape)} true poses; give three or more of both"
+        )
+    found, right = _centres(estimated), _centres(true)
+    path = float(np.linalg.norm(np.diff(right, axis=0), axis=1).sum())
+    if path <= LEAST_PATH_SHARE * max(1.0, float(np.abs(right).max())):
+        return None
+    rotation, scale = _alignment(found, right)
+    rmse = lambda factor: _rmse(factor * (found - found.mean(axis=0)) @ rotation.T, right - right.mean(axis=0))
+    turned = estimated[:, :3, :3] @ rotation.T
+    cosine = (np.einsum("nij,nij->n", turned, true[:, :3, :3]) - 1) / 2
+    return TrajectoryErrors(
+        rigid_share=rmse(1.0) / path,
+        similarity_share=rmse(scale) / path,
+        still_share=rmse(0.0) / path,
+        rigid_rmse=rmse(1.0),
+        rotation_deg=float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean()),
+        scale=scale,
+        path=path,
+        frames=len(true),
+    )
+
+
+def _centres(poses: Poses) -> Poses:
+    """Where cameras are [N, 3]."""
+    return np.asarray(-np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]))
+
+
+def _alignment(found: Poses, right: Poses) -> tuple[Poses, float]:
+    """The rotation [3, 3] and the factor that bring `found` nearest to `right`, both about their means; the factor of positions that are all
+    one is 0."""
+    a, b = found - found.mean(axis=0), right - right.mean(axis=0)
+    u, singular, vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    spread = float(np.square(a).sum())
+    return (u * signs) @ vt, float((singular * signs).sum() / spread) if spread > 0 else 0.0
+
+
+def _rmse(a: Poses, b: Poses) -> float:
+    return float(np.sqrt(np.square(a - b).sum(axis=1).mean()))

@@ -1,0 +1,52 @@
+"""Measuring a finished model in three dimensions: pictures from any camera, and the poses that it was made with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from gsplat_core.evaluation.geometry import Geometry, evaluate_geometry
+from gsplat_core.evaluation.pictures import Picture, PictureMaker
+from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.recordings.poses_file import read_poses
+from gsplat_core.io.recordings.truth import GroundTruth
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.model import Model
+
+
+class SeenFromAnywhere:
+    """Pictures of a model from any camera; one renderer for each size and projection."""
+
+    def __init__(self, device: str = "cpu", renderer: str = "alpha") -> None:
+        self._device, self._renderer = device, renderer
+        self._makers: dict[Camera, PictureMaker] = {}
+
+    def __call__(self, model: Model, camera: Camera, frame: Frame) -> Picture:
+        """The model at the frame's time and with its exposure, from where `camera` is."""
+        lens = camera.with_pose(np.eye(4))
+        maker = self._makers.get(lens)
+        if maker is None:
+            maker = self._makers[lens] = PictureMaker(lens, self._device, self._renderer)
+        return maker(model, frame.with_fields(pose=camera.world_to_camera))
+
+
+def measure_geometry(
+    frames: Iterable[Frame],
+    frame_count: int,
+    camera: Camera,
+    model: Model,
+    pictures: SeenFromAnywhere,
+    truth: GroundTruth,
+    poses: Path | None = None,
+) -> Geometry:
+    """`evaluate_geometry` of a model that was made with the poses of a file, or with those of the frames.
+
+    Raises RecordingInvalid for a file that holds no poses of as many frames.
+    """
+    read = None if poses is None else read_poses(poses, frame_count, Findings(strict=True))
+    own = lambda frame: frame.pose if read is None else read[frame.seq]
+    shown = lambda view, frame: pictures(model, view, frame)
+    return evaluate_geometry(frames, frame_count, camera, model, shown, truth, own)

@@ -1,0 +1,148 @@
+"""How true a model is in three dimensions, as rows: what was measured, in which unit, beside which trivial baseline."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from html import escape
+
+from services.reports.evaluation_rows import decibels
+from services.reports.evaluation_schema import EvaluationReport, GeometryFacts
+
+RELATIVE_FROM = 0.05
+"""A model whose lengths are off by a larger share than this is said to have no scale."""
+
+
+@dataclass(frozen=True)
+class GeometryRow:
+    """One figure, already in words."""
+
+    what: str
+    value: str
+    baselines: str
+    """Each trivial baseline with its value."""
+    relative: bool = False
+    """It says nothing about lengths: one factor was taken out of it first."""
+
+
+def geometry_rows(geometry: GeometryFacts) -> list[GeometryRow]:
+    """Everything that was measured, in the order of the page."""
+    return [*_depth(geometry), *_views(geometry), *_tracking(geometry), *_trajectory(geometry), *_parts(geometry)]
+
+
+def scale_sentence(geometry: GeometryFacts) -> str | None:
+    """Whether lengths of the model mean anything, as far as the true depth tells."""
+    if geometry.depth is None:
+        return None
+    scale = geometry.depth.scale
+    if abs(scale - 1) > RELATIVE_FROM:
+        return f"the model's lengths must be multiplied by {scale:.3g}: it is uncalibrated, and only the relative figures say something about it"
+    return f"the model's lengths must be multiplied by {scale:.3f}"
+
+
+def _depth(geometry: GeometryFacts) -> Iterator[GeometryRow]:
+    depth, normals = geometry.depth, geometry.normals
+    if depth is not None:
+        baselines = f"best flat plane {_percent(depth.plane_rmse_share)}, median depth everywhere {_percent(depth.level_rmse_share)}"
+        unit = "root mean squared error, share of the median depth"
+        yield GeometryRow(f"Depth, {unit}", _percent(depth.rmse_share), baselines)
+        yield GeometryRow(f"Depth after one scale, {unit}", _percent(depth.scaled_rmse_share), baselines, True)
+    if normals is not None:
+        yield GeometryRow(
+            "Normals, mean angle",
+            _degrees(normals.mean_deg),
+            f"best flat plane {_degrees(normals.plane_mean_deg)}",
+            True,
+        )
+
+
+def _views(geometry: GeometryFacts) -> Iterator[GeometryRow]:
+    for views, after, relative in ((geometry.views, "", False), (geometry.scaled_views, " after one scale", True)):
+        for view in views:
+            left, shifted = decibels(view.left.psnr_tissue_db), decibels(view.shifted.psnr_tissue_db)
+            ssim = "" if view.model.ssim is None else f", SSIM {view.model.ssim:.4f}"
+            yield GeometryRow(
+                f"View of the {view.name} camera{after}",
+                f"{decibels(view.model.psnr_tissue_db)} dB{ssim}",
+                f"left picture {left} dB, shifted {shifted} dB",
+                relative,
+            )
+
+
+def _tracking(geometry: GeometryFacts) -> Iterator[GeometryRow]:
+    tracking = geometry.tracking
+    if tracking is None:
+        return
+    still = tracking.still
+    for found, after, relative in ((tracking.model, "", False), (tracking.scaled, " after one scale", True)):
+        yield GeometryRow(
+            f"Followed points{after}, median and mean error",
+            f"{found.median_mm:.2f} mm, {found.mean_mm:.2f} mm",
+            f"no motion {still.median_mm:.2f} mm, {still.mean_mm:.2f} mm",
+            relative,
+        )
+    yield GeometryRow(
+        "Followed points, median and mean error in the picture",
+        f"{tracking.model.median_px:.2f} px, {tracking.model.mean_px:.2f} px",
+        f"no motion {still.median_px:.2f} px, {still.mean_px:.2f} px",
+        True,
+    )
+
+
+def _trajectory(geometry: GeometryFacts) -> Iterator[GeometryRow]:
+    way = geometry.trajectory
+    if way is None:
+        return
+    still = f"no motion {_percent(way.still_share)}"
+    yield GeometryRow("Trajectory (ATE), share of the path", _percent(way.rigid_share), still)
+    yield GeometryRow(
+        "Trajectory (ATE) after one scale, share of the path", _percent(way.similarity_share), still, True
+    )
+
+
+def _parts(geometry: GeometryFacts) -> Iterator[GeometryRow]:
+    parts = geometry.parts
+    if parts is not None:
+        whole = f"all parts together {_percent(parts.explained)}"
+        for name, share in (("motion", parts.motion), ("colour", parts.colour), ("size and opacity", parts.size)):
+            yield GeometryRow(f"Change of the pictures explained by {name}", _percent(share), whole, True)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2f} %"
+
+
+def _degrees(angle: float) -> str:
+    return f"{angle:.1f}°"
+
+
+def geometry_section(report: EvaluationReport) -> str:
+    """The rows as a table of `evaluation.html`."""
+    geometry = report.geometry
+    rows = [] if geometry is None else geometry_rows(geometry)
+    if geometry is None or not rows:
+        return ""
+    body = "".join(
+        f'<tr><th scope="row">{escape(row.what)}</th><td class="n">{escape(row.value)}</td><td>{escape(row.baselines)}</td>'
+        f"<td>{'relative' if row.relative else 'absolute'}</td></tr>"
+        for row in rows
+    )
+    scale = scale_sentence(geometry)
+    note = "" if scale is None else f'<p class="note">To be true in length, {escape(scale)}.</p>'
+    return (
+        f'<section><h2>In three dimensions</h2><p class="lead">{geometry.frames:,} frames, spread evenly; relative figures say nothing'
+        ' about lengths.</p><table><thead><tr><th scope="col">What</th><th scope="col" class="n">the model</th>'
+        f'<th scope="col">knowing nothing</th><th scope="col"></th></tr></thead><tbody>{body}</tbody></table>{note}</section>'
+    )
+
+
+def geometry_lines(report: EvaluationReport) -> list[str]:
+    """The rows for a terminal."""
+    geometry = report.geometry
+    rows = [] if geometry is None else geometry_rows(geometry)
+    if geometry is None or not rows:
+        return []
+    what, value = max(len(row.what) for row in rows), max(len(row.value) for row in rows)
+    lines = [f"{row.what:<{what}}  {row.value:<{value}}  {row.baselines}" for row in rows]
+    scale = scale_sentence(geometry)
+    return [*lines, *([f"to be true in length, {scale}"] if scale else [])]
