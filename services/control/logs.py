@@ -50,8 +50,14 @@ def log_to_stderr(settings: LogSettings) -> None:
     handler.setFormatter(TextFormatter() if text else JsonFormatter())
     logging.basicConfig(level=settings.level.upper(), handlers=[handler], force=True)
     logging.getLogger("uvicorn.access").disabled = True  # it writes addresses with tickets in them
+    logging.getLogger("uvicorn.error").addFilter(_is_no_refused_websocket)
     for chatty in ("websockets", "alembic"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+
+
+def _is_no_refused_websocket(record: logging.LogRecord) -> bool:
+    """uvicorn takes it for an error when a WebSocket is answered with a refusal, which the request's own line has."""
+    return record.getMessage() != "ASGI callable returned without completing handshake."
 
 
 def facts(**values: object) -> dict[str, dict[str, object]]:

@@ -198,6 +198,7 @@ def test_logs_do_not_have_the_ticket_of_a_websocket(tmp_path, form):
                 break
             time.sleep(0.02)
         assert said and "s3cret" not in "".join(process.lines)
+        assert "handshake" not in "".join(process.lines)  # to refuse is no error
 
 
 def test_sigterm_ends_it_with_0_and_the_log_has_it(tmp_path):
