@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
 import typer
 
 from gsplat_core.errors import UserError
+from services.audit import AuditInUse, AuditLog, AuditUnwritable, Keeping
 from services.cli.exit_codes import OK
-from services.control.app import KEYS_FILE
-from services.control.auth.keys import KeyConflict, KeyStore
+from services.control.app import AUDIT_FILE, KEYS_FILE
+from services.control.auth.key_changes import append_key_change
+from services.control.auth.keys import ApiKey, KeyConflict, KeyStore
 from services.control.auth.roles import Role
-from services.settings import load_settings
+from services.settings import ServiceSettings, load_settings
 from services.settings.sections import NAME_PATTERN
 
 
@@ -42,9 +45,10 @@ def keys_add_command(config: Path | None, data: Path | None, name: str, role: st
     if role not in (Role.VIEWER, Role.OPERATOR, Role.ADMIN):
         raise KeyRefused(f"the role is {role!r:.60}; choose viewer, operator or admin")
     try:
-        _, token = _store(config, data).create(name, Role(role))
+        key, token = _store(config, data).create(name, Role(role))
     except KeyConflict as error:
         raise KeyRefused(str(error)) from error
+    _audited(config, data, "key.create", key)
     typer.echo(token)
     return OK
 
@@ -57,10 +61,30 @@ def keys_revoke_command(config: Path | None, data: Path | None, key_id: str) -> 
         raise KeyRefused(f"there is no key {key_id!r:.60}; `intrasplat keys list` shows them") from error
     except KeyConflict as error:
         raise KeyRefused(str(error)) from error
+    _audited(config, data, "key.revoke", key)
     typer.echo(f"revoked {key.id} of {key.name}")
     return OK
 
 
+def _audited(config: Path | None, data: Path | None, event: str, key: ApiKey) -> None:
+    """Write the change into the audit log; a server that runs holds that log, and writes it itself within seconds."""
+    settings = _settings(config, data)
+    keep = settings.audit
+    with suppress(AuditInUse):
+        audit = AuditLog(
+            settings.data_dir / AUDIT_FILE, Keeping(keep.segment_bytes, keep.keep_segments, keep.keep_days)
+        )
+        try:
+            append_key_change(audit, event, key)
+        except AuditUnwritable as error:
+            raise KeyRefused(f"the key was changed, but the audit log could not be written: {error}") from error
+        finally:
+            audit.close()
+
+
 def _store(config: Path | None, data: Path | None) -> KeyStore:
-    settings = load_settings(config, {} if data is None else {"paths.data": json.dumps(str(data))})
-    return KeyStore(settings.data_dir / KEYS_FILE)
+    return KeyStore(_settings(config, data).data_dir / KEYS_FILE)
+
+
+def _settings(config: Path | None, data: Path | None) -> ServiceSettings:
+    return load_settings(config, {} if data is None else {"paths.data": json.dumps(str(data))})

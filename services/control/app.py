@@ -7,6 +7,7 @@ import logging
 import os
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -15,6 +16,7 @@ from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from services.audit import AuditLog, Keeping
 from services.control.answers import answer_with_problems
+from services.control.auth.key_changes import changed_outside, keys_read_again
 from services.control.auth.keys import KeyStore, first_admin_key
 from services.control.auth.tickets import Tickets
 from services.control.documents import ABOUT, describe
@@ -85,6 +87,7 @@ def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
     if made:
         audit.append("key.create", actor="system", subject="admin", detail={"role": "admin", "first": True})
         log.warning("the administrator's key was made: it is in %s", settings.admin_key_file)
+    keys.watch(partial(changed_outside, audit))
     limits = settings.limits
     return ControlState(
         settings=settings,
@@ -116,6 +119,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     control: ControlState = app.state.control
     async with AsyncExitStack() as running:
         await running.enter_async_context(control.parts.events.written_to(control.audit))
+        await running.enter_async_context(keys_read_again(control.keys))
         for enter in control.parts.background:
             await running.enter_async_context(enter())
         audit = control.audit

@@ -9,7 +9,7 @@ import json
 import os
 import secrets
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -44,9 +44,15 @@ class KeyStore:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self._on_change: Callable[[str, ApiKey], None] | None = None
         self._lock = threading.Lock()
         self._read: tuple[int, int, int] | None = None
         self._keys: dict[str, ApiKey] = {}
+
+    def watch(self, on_change: Callable[[str, ApiKey], None]) -> None:
+        """From now on, call `on_change` with `key.create` or `key.revoke` and the key for each change by another process, when it is seen."""
+        self._current()
+        self._on_change = on_change
 
     def find(self, token: str) -> ApiKey | None:
         """The key that a token is; takes the same time for a wrong token as for an unknown one."""
@@ -98,11 +104,19 @@ class KeyStore:
 
     def _current(self) -> dict[str, ApiKey]:
         with self._lock:
-            stamp = self._stamp()
+            before, stamp = self._keys, self._stamp()
             if stamp != self._read:
                 self._keys = _parse(self._path) if stamp is not None else {}
                 self._read = stamp
-            return self._keys
+            keys = self._keys
+        if self._on_change is not None and keys is not before:
+            for event, changed in (
+                ("key.create", keys.keys() - before.keys()),
+                ("key.revoke", before.keys() - keys.keys()),
+            ):
+                for key_id in sorted(changed):
+                    self._on_change(event, {**before, **keys}[key_id])
+        return keys
 
     def _stamp(self) -> tuple[int, int, int] | None:
         try:
@@ -120,6 +134,8 @@ class KeyStore:
             keys = dict(self._current())
             yield keys
             _write(self._path, keys)
+            with self._lock:  # what this process changes itself it knows
+                self._keys, self._read = keys, self._stamp()
 
 
 def first_admin_key(store: KeyStore, file: Path) -> bool:

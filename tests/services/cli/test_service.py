@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from functools import partial
 
 import pytest
 
@@ -42,6 +43,29 @@ def test_a_key_is_made_listed_and_revoked(tmp_path, capsys):
     assert run(["keys", "revoke", listed["wall"]["id"], *data]) == BAD_INPUT
     assert run(["keys", "revoke", listed["console"]["id"], *data]) == BAD_INPUT
     assert "only administrator" in capsys.readouterr().err
+    log = AuditLog(tmp_path / "audit.jsonl")
+    said = [(entry.event, entry.actor, entry.subject, entry.detail["role"]) for entry in reversed(log.newest(9))]
+    log.close()
+    assert said == [
+        ("key.create", "shell", "console", "admin"),
+        ("key.create", "shell", "wall", "viewer"),
+        ("key.revoke", "shell", listed["wall"]["id"], "viewer"),
+    ]
+
+
+def test_a_server_that_runs_writes_what_a_shell_changes(tmp_path, capsys):
+    from services.control.auth.key_changes import changed_outside
+
+    server = AuditLog(tmp_path / "audit.jsonl")
+    keys = KeyStore(tmp_path / "keys.json")
+    keys.watch(partial(changed_outside, server))
+    assert run(["keys", "add", "console", "--data", str(tmp_path)]) == OK
+    assert server.newest(9) == []
+    keys.all()
+    (entry,) = server.newest(9)
+    server.close()
+    assert (entry.event, entry.actor, entry.subject) == ("key.create", "shell", "console")
+    assert entry.detail["key_id"] in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
