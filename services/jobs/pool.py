@@ -22,9 +22,10 @@ from services.registry.database import Database
 from services.registry.errors import StoreUnavailable
 
 log = logging.getLogger(__name__)
-LOOK_S = 0.02
-TELL_S = 0.5
-"""So often claims are renewed, progress is written down, and a new job is looked for."""
+STEP_S = 0.02
+"""Between two looks at the attempts that run."""
+DATABASE_S = 0.5
+"""Between two questions to the database: claims are renewed with the progress, and a new job is looked for."""
 AGAIN_S = 2.0
 """After the database has not answered."""
 
@@ -56,7 +57,7 @@ class JobPool:
             self._workspace.remove_dead(dead)
         self._running: dict[str, tuple[Claimed, Task]] = {}
         self._ended: dict[str, str] = {}
-        self._told_s = self._looked_s = self._busy_s = time.monotonic() - TELL_S
+        self._renewed_s = self._searched_s = self._busy_s = time.monotonic() - DATABASE_S
 
     @property
     def idle_s(self) -> float:
@@ -72,7 +73,7 @@ class JobPool:
                 except StoreUnavailable as error:
                     log.warning("%s", error)
                     time.sleep(AGAIN_S)
-                time.sleep(LOOK_S)
+                time.sleep(STEP_S)
         finally:
             self._close()
 
@@ -83,10 +84,10 @@ class JobPool:
             self._settle(*self._running[job_id], how)
             del self._running[job_id], self._ended[job_id]
         now_s = time.monotonic()
-        if self._running and now_s - self._told_s >= TELL_S:
-            self._told_s = now_s
-            self._tell()
-        if now_s - self._looked_s >= TELL_S:
+        if self._running and now_s - self._renewed_s >= DATABASE_S:
+            self._renewed_s = now_s
+            self._renew_claims()
+        if now_s - self._searched_s >= DATABASE_S:
             self._fill()
 
     def _fill(self) -> None:
@@ -94,7 +95,7 @@ class JobPool:
         while len(self._running) < self._settings.workers:
             claimed = self._claims.take()
             if claimed is None:
-                self._looked_s = time.monotonic()
+                self._searched_s = time.monotonic()
                 return
             self._begin(claimed)
 
@@ -111,7 +112,7 @@ class JobPool:
         self._runner.start(task)
         log.info("%s began, attempt %d", claimed.id, claimed.attempt)
 
-    def _tell(self) -> None:
+    def _renew_claims(self) -> None:
         """Renew the claims and hear what became of the jobs meanwhile."""
         heard = self._claims.renew({job_id: task.progress() for job_id, (_, task) in self._running.items()})
         for job_id in heard.lost:
@@ -137,7 +138,7 @@ class JobPool:
             self._claims.end(claimed.id, *outcome)
             log.info("%s is %s", claimed.id, outcome[0])
         self._workspace.remove(Path(task.folder))
-        self._looked_s -= TELL_S  # there is room: look for the next one at once
+        self._searched_s -= DATABASE_S  # there is room: look for the next one at once
 
     def _publish(self, claimed: Claimed, task: Task) -> None:
         self._results.publish(task.out, claimed.folder)

@@ -6,6 +6,7 @@ import hashlib
 import json
 import secrets
 from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from services.registry.errors import Conflict, NotFound, Rejected
 from services.registry.rows import now
 
 MOST_AT_ONCE = 2000
+DAY_S = 86400.0
 FindSource = Callable[[sa.Connection, str], Path]
 
 
@@ -105,6 +107,21 @@ class JobStore:
                 raise Conflict(f"the replay {job_id} is {record.state}; cancel it first")
             connection.execute(sa.delete(JOBS).where(JOBS.c.id == job_id))
         return record
+
+    def surplus(self, max_age_s: float | None, most: int | None) -> list[tuple[str, str]]:
+        """Jobs that ended longer ago than that, and the oldest beyond so many that have ended: their ids, and why."""
+        ended = sa.select(JOBS.c.id, JOBS.c.ended_at).where(JOBS.c.state.not_in([str(state) for state in OPEN]))
+        with self.database.reading() as connection:
+            rows = connection.execute(ended.order_by(JOBS.c.ended_at.desc(), JOBS.c.number.desc())).all()
+        at = now()
+        found = []
+        for index, (job_id, ended_at) in enumerate(rows):
+            age_s = (at - datetime.fromisoformat(ended_at)).total_seconds()
+            if max_age_s is not None and age_s > max_age_s:
+                found.append((job_id, f"it ended {age_s / DAY_S:.1f} days ago; {max_age_s / DAY_S:g} are kept"))
+            elif most is not None and index >= most:
+                found.append((job_id, f"{index} that ended later are there; {most} are kept"))
+        return found
 
     def retry(self, states: Sequence[JobState]) -> int:
         """Queue jobs anew that ended in these states; returns how many."""

@@ -42,7 +42,7 @@ class RecordingRecord:
 
 @dataclass(frozen=True)
 class Expired:
-    """A recording that retention has removed, and why."""
+    """What retention has removed, and why: a recording by its name, a replay by its id."""
 
     name: str
     why: str

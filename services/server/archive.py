@@ -24,7 +24,7 @@ from services.registry.errors import StoreUnavailable
 from services.registry.models import DATABASE_FILE
 from services.server.pool_keeper import PoolKeeper
 from services.server.replays import Replays
-from services.server.retention import KeptRecordings
+from services.server.retention import RecordingRetention, ReplayRetention
 from services.settings import ServiceSettings
 
 log = logging.getLogger(__name__)
@@ -35,8 +35,9 @@ class Archive:
     """The parts."""
 
     recordings: RecordingStore
-    kept: KeptRecordings
+    recording_retention: RecordingRetention
     replays: Replays
+    replay_retention: ReplayRetention
     pool: PoolKeeper
     measures: ArchiveMeasures
 
@@ -60,12 +61,14 @@ def new_archive(settings: ServiceSettings, events: SystemEvents) -> Archive:
     results = Results((jobs.folder or data / "replays").absolute())
     threads = jobs.threads or max(1, (os.cpu_count() or 1) // (2 * jobs.workers))
     pool = PoolSettings(jobs.workers, threads, jobs.lease_s, jobs.attempts, NICENESS, pack_models=True)
-    told = PoolProcess(url, str(results.folder), pool, jobs.ray)
+    process = PoolProcess(url, str(results.folder), pool, jobs.ray)
+    replays = Replays(store, results)
     return Archive(
         recordings,
-        KeptRecordings(recordings, wanted.keep_days, wanted.keep_bytes, events),
-        Replays(store, results),
-        PoolKeeper(told, lambda: _open(store.counts())),
+        RecordingRetention(recordings, wanted.keep_days, wanted.keep_bytes, events),
+        replays,
+        ReplayRetention(replays, jobs.keep_days, jobs.keep_results, events),
+        PoolKeeper(process, lambda: _open(store.counts())),
         ArchiveMeasures(recordings, store),
     )
 

@@ -27,8 +27,8 @@ PASSED_ON = (
 class PoolKeeper:
     """Starts the pool when jobs wait for one, and again when it has died; what it prints goes to standard error."""
 
-    def __init__(self, told: PoolProcess, open_jobs: Callable[[], int]) -> None:
-        self._told, self._open_jobs = told, open_jobs
+    def __init__(self, pool: PoolProcess, open_jobs: Callable[[], int]) -> None:
+        self._pool, self._open_jobs = pool, open_jobs
         self._process: asyncio.subprocess.Process | None = None
 
     @property
@@ -38,8 +38,8 @@ class PoolKeeper:
         return None if process is None or process.returncode is not None else process.pid
 
     @asynccontextmanager
-    async def keeping(self) -> AsyncIterator[None]:
-        """Keep it until the block is left; then it gives its jobs back and ends."""
+    async def running(self) -> AsyncIterator[None]:
+        """Until the block is left, the pool runs whenever there are jobs; then it gives its jobs back and ends."""
         task = asyncio.create_task(self._keep(), name="pool of jobs")
         try:
             yield
@@ -74,7 +74,7 @@ class PoolKeeper:
             stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.DEVNULL, env=environment, start_new_session=True,
         )  # fmt: skip
         assert self._process.stdin is not None
-        self._process.stdin.write(self._told.line())
+        self._process.stdin.write(self._pool.line())
         return await self._process.wait()
 
     async def _end(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from services.control import replay_parts
 from services.jobs.records import JobRecord, JobState, NewJob, Submission
 from services.jobs.results import FILES, Results
 from services.jobs.store import JobStore
+from services.recordings.records import Expired
 from services.registry.errors import NotFound
 
 
@@ -46,6 +48,15 @@ class Replays:
         record = self._store.forget(job_id)
         self._results.remove(record.folder)
         return record
+
+    def expire(self, max_age_s: float | None, most: int | None) -> list[Expired]:
+        """Delete replays that ended longer ago than that, and the oldest beyond so many that have ended."""
+        gone = []
+        for job_id, why in self._store.surplus(max_age_s, most):
+            with suppress(NotFound):  # somebody has deleted it meanwhile
+                self.delete(job_id)
+                gone.append(Expired(job_id, why))
+        return gone
 
     def files(self, job: replay_parts.JobRecord) -> list[str]:
         """See `Jobs`."""

@@ -1,22 +1,24 @@
-"""Recordings are removed when they are older, or take more, than the settings allow: at start and every few minutes, each in the audit log."""
+"""Recordings, and replays that have ended, are removed when there are more or older ones than the settings allow: at start and every few minutes,
+each in the audit log."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
 from services.control.system_events import SystemEvents
 from services.recordings.store import RecordingStore
 from services.registry.errors import CheckFailed, NotFound, StoreUnavailable
+from services.server.replays import Replays
 
 log = logging.getLogger(__name__)
 AGAIN_S = 300.0
 DAY_S = 86400.0
 
 
-class KeptRecordings:
+class RecordingRetention:
     """Looks after a store of recordings while the server runs."""
 
     def __init__(
@@ -26,12 +28,12 @@ class KeptRecordings:
         self._max_age_s = None if keep_days is None else keep_days * DAY_S
 
     @asynccontextmanager
-    async def kept(self) -> AsyncIterator[None]:
+    async def running(self) -> AsyncIterator[None]:
         """Clear away what a server that died had half done, check what waits for it, and enforce the bounds until the block is left."""
         waiting = await asyncio.to_thread(self._store.recover)
         tasks = [
             asyncio.create_task(self._check(waiting), name="checks of waiting recordings"),
-            asyncio.create_task(self._enforce_again_and_again(), name="retention of recordings"),
+            asyncio.create_task(again_and_again(self.enforce), name="retention of recordings"),
         ]
         try:
             yield
@@ -49,17 +51,47 @@ class KeptRecordings:
             log.info("a recording was removed: %s", each.why)
             self._events.tell("recording.expire", each.name, why=each.why)
 
-    async def _enforce_again_and_again(self) -> None:
-        while True:
-            try:
-                await self.enforce()
-            except StoreUnavailable as error:
-                log.error("%s", error)
-            await asyncio.sleep(AGAIN_S)
-
     async def _check(self, waiting: list[str]) -> None:
         for name in waiting:
             try:
                 await asyncio.to_thread(self._store.check, name)
             except (NotFound, CheckFailed, StoreUnavailable) as error:
                 log.error("a recording was not checked: %s", error)
+
+
+class ReplayRetention:
+    """Looks after replays that have ended, and their results, while the server runs."""
+
+    def __init__(
+        self, replays: Replays, keep_days: float | None, keep_results: int | None, events: SystemEvents
+    ) -> None:
+        self._replays, self._most, self._events = replays, keep_results, events
+        self._max_age_s = None if keep_days is None else keep_days * DAY_S
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Enforce the bounds until the block is left."""
+        task = asyncio.create_task(again_and_again(self.enforce), name="retention of replays")
+        try:
+            yield
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    async def enforce(self) -> None:
+        """Remove what is too old or too much. Raises StoreUnavailable."""
+        if self._max_age_s is None and self._most is None:
+            return
+        for each in await asyncio.to_thread(self._replays.expire, self._max_age_s, self._most):
+            log.info("the replay %s was removed: %s", each.name, each.why)
+            self._events.tell("replay.expire", each.name, why=each.why)
+
+
+async def again_and_again(enforce: Callable[[], Awaitable[None]]) -> None:
+    """Until it is cancelled. A database that does not answer is asked again the next time."""
+    while True:
+        try:
+            await enforce()
+        except StoreUnavailable as error:
+            log.error("%s", error)
+        await asyncio.sleep(AGAIN_S)

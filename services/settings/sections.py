@@ -182,6 +182,12 @@ class JobSettings(Section):
         le=3600,
         description="What a pool that died had claimed is taken by another one after so long.",
     )
+    keep_days: float | None = Field(
+        default=None, gt=0, description="Remove replays that ended longer ago, with their results. Default: never."
+    )
+    keep_results: int | None = Field(
+        default=None, ge=1, description="Remove the oldest that have ended beyond this number. Default: never."
+    )
     ray: str | None = Field(
         default=None, max_length=300, description="Address of a Ray cluster (extra `ray`). Default: this machine."
     )

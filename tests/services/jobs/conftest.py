@@ -98,7 +98,7 @@ def new_pool(tmp_path: Path, store: JobStore, runner: FakeRunner) -> Callable[..
         step = pool.step
 
         def hasty_step() -> None:
-            pool._told_s = pool._looked_s = 0.0
+            pool._renewed_s = pool._searched_s = 0.0
             step()
 
         pool.step = hasty_step  # type: ignore[method-assign]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from datetime import timedelta
 
 import pytest
 from alembic.autogenerate import compare_metadata
@@ -11,8 +12,9 @@ from alembic.runtime.migration import MigrationContext
 from services.jobs.claims import Claims
 from services.jobs.options import ReplayOptions
 from services.jobs.records import JobState, NewJob
-from services.jobs.store import MOST_AT_ONCE, uses_recording
+from services.jobs.store import DAY_S, MOST_AT_ONCE, uses_recording
 from services.jobs.tables import METADATA, SCHEMA
+from services.registry import rows
 from services.registry.errors import Conflict, NotFound, Rejected
 
 
@@ -92,6 +94,23 @@ def test_cancelling_and_forgetting(new_store):
     store.forget(queued)
     with pytest.raises(NotFound):
         store.get(queued)
+
+
+def test_what_ended_too_long_ago_or_is_too_much(new_store, monkeypatch):
+    store = new_store()
+    ids = store.submit([NewJob(name) for name in "abcde"], {}, "operator").ids
+    began = rows.now()
+    for days, job_id in enumerate(ids[:4]):
+        monkeypatch.setattr("services.jobs.store.now", lambda days=days: began + timedelta(days=days))
+        store.cancel(job_id, "nurse")  # ended on day 0, 1, 2, 3; the fifth has not
+    monkeypatch.setattr("services.jobs.store.now", lambda: began + timedelta(days=4))
+    assert store.surplus(None, None) == store.surplus(5 * DAY_S, 4) == []
+    assert store.surplus(2.5 * DAY_S, None) == [
+        (ids[1], "it ended 3.0 days ago; 2.5 are kept"),
+        (ids[0], "it ended 4.0 days ago; 2.5 are kept"),
+    ]
+    assert [job_id for job_id, _ in store.surplus(None, 1)] == [ids[2], ids[1], ids[0]]
+    assert [why.partition(" ")[0] for _, why in store.surplus(3.5 * DAY_S, 1)] == ["1", "2", "it"]
 
 
 def test_a_recording_is_in_use_until_its_jobs_have_ended(new_store):

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import asyncio
 
+from services.jobs.records import NewJob
+from services.jobs.results import Results
+from services.jobs.store import JobStore
 from services.recordings.records import Expired
-from services.server.retention import DAY_S, KeptRecordings
+from services.server.replays import Replays
+from services.server.retention import DAY_S, RecordingRetention, ReplayRetention
 
 
 class FakeStore:
@@ -41,10 +45,10 @@ class FakeEvents:
 
 def test_at_start_what_waits_is_checked_and_what_is_too_old_goes():
     store, events = FakeStore([Expired("case-1", "it is older than 2 days")]), FakeEvents()
-    kept = KeptRecordings(store, 2, 10**9, events)
+    retention = RecordingRetention(store, 2, 10**9, events)
 
     async def serve():
-        async with kept.kept():
+        async with retention.running():
             while not (events.told and store.checked):
                 await asyncio.sleep(0.01)
 
@@ -55,5 +59,28 @@ def test_at_start_what_waits_is_checked_and_what_is_too_old_goes():
 
 def test_without_bounds_nothing_goes():
     store = FakeStore([Expired("case-1", "")])
-    asyncio.run(KeptRecordings(store, None, None, FakeEvents()).enforce())
+    asyncio.run(RecordingRetention(store, None, None, FakeEvents()).enforce())
     assert store.asked == []
+
+
+def test_replays_that_ended_go_with_their_results(tmp_path):
+    store = JobStore(f"sqlite:///{tmp_path / 'jobs.sqlite'}", lambda _, name: tmp_path / name)
+    results, events = Results(tmp_path / "results"), FakeEvents()
+    ids = store.submit([NewJob(name) for name in "abc"], {}, "operator").ids
+    for job_id in ids[:2]:
+        store.cancel(job_id, "nurse")
+        (results.folder / job_id).mkdir()
+    retention = ReplayRetention(Replays(store, results), None, 1, events)
+
+    async def serve():
+        async with retention.running():
+            while not events.told:
+                await asyncio.sleep(0.01)
+
+    asyncio.run(asyncio.wait_for(serve(), 20))
+    assert [(event, subject) for event, subject, _, _ in events.told] == [("replay.expire", ids[0])]
+    assert [job.id for job in store.newest()] == [ids[2], ids[1]]
+    assert not (results.folder / ids[0]).exists() and (results.folder / ids[1]).exists()
+    asyncio.run(ReplayRetention(Replays(store, results), None, None, events).enforce())
+    assert len(store.newest()) == 2
+    store.close()
