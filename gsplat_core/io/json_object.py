@@ -27,7 +27,7 @@ class JsonObject:
         try:
             values = json.loads(text.decode(), parse_constant=_refuse_constant, object_pairs_hook=_without_duplicates)
         except (ValueError, RecursionError) as error:
-            raise BundleCorrupt(f"{name} is not valid JSON ({error}); copy the bundle again") from error
+            raise BundleCorrupt(f"{name} is not valid JSON ({error}); copy it again") from error
         _check_nesting(values, name)
         return JsonObject(values, name)
 

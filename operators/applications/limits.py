@@ -60,6 +60,14 @@ def check_picture(camera: Camera, scale: float) -> None:
         )
 
 
+def check_width(width_px: int) -> None:
+    """Raises InvalidSetting when pictures side by side are wider than this program makes."""
+    if width_px > MAX_SIDE_PX:
+        raise InvalidSetting(
+            f"the pictures side by side are {width_px} px wide; at most {MAX_SIDE_PX}: give a smaller --scale"
+        )
+
+
 def frames_to_render(window_s: tuple[float, float], fps: float) -> int:
     """How many frames show a time window from end to end. Raises InvalidSetting for a rate that is out of range, and for too many frames."""
     if not (math.isfinite(fps) and 0 < fps <= 1000):

@@ -1,4 +1,4 @@
-"""A finished model as a video or as images, over its time window."""
+"""A finished model as a video or as images, over its time window, from its own camera or from elsewhere."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 
@@ -17,11 +18,14 @@ from gsplat_core.rendering.registry import check_renderer, new_renderer
 from gsplat_core.rendering.renderer import Renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.model import Model
+from gsplat_core.transfers import HostCopy
 from operators.applications.device import check_device
-from operators.applications.limits import check_picture, check_scale, frames_to_render
+from operators.applications.limits import check_picture, check_scale, check_width, frames_to_render
 from operators.applications.memory import render_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
+from operators.applications.views import View, view_of
 from operators.errors import OutputError
+from operators.layer_pictures import mark_unobserved
 from operators.output_folder import OutputFolder
 from operators.output_paths import check_file_path
 from operators.rasterize import displayed
@@ -41,11 +45,16 @@ def render_model(
     scale: float = 1.0,
     device: str = "cpu",
     renderer: str = "alpha",
+    view: str = "recorded",
+    baseline: float | None = None,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> int:
     """Render the model at `fps` frames per second of its own time, to `out`: a file ending in .mp4, or a folder of PNG images.
+
+    view: `recorded` (the model's own camera), `orbit`, `stereo` (two eyes `baseline` apart, side by side), or the file of a camera path
+    (`gsplat_core.io.camera_path`). What was never seen is hatched in all but the first.
 
     A video that is there already is replaced only with `overwrite`, a folder of images only when an earlier run made it; either stays as it
     was until the new one is complete. Returns the number of frames written; what was written before a stop is complete.
@@ -65,40 +74,61 @@ def render_model(
     if device == "cpu":
         needed = render_bytes(camera.width_px, camera.height_px, model.parameter_count)
         require_memory(needed, f"a picture of {camera.width_px}x{camera.height_px} px", "give a smaller --scale")
-    images = _images(model, new_renderer(renderer, camera, device), camera, fps, progress, stop_requested)
+    shown = view_of(model, camera, view, baseline)
+    check_width(shown.across * camera.width_px)
+    frames = frames_to_render(shown.window_s, fps)
+    pictures = _Pictures(model, new_renderer(renderer, camera, device), shown)
+    images = _images(pictures, frames, fps, progress, stop_requested)
     if not to_video:
         return _write_images(images, bundle, out)
     if overwrite:
         _check_not_trained_on(model, out)
-    return _write_video(images, out, camera, fps, overwrite)
+    return _write_video(images, out, (shown.across * camera.width_px, camera.height_px), fps, overwrite)
+
+
+class _Pictures:
+    """Draws a model from a view; for one thread."""
+
+    def __init__(self, model: Model, renderer: Renderer, view: View) -> None:
+        self._renderer, self.view = renderer, view
+        renderer.prepare(model)
+
+    def at(self, time_s: float) -> NDArray[np.uint8]:
+        """RGB uint8 [H, W, 3]: the view's pictures side by side."""
+        with torch.inference_mode():
+            return np.hstack([self._picture(camera, time_s) for camera in self.view.cameras(time_s)])
+
+    def _picture(self, camera: Camera, time_s: float) -> NDArray[np.uint8]:
+        if not self.view.is_virtual:
+            return displayed(self._renderer.render(camera, time_s, ("image",)).result().image)
+        output = self._renderer.render(camera, time_s, ("image", "alpha")).result()
+        image, alpha = np.array(displayed(output.image)), HostCopy(output.alpha).numpy()
+        mark_unobserved(image, alpha)
+        return image
 
 
 def _images(
-    model: Model,
-    renderer: Renderer,
-    camera: Camera,
+    pictures: _Pictures,
+    count: int,
     fps: float,
     progress: ProgressCallback | None,
     stop_requested: Callable[[], bool],
 ) -> Iterator[NDArray]:
-    """RGB uint8 [H, W, 3], over the time window, until a stop is requested."""
-    count = frames_to_render(model.time_window_s, fps)
-    renderer.prepare(model)
+    """RGB uint8 [H, W, 3], over the view's time window, until a stop is requested."""
     for k in range(count):
         if stop_requested():
             return
-        with torch.inference_mode():
-            yield displayed(renderer.render(camera, model.time_window_s[0] + k / fps, ("image",)).result().image)
+        yield pictures.at(pictures.view.window_s[0] + k / fps)
         if progress is not None:
             progress(Progress("render", k + 1, count))
 
 
-def _write_video(images: Iterator[NDArray], out: Path, camera: Camera, fps: float, overwrite: bool) -> int:
+def _write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], fps: float, overwrite: bool) -> int:
     """Write the video beside its name and rename it. One that ends early is kept where there was none before."""
     replaces = os.path.lexists(out)
     reserve = StorageReserve(out.parent, lambda: RESERVE_BYTES)
     with storage_errors(out.parent), PartialFile(out, overwrite=overwrite) as partial:
-        video = VideoFile(partial.path, camera.width_px, camera.height_px, fps, reserve)
+        video = VideoFile(partial.path, *size_px, fps, reserve)
         try:
             with video:
                 for image in images:

@@ -203,15 +203,23 @@ def render(
     scale: ScaleOption = 1.0,
     device: DeviceOption = "cpu",
     renderer: RendererOption = "alpha",
+    view: Annotated[
+        str, typer.Option(help="From where: recorded, orbit, stereo (side by side), or a camera path (a .json file).")
+    ] = "recorded",
+    baseline: Annotated[
+        float | None,
+        typer.Option(
+            help="Distance between the eyes of stereo, in the model's unit.", show_default="0.06 of the depth"
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a video that is there already.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Render a model over its time window to a video or to images."""
     from services.cli.render import render_command
 
-    return render_command(
-        model, out, fps, scale=scale, device=device, renderer=renderer, overwrite=overwrite, as_json=json
-    )
+    chosen = {"scale": scale, "device": device, "renderer": renderer, "view": view, "baseline": baseline}
+    return render_command(model, out, fps, overwrite=overwrite, as_json=json, **chosen)
 
 
 @app.command()

@@ -1,0 +1,131 @@
+"""A path of a camera through time, read from JSON: poses at some times, and between them a turn at even speed and a straight line.
+
+    {"cameras": [
+      {"time_s": 0.0, "camera_to_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
+      {"time_s": 1.5, "camera_to_world": [[...], [...], [...], [0, 0, 0, 1]]}
+    ]}
+
+Axes are the camera's (x right, y down, z forward), lengths the scene's, times the model's. `intrinsics` {"fx", "fy", "cx", "cy"}, in pixels of the
+model's camera, may be given with every camera or with none. A straight line does not overshoot, as a smoother curve would: into tissue.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting
+from gsplat_core.io.json_object import JsonObject
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.value_ranges import NumberIn
+
+MOST_BYTES = 1 << 24
+MOST_CAMERAS = 100_000
+TIME_S = NumberIn(-1e10, 1e10)
+PLACE = NumberIn(-1e9, 1e9)
+FOCAL_PX = NumberIn(1e-3, 1e7)
+CENTRE_PX = NumberIn(-1e7, 1e7)
+ROTATION_TOLERANCE = 2e-3
+INTRINSICS = {"fx": FOCAL_PX, "fy": FOCAL_PX, "cx": CENTRE_PX, "cy": CENTRE_PX}
+
+
+@dataclass(frozen=True, eq=False)
+class Waypoint:
+    """Where the camera is at a time."""
+
+    time_s: float
+    camera_to_world: NDArray[np.float64]
+    """[4, 4]."""
+    intrinsics: tuple[float, ...] | None = None
+    """fx, fy, cx and cy; None: those of the camera that goes along the path."""
+
+
+class CameraPath:
+    """Poses over time. Raises InvalidInput for times that do not increase, and where only some waypoints have intrinsics."""
+
+    def __init__(self, waypoints: list[Waypoint]) -> None:
+        if not waypoints:
+            raise InvalidInput("a camera path needs at least one camera")
+        times = [each.time_s for each in waypoints]
+        for before, after in pairwise(times):
+            if not before < after:
+                raise InvalidInput(f"the times of a camera path must increase; {after:g} s comes after {before:g} s")
+        if len({each.intrinsics is None for each in waypoints}) > 1:
+            raise InvalidInput("a camera path has intrinsics with every camera or with none")
+        self._waypoints, self._times = waypoints, times
+
+    @property
+    def window_s(self) -> tuple[float, float]:
+        """First and last time."""
+        return self._times[0], self._times[-1]
+
+    def camera(self, start: Camera, time_s: float) -> Camera:
+        """`start` where the path is at a time, before and after it at its nearest end; with the path's intrinsics, where it has them."""
+        k = min(max(bisect_right(self._times, time_s) - 1, 0), len(self._times) - 1)
+        before, after = self._waypoints[k], self._waypoints[min(k + 1, len(self._times) - 1)]
+        span = after.time_s - before.time_s
+        share = min(max((time_s - before.time_s) / span, 0.0), 1.0) if span > 0 else 0.0
+        pose = np.eye(4)
+        pose[:3, :3] = _turned(before.camera_to_world[:3, :3], after.camera_to_world[:3, :3], share)
+        pose[:3, 3] = (1 - share) * before.camera_to_world[:3, 3] + share * after.camera_to_world[:3, 3]
+        camera = start.with_pose(_inverse(pose))
+        if before.intrinsics is None or after.intrinsics is None:
+            return camera
+        fx, fy, cx, cy = (1 - share) * np.array(before.intrinsics) + share * np.array(after.intrinsics)
+        return replace(camera, K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+
+
+def read_camera_path(path: Path) -> CameraPath:
+    """The path that a file describes. Raises InvalidSetting, which names the file, what is wrong and where."""
+    try:
+        with path.open("rb") as file:
+            text = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise InvalidSetting(f"cannot read the camera path {path}: {error.strerror or error}") from error
+    if len(text) > MOST_BYTES:
+        raise InvalidSetting(f"{path} is larger than {MOST_BYTES} bytes; it is no camera path")
+    try:
+        listed = JsonObject.parse(text, path.name).values.get("cameras")
+        if not isinstance(listed, list) or not 1 <= len(listed) <= MOST_CAMERAS:
+            raise InvalidInput(f"{path.name}: cameras must be a list of 1 to {MOST_CAMERAS} objects")
+        return CameraPath([_waypoint(JsonObject(each, f"{path.name}: cameras[{k}]")) for k, each in enumerate(listed)])
+    except (BundleCorrupt, InvalidInput) as error:
+        raise InvalidSetting(f"the camera path cannot be used: {error}") from error
+
+
+def _waypoint(reader: JsonObject) -> Waypoint:
+    pose = np.array(reader.matrix("camera_to_world", 4, PLACE))
+    rotation = pose[:3, :3]
+    off = float(np.abs(np.clip(rotation, -2, 2) @ np.clip(rotation, -2, 2).T - np.eye(3)).max())
+    if off > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or pose[3].tolist() != [0, 0, 0, 1]:
+        raise InvalidInput(
+            f"{reader.name}: camera_to_world must be a rotation and a translation, with 0 0 0 1 as its last row; its rotation is off by {off:.3g}"
+        )
+    intrinsics = None
+    if reader.values.get("intrinsics") is not None:
+        nested = reader.nested("intrinsics")
+        intrinsics = tuple(nested.number(name, wanted) for name, wanted in INTRINSICS.items())
+    return Waypoint(reader.number("time_s", TIME_S), pose, intrinsics)
+
+
+def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+def _turned(first: NDArray[np.float64], second: NDArray[np.float64], share: float) -> NDArray[np.float64]:
+    """The rotation that lies `share` of the way from one to the other, round one axis (Rodrigues' formula)."""
+    import cv2  # a process that reads no path needs none
+
+    between, _ = cv2.Rodrigues(first.T @ second)
+    part, _ = cv2.Rodrigues(share * between)
+    # A product of rotations that are nearly ones; a rotation all the same.
+    u, _, v = np.linalg.svd(first @ part)
+    return np.asarray(u @ v)

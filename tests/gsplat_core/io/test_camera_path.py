@@ -1,0 +1,93 @@
+"""Camera paths: where they are between their cameras, and which files are refused."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from gsplat_core import Camera
+from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.io.camera_path import CameraPath, Waypoint, read_camera_path
+
+CAMERA = Camera.from_focal(40.0, 32, 24)
+
+
+def turned(degrees: float, place=(0.0, 0.0, 0.0)) -> np.ndarray:
+    angle = math.radians(degrees)
+    pose = np.eye(4)
+    pose[:3, :3] = [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+    pose[:3, 3] = place
+    return pose
+
+
+def test_it_turns_at_even_speed_and_goes_straight():
+    path = CameraPath([Waypoint(1.0, turned(-20)), Waypoint(3.0, turned(60, (8.0, 0, 4.0)))])
+    assert path.window_s == (1.0, 3.0)
+    for time_s, degrees, place in [(1, -20, (0, 0, 0)), (1.5, 0, (2, 0, 1)), (2, 20, (4, 0, 2)), (3, 60, (8, 0, 4))]:
+        camera = path.camera(CAMERA, time_s)
+        assert np.allclose(camera.world_to_camera @ turned(degrees, place), np.eye(4), atol=1e-9)
+        assert np.allclose(camera.position, place, atol=1e-9) and np.array_equal(camera.K, CAMERA.K)
+    for outside, inside in [(-5, 1), (9, 3)]:
+        assert np.allclose(path.camera(CAMERA, outside).position, path.camera(CAMERA, inside).position)
+
+
+def test_half_a_turn_is_a_rotation_all_the_way():
+    path = CameraPath([Waypoint(0.0, turned(0)), Waypoint(1.0, turned(180))])
+    for time_s in np.linspace(0, 1, 11):
+        rotation = path.camera(CAMERA, time_s).world_to_camera[:3, :3]
+        assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) == pytest.approx(1)
+
+
+def test_one_camera_stays_and_intrinsics_are_interpolated():
+    still = CameraPath([Waypoint(2.0, turned(10))])
+    assert still.window_s == (2.0, 2.0) and np.allclose(still.camera(CAMERA, 7).world_to_camera @ turned(10), np.eye(4))
+    zoom = CameraPath([Waypoint(0, turned(0), (40, 40, 16, 12)), Waypoint(1, turned(0), (80, 60, 14, 12))])
+    assert zoom.camera(CAMERA, 0.5).K.tolist() == [[60, 0, 15], [0, 50, 12], [0, 0, 1]]
+
+
+def write(tmp_path, cameras):
+    file = tmp_path / "path.json"
+    file.write_text(cameras if isinstance(cameras, str) else json.dumps({"cameras": cameras}))
+    return file
+
+
+def camera(time_s=0.0, pose=None, **more):
+    return {"time_s": time_s, "camera_to_world": (np.eye(4) if pose is None else pose).tolist(), **more}
+
+
+def test_a_file_is_read(tmp_path):
+    intrinsics = {"fx": 30, "fy": 31.5, "cx": 15, "cy": 11}
+    path = read_camera_path(write(tmp_path, [camera(0.5, intrinsics=intrinsics), camera(2, intrinsics=intrinsics)]))
+    assert path.window_s == (0.5, 2.0) and path.camera(CAMERA, 1).K[1, 1] == pytest.approx(31.5)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "said"),
+    [
+        ("{", "not valid JSON"),
+        ("[]", "must be a JSON object"),
+        ("{}", "cameras must be a list"),
+        ([], "cameras must be a list"),
+        ([3], r"cameras\[0\] must be a JSON object"),
+        ([{"time_s": 0}], "camera_to_world must be 4 rows"),
+        ([camera(float("nan"))], "NaN is not a number"),
+        ([camera(pose=2 * np.eye(4))], "must be a rotation"),
+        ([camera(pose=np.diag([1.0, 1, -1, 1]))], "must be a rotation"),
+        ([camera(1), camera(1)], "times of a camera path must increase"),
+        ([camera(0), camera(1, intrinsics={"fx": 1, "fy": 1, "cx": 0, "cy": 0})], "with every camera or with none"),
+        ([camera(intrinsics={"fx": 0, "fy": 1, "cx": 0, "cy": 0})], "fx must be"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path, cameras, said):
+    with pytest.raises(InvalidSetting, match=said):
+        read_camera_path(write(tmp_path, cameras))
+
+
+def test_no_file_and_no_camera(tmp_path):
+    with pytest.raises(InvalidSetting, match=r"cannot read the camera path .*No such file"):
+        read_camera_path(tmp_path / "none.json")
+    with pytest.raises(InvalidInput, match="at least one"):
+        CameraPath([])
