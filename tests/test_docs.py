@@ -229,6 +229,7 @@ def test_the_manifest_in_the_guide_is_one():
         None,
         manifest.camera,
         (0, 1),
+        depth_source=manifest.depth_source,
     )
     assert set(example) == set(json.loads(manifest_bytes(model, 0, 64 * "0")))
 

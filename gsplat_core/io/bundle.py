@@ -175,7 +175,8 @@ def _model(path: Path, payload: bytes, manifest: Manifest) -> Model:
             field.check_state()
         except InvalidInput as error:
             raise BundleCorrupt(f"{path} cannot be used: {error}") from error
-    return Model(manifest.version, loaded, field, manifest.camera, manifest.time_window_s, manifest.training_digest)
+    facts = dict(training_digest=manifest.training_digest, depth_source=manifest.depth_source)
+    return Model(manifest.version, loaded, field, manifest.camera, manifest.time_window_s, **facts)  # type: ignore[arg-type]
 
 
 def _check_size(path: Path, expected: dict[str, Tensor], start: bytes, size: int) -> None:

@@ -14,9 +14,11 @@ from gsplat_core.deformation.registry import field_from_config, kind_of
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting, UnknownFormatVersion
 from gsplat_core.io.json_object import JsonObject
 from gsplat_core.scene.cameras import CAMERA_MODELS, Camera, CameraModel
+from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from gsplat_core.scene.model import Model
-from gsplat_core.value_ranges import IntegerIn, NumberIn
+from gsplat_core.value_ranges import IntegerIn, NumberIn, shortened
 
 FORMAT_VERSION = 1
 MAX_MANIFEST_BYTES = 1 << 20
@@ -39,6 +41,9 @@ ROTATION_TOLERANCE = 2e-3
 """How far the pose's rotation times its transpose may be from the identity, and its determinant from 1."""
 TENSOR_BYTES = IntegerIn(0, 1 << 40)
 PARAMETERS = IntegerIn(0, 1 << 38)
+DEPTH_ORIGINS = tuple(origin.value for origin in DepthOrigin)
+UNITLESS = (DepthOrigin.PARALLAX, DepthOrigin.LIGHT)
+"""Depth of these origins is never metric."""
 UNITS = {"length": ("mm",), "time": ("s",)}
 
 
@@ -56,6 +61,7 @@ class Manifest:
     tensors_bytes: int
     tensors_sha256: str
     parameters: int | None
+    depth_source: DepthSource | None = None
 
     def skeleton(self) -> tuple[Gaussians, DeformationField | None]:
         """Gaussians and field of the described shapes on the meta device: no memory is taken for them."""
@@ -107,7 +113,18 @@ def parse_manifest(text: bytes, name: str) -> Manifest:
         tensors_bytes=tensors.integer("bytes", TENSOR_BYTES),
         tensors_sha256=tensors.digest("sha256"),
         parameters=root.integer("parameters", PARAMETERS) if "parameters" in root.values else None,
+        depth_source=None if root.values.get("depth") is None else _depth_source(root.nested("depth")),
     )
+
+
+def _depth_source(reader: JsonObject) -> DepthSource:
+    origin = DepthOrigin(reader.choice("origin", DEPTH_ORIGINS))
+    metric = reader.values.get("metric")
+    if not isinstance(metric, bool):
+        raise BundleCorrupt(f"{reader.name}: metric must be true or false, got {shortened(metric)}")
+    if metric and origin in UNITLESS:
+        raise BundleCorrupt(f"{reader.name}: depth from {origin.value} has no unit, and metric is true")
+    return DepthSource(origin, metric)
 
 
 def _camera(reader: JsonObject) -> Camera:

@@ -17,6 +17,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.surface import Surface, certainty, render_surface
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.gaussians import Gaussians
 
 
@@ -49,6 +50,9 @@ class Model:
     unseen_s: Tensor | None = None
     """How long each Gaussian had not been seen, float64 [N] in seconds of the stream, when that was looked at last, which is every few frames
     of a live reconstruction; 0: it was seen. None: it is not known. It is neither saved nor part of the digest."""
+
+    depth_source: DepthSource | None = None
+    """Where the depth that it was trained on comes from; None: it had none, or a bundle of an earlier version does not say."""
 
     _deform: Callable[[float], Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
     _last: tuple[float, Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
@@ -88,6 +92,11 @@ class Model:
         field = None if self.field is None else self.field.detached_copy().to(device)
         seen = None if self.unseen_s is None else self.unseen_s.to(device)
         return dataclasses.replace(self, gaussians=self.gaussians.to(device), field=field, unseen_s=seen)
+
+    @property
+    def metric(self) -> bool:
+        """Whether lengths are known to be millimetres; otherwise they are relative, right up to one factor."""
+        return self.depth_source is not None and self.depth_source.metric
 
     @property
     def device(self) -> torch.device:
@@ -138,6 +147,9 @@ class Model:
 
     def description(self) -> dict[str, Any]:
         """All of the model but its tensors and version, as JSON-able values."""
+        source = self.depth_source
+        # Left out where it is not known: such a model has the digest that it had before this was kept.
+        depth = {} if source is None else {"depth": {"origin": source.origin.value, "metric": source.metric}}
         return {
             "gaussians": {"count": self.gaussians.count, "sh_degree": self.gaussians.sh_degree},
             "field": None if self.field is None else self.field.config(),
@@ -150,6 +162,7 @@ class Model:
             },
             "time_window_s": list(self.time_window_s),
             "training_digest": self.training_digest,
+            **depth,
         }
 
     def sha256(self) -> str:

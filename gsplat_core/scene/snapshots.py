@@ -20,6 +20,7 @@ from gsplat_core.deformation.field import DeformationField, continued_window
 from gsplat_core.deformation.field_slots import FieldSlot, copy_each
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model, clamp_time
 from gsplat_core.scene.rows import inert_gaussians
@@ -122,6 +123,7 @@ class Snapshot:
         time_window_s: tuple[float, float],
         training_digest: str | None = None,
         unseen_s: Tensor | None = None,
+        depth_source: DepthSource | None = None,
     ) -> None:
         self.version = version
         """Counts up with every snapshot, from 1."""
@@ -131,6 +133,8 @@ class Snapshot:
         """First and last time that the model has seen; other times show the nearest of these."""
         self.training_digest = training_digest
         self._unseen_s = unseen_s
+        self.depth_source = depth_source
+        """Where the depth that it was trained on comes from."""
         self.parameter_count = slot.parameter_count
         """Numbers in all tensors, without the slot's spare capacity."""
         self.slot = slot
@@ -183,9 +187,8 @@ class Snapshot:
                     gaussians = slot.gaussians.map(lambda tensor: tensor[: self.gaussian_count].clone())
                     field = None if slot._field is None else slot._field.exact_copy()
                     seen = self.unseen_s()
-                self._model = Model(
-                    self.version, gaussians, field, self.camera, self.time_window_s, self.training_digest, seen
-                )
+                facts = self.camera, self.time_window_s, self.training_digest, seen, self.depth_source
+                self._model = Model(self.version, gaussians, field, *facts)
             return self._model
 
 
@@ -219,6 +222,7 @@ class SnapshotSlots:
         time_window_s: tuple[float, float],
         training_digest: str | None = None,
         unseen_s: Tensor | None = None,
+        depth_source: DepthSource | None = None,
     ) -> Snapshot:
         """Queue a copy of a scene's state on the current stream; the originals may be changed on that stream at once. `unseen_s` is not
         copied and must stay as it is (`Model.unseen_s`).
@@ -236,6 +240,7 @@ class SnapshotSlots:
             time_window_s=time_window_s,
             training_digest=training_digest,
             unseen_s=unseen_s,
+            depth_source=depth_source,
         )
         slot._holder = weakref.ref(snapshot)
         return snapshot

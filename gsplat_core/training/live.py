@@ -7,6 +7,7 @@ from typing import Any
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
@@ -234,6 +235,7 @@ class LiveReconstructor(Reconstructor):
         self._first_time_s, self.camera = observation.time_s, observation.camera
         if self._taken_up is not None and self._taken_up[0] == frame.seq:
             return self._taken_up[1].gaussians.to(self.device)
+        self._depth_source = DepthSource.of_first(frame)
         if self.device.type != "cuda":
             return super()._first_gaussians(frame, observation)
         if self._start_here is None or not self._start_here.fits(observation.camera):

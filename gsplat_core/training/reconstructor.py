@@ -13,6 +13,7 @@ from gsplat_core.deformation.kind import NewField
 from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
@@ -73,6 +74,7 @@ class Reconstructor:
         self._slots = SnapshotSlots(self.device, rows=self._fixed_rows)
         self._usual_first_loss = math.inf
         self._first_time_s = self._last_time_s = self._learned_s = 0.0
+        self._depth_source: DepthSource | None = None
 
     _follows_at_once = True
     """Whether the motion prior sees a frame before the model is trained on it."""
@@ -130,6 +132,7 @@ class Reconstructor:
         if not train:
             return ObserveReport(frame.seq, 0, None, self.gaussians)
         self._learned_s = observation.time_s
+        self._depth_source = DepthSource.after(self._depth_source, frame)
         if self._follows_at_once:
             self._follow(frame, observation)
         self._window.add(observation)
@@ -213,6 +216,7 @@ class Reconstructor:
         assert self._step is not None
         self._last_time_s = seen[-1].time_s
         for number, (frame, observation) in enumerate(zip(frames, seen, strict=True)):
+            self._depth_source = DepthSource.after(self._depth_source, frame)
             self._grow(frame, observation, number == 0)
         most = self.config.max_gaussians
         training = OfflineTraining(self._step, seen, settings or FitSettings(), most_gaussians=most, seed=self._seed)
@@ -242,21 +246,19 @@ class Reconstructor:
 
     def _facts(self) -> dict[str, Any]:
         """What a model or snapshot states beside its tensors."""
-        window_s, digest = self._time_window_s, self._recording_digest
-        return dict(version=self._version, camera=self.camera, time_window_s=window_s, training_digest=digest)
+        known = dict(training_digest=self._recording_digest, depth_source=self._depth_source)
+        return dict(version=self._version, camera=self.camera, time_window_s=self._time_window_s, **known)
 
     def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
         """The Gaussians that a scene starts with; its camera and first time are those of the frame."""
         self._first_time_s = observation.time_s
+        self._depth_source = DepthSource.of_first(frame)
         self.camera = observation.camera
+        config = self.config
         return gaussians_from_frame(
-            frame,
-            observation.camera,
-            self.config.gaussians,
-            sh_degree=self.config.sh_degree,
-            default_depth_mm=self.config.default_depth_mm,
-            seed=self._seed,
-        ).to(self.device)
+            frame, observation.camera, config.gaussians, sh_degree=config.sh_degree,
+            default_depth_mm=config.default_depth_mm, seed=self._seed,
+        ).to(self.device)  # fmt: skip
 
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
         gaussians = self._first_gaussians(frame, observation)

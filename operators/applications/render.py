@@ -23,7 +23,7 @@ from operators.applications.device import check_device
 from operators.applications.limits import check_picture, check_scale, check_width, frames_to_render
 from operators.applications.memory import render_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
-from operators.applications.views import View, view_of
+from operators.applications.views import RECORDED, View, ViewWish, view_of
 from operators.errors import OutputError
 from operators.layer_pictures import mark_unobserved
 from operators.output_folder import OutputFolder
@@ -45,16 +45,14 @@ def render_model(
     scale: float = 1.0,
     device: str = "cpu",
     renderer: str = "alpha",
-    view: str = "recorded",
-    baseline: float | None = None,
+    view: ViewWish = RECORDED,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> int:
     """Render the model at `fps` frames per second of its own time, to `out`: a file ending in .mp4, or a folder of PNG images.
 
-    view: `recorded` (the model's own camera), `orbit`, `stereo` (two eyes `baseline` apart, side by side), or the file of a camera path
-    (`gsplat_core.io.camera_path`). What was never seen is hatched in all but the first.
+    What was never seen is hatched in all views but the recorded one.
 
     A video that is there already is replaced only with `overwrite`, a folder of images only when an earlier run made it; either stays as it
     was until the new one is complete. Returns the number of frames written; what was written before a stop is complete.
@@ -74,7 +72,7 @@ def render_model(
     if device == "cpu":
         needed = render_bytes(camera.width_px, camera.height_px, model.parameter_count)
         require_memory(needed, f"a picture of {camera.width_px}x{camera.height_px} px", "give a smaller --scale")
-    shown = view_of(model, camera, view, baseline)
+    shown = view_of(model, camera, view)
     check_width(shown.across * camera.width_px)
     frames = frames_to_render(shown.window_s, fps)
     pictures = _Pictures(model, new_renderer(renderer, camera, device), shown)

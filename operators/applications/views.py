@@ -28,6 +28,25 @@ COVERED = 0.5
 
 
 @dataclass(frozen=True)
+class ViewWish:
+    """From where a model is to be shown. Raises InvalidSetting."""
+
+    name: str = "recorded"
+    """`recorded` (the model's own camera), `orbit`, `stereo` (two eyes side by side), or the file of a camera path (`gsplat_core.io.camera_path`)."""
+    baseline: float | None = None
+    """Distance between the eyes of `stereo`, in the model's unit; None: a share of the scene's distance."""
+
+    def __post_init__(self) -> None:
+        if self.baseline is not None and (self.name != "stereo" or not 0 < self.baseline < math.inf):
+            raise InvalidSetting(
+                f"baseline is {self.baseline:g} and the view {self.name!r:.80}; a positive one goes with --view stereo"
+            )
+
+
+RECORDED = ViewWish()
+
+
+@dataclass(frozen=True)
 class View:
     """Cameras of a video. `cameras(time_s)` are those whose pictures stand side by side at a time, of one size."""
 
@@ -41,13 +60,9 @@ class View:
     """Pictures side by side."""
 
 
-def view_of(model: Model, camera: Camera, name: str, baseline: float | None = None) -> View:
-    """The view called `name`, or a camera path's file. `camera` is the model's own, of the pictures' size.
-
-    baseline: of `stereo`, in the model's unit. Raises InvalidSetting.
-    """
-    if baseline is not None and (name != "stereo" or not 0 < baseline < math.inf):
-        raise InvalidSetting(f"baseline is {baseline:g} and the view {name!r}; a positive one goes with --view stereo")
+def view_of(model: Model, camera: Camera, wish: ViewWish) -> View:
+    """The cameras that are wished for. `camera` is the model's own, of the pictures' size. Raises InvalidSetting."""
+    name, baseline = wish.name, wish.baseline
     if name == "recorded":
         return View(name, model.time_window_s, lambda time_s: (camera,), is_virtual=False)
     if name == "orbit":

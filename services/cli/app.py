@@ -7,28 +7,21 @@ from typing import Annotated, Any
 
 import typer
 
-from services.cli import recording_commands, service
+from services.cli import model_commands, recording_commands, service
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
     BatchOutOption,
-    DeviceOption,
     EvaluatedArgument,
     EvaluateOptions,
     EvaluationOutOption,
-    ExportedFileArgument,
     FolderArgument,
     JsonOption,
     LiveOptions,
     LiveOutOption,
-    ModelArgument,
     OutOption,
-    PackedFileArgument,
     RecordingArgument,
     RecordKeepOption,
-    RendererOption,
-    RenderOutOption,
     RunOptions,
-    ScaleOption,
     SourceArgument,
     SynthesizeOptions,
     takes_run_options,
@@ -196,33 +189,6 @@ def reconstruct(
 
 
 @app.command()
-def render(
-    model: ModelArgument,
-    out: RenderOutOption,
-    fps: Annotated[float, typer.Option(help="Frames per second of the model's time.")] = 30.0,
-    scale: ScaleOption = 1.0,
-    device: DeviceOption = "cpu",
-    renderer: RendererOption = "alpha",
-    view: Annotated[
-        str, typer.Option(help="From where: recorded, orbit, stereo (side by side), or a camera path (a .json file).")
-    ] = "recorded",
-    baseline: Annotated[
-        float | None,
-        typer.Option(
-            help="Distance between the eyes of stereo, in the model's unit.", show_default="0.06 of the depth"
-        ),
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a video that is there already.")] = False,
-    json: JsonOption = False,
-) -> int:
-    """Render a model over its time window to a video or to images."""
-    from services.cli.render import render_command
-
-    chosen = {"scale": scale, "device": device, "renderer": renderer, "view": view, "baseline": baseline}
-    return render_command(model, out, fps, overwrite=overwrite, as_json=json, **chosen)
-
-
-@app.command()
 @takes_run_options
 def evaluate(
     model: EvaluatedArgument,
@@ -247,41 +213,6 @@ def synthesize(out: OutOption, options: SynthesizeOptions, json: JsonOption = Fa
 
 
 @app.command()
-def pack(
-    model: ModelArgument,
-    file: PackedFileArgument,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
-    json: JsonOption = False,
-) -> int:
-    """Pack a model into one file, for an upload to the service."""
-    from services.cli.pack import pack_command
-
-    return pack_command(model, file, overwrite=overwrite, as_json=json)
-
-
-@app.command()
-def export(
-    model: ModelArgument,
-    file: ExportedFileArgument,
-    format: Annotated[
-        str | None, typer.Option(help="ply, splat, glb or ply-sequence.", show_default="by the file's ending")
-    ] = None,
-    time: Annotated[
-        float | None, typer.Option(help="Which time of the model, in seconds.", show_default="the end of its window")
-    ] = None,
-    times: Annotated[
-        int | None, typer.Option(help="Of a sequence: how many times of the window.", show_default="30")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
-    json: JsonOption = False,
-) -> int:
-    """Write a model as a file for other programs: .ply, .splat, .glb, or a .zip of .ply over time."""
-    from services.cli.export import export_command
-
-    return export_command(model, file, format, time, times, overwrite=overwrite, as_json=json)
-
-
-@app.command()
 def doctor(json: JsonOption = False) -> int:
     """Say what this machine has, what is missing, and what to do about it."""
     from services.cli.doctor import doctor_command
@@ -289,5 +220,6 @@ def doctor(json: JsonOption = False) -> int:
     return doctor_command(as_json=json)
 
 
+model_commands.add_to(app)
 recording_commands.add_to(app)
 service.add_to(app)

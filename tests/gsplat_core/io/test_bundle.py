@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,6 +13,8 @@ from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
 from gsplat_core.io import atomic_files, bundle
 from gsplat_core.io.bundle import load_bundle, save_bundle
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.scene.model import Model
 
 CAMERA = Camera([[812.5, 0, 319.25], [0, 811.0, 255.75], [0, 0, 1]], 640, 512)
@@ -40,6 +43,34 @@ def test_the_round_trip_is_exact(kind, count, make_gaussians, tmp_path):
     assert loaded.version == 3 and loaded.training_digest == "0f" * 32
     assert loaded.camera == CAMERA and loaded.time_window_s == (0.5, 2.0)
     assert torch.equal(loaded.at(1.0).means, model.at(1.0).means)
+
+
+@pytest.mark.parametrize("source", [None, *(DepthSource(origin, metric=False) for origin in DepthOrigin)])
+def test_where_depth_comes_from_is_kept_and_part_of_the_digest(source, make_gaussians, tmp_path):
+    model = replace(make_model(make_gaussians(4)), depth_source=source)
+    save_bundle(model, tmp_path)
+    loaded = load_bundle(tmp_path)
+    assert loaded.depth_source == source and loaded.sha256() == model.sha256() and not loaded.metric
+    assert ("depth" in json.loads((tmp_path / "manifest.json").read_text())) is (source is not None)
+    assert (model.sha256() == make_model(make_gaussians(4)).sha256()) is (source is None)
+
+
+@pytest.mark.parametrize(
+    ("depth", "said"),
+    [
+        ({"origin": "guess", "metric": False}, "origin must be one of measured, stereo, parallax, light"),
+        ({"origin": "measured", "metric": 1}, "metric must be true or false"),
+        ({"origin": "light", "metric": True}, "depth from light has no unit"),
+        ({"origin": "parallax", "metric": True}, "depth from parallax has no unit"),
+        ([], "must be a JSON object"),
+    ],
+)
+def test_claims_about_depth_that_cannot_be_true_are_refused(depth, said, make_gaussians, tmp_path):
+    save_bundle(make_model(make_gaussians(4)), tmp_path)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    (tmp_path / "manifest.json").write_text(json.dumps({**manifest, "depth": depth}))
+    with pytest.raises(BundleCorrupt, match=said):
+        load_bundle(tmp_path)
 
 
 def test_an_extended_and_trimmed_field_survives(make_gaussians, tmp_path):

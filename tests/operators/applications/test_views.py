@@ -13,7 +13,7 @@ from gsplat_core import Camera, Gaussians, Model
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.bundle import save_bundle
 from operators.applications.render import render_model
-from operators.applications.views import ROUND_S, typical_depth, view_of
+from operators.applications.views import ROUND_S, ViewWish, typical_depth, view_of
 from operators.layer_pictures import UNOBSERVED, UNOBSERVED_LINE
 
 CAMERA = Camera.from_focal(60.0, 48, 40)
@@ -33,7 +33,7 @@ def wall(distance: float = 50.0) -> Model:
 
 def test_an_orbit_starts_at_the_recorded_view_keeps_its_distance_and_comes_round():
     model = wall()
-    view = view_of(model, CAMERA, "orbit")
+    view = view_of(model, CAMERA, ViewWish("orbit"))
     assert typical_depth(model, CAMERA) == pytest.approx(50, abs=0.1)
     places = [view.cameras(1.0 + t)[0] for t in np.linspace(0, ROUND_S, 9)]
     assert np.allclose(places[0].world_to_camera, CAMERA.world_to_camera, atol=1e-9)
@@ -50,7 +50,7 @@ def test_an_orbit_starts_at_the_recorded_view_keeps_its_distance_and_comes_round
 def test_two_eyes_stand_apart_in_the_scene_s_unit_also_where_the_camera_is_turned(baseline, apart):
     pose = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     model = wall()
-    left, right = view_of(model, CAMERA.with_pose(pose), "stereo", baseline).cameras(1.0)
+    left, right = view_of(model, CAMERA.with_pose(pose), ViewWish("stereo", baseline)).cameras(1.0)
     moved = right.position - left.position
     assert np.linalg.norm(moved) == pytest.approx(apart, rel=2e-3)
     assert np.allclose(moved / np.linalg.norm(moved), pose[0, :3]), "to the picture's right"
@@ -65,14 +65,14 @@ def test_a_path_is_followed_at_the_size_of_the_pictures(tmp_path):
     ]
     file = tmp_path / "path.json"
     file.write_text(json.dumps({"cameras": cameras}))
-    view = view_of(wall(), CAMERA.scaled(0.5), str(file))
+    view = view_of(wall(), CAMERA.scaled(0.5), ViewWish(str(file)))
     assert view.window_s == (1.0, 1.5) and view.is_virtual
     (camera,) = view.cameras(1.25)
     assert (camera.width_px, camera.height_px) == (24, 20) and np.allclose(camera.position, [1, 0, 0])
     cameras[1]["time_s"] = 2.5
     file.write_text(json.dumps({"cameras": cameras}))
     with pytest.raises(InvalidSetting, match="the model has seen 1 to 2 s"):
-        view_of(wall(), CAMERA, str(file))
+        view_of(wall(), CAMERA, ViewWish(str(file)))
 
 
 @pytest.mark.parametrize(
@@ -86,23 +86,23 @@ def test_a_path_is_followed_at_the_size_of_the_pictures(tmp_path):
 )
 def test_what_there_is_not_is_refused(name, baseline, said):
     with pytest.raises(InvalidSetting, match=said):
-        view_of(wall(), CAMERA, name, baseline)
+        view_of(wall(), CAMERA, ViewWish(name, baseline))
 
 
 def test_an_empty_model_has_no_other_side():
     model = wall()
     away = Model(1, model.gaussians.select(slice(0, 0)), None, CAMERA, WINDOW_S)
     with pytest.raises(InvalidSetting, match="shows nothing"):
-        view_of(away, CAMERA, "orbit")
+        view_of(away, CAMERA, ViewWish("orbit"))
 
 
 def test_what_was_never_seen_is_hatched_and_the_rest_is_the_picture(tmp_path):
     save_bundle(wall(), tmp_path / "model")
-    assert render_model(tmp_path / "model", tmp_path / "orbit", fps=2, view="orbit") == 3
+    assert render_model(tmp_path / "model", tmp_path / "orbit", fps=2, view=ViewWish("orbit")) == 3
     aside = cv2.imread(str(tmp_path / "orbit" / "000001.png"))[..., ::-1]
     marked = np.isin(aside.reshape(-1, 3).tolist(), [UNOBSERVED, UNOBSERVED_LINE]).all(1).reshape(aside.shape[:2])
     assert 0.02 < marked.mean() < 0.6
     assert np.abs(aside[18:22, 22:26].astype(int) - 128).max() <= 2
-    assert render_model(tmp_path / "model", tmp_path / "pair.mp4", fps=2, view="stereo", baseline=5.0) == 3
+    assert render_model(tmp_path / "model", tmp_path / "pair.mp4", fps=2, view=ViewWish("stereo", 5.0)) == 3
     video = cv2.VideoCapture(str(tmp_path / "pair.mp4"))
     assert (video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (96, 40)

@@ -1,0 +1,165 @@
+"""Points, distances and lengths on a model's surface, each with its error, or refused.
+
+The standard error of a point has three parts, taken as independent: how far z spreads along the ray (`Surface.spread`), how far the surface is from the
+point if what was blended is half transparent, and the error of the depth that the model was trained on (`ORIGIN_ERROR`). The last one is the same for the
+whole scene to a good part; it is taken as independent between two points, which errs to the side of a larger error. The camera is taken as exact.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.surface import in_world, rays_of
+from gsplat_core.rendering.surface import COVERED, Surface
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.scene.model import Model
+from gsplat_core.transfers import HostCopy
+
+ORIGIN_ERROR: dict[DepthOrigin | None, float] = {
+    DepthOrigin.MEASURED: 0.005,
+    DepthOrigin.STEREO: 0.015,
+    DepthOrigin.PARALLAX: 0.05,
+    DepthOrigin.LIGHT: 0.15,
+    None: 0.3,
+}
+"""Standard error of depth over depth by where it comes from, beside what the model shows. They are assumed, from what such methods are known to reach."""
+MOST_STEPS = 4096
+"""Of a length along the surface."""
+
+
+@dataclass(frozen=True)
+class SurfacePoint:
+    """Where the surface is that a pixel shows."""
+
+    pixel: tuple[float, float]
+    """Column and row; the first pixel's centre is at (0.5, 0.5)."""
+    position: tuple[float, float, float]
+    """In the world."""
+    depth: float
+    """z in the camera."""
+    depth_error: float
+    """Standard error of z: the point lies on its pixel's ray, and this is how far it may be off along it, as z."""
+    opacity: float
+    confidence: float
+    along_ray: tuple[float, float, float]
+    """How the position changes with z, in the world."""
+
+    @property
+    def position_error(self) -> float:
+        """Standard error of the position, along the ray."""
+        return self.depth_error * math.hypot(*self.along_ray)
+
+
+@dataclass(frozen=True)
+class Length:
+    """A length and its standard error, in the model's unit."""
+
+    value: float
+    error: float
+
+
+class Measurement:
+    """A model's surface from one camera at one time, for measuring on it.
+
+    Raises InvalidSetting for a time outside of the model's window.
+    """
+
+    def __init__(self, model: Model, time_s: float, camera: Camera | None = None) -> None:
+        start_s, end_s = model.time_window_s
+        if not start_s - 1e-6 <= time_s <= end_s + 1e-6:
+            raise InvalidSetting(
+                f"the model has seen nothing at {time_s:g} s; its window is {start_s:.3f} to {end_s:.3f} s"
+            )
+        self.camera = camera or model.camera
+        self.metric = model.metric
+        self.origin = None if model.depth_source is None else model.depth_source.origin
+        self._surface = _on_host(model.surface(time_s, self.camera))
+
+    @property
+    def unit(self) -> str:
+        """`mm`, or `relative` where the model's lengths have no known unit."""
+        return "mm" if self.metric else "relative"
+
+    def point(self, x: float, y: float) -> SurfacePoint:
+        """The surface at pixel coordinates, at the centre of the pixel that they lie in.
+
+        Raises InvalidSetting outside of the picture and where nothing was ever observed.
+        """
+        camera, surface = self.camera, self._surface
+        if not (0 <= x < camera.width_px and 0 <= y < camera.height_px):
+            raise InvalidSetting(f"({x:g}, {y:g}) is outside of the picture of {camera.width_px}x{camera.height_px} px")
+        row, column = int(y), int(x)
+        opacity, depth = float(surface["alpha"][row, column]), float(surface["ray_depth"][row, column])
+        if opacity < COVERED or not depth > 0:
+            raise InvalidSetting(
+                f"nothing was observed at ({x:g}, {y:g}): the opacity there is {opacity:.2f}; measure where the model shows tissue"
+            )
+        start, step = rays_of(camera, np.array([column + 0.5, row + 0.5]))
+        spread = float(surface["spread"][row, column])
+        # What shines through may as well be as far off as the median says.
+        median = float(surface["median_depth"][row, column])
+        split = abs(depth - median) if median > 0 else spread
+        error = math.hypot(spread, (1 - opacity) * depth, split, ORIGIN_ERROR[self.origin] * depth)
+        return SurfacePoint(
+            pixel=(column + 0.5, row + 0.5),
+            position=_triple(in_world(start + step * depth, camera)),
+            depth=depth,
+            depth_error=error,
+            opacity=opacity,
+            confidence=float(surface["confidence"][row, column]),
+            along_ray=_triple(step @ camera.world_to_camera[:3, :3]),
+        )
+
+    def distance(self, first: SurfacePoint, second: SurfacePoint) -> Length:
+        """Straight from one point to the other."""
+        between = np.subtract(second.position, first.position)
+        value = float(np.linalg.norm(between))
+        return Length(value, _error_of_distance(first, second, between / value if value > 0 else np.zeros(3)))
+
+    def length_along(self, first: SurfacePoint, second: SurfacePoint) -> Length:
+        """Along the surface below the straight line in the picture from one point to the other; a gap that was never observed is refused.
+
+        Steps are as long as the splats' detail is coarse, two pixels, so that what z jitters from pixel to pixel does not lengthen the way.
+        The error is that of the two ends, and of each step's own jitter. Raises InvalidSetting where nothing was observed on the way.
+        """
+        (x0, y0), (x1, y1) = first.pixel, second.pixel
+        steps = min(MOST_STEPS, max(1, round(math.hypot(x1 - x0, y1 - y0) / 2)))
+        at = [self.point(x0 + (x1 - x0) * k / steps, y0 + (y1 - y0) * k / steps) for k in range(steps + 1)]
+        places = np.array([each.position for each in at])
+        value = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+        ends = self.distance(first, second)
+        jitter = _roughness(places)
+        return Length(value, math.hypot(ends.error, jitter))
+
+
+def _error_of_distance(first: SurfacePoint, second: SurfacePoint, direction: NDArray[np.floating]) -> float:
+    """To first order from both points' errors along their rays; across the rays a distance grows with the square of the error."""
+    parts = [point.depth_error * abs(float(np.dot(point.along_ray, direction))) for point in (first, second)]
+    # Both ends may be off together, by one factor: a distance across the rays is then off by it, too.
+    across = 0.5 * (first.depth_error / first.depth + second.depth_error / second.depth)
+    length = float(np.linalg.norm(np.subtract(second.position, first.position)))
+    return math.hypot(*parts, across * length)
+
+
+def _roughness(places: NDArray[np.floating]) -> float:
+    """By how much a way through such points is longer than one through each other of them."""
+    if len(places) < 3:
+        return 0.0
+    fine = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    coarse = [*places[:-1:2], places[-1]]
+    return max(0.0, fine - float(np.linalg.norm(np.diff(np.array(coarse), axis=0), axis=1).sum()))
+
+
+def _triple(values: NDArray[np.floating]) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _on_host(surface: Surface) -> dict[str, NDArray[np.float32]]:
+    return {name: HostCopy(plane).numpy() for name, plane in surface._asdict().items()}

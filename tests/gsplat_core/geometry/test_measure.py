@@ -1,0 +1,143 @@
+"""Measuring on models: walls whose geometry is known, error bars against true errors, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core import Camera, Frame, Gaussians, Model, Reconstructor, ReconstructorConfig
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.measure import ORIGIN_ERROR, Measurement
+from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.frames import DepthOrigin
+
+CAMERA = Camera.from_focal(60.0, 64, 48)
+MEASURED = DepthSource(DepthOrigin.MEASURED, metric=True)
+
+
+def slope(gradient: float, distance: float = 50.0, source: DepthSource | None = MEASURED) -> Model:
+    """Flat Gaussians on z = distance + gradient x."""
+    angle = math.atan(gradient)
+    a, b = torch.meshgrid(torch.arange(-60.0, 61), torch.arange(-45.0, 46), indexing="xy")
+    a, b = a.ravel(), b.ravel()
+    means = torch.stack([a * math.cos(angle), b, distance + a * math.sin(angle)], 1)
+    count = len(means)
+    quats = torch.tensor([math.cos(angle / 2), 0.0, -math.sin(angle / 2), 0.0]).repeat(count, 1)
+    scales = torch.tensor([1.0, 1.0, 0.02]).log().repeat(count, 1)
+    gaussians = Gaussians(means, quats, scales, torch.full((count,), 6.0), torch.zeros(count, 1, 3))
+    return Model(1, gaussians, None, CAMERA, (0.0, 1.0), depth_source=source)
+
+
+def on_slope(x: float, y: float, gradient: float, distance: float = 50.0) -> np.ndarray:
+    ray = np.array([(x - 32) / 60, (y - 24) / 60, 1.0])
+    return ray * distance / (1 - gradient * ray[0])
+
+
+@pytest.mark.parametrize("gradient", [0.0, 0.4, -0.6])
+def test_points_distances_and_lengths_on_a_plane(gradient):
+    found = Measurement(slope(gradient), 0.5)
+    first, second = found.point(10.2, 12.9), found.point(50.0, 30.0)
+    exact = [on_slope(10.5, 12.5, gradient), on_slope(50.5, 30.5, gradient)]
+    for point, true in zip((first, second), exact, strict=True):
+        assert np.linalg.norm(np.subtract(point.position, true)) < min(0.2, 2 * point.position_error)
+    distance, along = found.distance(first, second), found.length_along(first, second)
+    true_distance = np.linalg.norm(exact[1] - exact[0])
+    assert distance.value == pytest.approx(true_distance, abs=min(0.2, 2 * distance.error))
+    assert along.value == pytest.approx(true_distance, rel=0.01) and along.value >= distance.value - 1e-6
+    assert 0 < distance.error < 0.05 * true_distance and along.error >= distance.error
+    assert found.unit == "mm" and found.distance(first, first).value == 0
+
+
+def test_a_pose_moves_points_and_not_distances():
+    model = slope(0.2)
+    pose = np.array([[0.0, -1, 0, 3], [1, 0, 0, -2], [0, 0, 1, 7], [0, 0, 0, 1]])
+    turned = torch.tensor(np.linalg.inv(pose), dtype=torch.float32)
+    gaussians = model.gaussians
+    half = math.sqrt(0.5)  # a quarter turn the other way round z, before each Gaussian's own rotation
+    w, x, y, z = gaussians.quats.unbind(1)
+    quats = torch.stack([half * w + half * z, half * x + half * y, half * y - half * x, half * z - half * w], 1)
+    moved = replace(gaussians, means=gaussians.means @ turned[:3, :3].T + turned[:3, 3], quats=quats)
+    there = Measurement(replace(model, gaussians=moved, camera=CAMERA.with_pose(pose)), 0.0)
+    here = Measurement(model, 0.0)
+    ends = [(20, 20), (45, 31)]
+    values = [m.distance(*(m.point(*end) for end in ends)) for m in (here, there)]
+    assert values[0].value == pytest.approx(values[1].value, abs=1e-2)
+    assert values[0].error == pytest.approx(values[1].error, rel=0.05)
+    place = np.array([*there.point(20, 20).position, 1.0])
+    assert np.allclose((pose @ place)[:3], here.point(20, 20).position, atol=1e-2)
+
+
+def test_relative_models_say_so_and_are_less_sure():
+    errors = []
+    for source in (MEASURED, DepthSource(DepthOrigin.STEREO, True), DepthSource(DepthOrigin.LIGHT, False), None):
+        found = Measurement(slope(0.0, source=source), 0.0)
+        assert found.unit == ("mm" if source is not None and source.metric else "relative")
+        errors.append(found.point(32, 24).depth_error)
+    assert errors == sorted(errors) and errors[-1] > 0.2 * 50
+    assert set(ORIGIN_ERROR) == {*DepthOrigin, None}
+
+
+def test_what_was_never_observed_is_refused():
+    model = slope(0.0)
+    some = replace(model, gaussians=model.gaussians.select(model.gaussians.means[:, 0].abs() > 8))
+    found = Measurement(some, 0.0)
+    left, right = found.point(10, 24), found.point(54, 24)
+    assert found.distance(left, right).value > 30
+    with pytest.raises(InvalidSetting, match="nothing was observed at"):
+        found.point(32, 24)
+    with pytest.raises(InvalidSetting, match="nothing was observed at"):
+        found.length_along(left, right)
+    with pytest.raises(InvalidSetting, match="outside of the picture of 64x48"):
+        found.point(64, 24)
+    with pytest.raises(InvalidSetting, match=r"its window is 0.000 to 1.000 s"):
+        Measurement(model, 1.5)
+
+
+def test_two_surfaces_at_one_pixel_make_a_large_error():
+    near, far = slope(0.0, 40.0), slope(0.0, 50.0)
+    veil = replace(near.gaussians, logit_opacities=torch.full_like(near.gaussians.logit_opacities, -3.2))
+    both = Measurement(replace(near, gaussians=veil.append(far.gaussians)), 0.0)
+    assert both.point(32, 24).depth_error > 8 * Measurement(far, 0.0).point(32, 24).depth_error
+
+
+def test_error_bars_hold_on_a_trained_model():
+    """Of a model trained on one frame with its depth: most true errors lie within two standard errors, and the bars are not much wider."""
+    recording = render_recording(Asked(frames=1, width_px=96, height_px=80, fps=30, seed=5))
+    frame = next(iter(recording))
+    learning = Reconstructor(ReconstructorConfig(gaussians=2000, max_gaussians=2500), recording.camera)
+    learning.observe(frame, steps=20)
+    model = learning.snapshot()
+    assert model.metric and model.depth_source is not None and model.depth_source.origin is DepthOrigin.MEASURED
+    found = Measurement(model, 0.0)
+    rng = np.random.default_rng(0)
+    places = [(x, y) for x, y in rng.integers((4, 4), (92, 76), (200, 2)) if frame.mask is None or frame.mask[y, x]]
+    points = [found.point(x, y) for x, y in places]
+    off = np.array([point.depth - frame.depth[y, x] for point, (x, y) in zip(points, places, strict=True)])
+    errors = np.array([point.depth_error for point in points])
+    assert np.mean(np.abs(off) < 2 * errors) > 0.9
+    assert np.median(errors) < 0.02 * np.median(frame.depth)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "wanted"),
+    [
+        (DepthOrigin.MEASURED, DepthOrigin.MEASURED, True),
+        (DepthOrigin.MEASURED, DepthOrigin.LIGHT, False),
+        (DepthOrigin.PARALLAX, DepthOrigin.MEASURED, False),
+        (None, DepthOrigin.MEASURED, False),
+    ],
+)
+def test_a_model_is_metric_only_where_all_of_its_depth_is(first, second, wanted):
+    learning = Reconstructor(ReconstructorConfig(gaussians=60, max_gaussians=80, first_frame_steps=1), CAMERA)
+    for seq, origin in enumerate((first, second)):
+        depth = None if origin is None else np.full((48, 64), 50.0, np.float32)
+        image = np.full((48, 64, 3), 90, np.uint8)
+        frame = Frame(seq=seq, pts_ns=seq * 10**8, image=image, depth=depth, depth_origin=origin)
+        learning.observe(frame, steps=1)
+    assert learning.snapshot().metric is wanted
+    assert (learning.snapshot().depth_source is None) == (first is None)
