@@ -17,7 +17,10 @@ from services.cli.options import ExportedFileArgument, JsonOption
 SNAPSHOT = ("id", "taken_at", "gaussians", "size_bytes", "pause_ms", "taken_by")
 FormatOption = Annotated[
     str | None,
-    typer.Option(help="ply, splat, glb, ply-sequence or isplat.", show_default="by the file's ending"),
+    typer.Option(
+        help="ply, splat, glb, ply-sequence, mesh-ply, mesh-glb, points-ply or isplat.",
+        show_default="by the file's ending",
+    ),
 ]
 TimeOption = Annotated[float | None, typer.Option(help="Which time, in seconds.", show_default="the end")]
 TimesOption = Annotated[int | None, typer.Option(help="Of a sequence: how many times.", show_default="30")]

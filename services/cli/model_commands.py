@@ -67,7 +67,11 @@ def export(
     model: ModelArgument,
     file: ExportedFileArgument,
     format: Annotated[
-        str | None, typer.Option(help="ply, splat, glb or ply-sequence.", show_default="by the file's ending")
+        str | None,
+        typer.Option(
+            help="ply, splat, glb, ply-sequence; of the surface mesh-ply, mesh-glb, points-ply.",
+            show_default="by the file's ending",
+        ),
     ] = None,
     time: Annotated[
         float | None, typer.Option(help="Which time of the model, in seconds.", show_default="the end of its window")
@@ -78,7 +82,7 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
     json: JsonOption = False,
 ) -> int:
-    """Write a model as a file for other programs: .ply, .splat, .glb, or a .zip of .ply over time."""
+    """Write a model as a file for other programs: .ply, .splat, .glb, or a .zip of .ply over time; or its surface."""
     from services.cli.export import export_command
 
     return export_command(model, file, format, time, times, overwrite=overwrite, as_json=json)

@@ -13,9 +13,11 @@ from typing import BinaryIO
 import torch
 
 from gsplat_core.errors import ExportError
+from gsplat_core.geometry.mesh import mesh_of
 from gsplat_core.io.atomic_files import PartialFile
 from gsplat_core.io.exports.formats import ExportWish
 from gsplat_core.io.exports.glb import glb_pieces
+from gsplat_core.io.exports.mesh_files import mesh_glb_pieces, mesh_ply_pieces
 from gsplat_core.io.exports.rows import rows_of, unit_rotations
 from gsplat_core.io.exports.splat import splat_bytes
 from gsplat_core.io.ply import ply_pieces
@@ -39,6 +41,9 @@ def export_model(model: Model, path: Path, wish: ExportWish, *, overwrite: bool 
     with PartialFile(path, overwrite=overwrite) as partial, torch.inference_mode():
         if wish.format.is_sequence:
             _write_sequence(model, partial.file, times_s)
+        elif wish.format.is_surface:
+            for piece in _surface_pieces(wish.format.name, model, path.stem, times_s[0]):
+                partial.file.write(piece)
         else:
             for piece in _pieces(wish.format.name, model.at(times_s[0]), path.stem, times_s[0]):
                 partial.file.write(piece)
@@ -53,6 +58,16 @@ def _pieces(format_name: str, gaussians: Gaussians, name: str, time_s: float) ->
         yield from glb_pieces(rows, name, time_s)
     else:
         yield from ply_pieces(with_unit_rotations(gaussians))
+
+
+def _surface_pieces(format_name: str, model: Model, name: str, time_s: float) -> Iterator[bytes]:
+    rows_of(model.at(time_s))  # refuses what is not finite
+    mesh = mesh_of(model, time_s)
+    unit = "millimetre" if model.metric else "relative"
+    if format_name == "mesh-glb":
+        yield from mesh_glb_pieces(mesh, name, time_s, unit)
+    else:
+        yield from mesh_ply_pieces(mesh, unit, with_triangles=format_name == "mesh-ply")
 
 
 def with_unit_rotations(gaussians: Gaussians) -> Gaussians:

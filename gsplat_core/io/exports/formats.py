@@ -19,6 +19,8 @@ class ExportFormat:
     name: str
     suffix: str
     media_type: str
+    is_surface: bool = False
+    """It holds the surface that the model's camera sees, and not the Gaussians."""
     is_sequence: bool = False
     """It holds the model at several times of its window, and not at one."""
 
@@ -30,6 +32,9 @@ FORMATS: Mapping[str, ExportFormat] = {
         ExportFormat("splat", ".splat", "application/octet-stream"),
         ExportFormat("glb", ".glb", "model/gltf-binary"),
         ExportFormat("ply-sequence", ".zip", "application/zip", is_sequence=True),
+        ExportFormat("mesh-ply", ".ply", "application/octet-stream", is_surface=True),
+        ExportFormat("mesh-glb", ".glb", "model/gltf-binary", is_surface=True),
+        ExportFormat("points-ply", ".ply", "application/octet-stream", is_surface=True),
     )
 }
 
@@ -42,7 +47,7 @@ def format_named(name: str) -> ExportFormat:
 
 
 def format_of(path: Path) -> ExportFormat:
-    """The format that a file's name ends in. Raises InvalidSetting."""
+    """The format that a file's name ends in: of several the one with Gaussians. Raises InvalidSetting."""
     for each in FORMATS.values():
         if path.suffix.lower() == each.suffix:
             return each

@@ -41,16 +41,21 @@ def glb_pieces(rows: Rows, name: str, time_s: float) -> Iterator[bytes]:
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": values.nbytes, "target": ARRAY_BUFFER})
         accessors.append(_accessor(len(accessors), semantic, values))
         offset += values.nbytes
-    text = json.dumps(_document(list(attributes), views, accessors, offset, name, time_s), separators=(",", ":"))
-    head = text.encode()
+    yield from packed(_document(list(attributes), views, accessors, offset, name, time_s), list(attributes.values()))
+
+
+def packed(document: dict[str, Any], arrays: list[NDArray[Any]]) -> Iterator[bytes]:
+    """A binary glTF file: the document, then the arrays one behind the other, each a multiple of four bytes. Raises ExportError for one too large."""
+    head = json.dumps(document, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 4)
-    total = 12 + 8 + len(head) + 8 + offset
+    size = sum(array.nbytes for array in arrays)
+    total = 12 + 8 + len(head) + 8 + size
     if total > MOST_BYTES:
         raise ExportError(f"the model takes {total} bytes as .glb, which holds {MOST_BYTES} at most; export it as .ply")
     yield struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(head), b"JSON") + head
-    yield struct.pack("<I4s", offset, b"BIN\0")
-    for values in attributes.values():
-        yield values.tobytes()
+    yield struct.pack("<I4s", size, b"BIN\0")
+    for array in arrays:
+        yield array.tobytes()
 
 
 def _attributes(rows: Rows) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -71,11 +76,11 @@ def _attributes(rows: Rows) -> Iterator[tuple[str, NDArray[Any]]]:
         for n in range(2 * level + 1):
             coefficients = np.ascontiguousarray(rows.sh[:, level * level + n])
             yield f"{EXTENSION}:SH_DEGREE_{level}_COEF_{n}", coefficients
-    colours = np.column_stack([_linear(np.clip(0.5 + SH_C0 * rows.sh[:, 0], 0, 1)), rows.opacities])
+    colours = np.column_stack([linear(np.clip(0.5 + SH_C0 * rows.sh[:, 0], 0, 1)), rows.opacities])
     yield "COLOR_0", np.round(colours * 65535).astype("<u2")
 
 
-def _linear(srgb: NDArray[np.float32]) -> NDArray[np.float32]:
+def linear(srgb: NDArray[np.float32]) -> NDArray[np.float32]:
     """sRGB without its transfer curve (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
 

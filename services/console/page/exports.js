@@ -9,6 +9,9 @@ const FORMATS = {
   splat: "Gaussians (.splat)",
   glb: "glTF (.glb)",
   "ply-sequence": "over time (.zip)",
+  "mesh-glb": "surface, glTF (.glb)",
+  "mesh-ply": "surface (.ply)",
+  "points-ply": "surface points (.ply)",
 };
 
 /** Elements to save something in a format: `path` is what `/exports/FORMAT` follows. */

@@ -24,7 +24,7 @@ from services.exports.formats import ALL
 from services.settings import ResourceName
 
 router = new_router("exports")
-FormatName = Literal["ply", "splat", "glb", "ply-sequence", "isplat"]
+FormatName = Literal["ply", "splat", "glb", "ply-sequence", "mesh-ply", "mesh-glb", "points-ply", "isplat"]
 TimeS = Annotated[
     float | None,
     Query(
@@ -39,7 +39,7 @@ PIECE_BYTES = 1 << 18
 BINARY = {"schema": {"type": "string", "format": "binary"}}
 ANSWER: dict[int | str, dict[str, object]] = {
     200: {
-        "description": "The file. `ply`, `splat`, `glb` (KHR_gaussian_splatting), `ply-sequence` (a zip archive), or `isplat`, which can be uploaded.",
+        "description": "The file. `ply`, `splat`, `glb` (KHR_gaussian_splatting), `ply-sequence` (a zip archive), the surface as `mesh-ply`, `mesh-glb` or `points-ply`, or `isplat`, which can be uploaded.",
         "content": {media_type: BINARY for media_type in sorted({each.media_type for each in ALL.values()})},
         "headers": {
             name: {"description": description, "schema": {"type": "string"}}

@@ -20,6 +20,37 @@ ALLOWED = {
 
 def read_glb(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The document, and the attributes of its only primitive by name; normalised integers as shares of 1."""
+    document, binary = opened(data)
+    assert document["extensionsUsed"] == [NAME]
+    node = document["nodes"][document["scenes"][document["scene"]]["nodes"][0]]
+    (primitive,) = document["meshes"][node["mesh"]]["primitives"]
+    assert primitive["mode"] == 0
+    values = {name: accessor(document, binary, index) for name, index in primitive["attributes"].items()}
+    check_gaussians(document, primitive, values)
+    return document, values
+
+
+def read_mesh_glb(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray], np.ndarray]:
+    """The document, the attributes of its only primitive by name, and the indices of its triangles."""
+    document, binary = opened(data)
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
+    node = document["nodes"][document["scenes"][document["scene"]]["nodes"][0]]
+    (primitive,) = document["meshes"][node["mesh"]]["primitives"]
+    assert primitive["mode"] == 4
+    assert document["materials"][primitive["material"]]["extensions"] == {"KHR_materials_unlit": {}}
+    values = {name: accessor(document, binary, index) for name, index in primitive["attributes"].items()}
+    for name, kind in (("POSITION", "VEC3"), ("NORMAL", "VEC3"), ("COLOR_0", "VEC4")):
+        assert document["accessors"][primitive["attributes"][name]]["type"] == kind
+    assert {"min", "max"} <= document["accessors"][primitive["attributes"]["POSITION"]].keys()
+    assert len({len(each) for each in values.values()}) == 1
+    assert np.allclose(np.linalg.norm(values["NORMAL"], axis=1), 1, atol=1e-5)
+    indices = accessor(document, binary, primitive["indices"], target=34963)
+    assert indices.dtype == np.dtype("<u4") and len(indices) % 3 == 0 and indices.max() < len(values["POSITION"])
+    return document, values, indices
+
+
+def opened(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The document and the binary part."""
     magic, version, length = struct.unpack_from("<4sII", data)
     assert (magic, version, length) == (b"glTF", 2, len(data))
     size, kind = struct.unpack_from("<I4s", data, 12)
@@ -30,22 +61,16 @@ def read_glb(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     binary = data[28 + size :]
     assert document["asset"]["version"] == "2.0"
     assert document["buffers"] == [{"byteLength": len(binary)}]
-    assert document["extensionsUsed"] == [NAME]
-    node = document["nodes"][document["scenes"][document["scene"]]["nodes"][0]]
-    (primitive,) = document["meshes"][node["mesh"]]["primitives"]
-    assert primitive["mode"] == 0
-    values = {name: accessor(document, binary, index) for name, index in primitive["attributes"].items()}
-    check_gaussians(document, primitive, values)
-    return document, values
+    return document, binary
 
 
-def accessor(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
+def accessor(document: dict[str, Any], binary: bytes, index: int, target: int = 34962) -> np.ndarray:
     about = document["accessors"][index]
     view = document["bufferViews"][about["bufferView"]]
     kind = np.dtype(TYPES[about["componentType"]])
     parts = PARTS[about["type"]]
     start = view["byteOffset"]
-    assert view["buffer"] == 0 and view["target"] == 34962
+    assert view["buffer"] == 0 and view["target"] == target
     assert start % 4 == 0 and parts * kind.itemsize % 4 == 0, "vertex attributes are aligned to four bytes"
     assert view["byteLength"] == about["count"] * parts * kind.itemsize
     assert start + view["byteLength"] <= len(binary)

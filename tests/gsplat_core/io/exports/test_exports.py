@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,9 +17,11 @@ from gsplat_core.io.exports.formats import FORMATS, ExportWish, format_named, fo
 from gsplat_core.io.ply import load_ply
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.scene.model import Model
-from tests.gsplat_core.io.exports.glb_reader import NAME, read_glb
+from tests.gsplat_core.io.exports.glb_reader import NAME, read_glb, read_mesh_glb
 from tests.recipes.test_deformation_field import DriftField
 
 WINDOW_S = (1.0, 3.0)
@@ -178,7 +181,7 @@ def test_a_rotation_of_length_nothing_is_none(tmp_path):
 
 
 def test_one_gaussian_is_enough(tmp_path):
-    for name in FORMATS:
+    for name in (name for name, each in FORMATS.items() if not each.is_surface):
         assert exported(tmp_path, random_model(count=1), name)
 
 
@@ -213,3 +216,47 @@ def test_formats_are_found_by_name_and_by_ending(tmp_path):
     for wrong in (lambda: format_named("obj"), lambda: format_of(tmp_path / "a.obj")):
         with pytest.raises(InvalidSetting, match=r"ply"):
             wrong()
+
+
+def wall(source: DepthSource | None = None) -> Model:
+    x, y = torch.meshgrid(torch.arange(-20.0, 21), torch.arange(-16.0, 17), indexing="xy")
+    means = torch.stack([x.ravel(), y.ravel(), torch.full((x.numel(),), 20.0)], 1)
+    count = len(means)
+    quats, opacities = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1), torch.full((count,), 6.0)
+    sh = torch.tensor([0.5, -0.2, -0.9]).repeat(count, 1)[:, None]
+    gaussians = Gaussians(means, quats, torch.tensor([1.0, 1.0, 0.02]).log().repeat(count, 1), opacities, sh)
+    return Model(1, gaussians, None, Camera.from_focal(20.0, 32, 24), WINDOW_S, depth_source=source)
+
+
+def test_a_mesh_as_glb_is_the_surface_that_the_camera_sees(tmp_path):
+    data = exported(tmp_path, wall(DepthSource(DepthOrigin.MEASURED, metric=True)), "mesh-glb", time_s=2.0)
+    document, values, indices = read_mesh_glb(data)
+    assert document["asset"]["extras"] == {"time_s": 2.0, "unit": "millimetre"}
+    assert len(values["POSITION"]) == 32 * 24 and len(indices) == 3 * 2 * 31 * 23
+    assert np.allclose(values["POSITION"][:, 2], 20, atol=0.02) and np.allclose(values["NORMAL"], [0, 0, -1], atol=1e-2)
+    shown = np.clip(0.5 + SH_C0 * np.array([0.5, -0.2, -0.9]), 0, 1)
+    assert np.allclose(values["COLOR_0"][:, :3], ((shown + 0.055) / 1.055) ** 2.4, atol=0.01)
+    assert (values["COLOR_0"][:, 3] == 1).all()
+
+
+@pytest.mark.parametrize("name", ["mesh-ply", "points-ply"])
+def test_a_mesh_as_ply_has_its_vertices_and_triangles(tmp_path, name):
+    data = exported(tmp_path, wall(), name)
+    head, body = data.split(b"end_header\n", 1)
+    assert b"comment unit relative\nelement vertex 768\n" in head
+    vertices = np.frombuffer(body, [("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)], 768)
+    assert np.allclose(vertices["xyz"][:, 2], 20, atol=0.02) and np.allclose(
+        np.linalg.norm(vertices["normal"], axis=1), 1
+    )
+    faces = np.frombuffer(body[768 * 27 :], [("n", "u1"), ("v", "<i4", 3)])
+    assert len(faces) == (2 * 31 * 23 if name == "mesh-ply" else 0) and (faces["n"] == 3).all()
+    assert (b"element face" in head) is (name == "mesh-ply")
+    assert not len(faces) or (faces["v"].min(), faces["v"].max()) == (0, 767)
+
+
+def test_a_model_that_its_camera_does_not_see_has_no_surface(tmp_path):
+    model = wall()
+    behind = replace(model, gaussians=replace(model.gaussians, means=-model.gaussians.means))
+    with pytest.raises(ExportError, match="no surface"):
+        exported(tmp_path, behind, "mesh-glb")
+    assert not (tmp_path / "out.glb").exists()

@@ -1,0 +1,94 @@
+"""A model's surface at a time as triangles with colours: the depth that a camera sees, joined where it goes on and cut where it is torn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsplat_core.errors import ExportError
+from gsplat_core.geometry.surface import in_world, joined, points_of
+from gsplat_core.rendering.surface import COVERED
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.model import Model
+from gsplat_core.transfers import HostCopy
+
+LEAST_OPACITY = 0.5
+"""Of a pixel that becomes part of the surface; `COVERED` only says that something is there."""
+assert LEAST_OPACITY >= COVERED
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """V vertices and T triangles."""
+
+    vertices: NDArray[np.float32]
+    """[V, 3]."""
+    normals: NDArray[np.float32]
+    """[V, 3], of unit length, on the side that was seen."""
+    colours: NDArray[np.uint8]
+    """[V, 3]: red, green, blue, as displayed."""
+    triangles: NDArray[np.int32]
+    """[T, 3], counter-clockwise from the side that was seen; empty: a point cloud."""
+
+
+def mesh_of(model: Model, time_s: float, camera: Camera | None = None) -> Mesh:
+    """The surface that `camera` (the model's own when None) sees at a time, in the world: a vertex for each pixel that shows tissue.
+
+    Raises ExportError where it sees none.
+    """
+    camera = camera or model.camera
+    with torch.inference_mode():
+        surface = model.surface(time_s, camera)
+        image = model.render(time_s, camera, depth=False).image
+        displayed = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+    alpha = HostCopy(surface.alpha).numpy()
+    depth = np.where(alpha >= LEAST_OPACITY, HostCopy(surface.ray_depth).numpy(), 0).astype(np.float32)
+    return mesh_of_depth(depth, HostCopy(displayed).numpy(), camera)
+
+
+def mesh_of_depth(depth: NDArray[np.float32], image: NDArray[np.uint8], camera: Camera) -> Mesh:
+    """The surface of a depth map z [H, W], 0 = unknown, in the world. Raises ExportError where no three neighbouring pixels are on one surface."""
+    across, down = joined(depth, camera, 1), joined(depth, camera, 0)
+    triangles = _triangles(across, down)
+    if not len(triangles):
+        raise ExportError("the model shows no surface from this camera at this time; there is nothing to export")
+    used, flat = np.unique(triangles, return_inverse=True)
+    vertices = in_world(points_of(depth, camera), camera).reshape(-1, 3)[used]
+    numbered = flat.reshape(-1, 3).astype(np.int32)
+    return Mesh(
+        vertices=vertices.astype(np.float32),
+        normals=vertex_normals(vertices, numbered).astype(np.float32),
+        colours=np.ascontiguousarray(image.reshape(-1, 3)[used]),
+        triangles=numbered,
+    )
+
+
+def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Normals [V, 3] of unit length: those of the triangles around each vertex, weighted by their area; 0 for a vertex without any."""
+    a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
+    faces = np.cross(b - a, c - a)
+    corners, weights = triangles.T.ravel(), np.tile(faces, (3, 1))
+    sums = np.stack([np.bincount(corners, weights[:, axis], len(vertices)) for axis in range(3)], 1)
+    length = np.linalg.norm(sums, axis=1, keepdims=True)
+    return np.asarray(sums / np.where(length > 0, length, 1), np.float64)
+
+
+def _triangles(across: NDArray[np.bool_], down: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Numbers of pixels [T, 3]: two triangles for each square whose four sides go on, one where a corner is cut off."""
+    height, width = across.shape[0], down.shape[1]
+    pixel = np.arange(height * width).reshape(height, width)
+    upper_left, upper_right = pixel[:-1, :-1], pixel[:-1, 1:]
+    lower_left, lower_right = pixel[1:, :-1], pixel[1:, 1:]
+    top, bottom, left, right = across[:-1], across[1:], down[:, :-1], down[:, 1:]
+    whole = top & bottom & left & right
+    # Pixel rows go down, so that this order is counter-clockwise for who looks along z.
+    corners = (
+        (whole | (top & left), upper_left, lower_left, upper_right),
+        (whole | (bottom & right), lower_right, upper_right, lower_left),
+        (~whole & top & right & ~(bottom & right) & ~(top & left), upper_right, upper_left, lower_right),
+        (~whole & bottom & left & ~(bottom & right) & ~(top & left), lower_left, lower_right, upper_left),
+    )
+    return np.concatenate([np.stack([a[there], b[there], c[there]], 1) for there, a, b, c in corners])
