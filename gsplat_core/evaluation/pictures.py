@@ -39,9 +39,11 @@ class PictureMaker:
         self._renderer: Renderer = new_renderer(renderer, camera, device)
         self._prepared: Model | Snapshot | None = None
 
-    def __call__(self, model: Model | Snapshot, frame: Frame) -> Picture:
-        """The model as it would be shown for the frame. Its time is clamped to the model's window."""
-        camera = self.camera if frame.pose is None else self.camera.with_pose(frame.pose)
+    def __call__(self, model: Model | Snapshot, frame: Frame, camera: Camera | None = None) -> Picture:
+        """The model as it would be shown for the frame; with a `camera` of the same size, as that one sees it. Its time is clamped to the
+        model's window."""
+        if camera is None:
+            camera = self.camera if frame.pose is None else self.camera.with_pose(frame.pose)
         with torch.inference_mode():
             if model is not self._prepared:
                 self._renderer.prepare(model if self._reads_snapshots else model.as_model())

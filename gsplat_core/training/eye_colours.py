@@ -51,11 +51,8 @@ class EyeColours:
         return np.asarray(cv2.LUT(frame.right_image, self._table), np.uint8)
 
     def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> None:
-        height, width = left.shape[:2]
-        size = min(LOOKED_AT_PX, width), max(1, round(height * min(1.0, LOOKED_AT_PX / width)))
-        first, second = (
-            cv2.resize(eye, size, interpolation=cv2.INTER_AREA).astype(np.float32) for eye in (left, right)
-        )
+        first, second = _small(left), _small(right)
+        size = first.shape[1], first.shape[0]
         tissue = (
             np.ones(size[::-1], bool) if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0
         )
@@ -71,6 +68,18 @@ class EyeColours:
         self._offset += share * (offset - self._offset)
         off = np.abs(self._gain * off + self._offset - off).max()
         self._table = _table(self._gain, self._offset) if off > NOISE_LEVELS else None
+
+
+def typical_shift(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> float:
+    """By how much of its width the right picture as a whole shows the scene farther to the left, to a few pixels."""
+    first, second = _small(left), _small(right)
+    return best_shift(first.mean(-1), second.mean(-1)) / first.shape[1]
+
+
+def _small(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+    height, width = picture.shape[:2]
+    size = min(LOOKED_AT_PX, width), max(1, round(height * min(1.0, LOOKED_AT_PX / width)))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def best_shift(left: NDArray[np.float32], right: NDArray[np.float32]) -> int:

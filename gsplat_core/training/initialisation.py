@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsplat_core.geometry.depth_map import BELIEVED
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
@@ -19,8 +20,6 @@ THICKNESS = 0.3
 """Depth of a fresh Gaussian relative to its width: tissue is a surface."""
 
 FIRST_OPACITY = 0.9
-LEAST_CONFIDENCE = 0.5
-"""Depth that is believed less counts as unknown: where it is wrong, a scene is better off without it."""
 TOOL_MARGIN_PX = 2
 """So much around a tool is painted over with it: masks end a little early."""
 
@@ -163,7 +162,7 @@ def believed_depth(frame: Frame) -> NDArray[np.float32]:
         return np.zeros(frame.image.shape[:2], np.float32)
     if frame.depth_confidence is None:
         return frame.depth
-    return np.where(frame.depth_confidence >= LEAST_CONFIDENCE, frame.depth, np.float32(0))
+    return np.where(frame.depth_confidence >= BELIEVED, frame.depth, np.float32(0))
 
 
 def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:

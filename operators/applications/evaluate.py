@@ -19,6 +19,7 @@ from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.pictures import PictureMaker
 from gsplat_core.evaluation.retention import Retention, Return, evaluate_retention, find_places, returns
 from gsplat_core.evaluation.scores import Record
+from gsplat_core.evaluation.second_eye import SecondEye, evaluate_second_eye
 from gsplat_core.io.recordings.truth import open_truth
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.model import Model
@@ -116,6 +117,8 @@ class _Work:
         asked = name in self.settings.protocols
         if not asked and (self.settings.protocols or name not in WITHOUT_LEARNING):
             return False
+        if not asked and name == "second_eye" and not self._is_stereo:
+            return False
         reason = self._why_not(name)
         if reason is None:
             return True
@@ -130,6 +133,8 @@ class _Work:
                 self.notes.append("nothing says whether the held-out frames were kept from the model's training")
             elif not self.run.heldout:
                 return "the run trained on the held-out frames; make it with --heldout, or by reconstruct"
+        if name == "second_eye" and not self._is_stereo:
+            return "the recording has no right eye"
         if name == "live":
             if self.run is None:
                 return "it needs the folder of a live run, not a model alone"
@@ -216,6 +221,24 @@ class _Work:
             settings.poses,
         )
 
+    @property
+    def _is_stereo(self) -> bool:
+        return "right_image" in self.source.description.fields
+
+    def _second_eye(self) -> SecondEye | None:
+        shown = self._of_final_model()
+        with self._log("second_eye") as record:
+            found = evaluate_second_eye(
+                self._frames("second_eye"),
+                self.camera,
+                lambda frame, eye: shown(frame, eye).unrounded,
+                window_s=self.window_s,
+                record=record,
+            )
+        if found is None:
+            self.notes.append("second_eye was not measured: nothing says where the right eye's camera is")
+        return found
+
     def _live(self) -> Live:
         assert self.run is not None
         with self._log("live") as record:
@@ -237,7 +260,7 @@ class _Work:
         self._require_memory_of_picture()
         model = self.model.to(settings.device)
         pictures = PictureMaker(camera, settings.device, settings.renderer)
-        return lambda frame: pictures(model, frame)
+        return lambda frame, eye=None: pictures(model, frame, eye)
 
     def _require_memory_of_picture(self) -> None:
         """Raises MemoryTooSmall where no picture of the model fits into memory."""

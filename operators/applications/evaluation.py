@@ -15,12 +15,13 @@ from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.places import Visits
 from gsplat_core.evaluation.retention import LAST_S, Retention, Return
 from gsplat_core.evaluation.scores import Score
+from gsplat_core.evaluation.second_eye import SecondEye
 from gsplat_core.training.motion_priors import MOTION_PRIORS
 from operators.applications.limits import check_max_frames, check_scale, check_steps
 from operators.sources.source import SourceDescription
 
-PROTOCOLS = ("heldout", "live", "retention", "geometry", "causal")
-WITHOUT_LEARNING = ("heldout", "live", "retention", "geometry")
+PROTOCOLS = ("heldout", "live", "retention", "second_eye", "geometry", "causal")
+WITHOUT_LEARNING = ("heldout", "live", "retention", "second_eye", "geometry")
 """What is measured unless protocols are named: `causal` learns from the whole recording again."""
 
 
@@ -89,6 +90,7 @@ class Evaluation:
     live: Live | None = None
     retention: Retention | None = None
     geometry: Geometry | None = None
+    second_eye: SecondEye | None = None
     returns: Mapping[str, tuple[Return, ...]] = field(default_factory=dict)
     """How soon places were found again, by protocol."""
     logs: Mapping[str, Path] = field(default_factory=dict)

@@ -120,7 +120,7 @@ class EvaluateOptions:
     protocol: Annotated[
         list[str] | None,
         typer.Option(
-            help="heldout, live, retention, geometry or causal (which learns from the recording again); more than once for several.",
+            help="heldout, live, retention, second_eye, geometry or causal (which learns from the recording again); more than once for several.",
             show_default="all but causal",
         ),
     ] = None

@@ -17,6 +17,7 @@ from gsplat_core.evaluation.baselines import (
 )
 from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.retention import PlaceScore
+from gsplat_core.evaluation.second_eye import MATCHED, RIGHT_BEFORE, SHIFTED, SecondEye
 from gsplat_core.scene.model import Model
 from operators.applications.evaluated import EvaluatedRun
 from operators.applications.evaluation import Evaluation, EvaluationSettings
@@ -34,6 +35,7 @@ from services.reports.evaluation_schema import (
     RetentionFacts,
     ReturnFacts,
     ScoreFacts,
+    SecondEyeFacts,
 )
 from services.reports.machine import machine_facts
 from services.reports.schema import ModelFacts, RecordingFacts
@@ -45,6 +47,9 @@ LABELS = {
     HALF_WAY: "Half-way optical flow between the neighbours",
     TRAIN_MEAN: "Mean of all training frames",
     HALF_VELOCITY: "Half of a constant-velocity optical flow",
+    SHIFTED: "Left picture shifted by the typical disparity",
+    MATCHED: "Left picture warped by semi-global matching",
+    RIGHT_BEFORE: "Right picture of the frame before",
 }
 
 
@@ -76,6 +81,7 @@ def build_evaluation(
             places=[_place(place) for place in retention.places],
         ),
         geometry=None if evaluation.geometry is None else GeometryFacts.model_validate(asdict(evaluation.geometry)),
+        second_eye=None if evaluation.second_eye is None else _second_eye(evaluation.second_eye),
         returns={
             name: [
                 ReturnFacts(
@@ -129,6 +135,10 @@ def write_evaluation(report: EvaluationReport, folder: Path) -> EvaluationReport
     return report
 
 
+def _second_eye(found: SecondEye) -> SecondEyeFacts:
+    return SecondEyeFacts(score=ScoreFacts.model_validate(asdict(found.score)), left_out_px=found.left_out_px)
+
+
 def _live(live: Live) -> OnScreenFacts:
     facts = {name: value for name, value in asdict(live).items() if name in OnScreenFacts.model_fields}
     return OnScreenFacts.model_validate(facts)
@@ -157,6 +167,9 @@ def _baselines(evaluation: Evaluation) -> Iterator[BaselineFacts]:
     if evaluation.live is not None:
         yield _baseline(PREVIOUS_FRAME, LABELS[PREVIOUS_FRAME], "live", evaluation.live.previous)
         yield _baseline(PREVIOUS_FRAME, LABELS[PREVIOUS_FRAME], "settled", evaluation.live.settled_previous)
+    if evaluation.second_eye is not None:
+        for name, score in evaluation.second_eye.baselines.items():
+            yield _baseline(name, LABELS[name], "second_eye", score)
     if evaluation.retention is not None:
         yield _baseline("last_frame", "The stream's last frame, frozen", "last", evaluation.retention.frozen)
 

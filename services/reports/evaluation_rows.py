@@ -35,57 +35,35 @@ def measured(report: EvaluationReport) -> list[Measured]:
         by_name = {each.name: each for each in report.baselines if each.frames_of == frames_of}
         return tuple(by_name[name] for name in names if name in by_name)
 
-    found = []
-    if report.live is not None:
-        found.append(
-            Measured(
-                "live",
-                "Live",
-                "what was on the screen when the next frame came",
-                report.live.score,
-                named("live", "previous_frame"),
-            )
-        )
-        found.append(
-            Measured(
-                "settled",
-                "Live, settled",
-                "the same without the first second",
-                report.live.settled,
-                named("settled", "previous_frame"),
-            )
+    found: list[Measured] = []
+
+    def add(key: str, name: str, what: str, score: ScoreFacts, baselines: tuple[BaselineFacts, ...]) -> None:
+        found.append(Measured(key, name, what, score, baselines))
+
+    if (live := report.live) is not None:
+        shown = "what was on the screen when the next frame came"
+        add("live", "Live", shown, live.score, named("live", "previous_frame"))
+        add(
+            "settled",
+            "Live, settled",
+            "the same without the first second",
+            live.settled,
+            named("settled", "previous_frame"),
         )
     if report.causal is not None:
-        found.append(
-            Measured(
-                "causal",
-                "Causal",
-                "the next frame, predicted before it was seen",
-                report.causal.score,
-                named("every", "half_velocity_flow", "previous_frame"),
-            )
-        )
+        against = named("every", "half_velocity_flow", "previous_frame")
+        add("causal", "Causal", "the next frame, predicted before it was seen", report.causal.score, against)
     if report.heldout is not None:
-        found.append(
-            Measured(
-                "heldout",
-                "Held out",
-                "frames that training never saw",
-                report.heldout.score,
-                named("heldout", "half_way_flow", "neighbour_mean", "previous_frame", "train_mean"),
-            )
-        )
+        against = named("heldout", "half_way_flow", "neighbour_mean", "previous_frame", "train_mean")
+        add("heldout", "Held out", "frames that training never saw", report.heldout.score, against)
+    if report.second_eye is not None:
+        against = named("second_eye", "semi_global_matching", "previous_right", "left_shifted")
+        shown = "every tenth frame as the right eye sees the final model, a straight line per channel fitted"
+        add("second_eye", "Right eye", shown, report.second_eye.score, against)
     if report.retention is not None:
         start_s, end_s = report.retention.last_range_s
-        found.append(
-            Measured(
-                "retention",
-                "Retention",
-                f"the last {end_s - start_s:.3g} s again, by the final model",
-                report.retention.last,
-                named("last", "last_frame"),
-            )
-        )
+        shown = f"the last {end_s - start_s:.3g} s again, by the final model"
+        add("retention", "Retention", shown, report.retention.last, named("last", "last_frame"))
     return found
 
 

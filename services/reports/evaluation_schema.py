@@ -37,8 +37,9 @@ class BaselineFacts(Part):
 
     name: str
     label: str
-    frames_of: Literal["every", "heldout", "last", "live", "settled"]
-    """Which frames it is scored on: every one that has it, the held-out ones, the last seconds, those that the live figures are of."""
+    frames_of: Literal["every", "heldout", "last", "live", "settled", "second_eye"]
+    """Which frames it is scored on: every one that has it, the held-out ones, the last seconds, those that the live figures are of,
+    those whose right view is scored."""
     psnr_tissue_db: Decibels
     psnr_frame_db: Decibels
     frames: Count
@@ -204,6 +205,13 @@ class GeometryFacts(Part):
     parts: PartFacts | None
 
 
+class SecondEyeFacts(Part):
+    score: ScoreFacts
+    """`psnr_tissue_db` after a straight line for each channel, over what both eyes see."""
+    left_out_px: Count
+    """Columns at the right edge that were left out: only the right eye sees them."""
+
+
 class ReturnFacts(Part):
     """How soon a place was found again."""
 
@@ -243,6 +251,7 @@ class EvaluationReport(Part):
     live: OnScreenFacts | None
     retention: RetentionFacts | None
     geometry: GeometryFacts | None = None
+    second_eye: SecondEyeFacts | None = None
     returns: dict[str, list[ReturnFacts]]
     """By protocol."""
     baselines: list[BaselineFacts]
