@@ -82,17 +82,26 @@ class Spending:
         self.made = 0
         """Steps made or queued so far."""
 
-    def allows_step(self) -> bool:
-        """Whether another step is to be made."""
+    def allows_step(self, by_turns: bool = False) -> bool:
+        """Whether another step is to be made. by_turns: two eyes take turns (`turn`), and a step on the second one is begun where there is time for one
+        on the first after it, which is made then in any case: the newest step is on what is shown."""
         budget = self._budget
         if budget.steps is not None:
             return self.made < budget.steps
+        if by_turns and self.made and self.turn == 0:
+            return True
+        ahead = 2 if by_turns and self.made else 1
         if self.made < budget.at_least:
             return True
-        if budget.at_most is not None and self.made >= budget.at_most:
+        if budget.at_most is not None and self.made + ahead > budget.at_most:
             return False
-        # Steps that are queued come first; the next one must be over in time as well.
-        return budget.clock() + (self._in_flight + 1) * self.step_s <= budget.deadline_s
+        # Steps that are queued come first; the next ones must be over in time as well.
+        return budget.clock() + (self._in_flight + ahead) * self.step_s <= budget.deadline_s
+
+    @property
+    def turn(self) -> int:
+        """Whose turn the next step is where two take turns: 0 for the first one, which also has the last one of a given number of steps."""
+        return 0 if self.made + 1 == self._budget.steps else self.made % 2
 
     def step_made(self, in_flight: int = 0) -> None:
         """One more step was made, or queued; `in_flight` queued ones are not finished."""

@@ -282,9 +282,9 @@ class LiveReconstructor(Reconstructor):
         assert self._step is not None
         spending = Spending(budget, self._step_s)
         loss = None
-        while spending.allows_step():
+        while spending.allows_step(by_turns=observation.right is not None):
             rate = 1.0 if first else self._live.rate_at(spending.made)
-            loss = self._step(observation.by_turns(spending.made), rate, self._live.colour_relaxation)
+            loss = self._step(observation.by_turns(spending.turn), rate, self._live.colour_relaxation)
             spending.step_made(self._in_flight.queued() if budget.is_timed else 0)
         if loss is None:
             return ObserveReport(observation.seq, 0, None, self.gaussians, spending.ending)

@@ -154,7 +154,7 @@ class Reconstructor:
                     jump = self._is_jump(first_loss, first)
                 count = spending.planned()
                 plan = [observation] * count if jump else self._window.schedule(count)[::-1]
-            loss = self._step(plan.pop().by_turns(spending.made))
+            loss = self._step(plan.pop().by_turns(spending.turn))
             first_loss = first_loss or HostCopy(loss)
             spending.step_made(self._in_flight.queued() if budget.is_timed else 0)
         if first_loss is None:

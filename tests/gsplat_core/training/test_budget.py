@@ -248,3 +248,38 @@ def test_a_budget_that_makes_no_sense_is_refused(make, message):
 def test_two_budgets_at_once_are_refused(make_frame, camera):
     with pytest.raises(InvalidInput, match="budget and steps are both given"):
         Reconstructor(CONFIG, camera).observe(make_frame(), budget=Budget.of_steps(3), steps=3)
+
+
+def turns(budget, clock, step_s, slow_from=99):
+    """Whose turn each step was, of steps that take so long, and three times as long from one of them on."""
+    spending, taken = Spending(budget, step_s), []
+    while spending.allows_step(by_turns=True):
+        taken.append(spending.turn)
+        clock.now_s += step_s * (3 if len(taken) > slow_from else 1)
+        spending.step_made()
+    return taken
+
+
+@pytest.mark.parametrize("steps", [0, 1, 2, 3, 6])
+def test_of_a_number_of_steps_the_first_and_the_last_are_the_first_eyes(clock, steps):
+    expected = {0: [], 1: [0], 2: [0, 0], 3: [0, 1, 0], 6: [0, 1, 0, 1, 0, 0]}
+    assert turns(Budget.of_steps(steps), clock, 1.0) == expected[steps]
+
+
+@pytest.mark.parametrize(("room", "expected"), [(0.5, 1), (2.9, 1), (3.1, 3), (4.9, 3), (5.1, 5)])
+def test_before_a_deadline_the_second_eye_begins_where_there_is_time_for_both(clock, room, expected):
+    taken = turns(Budget.until(clock.now_s + room, clock=clock), clock, 1.0)
+    assert taken == [0, 1, 0, 1, 0][:expected]
+    again = turns(Budget.of_steps(len(taken)), clock, 1.0)
+    assert again == taken, "a recorded session makes the same steps by their number"
+
+
+def test_the_first_eye_has_its_turn_though_the_second_ones_step_took_longer(clock):
+    assert turns(Budget.until(clock.now_s + 3.5, clock=clock), clock, 1.0, slow_from=1) == [0, 1, 0]
+
+
+@pytest.mark.parametrize(("at_least", "at_most", "expected"), [(4, 9, 5), (1, 4, 3), (3, 3, 3)])
+def test_bounds_end_with_the_first_eye_too(clock, at_least, at_most, expected):
+    deadline_s = clock.now_s if at_least > 1 else clock.now_s + 100
+    budget = Budget.until(deadline_s, at_least=at_least, at_most=at_most, clock=clock)
+    assert len(turns(budget, clock, 1.0)) == expected
