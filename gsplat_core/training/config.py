@@ -77,7 +77,7 @@ class ReconstructorConfig:
     ssim_weight: float = 0.0
     """Weight of 1 - SSIM beside L1 or the squared error, 0..1."""
     depth_weight: float = 0.02
-    """Weight of the inverse-depth term where the recording has depth."""
+    """Weight of the inverse-depth term, where frames have depth, times the distance at which the scene starts: in any unit of length the same."""
     default_depth_mm: float = 60.0
     """Distance of the plane on which a recording without depth starts."""
     eyes: Eyes = "both"

@@ -47,8 +47,10 @@ class TrainingStep:
         self.field = field
         self._rates = config.rates
         self._has_no_end = config.history_s is not None
-        self._weights = LossWeights(config.ssim_weight, config.depth_weight, config.squared_error)
         self._mm_per_px = mm_per_px(gaussians, camera)
+        # Inverse depths times the distance have no unit: the term weighs the same whatever lengths are measured in.
+        depth_weight = config.depth_weight * self.distance(camera) if config.depth_weight else 0.0
+        self._weights = LossWeights(config.ssim_weight, depth_weight, config.squared_error)
         self._adam = FusedAdam(gaussians.tensors())
         self._rows: GaussianRows | None = None
         """Where Gaussians join and leave without a tensor moving."""
