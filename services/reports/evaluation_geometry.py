@@ -20,7 +20,7 @@ class GeometryRow:
     what: str
     value: str
     baselines: str
-    """Each trivial baseline with its value."""
+    """What it is to be compared with: each trivial baseline with its value."""
     relative: bool = False
     """It says nothing about lengths: one factor was taken out of it first."""
 
@@ -57,7 +57,10 @@ def _depth(geometry: GeometryFacts) -> Iterator[GeometryRow]:
 
 
 def _views(geometry: GeometryFacts) -> Iterator[GeometryRow]:
-    for views, after, relative in ((geometry.views, "", False), (geometry.scaled_views, " after one scale", True)):
+    found = [(geometry.views, "", False)]
+    if geometry.scaled_views != geometry.views:
+        found.append((geometry.scaled_views, " after one scale", True))
+    for views, after, relative in found:
         for view in views:
             left, shifted = decibels(view.left.psnr_tissue_db), decibels(view.shifted.psnr_tissue_db)
             ssim = "" if view.model.ssim is None else f", SSIM {view.model.ssim:.4f}"
@@ -132,7 +135,7 @@ def geometry_section(report: EvaluationReport) -> str:
     return (
         f'<section><h2>In three dimensions</h2><p class="lead">{geometry.frames:,} frames, spread evenly; relative figures say nothing'
         ' about lengths.</p><table><thead><tr><th scope="col">What</th><th scope="col" class="n">the model</th>'
-        f'<th scope="col">knowing nothing</th><th scope="col"></th></tr></thead><tbody>{body}</tbody></table>{note}</section>'
+        f'<th scope="col">compare with</th><th scope="col"></th></tr></thead><tbody>{body}</tbody></table>{note}</section>'
     )
 
 
