@@ -55,7 +55,7 @@ def test_a_true_model_scores_as_one(right: Geometry) -> None:
     assert right.tracking.model.median_mm < 0.3 and right.tracking.model.median_px < 0.3
     assert right.tracking.still.median_mm > 1.0
     assert right.tracking.model.within_mm > right.tracking.still.within_mm
-    assert right.scaled_views is right.views  # no scale is missing
+    assert right.scaled_views == right.views  # no scale is missing
 
 
 def test_views_are_scored_beside_the_left_picture(right: Geometry) -> None:
