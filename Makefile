@@ -12,7 +12,7 @@ CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*
 CUDA_ARCHITECTURES ?= native
 CUDA_TOOLKIT := build/cuda-toolkit
 
-.PHONY: demo test test-of-the-service test-of-the-rest lint format fuzz bench native cuda compilers lock licences sbom clean always
+.PHONY: demo test test-of-programs test-of-parts lint format fuzz bench native cuda compilers lock licences sbom clean always
 
 # On the NVIDIA GPU where there is one that torch can use: the CUDA kernels are built for it first. A build that fails ends it.
 demo: native
@@ -20,17 +20,17 @@ demo: native
 	@set -e; if $(BIN)/python -m services.cli.gpu_check; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
 	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --device $$device
 
-# All tests, in two groups beside each other: many of the service's wait for processes, and most of the others use one core. What a group says is
-# printed when it is over.
-SERVICE_TESTS := tests/services tests/system
+# All tests, in two groups beside each other, which take the processor for as long: whole programs, whose tests often wait, and all the others, most of
+# which use one core. What a group says is printed when it is over.
+PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py
 test: native .venv/.development
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going test-of-the-service test-of-the-rest
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going test-of-programs test-of-parts
 
-test-of-the-service:
-	$(BIN)/python -m pytest $(SERVICE_TESTS)
+test-of-programs:
+	$(BIN)/python -m pytest $(PROGRAM_TESTS)
 
-test-of-the-rest:
-	$(BIN)/python -m pytest $(SERVICE_TESTS:%=--ignore=%)
+test-of-parts:
+	$(BIN)/python -m pytest $(PROGRAM_TESTS:%=--ignore=%)
 
 lint: .venv/.development
 	$(BIN)/ruff check .

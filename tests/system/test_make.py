@@ -49,3 +49,10 @@ def test_ci_builds_the_cuda_kernels_and_requires_them():
     script = (ROOT / ".ci" / "run").read_text()
     assert "set -euo pipefail" in script and "INTRASPLAT_REQUIRE_CUDA_BUILD=1" in script
     assert "cuda CUDA_ARCHITECTURES=portable" in script
+
+
+def test_the_two_groups_of_tests_are_all_of_them():
+    lines = [line for group in ("test-of-programs", "test-of-parts") for line in dry_run(group).splitlines()]
+    programs, parts = (line.partition("-m pytest ")[2].split() for line in lines if "-m pytest " in line)
+    assert programs and all((ROOT / path).exists() for path in programs)
+    assert parts == [f"--ignore={path}" for path in programs]
