@@ -21,6 +21,9 @@ class ReplayOptions(BaseModel):
     )
     max_frames: int | None = Field(default=None, ge=1, le=10_000_000, description="Stop after this many frames.")
     scale: float = Field(default=1.0, gt=0, le=4, allow_inf_nan=False, description="Resize the frames by this factor.")
+    depth: Literal["auto", "recorded", "stereo", "none"] = Field(
+        default="auto", description="Where the frames' depth comes from; `stereo`: from the two eyes."
+    )
     eyes: Literal["left", "both"] = Field(default="both", description="Pictures of a stereo scope that are trained on.")
     heldout: bool = Field(
         default=False, description="Show every eighth frame without training on it, and score it apart."

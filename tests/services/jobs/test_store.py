@@ -9,6 +9,7 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 
+from services.cli.options import RunOptions
 from services.jobs.claims import Claims
 from services.jobs.options import ReplayOptions
 from services.jobs.records import JobState, NewJob
@@ -129,3 +130,8 @@ def test_a_recording_is_in_use_until_its_jobs_have_ended(new_store):
 def test_options_that_are_defaults_are_not_kept():
     assert ReplayOptions(seed=0, scale=0.5).chosen() == {"scale": 0.5}
     assert ReplayOptions().chosen() == {}
+
+
+def test_every_option_of_the_command_is_one_of_a_job():
+    """`intrasplat batch` hands all of them on."""
+    ReplayOptions(**RunOptions().settings())
