@@ -39,9 +39,11 @@ INDEPENDENT_PIXELS = 20.0
 """Of the fit's window: neighbours have the same noise and the same texture."""
 JUMP_PX, JUMP_WINDOW_PX = 2.0, 11
 """Where disparities differ by more within such a square there is an edge of something in front, beside which matching gives its disparity to what lies
-behind: nothing is known there."""
+behind."""
 HOLE_MARGIN_PX = 2
-"""Beside what could not be matched nothing is known either: a hole is what only one eye sees, behind such an edge."""
+"""Beside what could not be matched it is the same: a hole is what only one eye sees, behind such an edge."""
+EDGE_ERROR_PX = 1.5
+"""Standard deviation of what is matched near edges and holes."""
 SMOOTHNESS, SMOOTH_GREY = 100.0, 4.0
 """Of the edge-aware filter: its strength, and the step of grey values that it does not smooth over."""
 
@@ -77,24 +79,41 @@ class Span:
         return self.lowest + self.count - 1
 
 
-def find_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], span: Span, *, shrink: int = 1) -> Disparity:
-    """Matches two grey pictures [H, W] whose rows correspond.
-
-    shrink: match pictures that are smaller by this factor; the fit happens at full size.
-    """
-    if shrink == 1:
-        matched, known = match(left, right, span)
-    else:
-        size = left.shape[1] // shrink, left.shape[0] // shrink
-        small = [np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8) for each in (left, right)]
-        found, seen = match(small[0], small[1], Span.around(span.lowest / shrink, span.highest / shrink))
-        matched, known = _enlarged(found, seen, left.shape, left.shape[1] / size[0])
+def find_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], span: Span) -> Disparity:
+    """Matches two grey pictures [H, W] whose rows correspond."""
+    matched, known = match(left, right, span)
     columns = np.arange(left.shape[1], dtype=np.float32)
     # What lies beside the right eye's picture was guessed from its edge.
-    inside = (columns - matched >= 0) & (columns - matched <= left.shape[1] - 1)
-    known &= inside & _on_one_surface(matched, known)
-    return fit(
-        left, right, matched, known, steps=FIT_STEPS if shrink == 1 else 2 * FIT_STEPS, most_px=FIT_MOST_PX * shrink
+    known &= (columns - matched >= 0) & (columns - matched <= left.shape[1] - 1)
+    sure = _on_one_surface(matched, known)
+    found = fit(left, right, matched, known)
+    doubtful = np.where(sure, found.error_px, np.hypot(found.error_px, np.float32(EDGE_ERROR_PX)))
+    return Disparity(found.px, known, doubtful.astype(np.float32))
+
+
+def shrunk(picture: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """A picture that is smaller by a whole factor; each pixel is the mean of those that it stands for."""
+    if factor == 1:
+        return picture
+    size = picture.shape[1] // factor, picture.shape[0] // factor
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def enlarged(found: Disparity, width_px: int, height_px: int) -> Disparity:
+    """A disparity of shrunk pictures at full size; known where all that it is interpolated from is."""
+    size = width_px, height_px
+    if size == found.px.shape[::-1]:
+        return found
+    factor = width_px / found.px.shape[1]
+    share = cv2.resize(found.known.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    px = cv2.resize(found.px, size, interpolation=cv2.INTER_LINEAR)
+    finite = np.where(found.known, found.error_px, 0).astype(np.float32)
+    error_px = cv2.resize(finite, size, interpolation=cv2.INTER_LINEAR)
+    known = share > 0.99
+    return Disparity(
+        np.where(known, factor * px / np.maximum(share, 0.5), 0).astype(np.float32),
+        known,
+        np.where(known, factor * error_px, np.inf).astype(np.float32),
     )
 
 
@@ -128,11 +147,8 @@ def fit(
     right: NDArray[np.uint8],
     start: Plane,
     known: NDArray[np.bool_],
-    *,
-    steps: int,
-    most_px: float,
 ) -> Disparity:
-    """Move each known disparity by at most `most_px` to where the pictures agree best around it, whatever gain or offset of brightness is between them."""
+    """Move each known disparity a little to where the pictures agree best around it, whatever offset of brightness is between them."""
     bright, other = left.astype(np.float32), right.astype(np.float32)
     slope = cv2.Scharr(other, cv2.CV_32F, 1, 0, scale=1 / 32)
     rows, columns = np.indices(left.shape, dtype=np.float32)
@@ -140,7 +156,7 @@ def fit(
     count = np.maximum(_window(there), 1e-3)
     current: Plane = start
     information, spread = np.zeros_like(bright), np.zeros_like(bright)
-    for _ in range(steps):
+    for _ in range(FIT_STEPS):
         seen, rise = (_taken_from(each, columns - current, rows) for each in (other, slope))
         differs = bright - seen
         differs = differs - _window(differs * there) / count
@@ -148,7 +164,7 @@ def fit(
         information = _window(weight * rise * rise)
         step = _window(weight * rise * differs) / (information + FIT_RESISTANCE)
         moved = current - np.clip(step, -0.5, 0.5)
-        current = np.clip(moved, start - np.float32(most_px), start + np.float32(most_px)).astype(np.float32)
+        current = np.clip(moved, start - np.float32(FIT_MOST_PX), start + np.float32(FIT_MOST_PX)).astype(np.float32)
         spread = _window(weight * differs * differs)
     variance = (spread + count) / np.maximum(INDEPENDENT_PIXELS * information, 1e-6)
     error_px = np.where(known, np.sqrt(variance), np.inf).astype(np.float32)
@@ -170,14 +186,3 @@ def _taken_from(plane: Any, columns: Any, rows: Any) -> Plane:
 
 def _window(plane: Any) -> Plane:
     return np.asarray(cv2.GaussianBlur(plane, (0, 0), FIT_SIGMA_PX), np.float32)
-
-
-def _enlarged(
-    found: Plane, known: NDArray[np.bool_], shape: tuple[int, ...], factor: float
-) -> tuple[Plane, NDArray[np.bool_]]:
-    """Disparities of smaller pictures at full size; known where all that they are interpolated from is."""
-    size = shape[1], shape[0]
-    share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-    sums = cv2.resize(np.where(known, found, 0).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-    whole = share > 0.99
-    return np.where(whole, factor * sums / np.maximum(share, 1e-3), 0).astype(np.float32), whole

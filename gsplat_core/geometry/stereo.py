@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.geometry.depth_map import DepthMap, doubted
-from gsplat_core.geometry.disparity import Disparity, Span, find_disparity, smoothed
+from gsplat_core.geometry.disparity import Disparity, Span, enlarged, find_disparity, shrunk, smoothed
 from gsplat_core.geometry.eye_pair import LEAST_DISPARITY_PX, PairLook, look_at
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
@@ -16,12 +16,12 @@ LOOK_EVERY = 30
 """Frames after which the pair is looked at again: eyes do not move against each other, and what they look at comes nearer."""
 KEPT_LOOKS = 15
 """Of the looks whose rows are averaged."""
-SHRINK_FROM_PX = 800
-"""Wider pictures are matched at half size, and fitted at their own."""
+MATCHED_WIDTH_PX = 800
+"""Wider pictures are matched at half their size, or a third: endoscopes blur more than a pixel of theirs, and what is fitted is a fraction of one."""
 MARGIN_SHARE, MARGIN_PX = 0.2, 4
 """What is looked for beyond the disparities that were seen."""
 HALF_BELIEVED_PX = 0.5
-"""Standard deviation of a disparity that is believed with a confidence of a half."""
+"""Standard deviation of a disparity that is believed with a confidence of a half, in pixels of the pictures that are matched."""
 LEAST_BELIEVED = 0.05
 """Share of the pixels that must be believed."""
 ROWS_FROM_PX = 0.05
@@ -88,21 +88,25 @@ class StereoDepth:
         assert self._span is not None
         low, high = self._span
         margin = MARGIN_PX + MARGIN_SHARE * (high - low)
-        shrink = 2 if left.shape[1] > SHRINK_FROM_PX else 1
+        height, width = left.shape
+        shrink = _shrink(width)
         aligned = _with_rows_of_left(right, np.median(self._rows, axis=0), (low + high) / 2)
-        return smoothed(find_disparity(left, aligned, Span.around(low - margin, high + margin), shrink=shrink), guide)
+        small_left, small_right, small_guide = (shrunk(each, shrink) for each in (left, aligned, guide))
+        span = Span.around((low - margin) / shrink, (high + margin) / shrink)
+        return enlarged(smoothed(find_disparity(small_left, small_right, span), small_guide), width, height)
 
     def _as_depth(self, found: Disparity, frame: Frame, camera: Camera, parallel_px: float) -> DepthMap:
         shift = found.px - np.float32(parallel_px)
         known = found.known & (shift > LEAST_DISPARITY_PX)
         error_px = np.hypot(found.error_px, _off_along_rows(np.median(self._rows, axis=0), found.px.shape))
-        confidence = np.where(known, 1 / (1 + (error_px / HALF_BELIEVED_PX) ** 2), 0).astype(np.float32)
+        half_px = HALF_BELIEVED_PX * _shrink(found.px.shape[1])
+        confidence = np.where(known, 1 / (1 + (error_px / half_px) ** 2), 0).astype(np.float32)
         believed = confidence >= 0.5
         if believed.mean() < LEAST_BELIEVED:
             self._look_in = 0
             why = f"too little of the picture could be matched between the eyes: {believed.mean():.1%} of its pixels, {LEAST_BELIEVED:.0%} are needed"
             return doubted(found.px.shape, DepthOrigin.STEREO, why)
-        low, high = (float(value) for value in np.percentile(found.px[believed], (0.5, 99.5)))
+        low, high = (float(value) for value in np.percentile(found.px[known], (0.5, 99.5)))
         self._span = low, high
         baseline = 1.0 if frame.right_camera is None else -float(frame.right_camera.world_to_camera[0, 3])
         reach = float(camera.K[0, 0] * baseline)
@@ -124,6 +128,11 @@ class StereoDepth:
             f"the rows of the two eyes are not the same: those of the right one were moved by {off:.1f} px; if its columns are off by as much,"
             f" depth is off by {abs(off) * middle / reach:.1%}, so check the calibration"
         )
+
+
+def _shrink(width_px: int) -> int:
+    """By which factor pictures are smaller while they are matched."""
+    return -(-width_px // MATCHED_WIDTH_PX)
 
 
 def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
