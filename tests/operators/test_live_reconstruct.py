@@ -19,6 +19,7 @@ class FakeReconstructor:
     def __init__(self, make_model, camera):
         self.calls, self.version, self.make_model = [], 0, make_model
         self.camera, self.device, self.step_ns = camera, torch.device("cpu"), 1e6
+        self.eyes = SimpleNamespace(trained="both")
 
     def observe(self, frame, *, budget, train):
         self.calls.append(("observe", frame.seq, train))

@@ -15,6 +15,8 @@ from operators.reconstruct import ReconstructOp
 class FakeReconstructor:
     """Writes down what it is asked to do."""
 
+    eyes = SimpleNamespace(trained="both")
+
     def __init__(self, make_model):
         self.calls = []
         self.version = 0
