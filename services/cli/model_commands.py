@@ -10,6 +10,7 @@ from services.cli.options import (
     DeviceOption,
     ExportedFileArgument,
     JsonOption,
+    MeshArgument,
     ModelArgument,
     PackedFileArgument,
     RendererOption,
@@ -20,7 +21,7 @@ from services.cli.options import (
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands to the program."""
-    for command in (render, pack, export, measure):
+    for command in (render, pack, export, measure, compare):
         app.command()(command)
 
 
@@ -103,3 +104,27 @@ def measure(
     from services.cli.measure import measure_command
 
     return measure_command(model, time, start, end, as_json=json)
+
+
+def compare(
+    model: ModelArgument,
+    mesh: MeshArgument,
+    time: Annotated[
+        float | None, typer.Option(help="Which time of the model, in seconds.", show_default="the end of its window")
+    ] = None,
+    pairs: Annotated[
+        str | None,
+        typer.Option(
+            help="Points that belong together, model = mesh: x,y,z=x,y,z;... Three or more, where they start."
+        ),
+    ] = None,
+    inlier: Annotated[
+        float | None,
+        typer.Option(help="Distance of an inlier, in the mesh's unit.", show_default="0.02 of the mesh's extent"),
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Lay a model's surface onto a mesh (.ply, .stl or .obj, of a CT for one) without bending it, and say how far apart they are."""
+    from services.cli.compare import compare_command
+
+    return compare_command(model, mesh, time, pairs, inlier, as_json=json)

@@ -42,6 +42,7 @@ SourceArgument = Annotated[
 ]
 ModelArgument = Annotated[Path, path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
 PackedFileArgument = Annotated[Path, path_argument("FILE", "The packed file, which ends in .isplat.")]
+MeshArgument = Annotated[Path, path_argument("MESH", "A triangle mesh: .ply, .stl or .obj.")]
 ExportedFileArgument = Annotated[Path, path_argument("FILE", "The exported file.")]
 OutOption = Annotated[Path, path_option("--out", "Folder for the results: new, empty, or left by an earlier run.")]
 FolderArgument = Annotated[Path, path_argument("FOLDER", "A folder of recordings: videos, and folders of their own.")]

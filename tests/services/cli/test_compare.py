@@ -1,0 +1,101 @@
+"""`intrasplat compare`: a model beside a mesh of its own surface, in every format, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core import Camera, Gaussians, Model, save_bundle
+from gsplat_core.geometry.mesh import Mesh, mesh_of
+from gsplat_core.io.exports.mesh_files import mesh_ply_pieces
+from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.frames import DepthOrigin
+from services.cli.app import run
+from services.cli.exit_codes import BAD_INPUT, OK
+
+
+def bumpy(source: DepthSource | None) -> Model:
+    x, y = torch.meshgrid(torch.arange(-30.0, 31), torch.arange(-25.0, 26), indexing="xy")
+    x, y = x.ravel(), y.ravel()
+    z = 45 + 4 * torch.sin(x / 6) * torch.cos(y / 7) + 0.1 * x
+    count = len(x)
+    gaussians = Gaussians(
+        torch.stack([x, y, z], 1), torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        torch.full((count, 3), -0.7), torch.full((count,), 6.0), torch.zeros(count, 1, 3),
+    )  # fmt: skip
+    return Model(1, gaussians, None, Camera.from_focal(50.0, 48, 40), (0.0, 1.0), depth_source=source)
+
+
+def write(mesh: Mesh, path) -> None:
+    """In another program's way."""
+    if path.suffix == ".ply":
+        path.write_bytes(b"".join(mesh_ply_pieces(mesh, "millimetre", with_triangles=True)))
+    elif path.suffix == ".obj":
+        lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices.tolist()]
+        path.write_text(
+            "\n".join([*lines, *(f"f {a + 1}//1 {b + 1}//1 {c + 1}//1" for a, b, c in mesh.triangles.tolist())])
+        )
+    else:
+        rows = [struct.pack("<12fH", 0, 0, 0, *mesh.vertices[t].ravel().tolist(), 0) for t in mesh.triangles]
+        path.write_bytes(bytes(80) + struct.pack("<I", len(rows)) + b"".join(rows))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj"])
+def test_a_model_lies_on_its_own_moved_surface(suffix, tmp_path, capsys):
+    model = bumpy(DepthSource(DepthOrigin.MEASURED, metric=True))
+    save_bundle(model, tmp_path / "model")
+    mesh = mesh_of(model, 0.0)
+    angle = math.radians(3)
+    turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
+    moved = Mesh(
+        (mesh.vertices @ turn.T + [0.5, -0.4, 0.8]).astype(np.float32), mesh.normals, mesh.colours, mesh.triangles
+    )
+    write(moved, tmp_path / f"ct{suffix}")
+    assert run(["compare", str(tmp_path / "model"), str(tmp_path / f"ct{suffix}"), "--json"]) == OK
+    said = json.loads(capsys.readouterr().out)
+    assert said["signed_distances"]["rmse"] < 0.01 and said["signed_distances"]["inlier_share"] == 1
+    assert np.allclose(np.array(said["registration"]["transform"])[:3, :3], turn, atol=2e-3)
+
+
+def test_a_model_without_a_unit_takes_its_scale_from_pairs(tmp_path, capsys):
+    model = bumpy(None)
+    save_bundle(model, tmp_path / "model")
+    mesh = mesh_of(model, 0.0)
+    write(Mesh(2 * mesh.vertices, mesh.normals, mesh.colours, mesh.triangles), tmp_path / "ct.stl")
+    arguments = ["compare", str(tmp_path / "model"), str(tmp_path / "ct.stl")]
+    assert run(arguments) == BAD_INPUT
+    assert "give --pairs" in capsys.readouterr().err
+    chosen = mesh.vertices[[5, 40, 900, 1500]].tolist()
+    pairs = ";".join(f"{x},{y},{z}={2 * x},{2 * y},{2 * z}" for x, y, z in chosen)
+    assert run([*arguments, "--pairs", pairs, "--json"]) == OK
+    assert json.loads(capsys.readouterr().out)["registration"]["scale"] == pytest.approx(2, rel=1e-3)
+    assert run([*arguments, "--pairs", pairs]) == OK
+    assert "RMSE 0.0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("ct.vtk", b"", "ends in none of"),
+        (
+            "ct.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 2000000\nproperty float x\nend_header\n",
+            "more than the file",
+        ),
+        ("ct.ply", b"hello", "it has no header"),
+        ("ct.stl", b"solid x", "no triangles"),
+        ("ct.obj", b"v 0 0 0\nf 1 2 3\n", "a vertex that is not there"),
+        ("ct.obj", b"v 0 0 nan\n", "not finite"),
+        ("ct.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles with an area"),
+    ],
+)
+def test_files_that_are_no_meshes_are_refused(name, content, said, tmp_path, capsys):
+    save_bundle(bumpy(DepthSource(DepthOrigin.MEASURED, metric=True)), tmp_path / "model")
+    (tmp_path / name).write_bytes(content)
+    assert run(["compare", str(tmp_path / "model"), str(tmp_path / name)]) == BAD_INPUT
+    assert said in capsys.readouterr().err
