@@ -52,6 +52,7 @@ DEPTHS: Registry[Callable[[], Estimator]] = Registry(
     {
         "recorded": RecordedDepth,
         "stereo": "gsplat_core.geometry.stereo:StereoDepth",
+        "light": "gsplat_core.geometry.light:LightDepth",
         "none": NoDepth,
     },
 )

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.initialisation import believed_depth
 from gsplat_core.transfers import HostCopy, tensor_of
 
@@ -71,7 +71,7 @@ class Observation:
             camera=camera if frame.pose is None else camera.with_pose(frame.pose),
             image=tensor_of(scene_colours(frame.image, frame.exposure), device),
             mask=tensor_of(mask.astype(np.uint8, copy=False), device),
-            depth=None if frame.depth is None else known_depth(believed_depth(frame), device),
+            depth=known_depth(believed_depth(frame), device) if _is_trained_on(frame) else None,
             rehearsal_mask=None if frame.rehearsal_mask is None else tensor_of(frame.rehearsal_mask, device),
         )
 
@@ -81,6 +81,12 @@ def scene_colours(image: NDArray[np.uint8], exposure: tuple[float, float, float]
     if exposure == (1.0, 1.0, 1.0):
         return image
     return np.rint(np.clip(image / np.array(exposure, np.float32), 0, 255)).astype(np.uint8)
+
+
+def _is_trained_on(frame: Frame) -> bool:
+    """Whether the loss takes the frame's depth. The scene starts from depth by light, and is not held to it: it is rough, and right up to a factor that
+    no two frames need to share."""
+    return frame.depth is not None and frame.depth_origin is not DepthOrigin.LIGHT
 
 
 def known_depth(depth_mm: NDArray[np.floating], device: torch.device | str = "cpu") -> Tensor:

@@ -87,7 +87,10 @@ DeviceOption = Annotated[str, typer.Option(help="cpu or cuda.")]
 RendererOption = Annotated[str, typer.Option(help="How Gaussians become a picture: alpha.")]
 FieldOption = Annotated[str, typer.Option(help="Deformation field: auto, basis or hexplane.")]
 DepthOption = Annotated[
-    str, typer.Option(help="Depth of the frames: auto, recorded, stereo (from the two eyes) or none.")
+    str,
+    typer.Option(
+        help="Depth of the frames: auto, recorded, stereo (from the two eyes), light (of one fixed eye; relative) or none."
+    ),
 ]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
 EyesOption = Annotated[str, typer.Option(help="Pictures of a stereo scope that are trained on: left or both.")]

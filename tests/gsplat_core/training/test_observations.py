@@ -6,6 +6,7 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.training.observations import Observation, ObservationWindow
 
 
@@ -29,6 +30,12 @@ def test_an_observation_holds_what_the_frame_holds(make_frame, camera):
     assert np.array_equal(seen.mask.numpy(), mask)
     assert seen.depth.dtype == torch.float32
     assert np.array_equal(seen.depth.numpy(), depth)
+
+
+def test_depth_by_light_is_for_the_start_of_a_scene_and_not_for_the_loss(make_frame, camera):
+    frame = make_frame(depth=np.full((40, 48), 55.0), depth_origin=DepthOrigin.LIGHT)
+    assert Observation.of(frame, camera).depth is None
+    assert Observation.of(frame.with_fields(depth_origin=DepthOrigin.PARALLAX), camera).depth is not None
 
 
 @pytest.mark.cuda

@@ -1,0 +1,97 @@
+"""How good depth by the scope's own light is, beside a plane, and what it costs: python benchmarks/geometry_light.py [--pictures DIR]
+
+A line of JSON for each recording. `error` and `plane` are root mean squares after one factor per frame, by the median depth; `believed` is the
+share of the pixels with a confidence of at least 0.5, `doubted` that of the frames without an answer, which count as a plane.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.geometry.depth_map import BELIEVED
+from gsplat_core.geometry.light import LightDepth
+from gsplat_core.io.recordings import open_recording
+from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+
+RECORDINGS = Path(__file__).resolve().parents[2] / "shared/recordings"
+SEEDS = 6
+
+
+def error(found: NDArray[np.float32], true: NDArray[np.float32], kept: NDArray[np.bool_]) -> float:
+    """After the factor that makes the medians agree."""
+    shown, known = found[kept].astype(np.float64), true[kept].astype(np.float64)
+    off = shown * np.median(known / shown) - known
+    return float(np.sqrt(np.mean(off * off)) / np.median(known))
+
+
+def measure(name: str, frames: Iterable[Frame], camera: Camera, pictures: Path | None) -> dict[str, object]:
+    """All frames of a recording in order; the estimator is not shown their depth."""
+    estimator = LightDepth()
+    errors, planes, believed, doubted, spent = [], [], [], [], []
+    for frame in frames:
+        began = time.process_time()
+        found = estimator.estimate(frame.with_fields(depth=None, depth_confidence=None, depth_origin=None), camera)
+        spent.append(time.process_time() - began)
+        assert found is not None
+        depth = np.ones_like(found.depth) if found.doubt else found.depth
+        doubted.append(found.doubt is not None)
+        believed.append(float((found.confidence >= BELIEVED).mean()))
+        if frame.depth is not None:
+            kept = frame.depth > 0
+            if frame.mask is not None:
+                kept &= frame.mask != 0
+            errors.append(error(depth, frame.depth, kept))
+            planes.append(error(np.ones_like(depth), frame.depth, kept))
+        if pictures is not None and frame.seq == 0:
+            _draw(pictures / f"{name}.png", frame, depth)
+    figures: dict[str, object] = {"recording": name, "frames": len(spent)}
+    if errors:
+        figures |= {"error": round(float(np.mean(errors)), 4), "plane": round(float(np.mean(planes)), 4)}
+        figures["worst_beside_plane"] = round(float(np.max(np.subtract(errors, planes))), 4)
+    figures |= {"believed": round(float(np.mean(believed)), 3), "doubted": round(float(np.mean(doubted)), 3)}
+    return figures | {
+        "cpu_ms_per_look": round(1e3 * max(spent), 1),
+        "cpu_ms_per_frame": round(1e3 * float(np.mean(spent)), 2),
+    }
+
+
+def _draw(path: Path, frame: Frame, depth: NDArray[np.float32]) -> None:
+    """The picture and its depth side by side; the true depth after them, where it is known."""
+    planes = [depth] if frame.depth is None else [depth, frame.depth]
+    drawn = [cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)]
+    for plane in planes:
+        low, high = np.percentile(plane[plane > 0], [2, 98])
+        level = np.clip((plane - low) / max(high - low, 1e-6), 0, 1)
+        drawn.append(cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_TURBO))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.hstack(drawn))
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--recordings", type=Path, default=RECORDINGS)
+    parser.add_argument("--frames", type=int, default=75)
+    parser.add_argument("--pictures", type=Path)
+    asked = parser.parse_args()
+    for seed in range(SEEDS):
+        made = render_recording(Asked(frames=12, fps=3, seed=seed))
+        print(json.dumps(measure(f"synthetic_{seed}", made, made.camera, asked.pictures)), flush=True)
+    for name in ("colon", "cutting", "sinus", "heart/left.mp4"):
+        recording = open_recording(asked.recordings / name)
+        frames = (frame for frame in recording if frame.seq < asked.frames)
+        print(json.dumps(measure(name.split("/")[0], frames, recording.camera, asked.pictures)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,170 @@
+"""Depth by the scope's own light: a known surface is found, and what only looks like one is not made up."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.geometry.light import FLAT, UNSEEN, LightDepth
+from gsplat_core.geometry.registry import DEPTHS
+from gsplat_core.geometry.relief import find_relief
+from gsplat_core.geometry.shading import LEAST_DETAIL, Shading, shading_of
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin, Frame
+
+WIDTH, HEIGHT, FOCAL = 160, 128, 140.0
+CAMERA = Camera.from_focal(FOCAL, WIDTH, HEIGHT)
+PINK = np.array([0.6, 0.2, 0.15])
+
+
+def rays():
+    column, row = np.arange(WIDTH) + 0.5 - CAMERA.K[0, 2], np.arange(HEIGHT) + 0.5 - CAMERA.K[1, 2]
+    return np.meshgrid(column / FOCAL, row / FOCAL)
+
+
+def lit(z):
+    """Brightness of a Lambertian surface of depth z [H, W] in a lamp at the camera, from points and normals, 1 at distance 60."""
+    x, y = rays()
+    points = np.stack([x * z, y * z, z], axis=-1)
+    by_row, by_column = np.gradient(points, axis=(0, 1))
+    normal = np.cross(by_column, by_row)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    distance = np.linalg.norm(points, axis=-1)
+    facing = np.abs(np.einsum("hwi,hwi->hw", normal, points)) / distance
+    return facing * (60 / distance) ** 2
+
+
+def picture(z, colour=PINK, light=1.0):
+    """The surface as a camera shows it, with the sRGB curve."""
+    linear = np.clip(light * lit(z)[..., None] * colour, 0, 1)
+    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.round(255 * curve).astype(np.uint8)
+
+
+def bowl():
+    """The surface is twice as far away on one side as on the other, with a hollow."""
+    x, y = rays()
+    return 60 * np.exp(0.5 * x + 0.2 * np.cos(4 * y) + 0.15 * np.cos(5 * x))
+
+
+def plane():
+    return np.full((HEIGHT, WIDTH), 60.0)
+
+
+def error(found, true):
+    """Root mean square after one factor, by the median depth."""
+    scaled = found * np.median(true / found)
+    return float(np.sqrt(np.mean((scaled - true) ** 2)) / np.median(true))
+
+
+def look(image, **fields):
+    return LightDepth().estimate(Frame(0, 0, image, **fields), CAMERA)
+
+
+def noise(seed, cell_px):
+    grid = np.random.default_rng(seed).standard_normal((HEIGHT // cell_px + 2, WIDTH // cell_px + 2)).astype(np.float32)
+    return cv2.resize(grid, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+
+
+def test_a_lambertian_surface_is_found():
+    found, true = look(picture(bowl())), bowl()
+    assert found.doubt is None
+    assert (found.origin, found.metric) == (DepthOrigin.LIGHT, False)
+    assert error(found.depth, true) < 0.4 * error(plane(), true)
+    assert found.confidence.min() > 0.5
+
+
+def test_the_model_of_brightness_is_exact_where_nothing_is_unknown_but_relief():
+    rows, columns = 32, 40
+    x, y = (cv2.resize(ray, (columns, rows), interpolation=cv2.INTER_AREA) for ray in rays())
+    brightness = cv2.resize(np.log(lit(bowl())), (columns, rows), interpolation=cv2.INTER_AREA)
+    shading = Shading(brightness, np.ones((rows, columns)), LEAST_DETAIL)
+    assert find_relief(shading, x, y, (FOCAL / 4, FOCAL / 4)).share > 0.95
+
+
+def test_twice_the_light_shows_the_same_relief():
+    dim, bright = look(picture(bowl(), light=0.15)), look(picture(bowl(), light=0.3))
+    assert error(dim.depth, bright.depth) < 0.02
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_textured_plane_does_not_become_a_relief(seed):
+    pigment = np.exp(-np.maximum(noise(seed, 12), 0)[..., None] * np.array([0.3, 0.9, 0.8]))
+    found = look(picture(plane(), PINK * pigment))
+    depth = plane() if found.doubt else found.depth
+    assert error(depth, plane()) < 0.04
+
+
+def test_vessels_and_pale_tissue_do_not_hide_a_relief():
+    pigment = np.exp(-np.maximum(noise(3, 8), 0)[..., None] * np.array([0.3, 0.9, 0.8]))
+    found, true = look(picture(bowl(), PINK * pigment)), bowl()
+    assert error(found.depth, true) < 0.6 * error(plane(), true)
+
+
+def test_the_mixture_of_channels_leaves_the_light_and_not_the_pigment():
+    pigment = np.exp(-np.maximum(noise(3, 4), 0)[..., None] * np.array([0.3, 0.9, 0.8]))
+    mixed = shading_of(Frame(0, 0, picture(plane(), PINK * pigment)))
+    red = shading_of(Frame(0, 0, np.repeat(picture(plane(), PINK * pigment)[..., :1], 3, axis=2)))
+    assert mixed.detail < 0.5 * red.detail
+
+
+@pytest.mark.parametrize("level", [0, 8, 252, 255])
+def test_dark_and_overexposed_frames_say_that_nothing_is_seen(level):
+    found = look(np.full((HEIGHT, WIDTH, 3), level, np.uint8))
+    assert found.doubt == UNSEEN
+    assert not found.confidence.any()
+
+
+def test_a_facing_plane_without_texture_says_that_there_is_no_relief():
+    assert look(picture(plane())).doubt == FLAT
+
+
+def test_a_frame_full_of_tools_says_that_nothing_is_seen():
+    assert look(picture(bowl()), mask=np.zeros((HEIGHT, WIDTH), np.uint8)).doubt == UNSEEN
+
+
+def test_what_a_tool_hides_is_believed_less():
+    mask = np.ones((HEIGHT, WIDTH), np.uint8)
+    mask[:, 100:] = 0
+    found = look(picture(bowl()), mask=mask)
+    assert found.confidence[:, :60].min() > 0.5
+    assert found.confidence[:, 150:].max() < 0.5
+
+
+def test_the_answer_is_steady_and_the_same_twice():
+    first, second = LightDepth(), LightDepth()
+    rng = np.random.default_rng(0)
+    depths = []
+    for seq in range(41):
+        image = np.clip(picture(bowl()) + rng.normal(0, 3, (HEIGHT, WIDTH, 3)), 0, 255).astype(np.uint8)
+        frame = Frame(seq, seq * 33_000_000, image)
+        found, again = first.estimate(frame, CAMERA), second.estimate(frame, CAMERA)
+        assert np.array_equal(found.depth, again.depth)
+        depths.append(found.depth)
+    assert np.array_equal(depths[1], depths[9])
+    assert 0 < error(depths[40], depths[30]) < 0.01
+
+
+def test_another_scene_size_or_pose_begins_anew():
+    estimator = LightDepth()
+    estimator.estimate(Frame(0, 0, picture(bowl())), CAMERA)
+    mirrored = picture(bowl()[:, ::-1])
+    alone = look(mirrored).depth
+    assert np.array_equal(estimator.estimate(Frame(1, 1, mirrored, new_scene="cut"), CAMERA).depth, alone)
+    moved = np.eye(4)
+    moved[0, 3] = 1
+    assert np.array_equal(
+        estimator.estimate(Frame(2, 2, picture(bowl())), CAMERA.with_pose(moved)).depth, look(picture(bowl())).depth
+    )
+    small = cv2.resize(picture(bowl()), (80, 64), interpolation=cv2.INTER_AREA)
+    assert estimator.estimate(Frame(3, 3, small), CAMERA.scaled(0.5)).depth.shape == (64, 80)
+
+
+def test_a_camera_without_a_pinhole_gets_no_answer():
+    fisheye = Camera(CAMERA.K, WIDTH, HEIGHT, CAMERA.world_to_camera, model="fisheye")
+    assert LightDepth().estimate(Frame(0, 0, picture(bowl())), fisheye) is None
+
+
+def test_it_is_found_by_its_name():
+    assert DEPTHS["light"] is LightDepth
