@@ -106,6 +106,8 @@ def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConf
     ways = []
     if "right_image" in fields and choice in ("auto", "stereo"):
         ways.append("the two eyes")
+    if choice == "light":
+        ways.append("light and shade")
     if config.depth_from_motion and "pose" in fields:
         ways.append("the given poses")
     found = f"unless {' or '.join(ways)} show how far away it is, " if ways else ""

@@ -80,22 +80,22 @@ def _least_pigment(steps: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _reduced(frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """The picture in a small size, and 1 where it shows tissue by its own colour, 0 elsewhere [H, W]."""
-    usable = np.ones(frame.image.shape[:2], np.uint8)
+    height, width = frame.image.shape[:2]
+    usable = np.ones((height, width), np.uint8)
     for kept in (without_highlights(frame.image), frame.loss_mask):
         if kept is not None:
             usable &= (kept != 0).astype(np.uint8)
     image = frame.image
-    scale = LONG_SIDE_PX / max(usable.shape)
+    scale = min(1.0, LONG_SIDE_PX / max(height, width))
+    size = round(width * scale), round(height * scale)
     if scale < 1:
-        size = round(usable.shape[1] * scale), round(usable.shape[0] * scale)
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         usable = np.asarray(cv2.resize(usable, size, interpolation=cv2.INTER_NEAREST), np.uint8)
     brightest, darkest = image.max(axis=2), image.min(axis=2)
     usable &= ((brightest <= BRIGHTEST) & (brightest > DARKEST) & (darkest >= DARKEST_CHANNEL)).astype(np.uint8)
     if frame.mask is not None:
-        size = usable.shape[1], usable.shape[0]
         tissue = cv2.resize((frame.mask != 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-        side = 2 * round(BESIDE_TOOLS * max(usable.shape)) + 1
+        side = 2 * round(BESIDE_TOOLS * max(size)) + 1
         usable &= np.asarray(cv2.erode(tissue, np.ones((side, side), np.uint8)), np.uint8)
     return image, usable.astype(np.float32)
 
