@@ -53,6 +53,7 @@ DEPTHS: Registry[Callable[[], Estimator]] = Registry(
         "recorded": RecordedDepth,
         "stereo": "gsplat_core.geometry.stereo:StereoDepth",
         "light": "gsplat_core.geometry.light:LightDepth",
+        "parallax": "gsplat_core.geometry.key_frames:ParallaxDepth",
         "none": NoDepth,
     },
 )

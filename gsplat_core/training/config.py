@@ -90,7 +90,7 @@ class ReconstructorConfig:
     """Whether a motion prior moves the scene to where a new frame shows it, before the first step on that frame."""
     depth_from_motion: bool = False
     """Whether the depth of the scene is found where the camera moves, its poses are given, and no depth is: online by the motion prior,
-    offline before training."""
+    offline before training, in key frames (`training/parallax.py`)."""
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.densification import densify, shares_of
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.parallax import depth_by_parallax
 from gsplat_core.training.steadiness import steadiness
 from gsplat_core.training.step import TrainingStep
 
@@ -74,12 +73,6 @@ def observed(frames: Sequence[Frame], observation_of: Callable[[Frame], Observat
                 " frames must come in order"
             )
     return [observation_of(frame) for frame in frames]
-
-
-def with_depth(frames: Sequence[Frame], observations: Sequence[Observation]) -> Frame:
-    """The first frame, from which the scene starts, with the depth that the camera's motion shows, if it shows any."""
-    depth = depth_by_parallax(frames, [observation.camera for observation in observations])
-    return frames[0] if depth is None else frames[0].with_fields(depth=depth, depth_origin=DepthOrigin.PARALLAX)
 
 
 class OfflineTraining:

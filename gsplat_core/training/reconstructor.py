@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -26,7 +27,9 @@ from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion_prior
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.observe_report import ObserveReport
-from gsplat_core.training.offline import FitSettings, OfflineTraining, observed, with_depth
+from gsplat_core.training.offline import FitSettings, OfflineTraining
+from gsplat_core.training.parallax import to_fit
+from gsplat_core.training.placement import Placement
 from gsplat_core.training.right_eye import BothEyes
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.transfers import HostCopy
@@ -65,6 +68,7 @@ class Reconstructor:
         self.eyes = BothEyes(config.eyes, self.device)
         self._step: TrainingStep | None = None
         self._prior: MotionPrior | None = None
+        self._placement = Placement(None)
         self._coverage: CapturedCoverage | None = None
         self._unsettled: Observation | None = None
         """The frame whose steps are queued; whether their splats fitted the tile lists is not known yet."""
@@ -75,6 +79,7 @@ class Reconstructor:
         self._usual_first_loss = math.inf
         self._first_time_s = self._last_time_s = self._learned_s = 0.0
         self._depth_source: DepthSource | None = None
+        self.depth_doubts: Mapping[str, int] = {}  # why `fit` found no depth, and in how many frames of a moving camera
 
     _follows_at_once = True
     """Whether the motion prior sees a frame before the model is trained on it."""
@@ -119,6 +124,7 @@ class Reconstructor:
             if not train:
                 raise InvalidInput(f"frame {frame.seq} is the first one: a model can only start from a training frame")
             self._start(frame, observation)
+            self._placement = Placement(frame)
         elif observation.time_s < self._last_time_s:
             raise InvalidInput(
                 f"frame {frame.seq} is at {observation.time_s:.3f} s, before the last one at {self._last_time_s:.3f} s;"
@@ -136,6 +142,7 @@ class Reconstructor:
         if self._follows_at_once:
             self._follow(frame, observation)
         self._window.add(observation)
+        self._placement.apply(self._step, frame, observation)
         self._grow(frame, observation, first)
         if budget is None:
             budget = Budget.of_steps(self.config.first_frame_steps if first else self.config.steps_per_frame)
@@ -182,9 +189,8 @@ class Reconstructor:
 
     def _is_jump(self, first_loss: HostCopy | None, first: bool) -> bool:
         """Whether a frame's first loss shows a cut between shots or a sudden motion. Waits for it."""
-        return (
-            not first and first_loss is not None and first_loss.item() > self.config.jump_ratio * self._usual_first_loss
-        )
+        usual = self.config.jump_ratio * self._usual_first_loss
+        return not first and first_loss is not None and first_loss.item() > usual
 
     def _learn_first_loss(self, first_loss: float) -> None:
         known = self._usual_first_loss if self._usual_first_loss < math.inf else first_loss
@@ -207,20 +213,18 @@ class Reconstructor:
         `progress(step, loss)` is called after each step; on a GPU reading the loss, a tensor [] on the device, waits for the step. All
         frames are held in the device's memory (1 byte per channel).
         """
-        frames = list(frames)
-        seen = observed(frames, lambda frame: self.eyes.observation(frame, self.camera))
         if steps < 1:
             raise InvalidInput(f"steps is {steps}; it must be at least 1")
-        start = with_depth(frames, seen) if self.config.depth_from_motion else frames[0]
-        self._start(start, seen[0], end_s=seen[-1].time_s)
+        observed = partial(self.eyes.observation, camera=self.camera)
+        frames, seen, self.depth_doubts = to_fit(list(frames), observed, self.config.depth_from_motion)
+        self._start(frames[0], seen[0], end_s=seen[-1].time_s)
         assert self._step is not None
         self._last_time_s = seen[-1].time_s
         for number, (frame, observation) in enumerate(zip(frames, seen, strict=True)):
             self._depth_source = DepthSource.after(self._depth_source, frame)
             self._grow(frame, observation, number == 0)
-        most = self.config.max_gaussians
-        training = OfflineTraining(self._step, seen, settings or FitSettings(), most_gaussians=most, seed=self._seed)
-        loss = training(steps, progress)
+        most, settings = self.config.max_gaussians, settings or FitSettings()
+        loss = OfflineTraining(self._step, seen, settings, most_gaussians=most, seed=self._seed)(steps, progress)
         return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)
 
     def snapshot(self) -> Model:
@@ -251,14 +255,12 @@ class Reconstructor:
 
     def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
         """The Gaussians that a scene starts with; its camera and first time are those of the frame."""
-        self._first_time_s = observation.time_s
+        self._first_time_s, self.camera = observation.time_s, observation.camera
         self._depth_source = DepthSource.of_first(frame)
-        self.camera = observation.camera
-        config = self.config
+        count, degree, plane = self.config.gaussians, self.config.sh_degree, self.config.default_depth_mm
         return gaussians_from_frame(
-            frame, observation.camera, config.gaussians, sh_degree=config.sh_degree,
-            default_depth_mm=config.default_depth_mm, seed=self._seed,
-        ).to(self.device)  # fmt: skip
+            frame, self.camera, count, sh_degree=degree, default_depth_mm=plane, seed=self._seed
+        ).to(self.device)
 
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
         gaussians = self._first_gaussians(frame, observation)
@@ -287,13 +289,11 @@ class Reconstructor:
     def _cover(self, observation: Observation, frame: Callable[[], Frame]) -> None:
         """Add Gaussians where one eye sees tissue that the model does not cover."""
         assert self._step is not None
-        step = self._step
+        step, coverage = self._step, self._coverage
         most = self.config.max_gaussians - step.gaussians.count
         if most <= 0:
             return
-        if self._coverage is not None and not self._coverage.leaves_much_uncovered(
-            step.gaussians, step.field, observation
-        ):
+        if coverage is not None and not coverage.leaves_much_uncovered(step.gaussians, step.field, observation):
             return
         added = gaussians_for_uncovered_tissue(frame(), observation, step.at(observation.time_s), self.config, most)
         if added is not None:

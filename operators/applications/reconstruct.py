@@ -66,7 +66,7 @@ def reconstruct(
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
         source = prepare(inside, notes, offline=True)
         start = Start.now()
-        model, eyes, done = _fit(source, inside, steps, progress, stop_requested)
+        model, eyes, done = _fit(source, inside, steps, progress, stop_requested, notes)
         if done < steps:
             notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
         graph = ReplayApplication(
@@ -102,8 +102,9 @@ def _fit(
     steps: int,
     progress: ProgressCallback | None,
     stop_requested: Callable[[], bool],
+    notes: list[str],
 ) -> tuple[Model, BothEyes, int]:
-    """Train; returns the model, the eyes that it was trained on, and how many steps were made."""
+    """Train; returns the model, the eyes that it was trained on, and how many steps were made. Adds what is to be said about its depth to `notes`."""
     description = source.description
     if description.digest is None or description.frame_count is None:
         raise InvalidSetting(f"{description.name} can be read only once; reconstruct needs a recording, or use replay")
@@ -119,7 +120,10 @@ def _fit(
             raise _StopFitting
 
     frames = FirstFrames(source, description.frame_count)
-    finder = DepthFinder(settings.depth, description.camera)
+    # Offline parallax is found from all frames at once, in `fit`, and not from the frames before each.
+    finder = DepthFinder("none" if settings.depth == "parallax" else settings.depth, description.camera)
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
         learning.fit((finder.with_depth(frame) for frame in frames if _trains(frame)), steps, after_step)
+    for doubt, count in sorted(learning.depth_doubts.items()):
+        notes.append(f"{count} key frames were given no depth by parallax: {doubt}")
     return learning.snapshot(), learning.eyes, done

@@ -105,6 +105,8 @@ class ReplaySettings:
         """The reconstructor's settings for frames of so many pixels. offline: for `Reconstructor.fit`. Raises InvalidSetting."""
         config = ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig(field=self.field)
         config = replace(config, eyes=self.eyes)
+        if offline:
+            config = replace(config, depth_from_motion=self.depth in ("auto", "parallax"))
         if pixels is not None:
             # More Gaussians than a quarter of the pixels have nothing to show.
             most = max(64, pixels // PIXELS_PER_GAUSSIAN)

@@ -1,0 +1,130 @@
+"""Errors of rendered depth at the points of a structure from motion: a check for recordings of which no dense depth is known.
+
+The points were triangulated from the same pictures, apart from the model, and each is compared only in frames in which it was found. Their unit is that of
+the poses; a model's may be another one, so that one factor for the whole recording, the median of true over rendered depth, is taken out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.cameras import Camera
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """Points in the world, and which frame shows which of them."""
+
+    points: Array
+    """[P, 3]."""
+    seen_point: NDArray[np.int64]
+    """[S]: the point of each sighting."""
+    seen_frame: NDArray[np.int64]
+    """[S]: the number of the frame in which it was found."""
+
+    @classmethod
+    def read(cls, path: str | Path) -> SparsePoints:
+        """A `.npz` file with `points` [P, 3], `obs_point` [S] and `obs_frame` [S]. Raises InvalidInput where they do not fit together."""
+        with np.load(path, allow_pickle=False) as stored:
+            missing = {"points", "obs_point", "obs_frame"} - set(stored.files)
+            if missing:
+                raise InvalidInput(
+                    f"{path} has no {', '.join(sorted(missing))}; it must hold points, obs_point and obs_frame"
+                )
+            points, point, frame = (stored[name] for name in ("points", "obs_point", "obs_frame"))
+        if points.ndim != 2 or points.shape[1] != 3 or point.ndim != 1 or point.shape != frame.shape:
+            raise InvalidInput(
+                f"{path}: points must be [P, 3], obs_point and obs_frame [S]; got {list(points.shape)}, {list(point.shape)} and {list(frame.shape)}"
+            )
+        if len(point) and not (point.min() >= 0 and point.max() < len(points)):
+            raise InvalidInput(
+                f"{path}: obs_point goes from {point.min()} to {point.max()}, and there are {len(points)} points"
+            )
+        return cls(points.astype(np.float64), point.astype(np.int64), frame.astype(np.int64))
+
+    def seen_in(self, number: int, camera: Camera) -> tuple[Array, Array]:
+        """Where the points of a frame are in its picture [n, 2] (x, y), and their depth z [n]; `camera` is a pinhole with the frame's pose."""
+        world = self.points[self.seen_point[self.seen_frame == number]]
+        seen = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        seen = seen[seen[:, 2] > 0]
+        pixels = seen[:, :2] / seen[:, 2:] * np.diag(camera.K)[:2] + camera.K[:2, 2]
+        inside = ((pixels >= 0) & (pixels < [camera.width_px, camera.height_px])).all(1)
+        return pixels[inside], seen[inside, 2]
+
+
+@dataclass(frozen=True)
+class SparseDepthErrors:
+    """Over all sightings at which there is a depth."""
+
+    median: float
+    """Median relative error after `scale`, a share."""
+    percentile_90: float
+    """The error that a tenth of the sightings exceed."""
+    rank_correlation: float
+    """Spearman's: whether what is farther is rendered farther; a plane has none."""
+    scale: float
+    """The factor that was taken out: median of true over rendered depth."""
+    plane_median: float
+    """As `median`, for a plane across the axis at the best distance."""
+    covered: float
+    """Share of the sightings at which there is a depth; the others are in no error."""
+    sightings: int
+
+
+class SparseDepthSums:
+    """Takes frames one at a time; `errors` is what they come to."""
+
+    def __init__(self, points: SparsePoints) -> None:
+        self._points = points
+        self._rendered: list[Array] = []
+        self._true: list[Array] = []
+
+    def add(self, number: int, depth: NDArray[np.float32], camera: Camera) -> None:
+        """Compare depth z [H, W], 0 = unknown, of frame `number` with its points; `camera` has the frame's pose and this size."""
+        if depth.shape != (camera.height_px, camera.width_px):
+            raise InvalidInput(f"depth is {list(depth.shape)}, its camera {camera.width_px}x{camera.height_px}")
+        pixels, true = self._points.seen_in(number, camera)
+        column, row = pixels.astype(np.int64).T
+        self._rendered.append(depth[row, column].astype(np.float64))
+        self._true.append(true)
+
+    def errors(self) -> SparseDepthErrors | None:
+        """None where no sighting has a depth."""
+        rendered, true = (np.concatenate(each) if each else np.zeros(0) for each in (self._rendered, self._true))
+        known = np.isfinite(rendered) & (rendered > 0)
+        if not known.any():
+            return None
+        found, told = rendered[known], true[known]
+        scale = float(np.median(told / found))
+        relative = np.abs(scale * found - told) / told
+        plane = np.abs(np.median(told) - told) / told
+        return SparseDepthErrors(
+            median=float(np.median(relative)),
+            percentile_90=float(np.percentile(relative, 90)),
+            rank_correlation=_rank_correlation(found, told),
+            scale=scale,
+            plane_median=float(np.median(plane)),
+            covered=float(known.mean()),
+            sightings=len(true),
+        )
+
+
+def _rank_correlation(first: Array, second: Array) -> float:
+    """Spearman's, equal values sharing their mean rank; 0 where either is constant."""
+    ranks = [_ranks(each) for each in (first, second)]
+    if min(float(np.ptp(each)) for each in ranks) == 0:
+        return 0.0
+    return float(np.corrcoef(ranks[0], ranks[1])[0, 1])
+
+
+def _ranks(values: Array) -> Array:
+    _, group, counts = np.unique(values, return_inverse=True, return_counts=True)
+    last = np.cumsum(counts)
+    return np.asarray((last - (counts - 1) / 2)[group])

@@ -1,0 +1,107 @@
+"""Depth at sparse points, of scenes whose depth is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.evaluation.sparse_points import SparseDepthSums, SparsePoints
+from gsplat_core.scene.cameras import Camera
+
+CAMERA = Camera.from_focal(50.0, 60, 40)
+
+
+def some_points() -> SparsePoints:
+    random = np.random.default_rng(0)
+    z = random.uniform(2, 4, 200)
+    pixels = random.uniform([2, 2], [58, 38], (200, 2))
+    points = np.concatenate([(pixels - CAMERA.K[:2, 2]) / 50 * z[:, None], z[:, None]], 1)
+    return SparsePoints(points, np.arange(200), np.arange(200) % 2)
+
+
+def drawn(points: SparsePoints, number: int) -> np.ndarray:
+    depth = np.zeros((40, 60), np.float32)
+    pixels, z = points.seen_in(number, CAMERA)
+    depth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)] = z
+    return depth
+
+
+def test_another_unit_is_no_error() -> None:
+    points = some_points()
+    sums = SparseDepthSums(points)
+    sums.add(0, 7 * drawn(points, 0), CAMERA)
+    sums.add(1, 7 * drawn(points, 1), CAMERA)
+    found = sums.errors()
+    assert found is not None
+    assert found.median == pytest.approx(0, abs=1e-6)
+    assert found.scale == pytest.approx(1 / 7)
+    assert found.rank_correlation > 0.95
+    assert found.covered == 1
+    assert found.sightings == 200
+
+
+def test_one_factor_serves_all_frames() -> None:
+    points = some_points()
+    sums = SparseDepthSums(points)
+    sums.add(0, drawn(points, 0), CAMERA)
+    sums.add(1, 2 * drawn(points, 1), CAMERA)
+    found = sums.errors()
+    assert found is not None
+    assert found.median > 0.1
+
+
+def test_a_plane_has_no_order() -> None:
+    points = some_points()
+    sums = SparseDepthSums(points)
+    for number in (0, 1):
+        sums.add(number, np.full((40, 60), 9, np.float32), CAMERA)
+    found = sums.errors()
+    assert found is not None
+    assert found.rank_correlation == 0
+    assert found.median == pytest.approx(found.plane_median)
+    assert found.median > 0.1
+
+
+def test_what_has_no_depth_is_not_counted() -> None:
+    points = some_points()
+    sums = SparseDepthSums(points)
+    assert sums.errors() is None
+    sums.add(0, np.zeros((40, 60), np.float32), CAMERA)
+    assert sums.errors() is None
+    sums.add(1, drawn(points, 1), CAMERA)
+    found = sums.errors()
+    assert found is not None
+    assert found.covered == pytest.approx(0.5)
+
+
+def test_points_behind_the_camera_or_outside_of_its_picture_are_left_out() -> None:
+    points = SparsePoints(np.array([[0, 0, -3.0], [9, 0, 3], [0, 0, 3]]), np.arange(3), np.zeros(3, np.int64))
+    pixels, z = points.seen_in(0, CAMERA)
+    assert pixels.tolist() == [[30, 20]]
+    assert z.tolist() == [3]
+
+
+def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "points.npz"
+    whole = {"points": np.zeros((3, 3)), "obs_point": np.zeros(4, int), "obs_frame": np.zeros(4, int)}
+    np.savez(path, **whole)
+    assert len(SparsePoints.read(path).seen_frame) == 4
+    for change, said in (
+        ({"points": np.zeros((3, 2))}, "P, 3"),
+        ({"obs_point": np.full(4, 3)}, "from 3 to 3"),
+        ({"obs_frame": np.zeros(5, int)}, "obs_frame"),
+    ):
+        np.savez(path, **{**whole, **change})
+        with pytest.raises(InvalidInput, match=said):
+            SparsePoints.read(path)
+    np.savez(path, points=np.zeros((3, 3)))
+    with pytest.raises(InvalidInput, match="obs_frame, obs_point"):
+        SparsePoints.read(path)
+
+
+def test_a_depth_of_another_size_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="60x40"):
+        SparseDepthSums(some_points()).add(0, np.zeros((60, 40), np.float32), CAMERA)

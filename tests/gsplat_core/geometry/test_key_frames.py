@@ -1,0 +1,104 @@
+"""Depth of a stream, found against key frames."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.geometry.depth_map import BELIEVED, DepthMap
+from gsplat_core.geometry.key_frames import MOST_KEY_FRAMES, ParallaxDepth
+from gsplat_core.geometry.registry import DEPTHS
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, camera_at, video
+
+FRAME_NS = 33_333_333
+
+
+def stream(count: int, step: tuple[float, float, float] = SIDEWAYS) -> list[Frame]:
+    frames, cameras = video(count, step)
+    return [
+        frame.with_fields(seq=number, pts_ns=number * FRAME_NS, pose=camera.world_to_camera)
+        for number, (frame, camera) in enumerate(zip(frames, cameras, strict=True))
+    ]
+
+
+def answers(estimator: ParallaxDepth, frames: list[Frame]) -> list[DepthMap | None]:
+    return [estimator.estimate(frame, FIRST if frame.pose is None else FIRST.with_pose(frame.pose)) for frame in frames]
+
+
+def median_depth(found: DepthMap | None) -> float:
+    assert found is not None
+    assert found.doubt is None
+    return float(np.median(found.depth[found.confidence >= BELIEVED]))
+
+
+def test_it_is_found_by_name() -> None:
+    assert isinstance(DEPTHS["parallax"](), ParallaxDepth)
+
+
+def test_depth_comes_as_soon_as_there_is_parallax_and_then_from_time_to_time() -> None:
+    found = answers(ParallaxDepth(), stream(14))
+    known = [number for number, each in enumerate(found) if each is not None and each.doubt is None]
+    assert found[0] is None
+    assert known[0] <= 3
+    assert all(later - earlier >= 6 for earlier, later in pairwise(known))
+    assert len(known) >= 2
+    assert all(1.5 < median_depth(found[number]) < 2.1 for number in known)
+
+
+def test_memory_does_not_grow() -> None:
+    estimator = ParallaxDepth()
+    answers(estimator, stream(30, (0.006, 0.0, 0.0)))
+    assert len(estimator._kept) == MOST_KEY_FRAMES
+    places = sorted(float(view.camera.position[0]) for _, view in estimator._kept)
+    assert places[-1] - places[0] > 0.1
+
+
+def test_what_is_old_leaves() -> None:
+    estimator = ParallaxDepth()
+    frames = stream(4)
+    answers(estimator, frames)
+    late = frames[3].with_fields(seq=9, pts_ns=10_000_000_000, pose=camera_at((0.2, 0.0, 0.0)).world_to_camera)
+    assert answers(estimator, [late]) == [None]
+    assert len(estimator._kept) == 1
+
+
+def test_a_new_scene_begins_anew() -> None:
+    estimator = ParallaxDepth()
+    frames = stream(6)
+    answers(estimator, frames[:5])
+    assert answers(estimator, [frames[5].with_fields(new_scene="cut")]) == [None]
+    assert len(estimator._kept) == 1
+
+
+def test_frames_without_poses_or_of_other_projections_have_none() -> None:
+    frames = stream(4)
+    assert answers(ParallaxDepth(), [frame.with_fields(pose=None) for frame in frames]) == [None] * 4
+    fisheye = Camera(FIRST.K, WIDTH, HEIGHT, model="fisheye")
+    estimator = ParallaxDepth()
+    assert [estimator.estimate(frame, fisheye) for frame in frames] == [None] * 4
+
+
+def test_a_still_scope_has_none() -> None:
+    still = [frame.with_fields(pose=np.eye(4)) for frame in stream(5, (0.0, 0.0, 0.0))]
+    assert answers(ParallaxDepth(), still) == [None] * 5
+
+
+def test_poses_that_are_wrong_are_doubted() -> None:
+    def across(pose: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        assert pose is not None
+        turned = pose.copy()
+        turned[:3, 3] = pose[[1, 0, 2], 3]
+        return turned
+
+    found = answers(ParallaxDepth(), [frame.with_fields(pose=across(frame.pose)) for frame in stream(8)])
+    assert any(each is not None for each in found)
+    assert all(each is None or each.doubt is not None for each in found)
+
+
+def test_the_same_stream_gives_the_same_bytes() -> None:
+    first, again = (answers(ParallaxDepth(), stream(8)) for _ in range(2))
+    assert [each and each.depth.tobytes() for each in first] == [each and each.depth.tobytes() for each in again]

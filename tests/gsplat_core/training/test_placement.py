@@ -1,0 +1,79 @@
+"""A scene that starts on a plane, and is moved to where depth by parallax says it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.reconstructor import Reconstructor
+from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, depth_of_surface, video
+
+INSIDE = np.s_[12:-12, 12:-12]
+
+
+def learner() -> Reconstructor:
+    return Reconstructor(ReconstructorConfig(gaussians=1500, max_gaussians=2000, first_frame_steps=8), FIRST)
+
+
+def stream(count: int) -> list[Frame]:
+    frames, cameras = video(count, SIDEWAYS)
+    return [
+        frame.with_fields(seq=number, pts_ns=number * 33_333_333, pose=camera.world_to_camera)
+        for number, (frame, camera) in enumerate(zip(frames, cameras, strict=True))
+    ]
+
+
+def with_depth(frame: Frame, origin: DepthOrigin, factor: float = 1.0) -> Frame:
+    # The surface as the first camera sees it: near enough for one that moved by a hundredth of its distance.
+    return frame.with_fields(depth=factor * depth_of_surface(), depth_origin=origin)
+
+
+def shown(reconstructor: Reconstructor, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and picture at the frame's time, from where it was taken."""
+    model = reconstructor.snapshot()
+    assert frame.pose is not None
+    output = render(model.at(frame.time_s), FIRST.with_pose(frame.pose), depth=True)
+    return output.depth.numpy(), output.image.numpy()
+
+
+def test_the_scene_goes_to_the_first_depth_at_once_and_looks_the_same() -> None:
+    reconstructor, frames = learner(), stream(3)
+    reconstructor.observe(frames[0])
+    before, picture = shown(reconstructor, frames[0])
+    assert np.median(before[INSIDE]) == pytest.approx(60, rel=0.01)
+    again = frames[0].with_fields(seq=1)
+    reconstructor.observe(with_depth(again, DepthOrigin.PARALLAX), steps=1)
+    depth, same = shown(reconstructor, frames[0])
+    assert np.median(np.abs(depth / depth_of_surface() - 1)[INSIDE]) < 0.02
+    image = frames[0].image / 255
+    assert np.abs(same - image)[INSIDE].mean() < np.abs(picture - image)[INSIDE].mean() + 0.03
+
+
+def test_later_depth_moves_it_half_of_the_way() -> None:
+    reconstructor, frames = learner(), stream(1)
+    reconstructor.observe(frames[0])
+    reconstructor.observe(with_depth(frames[0].with_fields(seq=1), DepthOrigin.PARALLAX), steps=1)
+    reconstructor.observe(with_depth(frames[0].with_fields(seq=2), DepthOrigin.PARALLAX, 1.21), steps=1)
+    depth, _ = shown(reconstructor, frames[0])
+    assert np.median((depth / depth_of_surface())[INSIDE]) == pytest.approx(1.1, rel=0.02)
+
+
+def test_measured_depth_is_left_to_the_loss() -> None:
+    reconstructor, frames = learner(), stream(1)
+    reconstructor.observe(frames[0])
+    reconstructor.observe(with_depth(frames[0].with_fields(seq=1), DepthOrigin.MEASURED), steps=1)
+    depth, _ = shown(reconstructor, frames[0])
+    assert np.median(depth[INSIDE]) > 50
+
+
+def test_depth_that_is_believed_nowhere_places_nothing() -> None:
+    reconstructor, frames = learner(), stream(1)
+    reconstructor.observe(frames[0])
+    blind = with_depth(frames[0].with_fields(seq=1), DepthOrigin.PARALLAX)
+    blind = blind.with_fields(depth_confidence=np.zeros((HEIGHT, WIDTH), np.float32))
+    reconstructor.observe(blind, steps=1)
+    depth, _ = shown(reconstructor, frames[0])
+    assert np.median(depth[INSIDE]) > 50
