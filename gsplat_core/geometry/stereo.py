@@ -30,8 +30,9 @@ SAID_FROM_PX = 1.0
 """Rows that are off by more are remarked on."""
 PLAUSIBLE_MM = (2.0, 1000.0)
 """Median distance of what a scope in the body can be looking at."""
-SAME_FOCAL, SAME_ROW_PX, SAME_AXES = 1e-3, 0.1, 1e-6
-"""How far the cameras of a rectified pair may differ: focal lengths as a share, principal points in a row, turned axes."""
+SAME_FOCAL, SAME_ROW_PX, SAME_AXES = 1e-3, SAID_FROM_PX, 1e-6
+"""How far the cameras of a rectified pair may differ: focal lengths as a share, rows of the principal points (what the pictures say about rows is
+taken out), turned axes."""
 
 
 class StereoDepth:

@@ -76,7 +76,7 @@ class ReconstructorConfig:
     """Take the memory for `max_gaussians` at once, so that nothing is captured again when Gaussians join or leave."""
     ssim_weight: float = 0.0
     """Weight of 1 - SSIM beside L1 or the squared error, 0..1."""
-    depth_weight: float = 0.02
+    depth_weight: float = 0.1
     """Weight of the inverse-depth term, where frames have depth, times the distance at which the scene starts: in any unit of length the same."""
     default_depth_mm: float = 60.0
     """Distance of the plane on which a recording without depth starts."""
