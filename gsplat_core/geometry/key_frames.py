@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsplat_core.geometry.depth_map import DepthMap
-from gsplat_core.geometry.multiview import depth_of_view, view_of
+from gsplat_core.geometry.depth_map import DepthMap, doubted
+from gsplat_core.geometry.multiview import DEFORMS, depth_of_view, view_of
 from gsplat_core.geometry.plane_sweep import View
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
@@ -46,6 +46,8 @@ class ParallaxDepth:
         found = None
         if due and any(_apart(each, view) > 0 for each in others):
             found = depth_of_view(view, others, (frame.height_px, frame.width_px))
+            if found.doubt is None and not np.any(found.believed):
+                found = doubted(found.depth.shape, found.origin, DEFORMS)
             if found.doubt is None:
                 self._found_s = now_s
         if self._is_elsewhere(camera):

@@ -40,6 +40,10 @@ UNIQUE = 0.2
 """How much more, relatively, any other depth has to cost for nothing to speak against this one."""
 SMALLEST_PATCH = 0.0014
 """Share of the picture that a connected patch of depth has at least; less is a chance agreement."""
+MOST_OWN_MOTION = 0.06
+"""Motion of the tissue's own, relative to parallax, with which no depth is believed; from half of it on confidence falls."""
+DEFORMS = "the tissue itself moves too much beside the scope for depth to be told from parallax"
+"""What is to be said of a depth that is believed nowhere."""
 FILLED = 0.2
 """Confidence of a depth that is only continued from its surroundings."""
 
@@ -79,7 +83,10 @@ def chosen_views(reference: View, candidates: Sequence[View]) -> list[View]:
 
 
 def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, int]) -> DepthMap:
-    """Depth for pictures of `size` (height, width), in the unit of the poses; doubted where the poses do not explain the pictures."""
+    """Depth for pictures of `size` (height, width), in the unit of the poses; doubted where the poses do not explain the pictures.
+
+    Where the tissue itself moves too much, none of it is believed; it is still the rough distance at which a scene may start.
+    """
     others = chosen_views(reference, candidates)
     if not others:
         return doubted(size, DepthOrigin.PARALLAX, "the scope stands still")
@@ -96,7 +103,8 @@ def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, 
     confidence = np.minimum((WORST_COST - costs) / (WORST_COST - BEST_COST), unique / UNIQUE)
     # The nearest and the farthest distance stand for all beyond them.
     inside = (nearest[..., 0] > 0) & (nearest[..., 0] < len(inverse_depths) - 1)
-    confidence = np.clip(confidence, 0, 1) * inside * (reference.tissue != 0) * (agreeing >= min(2, len(found.views)))
+    confidence = np.clip(confidence, 0, 1) * float(np.clip(2 - 2 * found.own_motion / MOST_OWN_MOTION, 0, 1))
+    confidence = confidence * inside * (reference.tissue != 0) * (agreeing >= min(2, len(found.views)))
     confidence = _without_speckles(labels, confidence.astype(np.float32))
     return _at_full_size(*_filled(inverse, confidence, found), size)
 

@@ -35,6 +35,8 @@ LEAST_PARALLAX_PX = 1.5
 """Motion by parallax, as a median, in the view that has most of it: with less, depth is the pictures' noise."""
 MOST_LEFT_PX, MOST_LEFT = 1.0, 0.25
 """A view whose points are off by more than both this, as a median, and this share of its parallax contradicts its pose."""
+POSE_ERROR_PX = 0.6
+"""How far corners of still tissue are off by errors of poses and pictures."""
 FEWEST_AGREEING = 0.6
 """Share of the views whose poses have to explain their pictures."""
 ROUNDS = 6
@@ -55,6 +57,9 @@ class Parallax:
     """Which of the other views agree with their poses."""
     parallax_px: float
     """How far the median corner moves by parallax in the view where it does so most."""
+    own_motion: float
+    """How far corners move otherwise, relative to that, in the median view: what moves across the parallax moves along it, too, where it is taken
+    for depth, which is then off by about this share or twice that."""
 
 
 def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | str:
@@ -87,7 +92,9 @@ def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | st
     if moved.max() < LEAST_PARALLAX_PX:
         return "there is too little parallax to find depth from"
     agree = (seen[kept] & (_off_px(c[kept], d[kept], focal, inverse) < 3 * MOST_LEFT_PX)).any(0)
-    return Parallax(inverse[agree], plane, tuple(usable[number] for number in kept), float(moved.max()))
+    own = np.sqrt(np.maximum(off**2 - POSE_ERROR_PX**2, 0)) / np.maximum(moved, LEAST_PARALLAX_PX)
+    views = tuple(usable[number] for number in kept)
+    return Parallax(inverse[agree], plane, views, float(moved.max()), float(np.median(own)))
 
 
 def _corners(view: View) -> NDArray[np.float32]:

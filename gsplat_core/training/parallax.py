@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from gsplat_core.geometry.multiview import depth_of_view, view_of
+from gsplat_core.geometry.multiview import DEFORMS, depth_of_view, view_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.observations import Observation
@@ -44,6 +44,8 @@ def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> 
         if found.doubt is not None:
             doubts[found.doubt] += 1
             continue
+        if not np.any(found.believed):
+            doubts[DEFORMS] += 1
         given[number] = frame.with_fields(
             depth=found.depth, depth_confidence=found.confidence, depth_origin=found.origin
         )

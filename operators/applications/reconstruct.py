@@ -125,5 +125,5 @@ def _fit(
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
         learning.fit((finder.with_depth(frame) for frame in frames if _trains(frame)), steps, after_step)
     for doubt, count in sorted(learning.depth_doubts.items()):
-        notes.append(f"{count} key frames were given no depth by parallax: {doubt}")
+        notes.append(f"{count} key frames were given no depth to learn from by parallax: {doubt}")
     return learning.snapshot(), learning.eyes, done

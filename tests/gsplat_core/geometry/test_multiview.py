@@ -89,6 +89,14 @@ def test_what_moves_by_itself_is_not_believed() -> None:
     assert np.median(errors(found)) < 0.02
 
 
+def test_tissue_that_moves_as_a_whole_beside_the_scope_is_believed_nowhere() -> None:
+    found = found_in(*video(8, (0.0, 0.02, 0.0), tissue_px=0.3))
+    assert found.doubt is None
+    assert found.confidence.max() < BELIEVED
+    # Still something to start from.
+    assert np.median(found.depth) == pytest.approx(np.median(depth_of_surface()), rel=0.2)
+
+
 def test_tissue_without_texture_is_not_believed() -> None:
     frames, cameras = video(8, SIDEWAYS)
     random = np.random.default_rng(2)
