@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,11 +43,16 @@ class DepthOp(Operator):
     Params:
         choice: `auto`, or a name in `DEPTHS`. Raises InvalidSetting for another one.
         camera: that of the frames.
+        has_time: whether `auto` may ask what takes longer than a frame of a camera.
+        held_out: frames of which nothing may be learned, not even about the depth of others.
     """
 
-    def __init__(self, fragment: Any, *args: Any, choice: str, camera: Camera, **kwargs: Any) -> None:
+    def __init__(
+        self, fragment: Any, *args: Any, choice: str, camera: Camera, has_time: bool = False,
+        held_out: Callable[[Frame], bool] = lambda frame: False, **kwargs: Any,
+    ) -> None:  # fmt: skip
         check_depth(choice)
-        self.choice, self.camera = choice, camera
+        self.choice, self.camera, self.has_time, self.held_out = choice, camera, has_time, held_out
         self._finder: DepthFinder | None = None
         self._forget()
         super().__init__(fragment, *args, **kwargs)
@@ -62,12 +67,12 @@ class DepthOp(Operator):
 
     def start(self) -> None:
         self._forget()
-        self._finder = DepthFinder(self.choice, self.camera)
+        self._finder = DepthFinder(self.choice, self.camera, has_time=self.has_time)
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         assert self._finder is not None
         frame = op_input.receive("frame")
-        given = self._finder.with_depth(frame)
+        given = self._finder.with_depth(frame, shown_only=self.held_out(frame))
         if given.depth is not None:
             origin = given.depth_origin or DepthOrigin.MEASURED
             self._frames[origin.value] += 1

@@ -68,8 +68,14 @@ def _has_calibrated_eyes(frame: Frame) -> bool:
     return frame.right_camera is not None
 
 
+def _has_pose(frame: Frame) -> bool:
+    return frame.pose is not None
+
+
 AUTO: dict[str, Callable[[Frame], bool]] = {"recorded": _always, "stereo": _has_calibrated_eyes}
-"""What `auto` asks, in this order and for such frames, until one of them answers."""
+"""What `auto` asks, in this order and for such frames, until one of them answers ..."""
+AUTO_WITH_TIME: dict[str, Callable[[Frame], bool]] = {**AUTO, "parallax": _has_pose}
+"""... and where no camera has to be kept up with."""
 
 
 def check_depth(choice: str) -> None:
@@ -100,22 +106,26 @@ class Sentences:
 class DepthFinder:
     """Gives the frames of one stream the depth that a setting asks for."""
 
-    def __init__(self, choice: str, camera: Camera) -> None:
-        """choice: `auto` or a name in `DEPTHS`. camera: that of the frames. Raises as `check_depth`."""
+    def __init__(self, choice: str, camera: Camera, *, has_time: bool = False) -> None:
+        """choice: `auto` or a name in `DEPTHS`. camera: that of the frames. has_time: what takes long may be asked by `auto`, too.
+
+        Raises as `check_depth`.
+        """
         check_depth(choice)
         self._camera = camera
-        asked = AUTO if choice == "auto" else {choice: _always}
+        auto = AUTO_WITH_TIME if has_time else AUTO
+        asked = auto if choice == "auto" else {choice: _always}
         self._asked = [(DEPTHS[name](), suits) for name, suits in asked.items()]
         self.doubts, self.remarks = Sentences(), Sentences()
         """What spoke against a frame's depth as a whole, and what else was said about it."""
 
-    def find(self, frame: Frame) -> DepthMap | None:
-        """The first answer that is not doubted; None where there is none."""
+    def find(self, frame: Frame, *, shown_only: bool = False) -> DepthMap | None:
+        """The first answer that is not doubted; None where there is none. shown_only: nothing is learned from the frame, nor about later ones."""
         camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)
         if (camera.width_px, camera.height_px) != (frame.width_px, frame.height_px):  # a stream may change its size
             camera = camera.resized(frame.width_px, frame.height_px)
         # What is not learned from needs no depth; what it came with costs nothing.
-        shown_only = frame.status is FrameStatus.DAMAGED or frame.withheld is not None
+        shown_only = shown_only or frame.status is FrameStatus.DAMAGED or frame.withheld is not None
         for estimator, suits in self._asked:
             if not suits(frame) or (shown_only and not isinstance(estimator, RecordedDepth)):
                 continue
@@ -128,9 +138,9 @@ class DepthFinder:
                 return found
         return None
 
-    def with_depth(self, frame: Frame) -> Frame:
+    def with_depth(self, frame: Frame, *, shown_only: bool = False) -> Frame:
         """The frame with what was found, and without the depth that it came with where that is not it."""
-        found = self.find(frame)
+        found = self.find(frame, shown_only=shown_only)
         if found is None:
             return frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
         if found.depth is frame.depth:

@@ -162,9 +162,12 @@ class ReplayApplication(Application):
         reserve = StorageReserve(out, self.room_to_finish)
         source = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
         tool_mask = RecordedToolMaskOp(self, name="tool_mask")
-        # A session that is followed has its depth already, as training was given it.
+        # A session that is followed has its depth already, as training was given it. What shows a finished model learns nothing from depth.
         choice = "recorded" if self._followed is not None else settings.depth
-        depth = DepthOp(self, name="depth", choice=choice, camera=self.frame_source.description.camera)
+        depth = DepthOp(
+            self, name="depth", choice=choice, camera=self.frame_source.description.camera,
+            has_time=self.stage == "replay", held_out=self._held_out,
+        )  # fmt: skip
         self.reconstruct = self._reconstruct_op()
         deform = DeformOp(self, name="deform")
         rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)

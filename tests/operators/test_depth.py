@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry import registry
 from gsplat_core.geometry.depth_map import DepthMap, doubted
 from gsplat_core.geometry.registry import DEPTHS
 from gsplat_core.scene.cameras import Camera
@@ -136,3 +137,17 @@ def test_it_is_said_what_a_model_without_depth_means():
 def test_a_scene_that_depth_by_light_starts_is_not_said_to_start_on_a_plane_for_certain():
     said = without_depth("light", frozenset(), ReconstructorConfig())
     assert "unless light and shade show how far away it is" in said
+
+
+@pytest.mark.parametrize(("has_time", "asked"), [(True, [0, 2, 3]), (False, [])])
+def test_auto_asks_what_takes_long_where_there_is_time_and_never_about_held_out_frames(
+    frame, compute, monkeypatch, has_time, asked
+):
+    slow = Fixed(None)
+    monkeypatch.setattr(registry, "DEPTHS", {**{name: DEPTHS[name] for name in DEPTHS}, "parallax": lambda: slow})
+    operator = DepthOp(None, choice="auto", camera=CAMERA, has_time=has_time, held_out=lambda given: given.seq == 1)
+    operator.start()
+    for seq in range(4):
+        compute(operator, frame=frame(seq, pose=np.eye(4)))
+    compute(operator, frame=frame(4))
+    assert [given.seq for given, _ in slow.asked] == asked
