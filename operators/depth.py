@@ -102,7 +102,7 @@ class DepthOp(Operator):
 
 
 def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConfig) -> str | None:
-    """What is to be said where frames with these fields come without depth; None where they have it.
+    """What is to be said where frames with these fields come without depth, and there is time to find it; None where they have it.
 
     choice: the setting `depth`.
     """
@@ -113,7 +113,7 @@ def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConf
         ways.append("the two eyes")
     if choice == "light":
         ways.append("light and shade")
-    if config.depth_from_motion and "pose" in fields:
+    if "pose" in fields and (config.depth_from_motion or choice in ("auto", "parallax")):
         ways.append("the given poses")
     found = f"unless {' or '.join(ways)} show how far away it is, " if ways else ""
     return (

@@ -132,6 +132,8 @@ def test_it_is_said_what_a_model_without_depth_means():
     assert without_depth("auto", frozenset({"depth"}), config) is None
     assert "the scene starts on a plane" in without_depth("none", frozenset({"depth"}), config)
     assert "unless the two eyes show" in without_depth("auto", frozenset({"right_image"}), config)
+    assert "unless the given poses show" in without_depth("auto", frozenset({"pose"}), config)
+    assert "unless" not in without_depth("recorded", frozenset({"pose"}), config)
 
 
 def test_a_scene_that_depth_by_light_starts_is_not_said_to_start_on_a_plane_for_certain():
