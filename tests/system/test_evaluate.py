@@ -164,7 +164,7 @@ def test_the_size_of_the_model_is_taken_unless_another_one_is_asked_for(intraspl
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--protocol", "magic"], "choose among heldout, live, retention, geometry, causal"),
+        (["--protocol", "magic"], "choose among heldout, live, retention, second_eye, geometry, causal"),
         (["--scale", "0"], "scale must be a positive number"),
         (["--steps-per-frame", "0"], "steps_per_frame"),
         (["--max-frames", "0"], "max_frames"),

@@ -11,7 +11,7 @@ from gsplat_core.io.bundle import load_bundle
 from services.reports.schema import RunReport
 
 QUICK = ("--steps-per-frame", "2")
-PATH = "source,tool_mask,reconstruct,deform,rasterize,"
+PATH = "source,tool_mask,depth,reconstruct,deform,rasterize,"
 
 
 def test_everything_is_written_and_fits_together(finished, tiny):
@@ -29,7 +29,19 @@ def test_everything_is_written_and_fits_together(finished, tiny):
     assert report.run.stop_reason == "end of recording" and not report.run.interrupted
     assert set(report.latency_ms) == {PATH + leaf for leaf in ("video", "metrics,keyframes", "metrics,progress")}
     assert {name: times.calls for name, times in report.operators.items()} == dict.fromkeys(
-        ("source", "tool_mask", "reconstruct", "deform", "rasterize", "video", "metrics", "keyframes", "progress"), 6
+        (
+            "source",
+            "tool_mask",
+            "depth",
+            "reconstruct",
+            "deform",
+            "rasterize",
+            "video",
+            "metrics",
+            "keyframes",
+            "progress",
+        ),
+        6,
     )
     assert report.model is not None
     model = load_bundle(finished / "model")

@@ -62,10 +62,10 @@ def test_bare_video_gets_a_stated_default_camera(video_folder: Path) -> None:
 
 
 def test_a_single_video_of_any_name_is_found(video_folder: Path, refused: Refused, make: SimpleNamespace) -> None:
-    (video_folder / "video.mp4").rename(video_folder / "left eye.mp4")
+    (video_folder / "video.mp4").rename(video_folder / "scope.mp4")
     assert open_recording(video_folder).frame_count == 8
-    make.video(video_folder / "right eye.mp4", 8)
-    refused(video_folder, RecordingInvalid, "2 videos", "left eye.mp4", "video.mp4")
+    make.video(video_folder / "room.mp4", 8)
+    refused(video_folder, RecordingInvalid, "2 videos", "scope.mp4", "video.mp4")
 
 
 @pytest.mark.parametrize(("codec", "suffix"), [("MJPG", ".avi"), ("VP80", ".webm")])
