@@ -152,7 +152,7 @@ class ReplayApplication(Application):
         self.stage = stage
         self._progress = progress
         self._stop_requested = stop_requested
-        self._make_reconstructor = make_reconstructor or self._new_reconstructor
+        self._make_reconstructor = make_reconstructor or (lambda: new_reconstructor(settings, source))
         self._reserve_bytes = reserve_bytes
         self._followed = followed
 
@@ -161,20 +161,13 @@ class ReplayApplication(Application):
         settings, out = self.settings, self.settings.out
         reserve = StorageReserve(out, self.room_to_finish)
         source = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
-        tool_mask = RecordedToolMaskOp(self, name="tool_mask")
-        # A session that is followed has its depth already, as training was given it. What shows a finished model learns nothing from depth.
-        choice = "recorded" if self._followed is not None else settings.depth
-        depth = DepthOp(
-            self, name="depth", choice=choice, camera=self.frame_source.description.camera,
-            has_time=self.stage == "replay", held_out=self._held_out,
-        )  # fmt: skip
+        tool_mask, depth = RecordedToolMaskOp(self, name="tool_mask"), self._depth_op()
         self.reconstruct = self._reconstruct_op()
         deform = DeformOp(self, name="deform")
         rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
         self.metrics = MetricsOp(self, name="metrics", log=FrameLog(out / FRAMES_FILE, reserve))
-        self.add_flow(source, tool_mask, {("frame", "frame")})
-        self.add_flow(tool_mask, depth, {("frame", "frame")})
-        self.add_flow(depth, self.reconstruct, {("frame", "frame")})
+        for before, after in ((source, tool_mask), (tool_mask, depth), (depth, self.reconstruct)):
+            self.add_flow(before, after, {("frame", "frame")})
         self.add_flow(self.reconstruct, deform, {("reconstruction", "reconstruction")})
         self.add_flow(deform, rasterize, {("scene", "scene")})
         options = SinkOptions(out, self.frame_source.description, reserve)
@@ -194,6 +187,12 @@ class ReplayApplication(Application):
         progress = CallbackSinkOp(self, name="progress", callback=self._report)
         self.add_flow(self.metrics, progress, {("scored", "message")})
 
+    def _depth_op(self) -> DepthOp:
+        # A session that is followed has its depth already, as training was given it. What shows a finished model learns nothing from depth.
+        choice = "recorded" if self._followed is not None else self.settings.depth
+        camera, has_time = self.frame_source.description.camera, self.stage == "replay"
+        return DepthOp(self, name="depth", choice=choice, camera=camera, has_time=has_time, held_out=self._held_out)
+
     def _reconstruct_op(self) -> ReconstructOp:
         if self._followed is not None:
             return self._followed.reconstruct_op(self, "reconstruct")
@@ -205,9 +204,6 @@ class ReplayApplication(Application):
         """Bytes on the disk that finishing needs: the newest model, in float32, and the report."""
         model = self.reconstruct.newest
         return self._reserve_bytes + (0 if model is None else 4 * model.parameter_count)
-
-    def _new_reconstructor(self) -> Reconstructor:
-        return new_reconstructor(self.settings, self.frame_source)
 
     def _held_out(self, frame: Frame) -> bool:
         return self.settings.heldout and is_heldout(frame.seq)
