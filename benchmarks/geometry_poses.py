@@ -17,24 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.geometry.odometry import trajectory_of
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-
-
-def ate_share(poses: np.ndarray, given: np.ndarray) -> tuple[float, float]:
-    """Root mean square error of the camera's centres after the best similarity (Umeyama 1991), as a share of the given way; and that way's length."""
-    ours, theirs = (np.linalg.inv(each)[:, :3, 3] for each in (poses, given))
-    way = float(np.linalg.norm(np.diff(theirs, axis=0), axis=1).sum())
-    ours, theirs = ours - ours.mean(0), theirs - theirs.mean(0)
-    left, values, right = np.linalg.svd(theirs.T @ ours)
-    signs = np.array([1, 1, np.sign(np.linalg.det(left @ right))])
-    scale = float((values * signs).sum() / np.square(ours).sum())
-    error = scale * ours @ (left * signs @ right).T - theirs
-    return float(np.sqrt(np.square(error).sum(1).mean())) / way, way
 
 
 def measured(name: str, frames: Sequence[Frame], camera: Camera) -> dict[str, Any]:
@@ -52,8 +41,9 @@ def measured(name: str, frames: Sequence[Frame], camera: Camera) -> dict[str, An
     }
     given = [frame.pose for frame in frames if frame.pose is not None]
     if len(given) == len(frames) and np.ptp(np.stack(given), axis=0).max() > 1e-9:
-        share, way = ate_share(found.poses, np.stack(given))
-        figures |= {"ate_percent": round(100 * share, 3), "way": round(way, 4)}
+        errors = evaluate_trajectory(found.poses, np.stack(given))
+        if errors is not None:
+            figures |= {"ate_percent": round(100 * errors.similarity_share, 3), "way": round(errors.path, 4)}
     return figures
 
 

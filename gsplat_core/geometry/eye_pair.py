@@ -7,15 +7,13 @@ in both directions at full size. In a rectified pair a point is in the same row 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.geometry.disparity import Span, match
-
-Points = NDArray[np.float32]
+from gsplat_core.geometry.point_flow import Points, followed
 
 COARSE_WIDTH_PX = 200
 """Width at which the whole range is looked through."""
@@ -105,11 +103,9 @@ def _points_in_both(
     start = np.ascontiguousarray(corners[:, 0], np.float32)
     guess = start.copy()
     guess[:, 0] -= _coarse_disparity(left, right, start)
-    window: dict[str, Any] = {"winSize": (21, 21), "maxLevel": 2, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-    found, ok, _ = cv2.calcOpticalFlowPyrLK(left, right, start, guess, **window)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(right, left, found, start.copy(), **window)
-    kept = (ok[:, 0] > 0) & (again[:, 0] > 0) & (np.linalg.norm(back - start, axis=1) < BACK_PX)
-    return start[kept], np.asarray(found[kept], np.float32), len(start)
+    found, misses_px = followed(left, right, start, guess, window_px=21, levels=2)
+    kept = misses_px < BACK_PX
+    return start[kept], found[kept], len(start)
 
 
 def _levelled(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:

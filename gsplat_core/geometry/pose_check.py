@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.geometry.plane_sweep import View
+from gsplat_core.geometry.point_flow import followed
 from gsplat_core.scene.cameras import Camera
 
 POINTS = 400
@@ -108,21 +108,14 @@ def _corners(view: View) -> NDArray[np.float32]:
 def _followed(
     reference: View, view: View, corners: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Where each corner is in the other picture [n, 2], and whether it was found there (Lucas and Kanade, in a pyramid, there and back)."""
-    if not len(corners):
-        return corners, np.zeros(0, bool)
+    """Where each corner is in the other picture [n, 2], and whether it was found there, on tissue."""
     first, second = (each.grey.astype(np.uint8) for each in (reference, view))
-    options: Any = {"winSize": (15, 15), "maxLevel": 4}
-    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, corners.copy(), **options)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, there, corners.copy(), **options)
+    there, misses_px = followed(first, second, corners, window_px=15, levels=4)
     height, width = view.tissue.shape
     column, row = (
         np.clip(np.nan_to_num(there[:, axis]), 0, size - 1).astype(int) for axis, size in ((0, width), (1, height))
     )
-    arrives = np.linalg.norm(back - corners, axis=1) < RETURNS_PX
-    return np.asarray(there, np.float32), (found[:, 0] > 0) & (returned[:, 0] > 0) & arrives & (
-        view.tissue[row, column] > 0
-    )
+    return there, (misses_px < RETURNS_PX) & (view.tissue[row, column] > 0)
 
 
 def _terms(

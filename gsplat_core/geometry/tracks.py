@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.geometry.point_flow import followed
+
 MOST_POINTS = 700
 """Followed at once."""
 APART = 0.025
@@ -97,14 +99,9 @@ class FeatureTracks:
             np.clip(np.rint(self._points[:, axis]).astype(int), 0, size - 1) for axis, size in ((0, width), (1, height))
         )
         guess = self._points + flow[row, column]
-        options: dict[str, Any] = dict(
-            winSize=(PATCH_PX, PATCH_PX), maxLevel=LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
-        )  # fmt: skip
-        moved, found, _ = cv2.calcOpticalFlowPyrLK(before, grey, self._points, guess.copy(), **options)
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(grey, before, moved, self._points.copy(), **options)
-        trusted = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (np.linalg.norm(back - self._points, axis=1) < RETURN_PX)
-        column, row = (np.rint(moved[:, axis]).astype(int) for axis in (0, 1))
+        moved, misses_px = followed(before, grey, self._points, guess, window_px=PATCH_PX, levels=LEVELS)
+        trusted = misses_px < RETURN_PX
+        column, row = (np.rint(np.nan_to_num(moved[:, axis])).astype(int) for axis in (0, 1))
         trusted &= (column >= 0) & (row >= 0) & (column < width) & (row < height)
         trusted[trusted] = usable[row[trusted], column[trusted]] > 0
         return moved[trusted], self._numbers[trusted]

@@ -20,6 +20,7 @@ from gsplat_core.training.metrics import FrameQuality
 from operators.messages import RenderedFrame
 from operators.metrics import ScoredFrame
 from services.reports.schema import RunReport
+from tests.missing import missing
 from tests.services.registry.servers import new_database
 
 SERVER_STARTS_S = 30.0
@@ -100,16 +101,13 @@ def postgresql() -> Iterator[str]:
     """A PostgreSQL server without a port of its own: the folder of its socket."""
     programs = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
     if not programs:
-        message = "PostgreSQL is not installed (apt-get install postgresql)"
-        if os.environ.get("CI"):
-            pytest.fail(message)
-        pytest.skip(message)
+        missing("PostgreSQL is not installed (apt-get install postgresql)")
     user = None
     if os.geteuid() == 0:  # the server refuses to run as root
         try:
             user = pwd.getpwnam("postgres").pw_name
         except KeyError:
-            pytest.skip("there is no user postgres to run PostgreSQL as")
+            missing("there is no user postgres to run PostgreSQL as")
     folder = Path(tempfile.mkdtemp(prefix="pg-"))
     try:
         if user is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -16,6 +15,8 @@ from urllib.request import urlopen
 
 import pytest
 from websockets.sync.client import ClientConnection, connect
+
+from tests.missing import missing
 
 START_S = 60
 PROGRAMS = {"chromium": ("chromium", "chromium-browser", "google-chrome"), "firefox": ("firefox-esr", "firefox")}
@@ -30,10 +31,7 @@ def required(browser: str) -> str:
     """Where a browser's program is. Where it is not installed the test is skipped; in CI it fails."""
     path = find(browser)
     if path is None:
-        message = f"{browser} is not installed (Debian: apt-get install chromium firefox-esr)"
-        if os.environ.get("CI"):
-            pytest.fail(message)
-        pytest.skip(message)
+        missing(f"{browser} is not installed (Debian: apt-get install chromium firefox-esr)")
     return path
 
 

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from tests.missing import missing
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def dry_run(*arguments: str, **environment: str) -> str:
     if shutil.which("make") is None:
-        pytest.skip("there is no make")
+        missing("there is no make")
     clean = {name: value for name, value in os.environ.items() if name not in ("CUDACXX", "MAKEFLAGS", "MAKELEVEL")}
     done = subprocess.run(
         ["make", "--dry-run", "--always-make", *arguments],

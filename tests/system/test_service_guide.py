@@ -15,6 +15,7 @@ import pytest
 
 from gsplat_core.io.bundle import save_bundle
 from services.registry.bundle_file import pack
+from tests.missing import missing
 from tests.services.supervisor.test_model_show import uniform
 from tests.system.servers import ROOT, serving
 
@@ -22,11 +23,9 @@ from tests.system.servers import ROOT, serving
 @pytest.fixture(autouse=True)
 def programs() -> None:
     """What the guide's commands call: where it is missing the test is skipped, but in CI it fails."""
-    missing = [name for name in ("bash", "curl", "openssl") if shutil.which(name) is None]
-    if missing and os.environ.get("CI"):
-        pytest.fail(f"the guide's commands need {', '.join(missing)}; install it")
-    if missing:
-        pytest.skip(f"there is no {', '.join(missing)}")
+    absent = [name for name in ("bash", "curl", "openssl") if shutil.which(name) is None]
+    if absent:
+        missing(f"the guide's commands need {', '.join(absent)}; install it")
 
 
 def test_the_life_cycle_with_curl(tiny, tmp_path):

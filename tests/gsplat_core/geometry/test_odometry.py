@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.geometry.odometry import DISTANCE, Trajectory, trajectory_of
 from gsplat_core.geometry.tracks import FeatureTracks
 from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
@@ -34,13 +35,10 @@ def found(rigid: RenderedRecording) -> Trajectory:
 
 
 def off_share(found: Trajectory, frames: list[Frame]) -> float:
-    """Root mean square of the distance between both ways, after rotation and scale, as a share of the true way's length."""
-    ours, theirs = (np.linalg.inv(np.stack(list(poses)))[:, :3, 3] for poses in (found.poses, [f.pose for f in frames]))
-    path = np.linalg.norm(np.diff(theirs, axis=0), axis=1).sum()
-    ours, theirs = ours - ours.mean(0), theirs - theirs.mean(0)
-    left, values, right = np.linalg.svd(theirs.T @ ours)
-    turned = ours @ (left @ right).T * (values.sum() / np.square(ours).sum())
-    return float(np.sqrt(np.square(turned - theirs).sum(1).mean()) / path)
+    """The way's error after rotation and scale, as a share of the true way's length."""
+    errors = evaluate_trajectory(found.poses, np.stack([frame.pose for frame in frames]))
+    assert errors is not None
+    return errors.similarity_share
 
 
 def test_the_way_of_a_moving_scope_is_found(rigid, found):
