@@ -16,7 +16,7 @@ can be used.
     no-poses    one moving eye, whose poses are estimated first, as `intrasplat poses` does it
     depth       one eye at rest, with depth
 
-Usage: python benchmarks/geometry_synthetic.py [CASE...] [--scene open|colon] [--steps 400] [--frames 36] [--width 160] [--height 128]
+Usage: python benchmarks/geometry_synthetic.py [CASE...] [--scene open|colon] [--steps 400 | --replay 10] [--frames 36] [--width 160] [--height 128]
        [--device cuda] [--work FOLDER] [--depth-noise MM] [--smoke S] [--exposure-changes] [--json]
 On two CPU cores a case takes one to three minutes with these defaults. On a GPU: --device cuda --width 640 --height 512 --steps 3000.
 """
@@ -29,7 +29,7 @@ import shutil
 import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +43,7 @@ from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.io.recordings.truth import open_truth
 from operators.applications.geometry import SeenFromAnywhere, measure_geometry
 from operators.applications.reconstruct import reconstruct
-from operators.applications.replay import ReplaySettings
+from operators.applications.replay import ReplaySettings, replay
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,9 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("cases", nargs="*", metavar="CASE", choices=[[], *CASES])
     parser.add_argument("--scene", default="open", choices=["open", "colon"])
     parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument(
+        "--replay", type=int, metavar="N", help="frame by frame, with N steps each, in place of --steps over all frames"
+    )
     parser.add_argument("--frames", type=int, default=36)
     parser.add_argument("--fps", type=float, default=15.0)
     parser.add_argument("--width", type=int, default=160)
@@ -112,7 +115,10 @@ def measured(name: str, case: Case, arguments: argparse.Namespace, work: Path) -
         blind = open_recording(given)
         write_poses(given / POSES_FILE, trajectory_of(blind, blind.camera).poses)
     settings = ReplaySettings(given, work / f"{name}-run", device=arguments.device, sinks=(), seed=arguments.seed)
-    reconstruct(settings, arguments.steps)
+    if arguments.replay:
+        replay(replace(settings, steps_per_frame=arguments.replay))
+    else:
+        reconstruct(settings, arguments.steps)
     seconds = time.perf_counter() - begun
     model = load_bundle(work / f"{name}-run" / "model").to(arguments.device)
     recording = open_recording(whole)

@@ -23,7 +23,7 @@ from gsplat_core.deformation.continuation import Continuation
 from gsplat_core.deformation.displacement import displaced
 from gsplat_core.deformation.field import ops_for
 from gsplat_core.deformation.field_slots import BasisSlot
-from gsplat_core.deformation.smoothing import towards_neighbours_
+from gsplat_core.deformation.smoothing import least_squares_weights, towards_neighbours_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
@@ -166,6 +166,15 @@ class BasisField(BumpTensors):
         """See `DeformationField.move_to`: each bump's weight changes in proportion to its height then, the smallest change that does it."""
         centers, log_widths, weights = (p.data for p in self._parameters_of(self.count))
         self._ops.basis_field_move_to_(centers, log_widths, weights, self.tau(time_s), deltas)
+        return True
+
+    def follow(self, rows: slice, times_s: Sequence[float], offsets: Tensor) -> bool:
+        """See `DeformationField.follow`: least squares over the weights of bumps as they are laid out. False for a ring."""
+        if self._columns.is_ring:
+            return False
+        solution = least_squares_weights([self.tau(time_s) for time_s in times_s], self.bumps)
+        weights = torch.einsum("bt,ntc->nbc", solution.to(offsets), offsets)
+        self.weights.data[rows, : self.bumps, POSITION] = weights
         return True
 
     def add_colours(self, time_s: float, change: Tensor) -> None:

@@ -165,6 +165,11 @@ class DeformationField(torch.nn.Module):
         nothing changed, for a field that cannot do that: here."""
         return False
 
+    def follow(self, rows: slice, times_s: Sequence[float], offsets: Tensor) -> bool:
+        """Let what the field adds to the positions of the Gaussians in `rows` be `offsets` [n, T, 3] at the times [T], as nearly as it can, and smooth
+        between them. False, with nothing changed, for a field that cannot do that: here."""
+        return False
+
     def add_colours(self, time_s: float, change: Tensor) -> None:
         """Change what the field adds to the colours of degree 0 at `time_s` by `change` [N, 3], and at other times as little as it can. Raises
         InvalidInput for a kind that cannot: here."""

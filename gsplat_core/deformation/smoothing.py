@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from torch import Tensor
+
+from gsplat_core.ops.basis_field.plain_torch import basis_field
 
 ROWS_AT_ONCE = 1 << 14
 """Bounds the memory for differences."""
+
+BEND = 0.05
+"""How much a course that bends from bump to bump costs, beside being off by as much at one time: what is measured at each frame is noisy."""
 
 
 def towards_neighbours_(values: Tensor, amount: float) -> None:
@@ -17,3 +25,13 @@ def towards_neighbours_(values: Tensor, amount: float) -> None:
         return
     for rows in values.split(ROWS_AT_ONCE):
         rows[:, 1:-1].add_(rows.diff(n=2, dim=1), alpha=amount / 2)
+
+
+def least_squares_weights(taus: Sequence[float], bumps: int) -> Tensor:
+    """The matrix [B, T], float64, that makes weights of bumps in a row, of width 1 at 0, 1, ..., of values at `taus`: the nearest course that does not bend
+    too much."""
+    row = torch.arange(bumps, dtype=torch.float64)[None], torch.zeros(1, bumps, dtype=torch.float64)
+    each = torch.eye(bumps, dtype=torch.float64)[None]
+    heights = torch.stack([basis_field(*row, each, tau)[0] for tau in taus]) if taus else each.new_zeros(0, bumps)
+    bends = torch.eye(bumps, dtype=torch.float64).diff(n=2, dim=0)
+    return torch.linalg.solve(heights.T @ heights + BEND * bends.T @ bends + 1e-6 * torch.eye(bumps), heights.T)

@@ -51,6 +51,15 @@ class Budget:
         return Budget(steps)
 
     @staticmethod
+    def given(budget: Budget | None, steps: int | None) -> Budget | None:
+        """A budget, or a number of steps in place of one; None where neither is given. Raises InvalidInput where both are."""
+        if steps is None:
+            return budget
+        if budget is not None:
+            raise InvalidInput("budget and steps are both given; steps is short for Budget.of_steps(steps)")
+        return Budget.of_steps(steps)
+
+    @staticmethod
     def until(
         deadline_s: float,
         *,

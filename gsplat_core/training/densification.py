@@ -17,6 +17,7 @@ from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.surface_motion import Seen
 
 UNSEEN_PX = 0.5
 """A Gaussian whose blending weights add up to less than this in every picture is not seen."""
@@ -55,6 +56,20 @@ def shares_of(step: TrainingStep, observations: Sequence[Observation]) -> Shares
         seen = torch.maximum(seen, of_constant[:, 0])
         error += of_constant[:, 1]
     return Shares(seen, error)
+
+
+@torch.no_grad()
+def on_tissue(step: TrainingStep, observations: Sequence[Observation]) -> Tensor:
+    """Which Gaussians have their centre on tissue in at least one of these pictures, bool [N]; all where a camera is no pinhole."""
+    if any(one.camera.model != "pinhole" for one in observations):
+        return torch.ones(step.gaussians.count, dtype=torch.bool, device=step.gaussians.device)
+    found = torch.zeros(step.gaussians.count, dtype=torch.bool, device=step.gaussians.device)
+    for one in observations:
+        seen = Seen(one.camera, step.at(one.time_s).means)
+        height, width = one.mask.shape
+        column, row = seen.pixels.long().clamp(min=0).unbind(1)
+        found |= seen.inside[:, 0] & (one.mask[row.clamp(max=height - 1), column.clamp(max=width - 1)] > 0)
+    return found
 
 
 @torch.no_grad()

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsplat_core.geometry.depth_fill import continued
 from gsplat_core.geometry.depth_map import BELIEVED
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 SIGMA_IN_SPACINGS = 0.7
@@ -22,6 +23,7 @@ THICKNESS = 0.3
 FIRST_OPACITY = 0.9
 TOOL_MARGIN_PX = 2
 """So much around a tool is painted over with it: masks end a little early."""
+HOLE_MARGIN_PX = 2
 
 MAX_ANGLE_RAD = math.radians(85)
 """Widest angle from the axis at which a fisheye pixel is placed; what lies farther out is placed there."""
@@ -157,16 +159,22 @@ def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> N
 
 
 def believed_depth(frame: Frame) -> NDArray[np.float32]:
-    """The frame's depth [H, W] where it is to be believed, 0 elsewhere and where the frame has none."""
+    """The frame's depth [H, W] where it is to be believed, 0 elsewhere and where the frame has none.
+
+    What two eyes were matched by is not sharp at edges: beside what could not be matched, or is not believed, it is left out.
+    """
     if frame.depth is None:
         return np.zeros(frame.image.shape[:2], np.float32)
     if frame.depth_confidence is None:
         return frame.depth
-    return np.where(frame.depth_confidence >= BELIEVED, frame.depth, np.float32(0))
+    believed = (frame.depth_confidence >= BELIEVED).astype(np.uint8)
+    if frame.depth_origin is DepthOrigin.STEREO:
+        believed = np.asarray(cv2.erode(believed, np.ones((2 * HOLE_MARGIN_PX + 1,) * 2, np.uint8)), np.uint8)
+    return np.where(believed > 0, frame.depth, np.float32(0))
 
 
 def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
-    """z in millimetres for every pixel [H, W]: measured where known and not a tool, the nearest measured one elsewhere, else the default."""
+    """z in millimetres for every pixel [H, W]: measured where known and not a tool, the surface around it continued elsewhere, else the default."""
     height, width = frame.image.shape[:2]
     if frame.depth is None:
         return np.full((height, width), default_depth_mm, np.float32)
@@ -176,9 +184,4 @@ def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
         known &= frame.mask > 0
     if not known.any():
         return np.full((height, width), default_depth_mm, np.float32)
-    _, label = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    nearest = np.zeros(int(label.max()) + 1, np.float32)
-    nearest[label[known]] = measured[known]
-    return nearest[label]
+    return np.where(known, measured, continued(measured, known))

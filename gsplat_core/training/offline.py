@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.densification import densify, shares_of
+from gsplat_core.training.densification import UNSEEN_PX, densify, on_tissue, shares_of
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steadiness import steadiness
 from gsplat_core.training.step import TrainingStep
@@ -128,6 +128,17 @@ class OfflineTraining:
     def _densify(self, share: float) -> None:
         """A round; `share` of all rounds is over with it, and their number grows from the first to the most along with that."""
         self._step.settle(self._observations[-1], rate_scale=self._rate)
-        chosen = self._random.permutation(len(self._observations))[: self._settings.densify_frames]
-        shares = shares_of(self._step, [self._observations[int(index)] for index in chosen])
+        order = self._random.permutation(len(self._observations)).tolist()
+        chosen, others = (
+            [self._observations[index] for index in part]
+            for part in (order[: self._settings.densify_frames], order[self._settings.densify_frames :])
+        )
+        shares = shares_of(self._step, chosen)
+        # What a tool hides in all of the chosen pictures, or what lies outside of them, others may show.
+        unasked = ~on_tissue(self._step, chosen)
+        if bool(unasked.any()):
+            seen_px = torch.where(
+                unasked & on_tissue(self._step, others), shares.seen_px.clamp(min=UNSEEN_PX), shares.seen_px
+            )
+            shares = replace(shares, seen_px=seen_px)
         densify(self._step, shares, round(self._first_count + (self._most - self._first_count) * share))

@@ -32,6 +32,7 @@ from gsplat_core.training.parallax import to_fit
 from gsplat_core.training.placement import Placement
 from gsplat_core.training.right_eye import BothEyes
 from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.surface_tracks import SurfaceTracks
 from gsplat_core.transfers import HostCopy
 
 USUAL_DECAY = 0.1
@@ -114,10 +115,7 @@ class Reconstructor:
         Raises InvalidInput when the first frame is not to be trained on (there is nothing to show yet), when time runs backwards, or when
         the frame does not fit the camera.
         """
-        if steps is not None:
-            if budget is not None:
-                raise InvalidInput("budget and steps are both given; steps is short for Budget.of_steps(steps)")
-            budget = Budget.of_steps(steps)
+        budget = Budget.given(budget, steps)
         observation = self.eyes.observation(frame, self.camera, trains=train)
         first = self._step is None
         if first:
@@ -210,8 +208,7 @@ class Reconstructor:
     ) -> ObserveReport:
         """Train offline on all of `frames`, as `settings` say; `ReconstructorConfig.offline` is the configuration for it.
 
-        `progress(step, loss)` is called after each step; on a GPU reading the loss, a tensor [] on the device, waits for the step. All
-        frames are held in the device's memory (1 byte per channel).
+        `progress(step, loss)` is called after each step; reading the loss, a tensor [] on the device, waits for it. All frames are in its memory.
         """
         if steps < 1:
             raise InvalidInput(f"steps is {steps}; it must be at least 1")
@@ -220,9 +217,12 @@ class Reconstructor:
         self._start(frames[0], seen[0], end_s=seen[-1].time_s)
         assert self._step is not None
         self._last_time_s = seen[-1].time_s
+        tracks = SurfaceTracks(frames, seen)
         for number, (frame, observation) in enumerate(zip(frames, seen, strict=True)):
             self._depth_source = DepthSource.after(self._depth_source, frame)
+            first_new = self.gaussians if number else 0
             self._grow(frame, observation, number == 0)
+            tracks.carry(self._step, number, first_new)
         most, settings = self.config.max_gaussians, settings or FitSettings()
         loss = OfflineTraining(self._step, seen, settings, most_gaussians=most, seed=self._seed)(steps, progress)
         return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)

@@ -1,11 +1,14 @@
 """Smoothing along time: towards the mean of the neighbours, both ends held, in place, for each kind of field."""
 
+import math
+
 import pytest
 import torch
 
 from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
-from gsplat_core.deformation.smoothing import ROWS_AT_ONCE, towards_neighbours_
+from gsplat_core.deformation.smoothing import ROWS_AT_ONCE, least_squares_weights, towards_neighbours_
 from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.basis_field.plain_torch import basis_field
 
 
 @pytest.mark.parametrize("amount", [0.0, 0.3, 1.0])
@@ -75,3 +78,37 @@ def test_a_hexplane_smooths_its_time_planes_along_time_alone(make_gaussians):
 
 def test_a_field_without_times_is_left_alone():
     DeformationField((0.0, 1.0)).smooth_in_time(0.5)
+
+
+def test_weights_of_a_course_give_it_back():
+    taus = [1 + 0.5 * k for k in range(17)]
+    course = torch.tensor([math.sin(0.7 * tau) for tau in taus], dtype=torch.float64)
+    weights = least_squares_weights(taus, 11) @ course
+    row = torch.arange(11, dtype=torch.float64)[None], torch.zeros(1, 11, dtype=torch.float64)
+    again = torch.stack([basis_field(*row, weights[None, :, None], tau)[0, 0] for tau in taus])
+    torch.testing.assert_close(again, course, atol=0.03, rtol=0)
+
+
+@pytest.mark.parametrize("taus", [[1.0], [1.0, 1.0], [8.0], []])
+def test_few_times_give_finite_weights(taus):
+    weights = least_squares_weights(taus, 10)
+    assert weights.shape == (10, len(taus)) and weights.isfinite().all()
+
+
+def test_a_field_follows_a_course_in_the_rows_that_are_asked_for():
+    field = BasisField(5, (0.0, 1.0), bumps=13)
+    times = [k / 12 for k in range(13)]
+    offsets = torch.randn(2, 1, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor(times)[None, :, None]
+    assert field.follow(slice(1, 3), times, offsets)
+    for k, time_s in enumerate(times):
+        deltas = field.deltas(time_s)
+        torch.testing.assert_close(deltas[1:3, :3], offsets[:, k], atol=0.03, rtol=0)
+        assert not deltas[[0, 3, 4]].any() and not deltas[:, 3:].any()
+
+
+def test_fields_that_cannot_follow_say_so():
+    offsets = torch.zeros(2, 1, 3)
+    ring = BasisField(2, (0.0, 1.0), bumps=8)
+    ring.keep_last(0.5)
+    for field in (ring, DeformationField((0.0, 1.0))):
+        assert not field.follow(slice(0, 2), [0.5], offsets)

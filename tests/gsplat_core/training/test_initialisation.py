@@ -103,12 +103,13 @@ def test_all_tool_or_no_known_depth_lies_on_the_default_plane(make_frame):
         assert (tissue_depth(frame, 60.0) == 60).all()
 
 
-def test_unknown_depth_is_that_of_the_nearest_known_pixel(make_frame):
+def test_where_depth_is_not_known_the_surface_around_it_goes_on(make_frame):
     depth = np.zeros((40, 48), np.float32)
-    depth[:, 0], depth[:, 47] = 50, 70
+    depth[:, :4], depth[:, 44:] = 50, 70
     filled = tissue_depth(make_frame(depth=depth), 60.0)
-    assert (filled[:, :23] == 50).all()
-    assert (filled[:, 25:] == 70).all()
+    assert (filled[:, :4] == 50).all() and (filled[:, 44:] == 70).all(), "as measured where it is known"
+    middle = filled[:, 4:44].mean(axis=0)
+    assert middle.min() > 48 and middle.max() < 74 and 55 < middle[20] < 65
 
 
 @pytest.mark.parametrize("sh_degree", [1, 3])

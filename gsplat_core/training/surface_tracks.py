@@ -1,0 +1,166 @@
+"""Where the surface goes over a recording of which all frames are known and have depth: a way through time for every Gaussian, before the first step.
+
+Pictures of one eye hardly tell how tissue moves along the line of sight, so that the loss alone would leave each Gaussian about as far away as it was
+when it was made. Where its point goes across the picture is followed by optical flow from frame to frame, and how far away it is, is read there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from gsplat_core.geometry.depth_fill import continued
+from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.training.image_motion import SMALLEST_PX, Flow, ImageMotion
+from gsplat_core.training.motion_prior import followed
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.surface_motion import Seen, SurfaceMotion, beside
+from gsplat_core.transfers import HostCopy, tensor_of
+
+TOLD_BY = (None, DepthOrigin.MEASURED, DepthOrigin.STEREO)
+"""Depth whose differences from frame to frame are motion; that of a frame that does not say is measured."""
+EDGE_PX = 2
+"""Beside a tool or a hole depth is not read: a point that is followed is not exact to the pixel."""
+ROWS_AT_ONCE = 1 << 14
+"""Bounds the memory for ways: Gaussians times frames."""
+
+
+class SurfaceTracks:
+    """The motion of the surface that the frames of a recording show; nothing where they do not tell it."""
+
+    def __init__(self, frames: Sequence[Frame], observations: Sequence[Observation]) -> None:
+        """As many of both."""
+        self._seen = observations
+        self._times = observations[0].image.new_tensor([one.time_s for one in observations], dtype=torch.float32)
+        self._tells = _tell_motion(frames, observations)
+        if not self._tells:
+            return
+        device = observations[0].image.device
+        self._ahead = [
+            SurfaceMotion(tensor_of(flow, device), before.camera, after.camera)
+            for flow, (before, after) in zip(_flows(frames), pairwise(observations), strict=True)
+        ]
+        self._back = [
+            SurfaceMotion(tensor_of(flow, device), after.camera, before.camera)
+            for flow, (before, after) in zip(_flows(frames[::-1])[::-1], pairwise(observations), strict=True)
+        ]
+        told = (frame.depth_origin in TOLD_BY for frame in frames)
+        self._depths = [SurfaceDepth.of(one) if tells else None for tells, one in zip(told, observations, strict=True)]
+
+    def carry(self, step: TrainingStep, number: int, first_row: int) -> None:
+        """Let the Gaussians from `first_row` on, which are where frame `number` shows the surface, go its way at all times. Nothing changes
+        where the field cannot follow, or the frames do not tell the motion."""
+        if not self._tells:
+            return
+        times = [one.time_s for one in self._seen]
+        with torch.no_grad():
+            for start in range(first_row, step.gaussians.count, ROWS_AT_ONCE):
+                rows = slice(start, min(start + ROWS_AT_ONCE, step.gaussians.count))
+                points = step.gaussians.means[rows]
+                if not step.field.follow(rows, times, self.ways(points, number) - points[:, None]):
+                    return
+
+    def ways(self, points: Tensor, number: int) -> Tensor:
+        """Where `points` [N, 3] of the surface that frame `number` shows are in every frame [N, T, 3]."""
+        pixels = self._pixels(points, number)
+        nothing = points.new_zeros(len(points))
+        read = [
+            (nothing, nothing) if depth is None else depth.at(here)
+            for depth, here in zip(self._depths, pixels, strict=True)
+        ]
+        around, relief = (torch.stack(each, dim=1) for each in zip(*read, strict=True))
+        # What a tool hides for a while stands out from what is around it as it did before and does afterwards.
+        depth = around * between_known(relief, torch.ones_like(relief), self._times)
+        depth = between_known(depth, depth, self._times)
+        return torch.stack([_world(pixels[k], depth[:, k], one) for k, one in enumerate(self._seen)], dim=1)
+
+    def _pixels(self, points: Tensor, number: int) -> list[Tensor]:
+        """Where each frame shows the points: T times [N, 2]."""
+        here = Seen(self._seen[number].camera, points).pixels
+        after, before = [here], [here]
+        for motion in self._ahead[number:]:
+            after.append(after[-1] + motion.at(after[-1]))
+        for motion in self._back[:number][::-1]:
+            before.append(before[-1] + motion.at(before[-1]))
+        return before[:0:-1] + after
+
+
+@dataclass(frozen=True)
+class SurfaceDepth:
+    """One frame's depth, read at points that are followed."""
+
+    planes: Tensor
+    """[3, H, W]: depth where tissue and depth are known and nothing else is near, 0 elsewhere; whether that is so; the surface continued smoothly
+    everywhere."""
+
+    @staticmethod
+    def of(one: Observation) -> SurfaceDepth | None:
+        """None where nothing is known."""
+        if one.depth is None:
+            return None
+        unknown = ((one.mask == 0) | (one.depth <= 0)).to(one.depth.dtype)
+        near = torch.nn.functional.max_pool2d(unknown[None], 2 * EDGE_PX + 1, stride=1, padding=EDGE_PX)[0]
+        inner = torch.where(near > 0, 0.0, one.depth)
+        on_host = HostCopy(inner).numpy()
+        if not on_host.any():
+            return None
+        smooth = tensor_of(continued(on_host, on_host > 0), inner.device)
+        return SurfaceDepth(torch.stack([inner, (inner > 0).to(inner.dtype), smooth]))
+
+    def at(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """At pixels [N, 2], bilinear: the smooth depth [N], and the share of it that the depth itself is [N], 0 where that is not known."""
+        size = beside(pixels, [self.planes.shape[2], self.planes.shape[1]])
+        grid = (2 * pixels / size - 1)[None, None]
+        found, known, smooth = torch.nn.functional.grid_sample(
+            self.planes[None], grid, padding_mode="border", align_corners=False
+        )[0, :, 0]
+        return smooth, torch.where(known > 1 - 1e-3, found / smooth, 0.0)
+
+
+def _tell_motion(frames: Sequence[Frame], observations: Sequence[Observation]) -> bool:
+    """Whether half of the frames at least have depth whose differences are motion, a pinhole camera saw them, and flow can be found in pictures of
+    their size."""
+    told = sum(
+        one.depth is not None and frame.depth_origin in TOLD_BY for frame, one in zip(frames, observations, strict=True)
+    )
+    sizes = {frame.image.shape[:2] for frame in frames}
+    pinhole = all(one.camera.model == "pinhole" for one in observations)
+    return (
+        pinhole and len(frames) > 1 and 2 * told >= len(frames) and len(sizes) == 1 and min(min(sizes)) >= SMALLEST_PX
+    )
+
+
+def between_known(values: Tensor, otherwise: Tensor, times: Tensor) -> Tensor:
+    """`values` [N, T], of which 0 are not known, with these on the straight line in time [T] between the known ones before and after, at either end
+    like the nearest one, and in a row without any as in `otherwise` [N, T]."""
+    known = values > 0
+    index = torch.arange(values.shape[1], device=values.device).expand_as(values)
+    last = torch.where(known, index, -1).cummax(dim=1).values
+    following = torch.where(known, index, values.shape[1]).flip(1).cummin(dim=1).values.flip(1)
+    has_last, has_next = last >= 0, following < values.shape[1]
+    last, following = last.clamp(min=0), following.clamp(max=values.shape[1] - 1)
+    last, following = torch.where(has_last, last, following), torch.where(has_next, following, last)
+    a, b = values.gather(1, last), values.gather(1, following)
+    span = times[following] - times[last]
+    share = torch.where(span > 0, (times - times[last]) / span.clamp(min=1e-9), torch.zeros_like(span))
+    return torch.where(known.any(dim=1, keepdim=True), a + share * (b - a), otherwise)
+
+
+def _flows(frames: Sequence[Frame]) -> list[Flow]:
+    """From each frame to the next."""
+    motion = ImageMotion()
+    flows = [motion.follow(frame.image, followed(frame)) for frame in frames]
+    return [flow for flow in flows[1:] if flow is not None]
+
+
+def _world(pixels: Tensor, depth: Tensor, one: Observation) -> Tensor:
+    """The points [N, 3] that a frame's camera sees at pixels [N, 2] in depth [N]."""
+    view, intrinsics = one.camera.matrices(pixels.device, pixels.dtype)
+    slopes = (pixels - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
+    local = torch.cat([slopes, torch.ones_like(slopes[:, :1])], dim=1) * depth[:, None]
+    return (local - view[:3, 3]) @ view[:3, :3]

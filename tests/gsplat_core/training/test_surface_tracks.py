@@ -1,0 +1,144 @@
+"""Ways of the surface through a recording, against what the generator of the recording knows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.deformation import BasisField
+from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.initialisation import gaussians_from_frame
+from gsplat_core.training.observations import Observation
+from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.step import TrainingStep
+from gsplat_core.training.surface_motion import Seen
+from gsplat_core.training.surface_tracks import SurfaceTracks, between_known
+
+FRAMES, FPS = 12, 8.0
+ASKED = Asked(FRAMES, 192, 160, FPS, seed=1)
+MOVING = replace(ASKED, camera="moving")
+
+
+@pytest.fixture(scope="module")
+def fixed():
+    return render_recording(ASKED)
+
+
+@pytest.fixture(scope="module")
+def moving():
+    return render_recording(MOVING)
+
+
+def observations(recording) -> list[Observation]:
+    return [Observation.of(frame, recording.camera) for frame in recording]
+
+
+def points_of(asked: Asked) -> torch.Tensor:
+    """Where the generator has a grid of the tissue's points in each frame [T, P, 3]."""
+    moves = asked.camera == "moving"
+    scene = SyntheticScene.from_seed(asked.seed, asked.width_px, asked.height_px, asked.frames / asked.fps, moves)
+    return torch.from_numpy(np.stack([scene.track(number / asked.fps) for number in range(asked.frames)]))
+
+
+def seen_throughout(recording, points: torch.Tensor) -> torch.Tensor:
+    """Of each point, whether all frames show it well inside and off the tool [P]."""
+    shown = torch.ones(points.shape[1], dtype=torch.bool)
+    for frame, here in zip(recording, points, strict=True):
+        seen = Seen(recording.camera.with_pose(frame.pose), here)
+        x, y = seen.pixels.long().unbind(1)
+        inside = (x > 8) & (y > 8) & (x < recording.width_px - 8) & (y < recording.height_px - 8)
+        tissue = torch.from_numpy(frame.mask)[y.clamp(0, recording.height_px - 1), x.clamp(0, recording.width_px - 1)]
+        shown &= inside & (tissue > 0)
+    return shown
+
+
+@pytest.mark.parametrize("number", [0, 5, FRAMES - 1])
+@pytest.mark.parametrize("camera", ["fixed", "moving"])
+def test_points_go_where_the_tissue_goes(request, camera, number):
+    recording, true = request.getfixturevalue(camera), points_of(ASKED if camera == "fixed" else MOVING)
+    chosen = seen_throughout(recording, true)
+    assert chosen.sum() > 12
+    ways = SurfaceTracks(list(recording), observations(recording)).ways(true[number][chosen], number)
+    off = (ways - true[:, chosen].transpose(0, 1)).norm(dim=2)
+    moved = (true - true[number]).norm(dim=2)[:, chosen]
+    assert moved.median() > 0.8, "millimetres"
+    assert off.median() < 0.25 and off.quantile(0.9) < 0.8
+
+
+def test_behind_a_tool_tissue_goes_with_what_is_around_it(fixed):
+    frames, true = list(fixed), points_of(ASKED)
+    chosen = seen_throughout(fixed, true)
+    # A tool that covers everything but the edges for half of the time.
+    hidden = [
+        frame.with_fields(mask=covered(frame.mask)) if 3 <= frame.seq < 9 else frame for frame in frames
+    ]  # fmt: skip
+    ways = SurfaceTracks(hidden, [Observation.of(frame, fixed.camera) for frame in hidden]).ways(true[0][chosen], 0)
+    off = (ways - true[:, chosen].transpose(0, 1)).norm(dim=2)
+    still = (true - true[0]).norm(dim=2)[:, chosen]
+    assert off[:, 3:9].median() < 0.6 * still.T[:, 3:9].median()
+
+
+def covered(mask: np.ndarray) -> np.ndarray:
+    mask = mask.copy()
+    mask[40:120, 50:140] = 0
+    return mask
+
+
+@pytest.mark.parametrize(
+    "fields", [{"depth": None}, {"depth_origin": DepthOrigin.LIGHT}, {"depth_origin": DepthOrigin.PARALLAX}]
+)
+def test_frames_that_do_not_tell_the_motion_of_a_surface_leave_the_field_alone(fixed, fields):
+    frames = [frame.with_fields(**fields) for frame in fixed]
+    assert not moves_before_the_first_step(fixed.camera, frames)
+
+
+def test_one_frame_tells_no_motion(fixed):
+    assert not moves_before_the_first_step(fixed.camera, list(fixed)[:1])
+
+
+def test_frames_with_depth_tell_the_motion_before_the_first_step(fixed):
+    assert moves_before_the_first_step(fixed.camera, list(fixed))
+
+
+def moves_before_the_first_step(camera, frames: list[Frame]) -> bool:
+    seen = [Observation.of(frame, camera) for frame in frames]
+    gaussians = gaussians_from_frame(frames[0], camera, 200, sh_degree=0, default_depth_mm=60.0)
+    field = BasisField(gaussians.count, (0.0, 2.0), bumps=12)
+    step = TrainingStep(gaussians, field, ReconstructorConfig(field="basis", gaussians=200), camera)
+    SurfaceTracks(frames, seen).carry(step, 0, 0)
+    return bool(field.weights.any())
+
+
+def test_between_what_is_known():
+    values = torch.tensor([[0.0, 2, 0, 0, 8, 0], [0, 0, 0, 0, 0, 0], [5, 0, 0, 0, 0, 0]])
+    otherwise = torch.full_like(values, 3.0)
+    times = torch.tensor([0.0, 1, 2, 3, 4, 5])
+    expected = torch.tensor([[2.0, 2, 4, 6, 8, 8], [3] * 6, [5] * 6])
+    torch.testing.assert_close(between_known(values, otherwise, times), expected)
+
+
+def test_a_model_has_the_motion_along_the_line_of_sight_after_few_steps(fixed):
+    """Which steps alone would not learn: positions move by hundredths of a pixel in a step."""
+    config = replace(ReconstructorConfig.offline(), gaussians=1500, max_gaussians=2000)
+    learner = Reconstructor(config, fixed.camera)
+    learner.fit(list(fixed), 24)
+    model = learner.snapshot()
+    errors, at_rest = [], []
+    first = next(iter(fixed))
+    for frame in fixed:
+        shown = render(model.at(frame.time_s), fixed.camera, depth=True).depth.numpy()
+        both = (frame.mask > 0) & (first.mask > 0)
+        errors.append(error_of(shown, frame, both))
+        at_rest.append(error_of(first.depth, frame, both))
+    assert np.mean(errors) < 0.4 * np.mean(at_rest)
+
+
+def error_of(depth: np.ndarray, frame: Frame, where: np.ndarray) -> float:
+    return float(np.sqrt(np.square(depth - frame.depth)[where].mean()))
