@@ -96,20 +96,20 @@ def _without_tools(frame: Frame, image: Tensor) -> Tensor:
     return torch.where(tool > 0, filled(picture, 1 - tool), picture)
 
 
-def filled(picture: Tensor, known: Tensor) -> Tensor:
-    """`picture` [C, H, W] with the pixels whose `known` [1, H, W] is 0 taken from the known ones around them, smoothly and at a coarse size.
+def filled(picture: Tensor, known: Tensor, coarse: int = COARSE) -> Tensor:
+    """`picture` [C, H, W] with the pixels whose `known` [1, H, W] is 0 taken from the known ones around them, smoothly, and all of it coarser by a factor.
 
     A pyramid of means over what is known ("push and pull": Gortler et al., "The Lumigraph", 1996): each level fills the holes of the finer one.
     """
     height, width = known.shape[1:]
-    levels = [_shrunk((picture * known)[None], known[None], COARSE)]
+    levels = [_shrunk((picture * known)[None], known[None], coarse)]
     while max(levels[-1][1].shape[2:]) > 1:
         levels.append(_shrunk(*levels[-1], 2))
     total, weight = levels.pop()
     whole = total / weight.clamp(min=1e-6)
     for total, weight in reversed(levels):
         coarser = interpolate(whole, size=weight.shape[2:], mode="bilinear", align_corners=False)
-        sure = (COARSE * weight).clamp(max=1)
+        sure = (coarse * weight).clamp(max=1)
         whole = sure * total / weight.clamp(min=1e-6) + (1 - sure) * coarser
     return interpolate(whole, size=(height, width), mode="bilinear", align_corners=False)[0]
 

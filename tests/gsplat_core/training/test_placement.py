@@ -61,12 +61,35 @@ def test_later_depth_moves_it_half_of_the_way() -> None:
     assert np.median((depth / depth_of_surface())[INSIDE]) == pytest.approx(1.1, rel=0.02)
 
 
-def test_measured_depth_is_left_to_the_loss() -> None:
+@pytest.mark.parametrize("origin", [DepthOrigin.MEASURED, DepthOrigin.STEREO])
+def test_depth_that_is_not_of_parallax_moves_tissue_at_its_own_time(origin) -> None:
+    reconstructor, frames = learner(), stream(1)
+    reconstructor.observe(with_depth(frames[0], origin))
+    later = frames[0].with_fields(seq=1, pts_ns=2_000_000_000)
+    reconstructor.observe(with_depth(later, origin, 1.21), steps=1)
+    (first, before), (moved, picture) = shown(reconstructor, frames[0]), shown(reconstructor, later)
+    assert np.median(np.abs(first / depth_of_surface() - 1)[INSIDE]) < 0.02, "as it was"
+    assert np.median((moved / depth_of_surface())[INSIDE]) == pytest.approx(1.1, rel=0.02), "half of the way"
+    assert np.abs(picture - before)[INSIDE].mean() < 0.03
+
+
+def test_what_the_depth_does_not_show_goes_along_with_what_is_around_it() -> None:
+    reconstructor, frames = learner(), stream(1)
+    reconstructor.observe(with_depth(frames[0], DepthOrigin.STEREO))
+    later = with_depth(frames[0].with_fields(seq=1, pts_ns=2_000_000_000), DepthOrigin.STEREO, 1.21)
+    hole = later.depth.copy()
+    hole[20:44, 24:48] = 0
+    reconstructor.observe(later.with_fields(depth=hole), steps=1)
+    moved, _ = shown(reconstructor, later)
+    assert np.median((moved / depth_of_surface())[24:40, 28:44]) == pytest.approx(1.1, rel=0.03)
+
+
+def test_depth_by_light_moves_nothing() -> None:
     reconstructor, frames = learner(), stream(1)
     reconstructor.observe(frames[0])
-    reconstructor.observe(with_depth(frames[0].with_fields(seq=1), DepthOrigin.MEASURED), steps=1)
+    reconstructor.observe(with_depth(frames[0].with_fields(seq=1), DepthOrigin.LIGHT), steps=1)
     depth, _ = shown(reconstructor, frames[0])
-    assert np.median(depth[INSIDE]) > 50
+    assert np.median(depth[INSIDE]) == pytest.approx(60, rel=0.01)
 
 
 def test_depth_that_is_believed_nowhere_places_nothing() -> None:
