@@ -36,13 +36,16 @@ class Calibration:
     source: str
 
 
-def default_calibration(root: Path, width_px: int, height_px: int, findings: Findings) -> Calibration:
-    """A stated guess: pinhole, f = 0.9 of the longer side, principal point in the middle, poses unknown."""
+def default_calibration(
+    root: Path, width_px: int, height_px: int, findings: Findings, *, poses_known: bool = False
+) -> Calibration:
+    """A stated guess: pinhole, f = 0.9 of the longer side, principal point in the middle. poses_known: from elsewhere; nothing is assumed of them."""
     camera = default_camera(width_px, height_px)
+    still = "" if poses_known else " and no camera motion"
     findings.warn(
         root,
-        f"there is no calibration; a pinhole with f = {camera.K[0, 0]:.1f} px and no camera motion is assumed",
-        "Add poses_bounds.npy or cameras.json; lengths have no scale until then",
+        f"there is no calibration; a pinhole with f = {camera.K[0, 0]:.1f} px{still} is assumed",
+        "Add cameras.json, poses_bounds.npy or a recording.json with the camera; lengths have no scale until then",
     )
     return Calibration(camera, None, "default")
 

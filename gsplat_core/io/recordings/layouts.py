@@ -31,7 +31,7 @@ from gsplat_core.io.recordings.image_files import list_images
 from gsplat_core.io.recordings.numbering import frame_times
 from gsplat_core.io.recordings.plain_files import all_stay_inside, stays_inside
 from gsplat_core.io.recordings.poses_file import POSES_FILE
-from gsplat_core.io.recordings.sidecars import Beside
+from gsplat_core.io.recordings.sidecars import DESCRIPTION_FILE, Beside
 from gsplat_core.io.recordings.stereo_calibration import rectified_by_file
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES, open_video
 
@@ -210,12 +210,15 @@ def _calibrated(
     """The cameras, from all that lies beside the images. found: what one file says of the left one. stereo: whether there is another eye."""
     described, poses = beside.description(), beside.poses_alone()
     rectified = rectified_by_file(root, size, found, findings) if stereo and root.is_dir() else None
+    stated = described.get("camera")
     if rectified is not None:
         found = rectified.calibration
+    elif found is None and stated is not None:
+        found = Calibration(stated, None, DESCRIPTION_FILE)
     elif found is None:
-        found = default_calibration(root, *size, findings)
-    if rectified is None and (camera := described.get("camera")):
-        found = replace(found, camera=camera.with_pose(found.camera.world_to_camera))
+        found = default_calibration(root, *size, findings, poses_known=poses is not None)
+    elif stated is not None:
+        found = replace(found, camera=stated.with_pose(found.camera.world_to_camera))
     if poses is not None:
         poses = poses if rectified is None else rectified.by.turn @ poses
         camera = found.camera.with_pose(poses[0])

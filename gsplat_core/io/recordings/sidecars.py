@@ -24,7 +24,8 @@ from gsplat_core.io.recordings.poses_file import POSES_FILE, read_poses
 
 RECORDING_FORMAT = "intrasplat-recording"
 RECORDING_VERSION = 1
-_FILES = ("recording.json", POSES_FILE, "poses_bounds.npy", "cameras.json", "valid_mask.png")
+DESCRIPTION_FILE = "recording.json"
+_FILES = (DESCRIPTION_FILE, POSES_FILE, "poses_bounds.npy", "cameras.json", "valid_mask.png")
 
 
 class Beside:
@@ -43,7 +44,7 @@ class Beside:
 
     def description(self) -> dict[str, Any]:
         """fps, camera, depth_unit_mm and stereo_baseline_mm of `recording.json`, each optional."""
-        path = self._file("recording.json")
+        path = self._file(DESCRIPTION_FILE)
         return (_read_description(path, self._size, self._findings) if path else None) or {}
 
     def poses(self) -> Calibration | None:

@@ -80,7 +80,21 @@ def test_images_alone_sort_by_number(tmp_path: Path, make: SimpleNamespace) -> N
     recording = open_recording(tmp_path)
     assert recording.frame_count == 12
     assert [int(frame.image[0, 0, 0]) for frame in recording] == [20 * index + 10 for index in range(12)]
-    assert any("no calibration" in note for note in recording.notes)
+    assert any("no calibration" in note and "no camera motion" in note for note in recording.notes)
+
+
+def test_nothing_is_assumed_of_what_is_stated(tmp_path: Path, make: SimpleNamespace) -> None:
+    make.images(tmp_path, 3, "{}.png")
+    np.save(tmp_path / "poses.npy", np.tile(np.eye(4), (3, 1, 1)))
+    (note,) = (note for note in open_recording(tmp_path).notes if "no calibration" in note)
+    assert "px is assumed" in note and "motion" not in note
+    camera = {"width": make.width, "height": make.height, "fx": 70.0, "fy": 70.0, "cx": 20.0, "cy": 18.0}
+    described = {"format": "intrasplat-recording", "version": 1, "camera": camera}
+    (tmp_path / "recording.json").write_text(json.dumps(described))
+    recording = open_recording(tmp_path)
+    assert not any("no calibration" in note for note in recording.notes)
+    assert recording.camera.K[0, 0] == 70.0
+    assert validate_recording(tmp_path).facts["calibration"] == "poses.npy, and the camera of recording.json"
 
 
 def test_grey_and_transparent_images_become_rgb(tmp_path: Path, make: SimpleNamespace) -> None:
