@@ -8,6 +8,7 @@ from pathlib import Path
 
 import typer
 
+from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.geometry.odometry import DISTANCE, Trajectory, trajectory_of
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.poses_file import write_poses
@@ -41,7 +42,10 @@ def poses_command(recording: Path, out: Path, max_frames: int | None, *, overwri
                 show(Progress("follow", done, opened.frame_count))
                 yield frame
 
-        found = trajectory_of(frames(), opened.camera)
+        try:
+            found = trajectory_of(frames(), opened.camera)
+        except InvalidInput as error:  # all that it refuses are pictures and cameras, which are the recording's here
+            raise RecordingInvalid(f"{recording}: {error}") from error
     with storage_errors(out.parent):
         write_poses(out, found.poses, overwrite=overwrite)
     _say(found, opened, out, as_json)

@@ -1,0 +1,126 @@
+"""`intrasplat poses`: a file that the recording is read with from then on, what is said about it, and what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.evaluation.trajectory import evaluate_trajectory
+from gsplat_core.io.recordings import open_recording
+from services.cli.app import run
+from services.cli.exit_codes import BAD_INPUT, OK
+from tests.gsplat_core.geometry.moving_scope import FOCAL, HEIGHT, SIDEWAYS, WIDTH, video
+
+COUNT = 10
+STILL = (0.0, 0.0, 0.0)
+
+
+@pytest.fixture
+def clip(tmp_path):
+    """Writes the pictures of a scope that moves by `step` from frame to frame, and what its camera is like where that is known."""
+
+    def write(step=SIDEWAYS, calibrated=True, blank=()):
+        folder = tmp_path / "clip"
+        folder.mkdir()
+        frames, _ = video(COUNT, step)
+        noise = np.random.default_rng(0)
+        for number, frame in enumerate(frames):
+            noisy = np.clip(frame.image + noise.normal(0, 3, frame.image.shape), 0, 255).astype(np.uint8)
+            picture = np.full_like(noisy, 90) if number in blank else noisy
+            cv2.imwrite(str(folder / f"{number}.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        if calibrated:
+            size = {"width": WIDTH, "height": HEIGHT}
+            camera = {**size, "fx": FOCAL, "fy": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+            facts = {"format": "intrasplat-recording", "version": 1, "fps": 30, "camera": camera}
+            (folder / "recording.json").write_text(json.dumps(facts))
+        return folder
+
+    return write
+
+
+def said_of(capsys, clip, *options):
+    assert run(["poses", str(clip), "--out", str(clip / "poses.npy"), "--json", *options]) == OK
+    return json.loads(capsys.readouterr().out)
+
+
+def test_the_file_goes_beside_the_pictures_and_the_recording_is_read_with_it(clip, capsys):
+    folder = clip()
+    said = said_of(capsys, folder)
+    assert (said["path"], said["frames"], said["not_placed"]) == (str(folder / "poses.npy"), COUNT, [])
+    assert said["way"] > 0 and said["points"] > 50 and said["explained"] > 0.9
+    assert 0 < said["error_px"] < said["error_px_of_a_still_scope"]
+    poses = np.stack([frame.pose for frame in open_recording(folder)])
+    _, cameras = video(COUNT, SIDEWAYS)
+    errors = evaluate_trajectory(poses, np.stack([camera.world_to_camera for camera in cameras]))
+    assert errors is not None and errors.similarity_share < 0.05
+
+
+def test_the_unit_of_length_is_said_to_be_none(clip, capsys):
+    notes = said_of(capsys, clip())["notes"]
+    assert notes == ["lengths have no scale: the first frame's tissue is taken to be 60 away"]
+
+
+def test_without_json_it_is_a_table_and_notes(clip, capsys):
+    folder = clip()
+    assert run(["poses", str(folder), "--out", str(folder / "poses.npy")]) == OK
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["path", str(folder / "poses.npy")]
+    assert "not_placed                 -" in lines
+    assert lines[-1].startswith("note: lengths have no scale")
+
+
+def test_only_so_many_frames_are_read(clip, capsys):
+    assert said_of(capsys, clip(), "--max-frames", "5")["frames"] == 5
+
+
+def test_a_camera_that_is_not_known_is_said(clip, capsys):
+    notes = said_of(capsys, clip(calibrated=False))["notes"]
+    assert any("there is no calibration; a pinhole with f = 144.0 px" in note for note in notes)
+
+
+def test_a_scope_that_may_stand_still_is_said(clip, capsys):
+    said = said_of(capsys, clip(STILL))
+    assert said["explained"] < 0.75
+    assert any("it may stand still before tissue that moves" in note for note in said["notes"])
+
+
+def test_frames_that_show_nothing_are_named(clip, capsys):
+    said = said_of(capsys, clip(blank=[4]))
+    assert said["not_placed"] == [4]
+    assert any("1 frames could not be placed" in note and "from frame 4 on" in note for note in said["notes"])
+
+
+def test_a_file_that_is_there_is_replaced_only_on_request(clip, capsys):
+    folder = clip()
+    file = folder.parent / "mine.npy"
+    file.write_bytes(b"mine")
+    assert run(["poses", str(folder), "--out", str(file)]) == BAD_INPUT
+    assert "is there already" in capsys.readouterr().err and file.read_bytes() == b"mine"
+    assert run(["poses", str(folder), "--out", str(file), "--overwrite"]) == OK
+    assert np.load(file).shape == (COUNT, 4, 4)
+
+
+def test_a_folder_is_never_replaced(clip, capsys, tmp_path):
+    assert run(["poses", str(clip()), "--out", str(tmp_path), "--overwrite"]) == BAD_INPUT
+    assert "is there already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("recording", "file", "said"),
+    [
+        ("clip", "nowhere/poses.npy", "there is no folder"),
+        ("missing", "poses.npy", "there is no such file or folder"),
+        ("few", "poses.npy", "at least 3 frames, got 2"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_sentence(clip, capsys, tmp_path, recording, file, said):
+    folder = clip()
+    options = ["--max-frames", "2"] if recording == "few" else []
+    given = folder if recording == "few" else tmp_path / recording
+    assert run(["poses", str(given), "--out", str(tmp_path / file), *options]) == BAD_INPUT
+    error = capsys.readouterr().err
+    assert said in error and "Traceback" not in error
+    assert not (tmp_path / file).exists()
