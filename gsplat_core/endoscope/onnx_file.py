@@ -29,24 +29,25 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 """Wire types of protobuf."""
 
 
-def read_model(path: Path) -> bytes:
-    """The bytes of an ONNX file. Raises InvalidSetting for what is no such file, is too large or has data in other files."""
+def read_model(path: Path, what: str) -> bytes:
+    """The bytes of an ONNX file. what: what it is to the user, "tool network".
+
+    Raises InvalidSetting for what is no such file, is too large or has data in other files.
+    """
     try:
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
     except OSError as error:
-        raise InvalidSetting(
-            f"tool network {path} cannot be read ({error.strerror or error}); give an ONNX file"
-        ) from error
+        raise InvalidSetting(f"{what} {path} cannot be read ({error.strerror or error}); give an ONNX file") from error
     if len(data) > MOST_BYTES:
-        raise InvalidSetting(f"tool network {path} is larger than {MOST_BYTES >> 20} MiB; give a smaller one")
+        raise InvalidSetting(f"{what} {path} is larger than {MOST_BYTES >> 20} MiB; give a smaller one")
     try:
         external = has_external_data(data)
     except ValueError as error:
-        raise InvalidSetting(f"tool network {path} is no ONNX model ({error}); export it again") from error
+        raise InvalidSetting(f"{what} {path} is no ONNX model ({error}); export it again") from error
     if external:
         raise InvalidSetting(
-            f"tool network {path} keeps data in other files, which are not opened;"
+            f"{what} {path} keeps data in other files, which are not opened;"
             " export it as one file (torch.onnx.export(..., external_data=False))"
         )
     return data

@@ -80,7 +80,7 @@ def test_a_file_that_is_too_large_is_not_read_whole(tmp_path, monkeypatch):
     path = tmp_path / "net.onnx"
     path.write_bytes(bytes(1001))
     with pytest.raises(InvalidSetting, match="is larger than 0 MiB; give a smaller one"):
-        read_model(path)
+        read_model(path, "tool network")
 
 
 @pytest.mark.parametrize(
