@@ -41,7 +41,7 @@ class DepthOp(Operator):
         frame: `Frame` with `depth`, `depth_confidence` and `depth_origin`, or with none of them.
 
     Params:
-        choice: `auto`, or a name in `DEPTHS`. Raises InvalidSetting for another one.
+        choice: `auto`, or what `check_depth` takes. Raises InvalidSetting for another one.
         camera: that of the frames.
         has_time: whether `auto` may ask what takes longer than a frame of a camera.
         held_out: frames of which nothing may be learned, not even about the depth of others.
@@ -113,6 +113,8 @@ def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConf
         ways.append("the two eyes")
     if choice == "light":
         ways.append("light and shade")
+    if choice.startswith("onnx:"):
+        ways.append("answers of the depth network")
     if "pose" in fields and (config.depth_from_motion or choice in ("auto", "parallax")):
         ways.append("the given poses")
     found = f"unless {' or '.join(ways)} show how far away it is, " if ways else ""

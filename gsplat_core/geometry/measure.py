@@ -26,6 +26,7 @@ ORIGIN_ERROR: dict[DepthOrigin | None, float] = {
     DepthOrigin.STEREO: 0.015,
     DepthOrigin.PARALLAX: 0.05,
     DepthOrigin.LIGHT: 0.15,
+    DepthOrigin.LEARNED: 0.2,
     None: 0.3,
 }
 """Standard error of depth over depth by where it comes from, beside what the model shows. They are assumed, from what such methods are known to reach."""

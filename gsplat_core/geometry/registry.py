@@ -47,17 +47,20 @@ class NoDepth:
         return None
 
 
-DEPTHS: Registry[Callable[[], Estimator]] = Registry(
+DEPTHS: Registry[Callable[..., Estimator]] = Registry(
     "depth",
     {
         "recorded": RecordedDepth,
         "stereo": "gsplat_core.geometry.stereo:StereoDepth",
         "light": "gsplat_core.geometry.light:LightDepth",
         "parallax": "gsplat_core.geometry.key_frames:ParallaxDepth",
+        "onnx": "gsplat_core.geometry.learned:LearnedDepth",
         "none": NoDepth,
     },
 )
-"""Estimators by name: what makes one for a stream."""
+"""Estimators by name: what makes one for a stream, from an address if its name is in `WITH_ADDRESS`."""
+WITH_ADDRESS = {"onnx": "onnx:FILE"}
+"""Whose name is followed by a colon and an address, and how that looks."""
 
 
 def _always(frame: Frame) -> bool:
@@ -79,9 +82,21 @@ AUTO_WITH_TIME: dict[str, Callable[[Frame], bool]] = {**AUTO, "parallax": _has_p
 
 
 def check_depth(choice: str) -> None:
-    """Raises InvalidSetting for what is neither `auto` nor in `DEPTHS`."""
-    if choice != "auto" and choice not in DEPTHS:
-        raise InvalidSetting(f"depth is {choice!r}; choose auto, {', '.join(DEPTHS)}")
+    """Raises InvalidSetting for what is neither `auto` nor in `DEPTHS`, and as what makes an estimator from an address."""
+    name, colon, address = choice.partition(":")
+    if name in WITH_ADDRESS and not address:
+        raise InvalidSetting(f"depth is {choice!r}; it needs an address: {WITH_ADDRESS[name]}")
+    if choice != "auto" and (name not in DEPTHS or (colon and name not in WITH_ADDRESS)):
+        names = (WITH_ADDRESS.get(each, each) for each in DEPTHS)
+        raise InvalidSetting(f"depth is {choice!r}; choose auto, {', '.join(names)}")
+    if name in WITH_ADDRESS:
+        new_estimator(choice)
+
+
+def new_estimator(choice: str) -> Estimator:
+    """The estimator that `choice` names, for one stream. Raises as `check_depth`."""
+    name, _, address = choice.partition(":")
+    return DEPTHS[name](address) if name in WITH_ADDRESS else DEPTHS[name]()
 
 
 class Sentences:
@@ -107,7 +122,7 @@ class DepthFinder:
     """Gives the frames of one stream the depth that a setting asks for."""
 
     def __init__(self, choice: str, camera: Camera, *, has_time: bool = False) -> None:
-        """choice: `auto` or a name in `DEPTHS`. camera: that of the frames. has_time: what takes long may be asked by `auto`, too.
+        """choice: `auto` or as `new_estimator` takes it. camera: that of the frames. has_time: what takes long may be asked by `auto`, too.
 
         Raises as `check_depth`.
         """
@@ -115,7 +130,7 @@ class DepthFinder:
         self._camera = camera
         auto = AUTO_WITH_TIME if has_time else AUTO
         asked = auto if choice == "auto" else {choice: _always}
-        self._asked = [(DEPTHS[name](), suits) for name, suits in asked.items()]
+        self._asked = [(new_estimator(name), suits) for name, suits in asked.items()]
         self.doubts, self.remarks = Sentences(), Sentences()
         """What spoke against a frame's depth as a whole, and what else was said about it."""
 

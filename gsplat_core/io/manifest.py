@@ -42,7 +42,7 @@ ROTATION_TOLERANCE = 2e-3
 TENSOR_BYTES = IntegerIn(0, 1 << 40)
 PARAMETERS = IntegerIn(0, 1 << 38)
 DEPTH_ORIGINS = tuple(origin.value for origin in DepthOrigin)
-UNITLESS = (DepthOrigin.PARALLAX, DepthOrigin.LIGHT)
+UNITLESS = (DepthOrigin.PARALLAX, DepthOrigin.LIGHT, DepthOrigin.LEARNED)
 """Depth of these origins is never metric."""
 UNITS = {"length": ("mm",), "time": ("s",)}
 
@@ -123,7 +123,7 @@ def _depth_source(reader: JsonObject) -> DepthSource:
     if not isinstance(metric, bool):
         raise BundleCorrupt(f"{reader.name}: metric must be true or false, got {shortened(metric)}")
     if metric and origin in UNITLESS:
-        raise BundleCorrupt(f"{reader.name}: depth from {origin.value} has no unit, and metric is true")
+        raise BundleCorrupt(f"{reader.name}: depth of origin {origin.value!r} has no unit, and metric is true")
     return DepthSource(origin, metric)
 
 

@@ -35,6 +35,8 @@ class DepthOrigin(Enum):
     """Matched between times at which the scope was elsewhere: in the unit of its poses."""
     LIGHT = "light"
     """From how bright tissue is in the scope's own light: relative, never metric."""
+    LEARNED = "learned"
+    """By a network of the user's, from one picture: relative, never metric."""
 
 
 @dataclass(frozen=True)

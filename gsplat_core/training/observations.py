@@ -84,9 +84,9 @@ def scene_colours(image: NDArray[np.uint8], exposure: tuple[float, float, float]
 
 
 def _is_trained_on(frame: Frame) -> bool:
-    """Whether the loss takes the frame's depth. The scene starts from depth by light, and is not held to it: it is rough, and right up to a factor that
-    no two frames need to share."""
-    return frame.depth is not None and frame.depth_origin is not DepthOrigin.LIGHT
+    """Whether the loss takes the frame's depth. The scene starts from depth of a single picture, by light or learned, and is not held to it: it is rough,
+    and right up to a factor that no two frames need to share."""
+    return frame.depth is not None and frame.depth_origin not in (DepthOrigin.LIGHT, DepthOrigin.LEARNED)
 
 
 def known_depth(depth_mm: NDArray[np.floating], device: torch.device | str = "cpu") -> Tensor:

@@ -89,7 +89,7 @@ FieldOption = Annotated[str, typer.Option(help="Deformation field: auto, basis o
 DepthOption = Annotated[
     str,
     typer.Option(
-        help="Depth of the frames: auto, recorded, stereo (from the two eyes), light (of one fixed eye; relative) or none."
+        help="Depth of the frames: auto, recorded, stereo (from the two eyes), parallax (of a moving scope with poses), light (of one fixed eye; relative), onnx:FILE (by a network of yours; relative) or none."
     ),
 ]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]

@@ -139,6 +139,8 @@ def test_it_is_said_what_a_model_without_depth_means():
 def test_a_scene_that_depth_by_light_starts_is_not_said_to_start_on_a_plane_for_certain():
     said = without_depth("light", frozenset(), ReconstructorConfig())
     assert "unless light and shade show how far away it is" in said
+    said = without_depth("onnx:net.onnx", frozenset(), ReconstructorConfig())
+    assert "unless answers of the depth network show how far away it is" in said
 
 
 @pytest.mark.parametrize(("has_time", "asked"), [(True, [0, 2, 3]), (False, [])])

@@ -58,10 +58,11 @@ def test_where_depth_comes_from_is_kept_and_part_of_the_digest(source, make_gaus
 @pytest.mark.parametrize(
     ("depth", "said"),
     [
-        ({"origin": "guess", "metric": False}, "origin must be one of measured, stereo, parallax, light"),
+        ({"origin": "guess", "metric": False}, "origin must be one of measured, stereo, parallax, light, learned"),
         ({"origin": "measured", "metric": 1}, "metric must be true or false"),
-        ({"origin": "light", "metric": True}, "depth from light has no unit"),
-        ({"origin": "parallax", "metric": True}, "depth from parallax has no unit"),
+        ({"origin": "light", "metric": True}, "depth of origin 'light' has no unit"),
+        ({"origin": "parallax", "metric": True}, "depth of origin 'parallax' has no unit"),
+        ({"origin": "learned", "metric": True}, "depth of origin 'learned' has no unit"),
         ([], "must be a JSON object"),
     ],
 )

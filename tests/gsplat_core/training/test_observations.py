@@ -32,8 +32,9 @@ def test_an_observation_holds_what_the_frame_holds(make_frame, camera):
     assert np.array_equal(seen.depth.numpy(), depth)
 
 
-def test_depth_by_light_is_for_the_start_of_a_scene_and_not_for_the_loss(make_frame, camera):
-    frame = make_frame(depth=np.full((40, 48), 55.0), depth_origin=DepthOrigin.LIGHT)
+@pytest.mark.parametrize("origin", [DepthOrigin.LIGHT, DepthOrigin.LEARNED])
+def test_depth_of_a_single_picture_is_for_the_start_of_a_scene_and_not_for_the_loss(make_frame, camera, origin):
+    frame = make_frame(depth=np.full((40, 48), 55.0), depth_origin=origin)
     assert Observation.of(frame, camera).depth is None
     assert Observation.of(frame.with_fields(depth_origin=DepthOrigin.PARALLAX), camera).depth is not None
 

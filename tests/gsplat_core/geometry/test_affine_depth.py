@@ -1,0 +1,80 @@
+"""A factor and a summand are found by other depth whatever part of it is wrong, and do not wear down from frame to frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.geometry.affine_depth import LEAST_VALUES, MOST_SPAN, fitted, is_constant, with_assumed_zero
+
+COUNT = 2000
+
+
+@pytest.fixture
+def values(rng):
+    return rng.normal(3.0, 1.0, COUNT)
+
+
+@pytest.mark.parametrize("factor", [3.0, -0.2])
+def test_what_was_done_is_found(values, factor):
+    found = fitted(values, factor * values + 5)
+    assert found is not None
+    assert found[:2] == pytest.approx((factor, 5)) and found.alike == pytest.approx(np.sign(factor))
+    assert found.of(values) == pytest.approx(factor * values + 5)
+
+
+@pytest.mark.parametrize("wrong", ["another place", "anything"])
+def test_a_fifth_of_it_may_be_wrong(values, rng, wrong):
+    known = 3 * values + 5
+    part = slice(0, COUNT // 5)
+    known[part] = known[part] + 30 if wrong == "another place" else 20 * rng.normal(size=COUNT // 5)
+    found = fitted(values, known)
+    assert found is not None and found[:2] == pytest.approx((3, 5), rel=1e-6)
+
+
+def test_relief_stays_however_often_noisy_values_are_fitted_to_those_before(values, rng):
+    last = values.copy()
+    for _ in range(200):
+        seen = (values + 0.1 * rng.normal(size=COUNT)) * rng.uniform(0.5, 2) + rng.normal()
+        found = fitted(seen, last)
+        assert found is not None
+        last = found.of(seen)
+    assert last.std() == pytest.approx(values.std(), rel=0.05) and last.mean() == pytest.approx(3.0, abs=0.1)
+
+
+def test_what_has_nothing_to_do_with_each_other_is_not_alike(values, rng):
+    found = fitted(values, rng.normal(size=COUNT))
+    assert found is not None and abs(found.alike) < 0.4
+
+
+def test_too_few_values_or_one_distance_give_nothing(values):
+    few = values[: LEAST_VALUES - 1]
+    assert fitted(few, few) is None
+    assert fitted(values, np.full(COUNT, 7.0)) is None and fitted(np.full(COUNT, 7.0), values) is None
+
+
+def test_half_of_the_values_may_be_one_and_the_same(values):
+    values[: COUNT * 2 // 3] = 2.0
+    found = fitted(values, 2 * values)
+    assert found is not None and found[:2] == pytest.approx((2, 0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("values", "constant"),
+    [
+        (np.full(99, -4.0), True),
+        (np.zeros(99), True),
+        (np.linspace(4, 4.0001, 99), True),
+        (np.linspace(4, 4.1, 99), False),
+    ],
+)
+def test_one_distance_is_recognised_at_any_size(values, constant):
+    assert is_constant(values) == is_constant(1e6 * values) == constant
+
+
+def test_an_assumed_zero_bounds_how_deep_a_picture_is():
+    assert with_assumed_zero(np.linspace(2, 4, 99)).summand == 0
+    for low, high in ((0, 1), (-5, -1), (-3, 8), (0.1, 3)):
+        moved = with_assumed_zero(np.linspace(low, high, 1001)).of(np.linspace(low, high, 1001))
+        near, far = np.percentile(moved, (2, 98))
+        assert near > 0 and far / near == pytest.approx(MOST_SPAN)
