@@ -102,7 +102,7 @@ class DepthOp(Operator):
 
 
 def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConfig) -> str | None:
-    """What is to be said where frames with these fields come without depth, and there is time to find it; None where they have it.
+    """What is to be said where frames with these fields are given no recorded depth, and there is time to find it; None where they keep it.
 
     choice: the setting `depth`.
     """
@@ -118,7 +118,12 @@ def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConf
     if "pose" in fields and (config.depth_from_motion or choice in ("auto", "parallax")):
         ways.append("the given poses")
     found = f"unless {' or '.join(ways)} show how far away it is, " if ways else ""
+    lacking = (
+        f"the recording's depth is left out (depth is {choice!r})"
+        if "depth" in fields
+        else "the recording has no depth"
+    )
     return (
-        f"the recording has no depth: {found}the scene starts on a plane {config.default_depth_mm:g} mm away, and its"
+        f"{lacking}: {found}the scene starts on a plane {config.default_depth_mm:g} mm away, and its"
         " depth has no measured scale"
     )

@@ -130,7 +130,11 @@ def test_another_name_is_refused():
 def test_it_is_said_what_a_model_without_depth_means():
     config = ReconstructorConfig()
     assert without_depth("auto", frozenset({"depth"}), config) is None
-    assert "the scene starts on a plane" in without_depth("none", frozenset({"depth"}), config)
+    said = without_depth("none", frozenset({"depth"}), config)
+    assert said.startswith("the recording's depth is left out (depth is 'none'): the scene starts on a plane")
+    assert without_depth("auto", frozenset(), config).startswith(
+        "the recording has no depth: the scene starts on a plane"
+    )
     assert "unless the two eyes show" in without_depth("auto", frozenset({"right_image"}), config)
     assert "unless the given poses show" in without_depth("auto", frozenset({"pose"}), config)
     assert "unless" not in without_depth("recorded", frozenset({"pose"}), config)
