@@ -12,13 +12,13 @@ from gsplat_core.errors import InvalidSetting
 Array = NDArray[np.float64]
 
 SAMPLES = 100_000
-"""About as many places on the mesh are looked at first."""
+"""Points spread over the mesh, about so many, among which the nearest are searched first."""
 CANDIDATES = 6
-"""Of these the nearest; the closest point is on one of their triangles. Where triangles of very different sizes meet it may be on another one, by
-less than the distance between places."""
+"""So many of the nearest samples are looked at; the closest point is taken from their triangles. Where triangles of very different sizes meet it may be on
+another one; the error is less than the distance between samples."""
 MOST_TRIANGLES = 5_000_000
 EXACT_KD_TREE = 4
-"""FLANN's single tree, which finds the nearest ones themselves; the others guess."""
+"""FLANN's single k-d tree: an exact search; its other indices are approximate."""
 
 
 class Closest(NamedTuple):
@@ -49,19 +49,19 @@ class ClosestPoints:
         self._corners, areas = corners[usable], areas[usable]
         self._normals = normals[usable] / (2 * areas[:, None])
         self.extent = float(np.linalg.norm(np.ptp(self._corners.reshape(-1, 3), axis=0)))
-        places, self._triangle = _sampled(self._corners, areas)
-        self._centre = places.mean(0)
+        samples, self._triangle = _sampled(self._corners, areas)
+        self._centre = samples.mean(0)
         # float32 is enough to find candidates once the middle is taken off.
         import cv2
 
-        self._places = np.ascontiguousarray((places - self._centre).astype(np.float32))
+        self._samples = np.ascontiguousarray((samples - self._centre).astype(np.float32))
         self._tree = cv2.flann_Index(  # type: ignore[attr-defined]
-            self._places, {"algorithm": EXACT_KD_TREE, "leaf_max_size": 10}
+            self._samples, {"algorithm": EXACT_KD_TREE, "leaf_max_size": 10}
         )
 
     def closest(self, points: Array) -> Closest:
         """The closest points of the mesh to points [N, 3]."""
-        count = min(CANDIDATES, len(self._places))
+        count = min(CANDIDATES, len(self._samples))
         asked = np.ascontiguousarray((points - self._centre).astype(np.float32))
         found, _ = self._tree.knnSearch(asked, count, params={"checks": -1, "eps": 0.0, "sorted": True})
         best = Closest(np.zeros_like(points), np.zeros_like(points), np.full(len(points), np.inf))
@@ -97,20 +97,20 @@ def _on_segment(points: Array, start: Array, end: Array) -> Array:
 
 
 def _sampled(corners: Array, areas: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Places spread evenly over the triangles, at least one each, and the triangle of each."""
-    # A triangle is cut into n² alike; the middle of each is a place.
+    """Points spread evenly over the triangles, at least one each, and the triangle of each."""
+    # A triangle is cut into n² equal ones; the centroid of each is a sample.
     cuts = np.clip(np.ceil(np.sqrt(areas * SAMPLES / areas.sum())), 1, 400).astype(int)
-    places, owners = [], []
+    samples, owners = [], []
     for n in np.unique(cuts):
         chosen = np.flatnonzero(cuts == n)
         weights = _middles(int(n))
-        places.append(np.einsum("kc,tcd->tkd", weights, corners[chosen]).reshape(-1, 3))
+        samples.append(np.einsum("kc,tcd->tkd", weights, corners[chosen]).reshape(-1, 3))
         owners.append(np.repeat(chosen, len(weights)))
-    return np.concatenate(places), np.concatenate(owners)
+    return np.concatenate(samples), np.concatenate(owners)
 
 
 def _middles(n: int) -> Array:
-    """Barycentric coordinates [n², 3] of the middles of the n² alike triangles that a triangle is cut into."""
+    """Barycentric coordinates [n², 3] of the middles of the n² equal triangles that a triangle is cut into."""
     upright = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
     turned = [(i + 2 / 3, j + 2 / 3) for i in range(n - 1) for j in range(n - 1 - i)]
     two = np.array(upright + turned) / n

@@ -19,13 +19,13 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 DISTANCE = 60.0
 """Geometric mean of every depth, in no unit: where a scene without depth starts."""
 EVERY_S = 0.3
-"""Time from one look at the light to the next; the answer holds on meanwhile."""
+"""Time from one estimate to the next; frames between get the last answer."""
 NEWEST = 0.2
-"""Weight of the newest look beside the earlier ones, once there are as many."""
+"""Weight of the newest estimate in the running mean; the first few count alike."""
 LEAST_SEEN = 0.25
 """Share of the picture that must be tissue, lit neither too dark nor too bright."""
 REACH = 0.05
-"""Of the picture's longer side: so far from what was seen the relief is half believed."""
+"""Distance from usable cells at which confidence has fallen to a half, as a share of the picture's longer side."""
 
 UNSEEN = "too little of the picture is tissue that is lit neither too dark nor too bright to find depth by light"
 FLAT = "brightness does not change more than pigment could explain, so depth by light is no better than a plane"

@@ -1,4 +1,4 @@
-"""A model's surface at a time as triangles with colours: the depth that a camera sees, joined where it goes on and cut where it is torn."""
+"""A model's surface at a time as triangles with colours: the depth that a camera sees, connected between neighbouring pixels and cut at occlusion edges."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Where a camera is, from one picture and the Gaussians that it shows: refined by the renderer's own gradient with respect to `viewmats`.
 
-Each round renders once forward and back. The gradient is exact. The first Hessian is that of pixels that move as their depth says (Baker and
-Matthews, "Lucas-Kanade 20 Years On", 2004); each step that was taken then improves it (BFGS; Nocedal and Wright, 2006, section 6.1): before a
-wall, turning and moving sideways look so much alike that the first one alone gets nowhere. A step is only taken when the error falls.
+Each round renders once forward and back. The gradient is exact. The first Hessian is Gauss-Newton's, for pixels that move as their depth says (Baker and
+Matthews, "Lucas-Kanade 20 Years On", 2004); BFGS updates it after each step (Nocedal and Wright, 2006, section 6.1): before a flat surface a rotation
+and a sideways translation look so much alike that the first Hessian alone does not converge. A step is only taken when the error falls.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 
 SOFT = 0.05
-"""Of full brightness: residuals well above it count by their size and no longer by its square."""
+"""Of the Charbonnier loss, as a share of full brightness: residuals well below it count by their square, those well above it by their size."""
 COVERED = 0.5
 """Opacity from which a pixel shows the scene."""
 LEAST_PIXELS = 64
 DONE = 1e-5
-"""When a step lessens the error by less than this share of it, the last one was made."""
+"""Converged when a step lessens the error by less than this share of it."""
 
 
 @dataclass(frozen=True)
@@ -68,14 +68,14 @@ def refine_pose(
     if mask is not None:
         counted = torch.as_tensor(np.asarray(mask) != 0, device=device)
     viewmat, _ = camera.matrices(device)
-    now = _look(gaussians, camera, viewmat, target, counted)
+    now = _compare(gaussians, camera, viewmat, target, counted)
     hessian = now.hessian
     first, damping, tried = now.error, 1e-3, 0
     for _ in range(rounds):
         tried += 1
         step = torch.linalg.solve(hessian + damping * torch.diag(hessian.diagonal() + 1e-12), -now.gradient)
         moved = exp(step.double()).to(viewmat) @ viewmat
-        then = _look(gaussians, camera, moved, target, counted)
+        then = _compare(gaussians, camera, moved, target, counted)
         if not then.error < now.error:
             damping *= 10
             if damping > 1e6:
@@ -91,15 +91,15 @@ def refine_pose(
 
 
 @dataclass(frozen=True)
-class _Look:
+class _Comparison:
     error: float
     gradient: Tensor
-    """[6], by a twist of the camera."""
+    """[6]: derivatives by a twist of the camera (`pose`)."""
     hessian: Tensor
     """[6, 6]."""
 
 
-def _look(gaussians: Gaussians, camera: Camera, viewmat: Tensor, target: Tensor, counted: Tensor) -> _Look:
+def _compare(gaussians: Gaussians, camera: Camera, viewmat: Tensor, target: Tensor, counted: Tensor) -> _Comparison:
     """Compare the picture of a pose with what it should be."""
     twist = torch.zeros(6, dtype=torch.float32, device=viewmat.device, requires_grad=True)
     intrinsics = camera.matrices(viewmat.device)[1]
@@ -124,20 +124,20 @@ def _look(gaussians: Gaussians, camera: Camera, viewmat: Tensor, target: Tensor,
     weight = 1 / (size.detach() * size.numel())
     by_twist = _by_twist(picture.detach(), colors[0, ..., 3].detach(), intrinsics)[compared]
     hessian = torch.einsum("nci,nc,ncj->ij", by_twist, weight, by_twist)
-    return _Look(float(error.detach()), gradient, hessian)
+    return _Comparison(float(error.detach()), gradient, hessian)
 
 
 def _improved(hessian: Tensor, step: Tensor, change: Tensor) -> Tensor:
-    """The Hessian that also explains how the gradient changed with a step; as it was where that would not be one of a minimum."""
+    """The Hessian after BFGS' update with a step and the change of the gradient; as it was where it would not stay positive definite."""
     along = hessian @ step
-    bent = step @ change
-    if not bent > 1e-6 * step.norm() * change.norm():
+    curvature = step @ change
+    if not curvature > 1e-6 * step.norm() * change.norm():
         return hessian
-    return hessian + torch.outer(change, change) / bent - torch.outer(along, along) / (step @ along)
+    return hessian + torch.outer(change, change) / curvature - torch.outer(along, along) / (step @ along)
 
 
 def _by_twist(picture: Tensor, depth: Tensor, intrinsics: Tensor) -> Tensor:
-    """[H, W, 3, 6]: how each pixel's colour changes with a twist of the camera, if the surface keeps its colour."""
+    """Jacobian [H, W, 3, 6] of each pixel's colour by a twist of the camera, if the surface keeps its colour."""
     down, right = torch.gradient(picture, dim=(0, 1))
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]

@@ -15,11 +15,11 @@ from gsplat_core.scene.cameras import Camera
 WINDOW_PX = 7
 """Side of the square in which two pictures are compared."""
 NOISE_GREY = 2.0
-"""Standard deviation of a picture's noise in grey levels: contrast that is not more says nothing."""
+"""Standard deviation of a picture's noise in grey levels; patches with no more contrast than that do not correlate."""
 DISAGREES = 0.5
-"""The cost of pictures that have nothing to do with each other, and the most that one view may say against a distance."""
+"""The cost of uncorrelated patches, and the largest one: a view in which the point is hidden must not outvote the others."""
 AGREES = 0.2
-"""The cost below which a view speaks for a distance: a correlation of 0.6."""
+"""The cost below which a view votes for a distance: a correlation of 0.6."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,9 @@ class View:
 def sweep(
     reference: View, others: Sequence[View], inverse_depths: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """How little the views agree at each inverse depth of each pixel of `reference`: costs [H, W, D] from 0 to `DISAGREES`, and how many views
-    speak for it [H, W, D].
+    """Matching costs of each inverse depth at each pixel of `reference` [H, W, D], from 0 to `DISAGREES`, and how many views vote for it [H, W, D].
 
-    Patches are compared by their correlation (ZNCC), which knows no brightness: the light moves with the scope.
+    Patches are compared by zero-mean normalised cross-correlation, which does not depend on brightness: the light moves with the scope.
     """
     height, width = reference.grey.shape
     cost = np.empty((len(inverse_depths), height, width), np.float32)

@@ -1,4 +1,4 @@
-"""Points of one picture found again in another one, and how far the way back misses them."""
+"""Points of one picture found again in another one, with their forward-backward error (Kalal et al. 2010)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def followed(
     window_px: int,
     levels: int,
 ) -> tuple[Points, NDArray[np.float32]]:
-    """Where points of `first` are in `second` [N, 2], and by how many pixels each misses its start on the way back [N]; infinity where it was lost.
+    """Where points of `first` are in `second` [N, 2], and how far from its start each arrives when it is followed back [N], in pixels; infinity where it was lost.
 
     By Lucas and Kanade's method in a pyramid, on grey pictures [H, W].
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 SMALL = 1e-4
-"""Angle in radians below which series stand for the quotients: their next term is below what float64 tells apart."""
+"""Angle in radians below which Taylor series replace the quotients; their next term is below float64's precision."""
 
 
 def hat(vector: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Whether the poses that come with pictures explain how these differ, before anything is built on them.
 
-Where a point of inverse depth w appears in another picture is linear in w (Hartley and Zisserman 2004, section 12.2), so that where a point is found and two poses
-give it a least-squares w, and an error that no w removes. Poses that are right leave little of it; others leave much.
+That a point of inverse depth w is seen at a certain place of another picture is a condition linear in w (triangulation; Hartley and Zisserman 2004, section 12.2). So a
+corner that is followed to another picture gives, with the two poses, a least-squares w and a residual that no w removes. With right poses it is small.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ FEWEST_POINTS = 24
 TRACK_ERROR_PX = 0.5
 """Standard deviation of where a corner is found."""
 RELIEF = 0.5
-"""Standard deviation of the tissue's inverse depth, relative to that of the plane that fits best."""
+"""Standard deviation of the tissue's inverse depth before it is seen, relative to that of the plane that fits best."""
 LARGEST_RELIEF = 4.0
 """Nothing is taken to be so many times nearer or farther than that plane."""
 LEAST_PARALLAX_PX = 1.5
-"""Motion by parallax, as a median, in the view that has most of it: with less, depth is the pictures' noise."""
+"""Median parallax of the corners in the view that has most of it: with less, depth is the pictures' noise."""
 MOST_LEFT_PX, MOST_LEFT = 1.0, 0.25
-"""A view whose points are off by more than both this, as a median, and this share of its parallax contradicts its pose."""
+"""A view contradicts its pose where the median residual is more than so many pixels, and more than this share of its parallax."""
 POSE_ERROR_PX = 0.6
-"""How far corners of still tissue are off by errors of poses and pictures."""
+"""Residual of tissue that stands still, by errors of poses and tracking."""
 FEWEST_AGREEING = 0.6
 """Share of the views whose poses have to explain their pictures."""
 ROUNDS = 6
-"""Of reweighting, so that points that move otherwise decide nothing."""
+"""Of iteratively reweighted least squares, so that corners that move by themselves have little weight."""
 
 Array = NDArray[np.float64]
 
@@ -58,8 +58,8 @@ class Parallax:
     parallax_px: float
     """How far the median corner moves by parallax in the view where it does so most."""
     own_motion: float
-    """How far corners move otherwise, relative to that, in the median view: what moves across the parallax moves along it, too, where it is taken
-    for depth, which is then off by about this share or twice that."""
+    """The residual that no depth explains, as a share of the parallax, in the median view: tissue that moves by itself. As much motion along the
+    parallax is taken for depth, which is then off by about this share, or twice that."""
 
 
 def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | str:
@@ -148,7 +148,7 @@ def _plane(c: Array, d: Array, seen: NDArray[np.bool_], focal: float) -> float:
 
 
 def _relief(c: Array, d: Array, seen: NDArray[np.bool_], focal: float, plane: float) -> Array:
-    """Each point's inverse depth [points], from all views and, as far as these do not tell, from the plane."""
+    """Each point's inverse depth [points], by robust least squares over all views, with the plane as the prior mean."""
     prior = 1 / (RELIEF * plane) ** 2
     inverse = np.full(c.shape[1], plane)
     for _ in range(ROUNDS):
@@ -161,7 +161,7 @@ def _relief(c: Array, d: Array, seen: NDArray[np.bool_], focal: float, plane: fl
 
 
 def _agreement(c: Array, d: Array, focal: float, inverse: Array) -> Array:
-    """Weights [views, points] with which least squares become the smallest sum of distances: what moves otherwise decides nothing."""
+    """Weights [views, points] with which repeated least squares minimise the sum of distances (L1), which outliers hardly move."""
     return np.asarray(TRACK_ERROR_PX / np.maximum(_off_px(c, d, focal, inverse), TRACK_ERROR_PX))
 
 

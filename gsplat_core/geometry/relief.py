@@ -1,4 +1,4 @@
-"""The relief of a surface by how brightly a light beside the camera lights it.
+"""Shape from shading, for a light at the camera: the relief of a surface from how brightly it is lit (Prados and Faugeras 2005).
 
 Logarithms of depth are a sum of cosines along the picture's sides: u = Σ c_k cos_k, z = exp(u). A surface in the light of a small lamp at the
 camera's centre has the brightness cos θ / r², for the angle θ between its normal and the ray, and the distance r along the ray. With x = X / z
@@ -7,8 +7,8 @@ and y = Y / z that is, without approximation (∂ are derivatives by x and y):
     r² = z² (1 + x² + y²),   cos θ = 1 / (√(1 + x² + y²) |N|),   N = (-∂x u, -∂y u, 1 + x ∂x u + y ∂y u)
 
 Unknown beside the relief are how much light there is, how the lamp and the lens darken towards the border (a power of the cosine of the angle
-to the axis), and what is left of the tissue's colour, another sum of cosines. All have priors; that of the relief is as wide as the picture
-asks for (MacKay 1992). The most probable answer is found by Gauss-Newton.
+to the axis), and what is left of the tissue's colour, another sum of cosines. All have Gaussian priors; the width of that of the relief is estimated
+from the picture (evidence maximisation, MacKay 1992). The maximum a posteriori is found by Gauss-Newton.
 """
 
 from __future__ import annotations
@@ -24,25 +24,27 @@ from gsplat_core.geometry.shading import Shading
 Array = NDArray[np.float64]
 
 HALF_WAVES = 9
-"""Of the finest cosine along the longer side."""
+"""Half periods of the finest cosine along the longer side."""
 RELIEF = 0.05
-"""Standard deviation of a coarse cosine of u before the picture is seen ..."""
+"""Prior standard deviation of the coefficients of coarse cosines of u ..."""
 RELIEF_COUNT = 100
-"""... and how many cosines' worth of evidence that is."""
+"""... and the weight of that value while the width is estimated: as if so many coefficients had shown it."""
 SMALLEST_RELIEF, LARGEST_RELIEF = 0.025, 2.0
 RELIEF_HALF_WAVES, RELIEF_POWER = 1.5, 4.0
-"""Standard deviations fall as (1 + (half waves / RELIEF_HALF_WAVES)²) to the power of -RELIEF_POWER / 2."""
+"""Prior standard deviations fall with finer cosines as (1 + (half waves / RELIEF_HALF_WAVES)²) to the power of -RELIEF_POWER / 2."""
 PIGMENT = 0.5
-"""Standard deviation of a coarse cosine of what is left of pigment, beside `Shading.detail` ..."""
+"""Prior standard deviation of the coefficients of coarse cosines of the pigment that is left, in units of `Shading.detail` ..."""
 PIGMENT_HALF_WAVES = 2.0
 """... and from how many half waves on it falls, with their square."""
 FALL_OFF, FALL_OFF_DEVIATION = 1.0, 0.5
-"""Power of the cosine to the axis: 1 for a flat lamp."""
+"""Prior of the power of the cosine to the axis by which it darkens towards the border: 1 for a flat lamp."""
 SOFTNESS = 0.25
-"""Light that has wandered through tissue, or comes from the walls around, reaches slopes that face away: (cos θ + SOFTNESS) / (1 + SOFTNESS)."""
+"""Subsurface scattering and light from the walls around also reach slopes that face away: (cos θ + SOFTNESS) / (1 + SOFTNESS) in place of cos θ."""
+UNREMOVED_PIGMENT = 0.05
+"""Standard deviation in log brightness of large patches of pigment that no weights of the channels remove."""
 ROUNDS = 10
 ROUNDS_TO_SLOPES = 4
-"""In these the slopes' part grows from nothing: by distance alone there is one answer only."""
+"""Over these the cosine term is faded in: by distance alone brightness is linear in the unknowns, and the later rounds start from that solution."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +67,7 @@ class Relief:
     coefficients: Array
     """Of the cosines."""
     share: float
-    """Which share of the relief to believe, 0 to 1: brightness by distance, squared, beside that by pigment that no mixture of channels removes."""
-
-
-UNREMOVED_PIGMENT = 0.05
-"""Standard deviation of coarse pigment that is left in a logarithm of brightness."""
+    """How much of the relief to believe, 0 to 1: the variance of log brightness by distance, over that plus the one by pigment (`UNREMOVED_PIGMENT`)."""
 
 
 @lru_cache(maxsize=8)
@@ -131,7 +129,7 @@ def find_relief(shading: Shading, x: Array, y: Array, focal_cells: tuple[float, 
 
 
 def _width(scaled: Array, undecided: Array) -> float:
-    """The prior's width that makes what was found most probable; `undecided`: which share of each coefficient's prior variance is left."""
+    """The prior's width that makes what was found most probable; `undecided`: posterior over prior variance of each coefficient."""
     decided = float(np.sum(1 - undecided))
     variance = (float(scaled @ scaled) + RELIEF_COUNT * RELIEF**2) / (decided + RELIEF_COUNT)
     return float(np.clip(np.sqrt(variance), SMALLEST_RELIEF, LARGEST_RELIEF))

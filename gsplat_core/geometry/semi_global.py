@@ -1,4 +1,4 @@
-"""Semi-global matching (Hirschmüller 2008): the labels of pixels that cost little and differ little from their neighbours'."""
+"""Semi-global matching (Hirschmüller 2008): labels (distances) of low cost that change little from pixel to pixel."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 SMALL_STEP = 0.02
-"""What a difference of one label between neighbours costs."""
+"""Penalty for a difference of one label between neighbours (P1)."""
 LARGE_STEP = 0.1
-"""What any larger one costs."""
+"""Penalty for any larger one (P2)."""
 
 
 def aggregated(cost: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -40,8 +40,8 @@ def _add_paths(cost: NDArray[np.float32], total: NDArray[np.float32]) -> None:
 
 
 def best_labels(total: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The cheapest label of each pixel [H, W], between whole ones by a parabola, and how unique it is [H, W]: by how much the best label
-    that is not its neighbour costs more, as a share of its own cost."""
+    """The cheapest label of each pixel [H, W], refined between whole ones by a parabola, and its uniqueness [H, W]: by how much the next best label
+    further than two away costs more, as a share of its own cost."""
     labels = total.shape[2]
     best = total.argmin(axis=2)
     inner = np.clip(best, 1, labels - 2)[..., None]

@@ -1,8 +1,8 @@
 """How brightly each part of a picture is lit, told apart from what colour it has.
 
 Light that gets weaker with distance weakens red, green and blue alike; pigment takes them away unequally. Fine detail of a picture is mostly
-pigment, since what changes by distance and slope changes slowly. So the mixture of the channels that shows least of the fine detail, while it
-counts what all of them have in common once, is the one that shows most of the light (the best linear unbiased estimate; Aitken 1936).
+pigment, since what changes by distance and slope changes slowly. So log brightness is the weighted sum of the channels' logarithms, with weights that
+sum to 1, that has the least fine detail (the best linear unbiased estimate; Aitken 1936).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gsplat_core.scene.frames import Frame
 LONG_SIDE_PX = 320
 """Larger pictures are looked at in this size."""
 CELLS = 40
-"""Along the longer side."""
+"""Along the longer side of the grid on which brightness is averaged."""
 BRIGHTEST, DARKEST = 249, 20
 """Levels of the brightest channel beyond which it is clipped, or noise."""
 DARKEST_CHANNEL = 5
@@ -27,11 +27,11 @@ DARKEST_CHANNEL = 5
 SHOULDER = 0.8
 """How far cameras compress what is bright after their gamma: linear light x is recorded as (1 - exp(-SHOULDER x)) / SHOULDER. Cameras differ; 0 is none."""
 BESIDE_TOOLS = 0.07
-"""Of the longer side: so far around a tool its shadow may lie."""
+"""Margin around tools that is left out because of their shadows, as a share of the longer side."""
 LEAST_KNOWN = 0.3
 """Share of a cell's pixels that must be tissue lit neither too dark nor too bright."""
 LEAST_DETAIL = 0.01
-"""Fine detail of the mixture in logarithms; no picture has less noise."""
+"""Lower bound of `Shading.detail`: no picture has less noise."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class Shading:
     brightness: NDArray[np.float64]
     """Logarithm [h, w] of how bright the cell would be without its pigment, up to one summand; meaningless where `share` is too small."""
     share: NDArray[np.float64]
-    """[h, w]: share of the cell's pixels that were taken."""
+    """[h, w]: share of the cell's pixels that could be used."""
     detail: float
-    """Standard deviation between neighbouring cells of what the mixture leaves of pigment, and of noise."""
+    """Standard deviation of `brightness` between neighbouring cells: pigment that is left, and noise."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """The cells that tell something [h, w]."""
+        """The cells of which enough could be used [h, w]."""
         return self.share >= LEAST_KNOWN
 
 
@@ -66,13 +66,13 @@ def shading_of(frame: Frame) -> Shading:
             (cells[1:] - cells[:-1])[known[1:] & known[:-1]],
         ]
     )
-    mixture = _least_pigment(steps)
-    spread = 1.4826 * float(np.median(np.abs(steps @ mixture))) if len(steps) else 0.0
-    return Shading(cells @ mixture, share, max(spread, LEAST_DETAIL))
+    weights = _least_pigment(steps)
+    spread = 1.4826 * float(np.median(np.abs(steps @ weights))) if len(steps) else 0.0
+    return Shading(cells @ weights, share, max(spread, LEAST_DETAIL))
 
 
 def _least_pigment(steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights [3] of the channels that sum to 1 and leave the smallest squares of `steps` [N, 3]."""
+    """Weights [3] of the channels that sum to 1, with the least mean square of `steps` [N, 3] weighted by them."""
     covariance = steps.T @ steps / max(len(steps), 1) + 1e-5 * np.eye(3)
     weights = np.linalg.solve(covariance, np.ones(3))
     return np.asarray(weights / weights.sum())

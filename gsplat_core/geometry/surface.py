@@ -1,4 +1,4 @@
-"""A depth map as a piece of surface: its points, its normals, and where it is torn."""
+"""A depth map as a surface: its points, its normals, and where it is cut at occlusion edges."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from gsplat_core.scene.cameras import Camera
 Array = NDArray[np.floating]
 
 TORN_DEGREES = 80.0
-"""Between neighbouring pixels a surface that is tilted further against the line of sight is taken for two surfaces, one behind the other."""
+"""A depth step between neighbouring pixels that would need a steeper tilt against the line of sight is taken for an occlusion edge."""
 MOST_ANGLE_RAD = 1.5
-"""Of a fisheye's ray to its axis: at a right angle no z leads anywhere."""
+"""Largest angle of a fisheye's ray to its axis: at a right angle a ray has no point at z = 1."""
 
 
 def rays_of(camera: Camera, pixels: Array) -> tuple[Array, Array]:
