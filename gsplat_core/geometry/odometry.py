@@ -84,7 +84,7 @@ def trajectory_of(frames: Iterable[Frame], camera: Camera) -> Trajectory:
     for count, frame in enumerate(frames, start=1):
         if count > MOST_FRAMES:
             raise InvalidInput(f"poses are estimated for at most {MOST_FRAMES} frames at once: read fewer of them")
-        tracks.follow(frame.image, _followed(frame))
+        tracks.follow(frame.image, followed_part(frame))
     if count < 3:
         raise InvalidInput(f"poses are estimated from at least 3 frames, got {count}")
     seen = tracks.observations(LEAST_SEEN if count > LEAST_SEEN else 3)
@@ -95,7 +95,7 @@ def trajectory_of(frames: Iterable[Frame], camera: Camera) -> Trajectory:
     return _Odometry(seen, camera, count).run()
 
 
-def _followed(frame: Frame) -> NDArray[np.uint8] | None:
+def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
     """[H, W]; 0 where nothing is followed: tools, what is outside of the field of view, reflections of the lamp."""
     masks = [each for each in (frame.mask, frame.loss_mask, without_highlights(frame.image)) if each is not None]
     return np.logical_and.reduce([mask != 0 for mask in masks]).astype(np.uint8) if masks else None

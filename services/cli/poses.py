@@ -9,10 +9,12 @@ from pathlib import Path
 import typer
 
 from gsplat_core.errors import InvalidInput, RecordingInvalid
+from gsplat_core.geometry.focal_length import FocalLength, trajectory_without_calibration, with_focal_length
 from gsplat_core.geometry.odometry import DISTANCE, Trajectory, trajectory_of
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.poses_file import write_poses
 from gsplat_core.io.recordings.recording import FileRecording
+from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from operators.applications.progress import Progress
 from operators.errors import OutputError
@@ -35,7 +37,7 @@ def poses_command(recording: Path, out: Path, max_frames: int | None, *, overwri
     opened = open_recording(recording, max_frames=max_frames)
     with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as show:
 
-        def frames() -> Iterator[Frame]:
+        def read() -> Iterator[Frame]:
             for done, frame in enumerate(opened, start=1):
                 if interrupt():
                     raise KeyboardInterrupt
@@ -43,17 +45,49 @@ def poses_command(recording: Path, out: Path, max_frames: int | None, *, overwri
                 yield frame
 
         try:
-            found = trajectory_of(frames(), opened.camera)
+            focal = None
+            if opened.camera_is_assumed:
+                found, focal = trajectory_without_calibration(read, opened.camera)
+            else:
+                found = trajectory_of(read(), opened.camera)
         except InvalidInput as error:  # all that it refuses are pictures and cameras, which are the recording's here
             raise RecordingInvalid(f"{recording}: {error}") from error
     with storage_errors(out.parent):
         write_poses(out, found.poses, overwrite=overwrite)
-    _say(found, opened, out, as_json)
+    _say(found, focal, opened, out, as_json)
     return OK
 
 
-def _say(found: Trajectory, recording: FileRecording, out: Path, as_json: bool) -> None:
+def _about_focal_length(focal: FocalLength | None, camera: Camera) -> str:
+    """What the pictures tell of a focal length that no calibration gives."""
+    assumed_px = float(camera.K[0, 0])
+    if focal is None:
+        return f"too few points could be followed far enough to tell the focal length: the poses are those of the assumed {assumed_px:.4g} px"
+    low_px, high_px = focal.range_px
+    if not focal.known:
+        return (
+            f"the pictures do not tell the focal length: all from {low_px:.4g} to {high_px:.4g} px fit nearly as well, of those that were tried. The poses are those of"
+            f" the assumed {assumed_px:.4g} px, and as far as that is wrong, distances along the view are wrong beside those across it"
+        )
+    K = with_focal_length(camera, round(focal.best_px, 1)).K
+    stated = {
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "fx": K[0, 0],
+        "fy": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+    }
+    return (
+        f"the focal length was found in the pictures: {focal.best_px:.4g} px fits best, and all from {low_px:.4g} to {high_px:.4g} px nearly as well. The poses are those of"
+        f' it; the recording is read with {assumed_px:.4g} px until its recording.json has "camera": {json.dumps(stated)}'
+    )
+
+
+def _say(found: Trajectory, focal: FocalLength | None, recording: FileRecording, out: Path, as_json: bool) -> None:
     notes = [f"lengths have no scale: the first frame's tissue is taken to be {DISTANCE:g} away", *recording.notes]
+    if recording.camera_is_assumed:
+        notes.append(_about_focal_length(focal, recording.camera))
     if found.explained < MOSTLY:
         notes.append(
             f"the scope's motion explains only {found.explained:.0%} of how the pictures move: it may stand still before tissue that moves"
@@ -71,6 +105,13 @@ def _say(found: Trajectory, recording: FileRecording, out: Path, as_json: bool) 
         "error_px_of_a_still_scope": round(found.still_error_px, 4),
         "explained": round(found.explained, 4),
         "not_placed": list(found.lost),
+        "focal_px": round(focal.best_px if focal and focal.known else float(recording.camera.K[0, 0]), 2),
+        "focal_px_from": "pictures"
+        if focal and focal.known
+        else "assumed"
+        if recording.camera_is_assumed
+        else "calibration",
+        "focal_px_range": [round(end, 1) for end in focal.range_px] if focal else [],
     }
     if as_json:
         typer.echo(json.dumps({**facts, "notes": notes}, indent=2))

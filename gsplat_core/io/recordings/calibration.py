@@ -34,6 +34,8 @@ class Calibration:
     poses: NDArray[np.float64] | None
     """World-to-camera [N, 4, 4]; None = not known (the camera of frame 0 stands for all)."""
     source: str
+    assumed: bool = False
+    """Whether nothing is known of the camera's intrinsics, and they are a guess."""
 
 
 def default_calibration(
@@ -47,7 +49,7 @@ def default_calibration(
         f"there is no calibration; a pinhole with f = {camera.K[0, 0]:.1f} px{still} is assumed",
         "Add cameras.json, poses_bounds.npy or a recording.json with the camera; lengths have no scale until then",
     )
-    return Calibration(camera, None, "default")
+    return Calibration(camera, None, "default", assumed=True)
 
 
 def default_camera(width_px: int, height_px: int) -> Camera:

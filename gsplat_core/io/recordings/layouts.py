@@ -222,7 +222,8 @@ def _calibrated(
     if poses is not None:
         poses = poses if rectified is None else rectified.by.turn @ poses
         camera = found.camera.with_pose(poses[0])
-        found = Calibration(camera, poses, f"{POSES_FILE}, and the camera of {found.source}")
+        source = f"{POSES_FILE}, and the camera of {found.source}"
+        found = Calibration(camera, poses, source, found.assumed)
     if rectified is None:
         return _Calibrated(found, described.get("stereo_baseline_mm"))
     return _Calibrated(found, rectified.baseline_mm, rectified.by, rectified.files)

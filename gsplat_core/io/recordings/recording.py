@@ -71,6 +71,8 @@ class FileRecording:
         # A relative path such as `.` has no name of its own.
         self.name = printable(contents.root.name or contents.root.resolve().name)
         self.camera = contents.calibration.camera.scaled(scale)
+        self.camera_is_assumed = contents.calibration.assumed
+        """Whether nothing is known of the camera's intrinsics, and they are a guess."""
         self.width_px, self.height_px = self.camera.width_px, self.camera.height_px
         self.frame_count = min(contents.images.frame_count, max_frames or contents.images.frame_count)
         self.fps = contents.fps

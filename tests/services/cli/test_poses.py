@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
+from gsplat_core.geometry import focal_length
+from gsplat_core.geometry.focal_length import FocalLength
 from gsplat_core.io.recordings import open_recording
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK
@@ -77,8 +79,29 @@ def test_only_so_many_frames_are_read(clip, capsys):
 
 
 def test_a_camera_that_is_not_known_is_said(clip, capsys):
-    notes = said_of(capsys, clip(calibrated=False))["notes"]
-    assert any("there is no calibration; a pinhole with f = 144.0 px" in note for note in notes)
+    said = said_of(capsys, clip(calibrated=False))
+    assert any("there is no calibration; a pinhole with f = 144.0 px" in note for note in said["notes"])
+    assert any("the pictures do not tell the focal length: all from 96 to 256 px" in note for note in said["notes"])
+    assert (said["focal_px"], said["focal_px_from"], said["focal_px_range"]) == (144, "assumed", [96, 256])
+
+
+def test_a_focal_length_that_pictures_tell_is_used_and_said(clip, capsys, monkeypatch):
+    told = FocalLength(144.0, FOCAL, (130.0, 150.0), True)
+    monkeypatch.setattr(focal_length, "focal_length_of", lambda frames, camera, found: told)
+    folder = clip(calibrated=False)
+    said = said_of(capsys, folder)
+    assert (said["focal_px"], said["focal_px_from"], said["focal_px_range"]) == (FOCAL, "pictures", [130, 150])
+    (note,) = (note for note in said["notes"] if "the focal length was found" in note)
+    assert "140 px fits best, and all from 130 to 150 px nearly as well" in note
+    stated = json.loads(note.partition('"camera": ')[2])
+    described = {"format": "intrasplat-recording", "version": 1, "fps": 30, "camera": stated}
+    (folder / "recording.json").write_text(json.dumps(described))
+    assert open_recording(folder).camera.K[0, 0] == FOCAL
+
+
+def test_a_calibrated_camera_is_taken_as_it_is(clip, capsys):
+    said = said_of(capsys, clip())
+    assert (said["focal_px"], said["focal_px_from"], said["focal_px_range"]) == (FOCAL, "calibration", [])
 
 
 def test_a_scope_that_may_stand_still_is_said(clip, capsys):
