@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -24,6 +21,7 @@ from gsplat_core.io.sessions.session_file import SESSION_FILE
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
 from operators.errors import OutputError
+from operators.side_thread import step_back
 from operators.sinks.recorded import Recorded
 from operators.storage import StorageReserve, storage_errors
 
@@ -39,11 +37,9 @@ CLOSE_S = 10.0
 """How long `close` waits while nothing more of what is in the queue is written."""
 MOST_CLOSE_S = 60.0
 """How long it waits at most."""
-NICENESS = 10
-"""How far the thread steps back behind the graph where both want the processor."""
 _SLOW = "writing is too slow"
 _UNFIT = "no recording can hold it"
-What = Literal["frame", "prepared", "shown"]
+What = Literal["frame", "prepared", "shown", "depth"]
 
 
 @dataclass(frozen=True)
@@ -141,6 +137,12 @@ class SessionRecorder:
         with self._changed:
             self._put(_Part(lambda writer: writer.line(line)))
 
+    def depth(self, frame: Frame) -> None:
+        """A frame that was trained on before, with the depth that training was given of it now: in its place among the lines of what was trained."""
+        size = sum(plane.nbytes for plane in (frame.depth, frame.depth_confidence) if plane is not None)
+        with self._changed:
+            self._put(_Part(lambda writer: writer.late_depth(frame), "depth", frame.seq, size))
+
     def shown(self, shown: Shown) -> None:
         """A picture that was shown."""
         size = shown.rendered.nbytes if shown.new else 0
@@ -213,9 +215,7 @@ class SessionRecorder:
 
     def _run(self, writer: SessionWriter) -> None:
         """The life of the thread."""
-        if sys.platform == "linux":  # elsewhere it means the whole process
-            with suppress(OSError):  # a system that does not allow it lets the thread run as all others do
-                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+        step_back()
         try:
             with storage_errors(self.folder):
                 while (taken := self._take()) is not None:
@@ -264,7 +264,7 @@ class SessionRecorder:
 
 def _bytes(frame: Frame, arrived: Frame | None = None) -> int:
     """Of the frame's pictures, but for those that wait already as those of `arrived`."""
-    planes = ("image", "right_image", "depth", "mask", "loss_mask", "rehearsal_mask")
+    planes = ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask")
     mine = {id(plane): plane.nbytes for name in planes if (plane := getattr(frame, name)) is not None}
     others = () if arrived is None else (id(getattr(arrived, name)) for name in planes)
     for key in others:

@@ -80,7 +80,8 @@ def _versions() -> list[Check]:
 def _processor() -> list[Check]:
     import torch
 
-    from services.reports.machine import processor_name, usable_cores
+    from operators.side_thread import usable_cores
+    from services.reports.machine import processor_name
 
     threads, cores = torch.get_num_threads(), usable_cores()
     advice = "" if threads <= cores else f"set OMP_NUM_THREADS={cores}: more threads than cores slow each other down"

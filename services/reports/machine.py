@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import platform
 
 import torch
 
 from gsplat_core.ops.native import instruction_set
+from operators.side_thread import usable_cores
 
 
 def machine_facts() -> dict[str, str]:
@@ -31,8 +31,3 @@ def processor_name() -> str:
     except FileNotFoundError:
         pass
     return platform.processor() or platform.machine()
-
-
-def usable_cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import logging
-import os
-import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from typing import Any
 
 from gsplat_core.scene.orbit import Orbit
 from operators.display import DisplaySettings
 from operators.messages import PictureState
+from operators.side_thread import step_back
 from operators.sources.source import SourceState
 from services.bus.errors import BadMessage
 from services.bus.runtime import LAYERS, Layer, StreamFolder
@@ -22,8 +20,6 @@ from services.bus.watched_pictures import WatchedPublisher, wait_for_readers
 from services.supervisor.layer_drawing import LayerDrawing, LayerScene, label
 
 log = logging.getLogger(__name__)
-NICENESS = 10
-"""How far the thread steps back behind the reconstruction where both want the processor."""
 PERIOD_S = {"cpu": 0.1, "cuda": 1 / 30}
 """Pictures of one kind come no closer together."""
 MOST_SHARE = {"cpu": 1 / 6, "cuda": 1 / 4}
@@ -94,9 +90,7 @@ class Layers:
         return {"layers": {**layers, **({"failed": self._failed} if self._failed else {})}}
 
     def _run(self) -> None:
-        if sys.platform == "linux":  # elsewhere it means the whole process
-            with suppress(OSError):  # a system that does not allow it lets the thread run as all others do
-                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+        step_back()
         publishers = {layer: WatchedPublisher(self._folder.endpoint(layer)) for layer in LAYERS}
         try:
             drawing: LayerDrawing | None = None
