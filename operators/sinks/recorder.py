@@ -13,7 +13,6 @@ from typing import Any
 
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.initialisation import believed_depth
 from operators.graph import Operator, OperatorSpec
 from operators.messages import ShownPicture
 from operators.outcome import OutcomeBuilder
@@ -95,11 +94,7 @@ class RecordPreparationOp(Operator):
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         frame = op_input.receive("frame")
-        prepared = frame
-        if frame.depth_confidence is not None:
-            # What of the depth is believed is what training takes; the confidence has no track.
-            prepared = frame.with_fields(depth=believed_depth(frame), depth_confidence=None)
-        self.recorder.prepared(prepared)
+        self.recorder.prepared(frame)
         op_output.emit(frame, "frame")
 
 

@@ -31,6 +31,7 @@ CODINGS: Mapping[str, Coding] = {
     "loss_mask": "grey",
     "rehearsal_mask": "grey",
     "depth": "float",
+    "depth_confidence": "float",
     "shown": "colour",
 }
 """How each track is coded; `shown` may be vp9."""

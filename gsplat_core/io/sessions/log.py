@@ -21,14 +21,14 @@ from gsplat_core.io.sessions.records import (
     SegmentEnds,
     ShownLine,
 )
-from gsplat_core.io.sessions.schedule import Grown, Observed, ReconstructorMade, Rehearsed, SceneBegun
+from gsplat_core.io.sessions.schedule import DepthTaken, Grown, Observed, ReconstructorMade, Rehearsed, SceneBegun
 
 LOG_FILE = "log.jsonl"
 MAX_LINE_BYTES = 1 << 20
 
 Line = (
     SegmentBegins | FrameLine | PreparedLine | ShownLine | LostLine | DeletedLine | NoteLine | SegmentEnds
-    | ReconstructorMade | SceneBegun | Observed | Grown | Rehearsed
+    | ReconstructorMade | SceneBegun | Observed | DepthTaken | Grown | Rehearsed
 )  # fmt: skip
 _LINES: TypeAdapter[Line] = TypeAdapter(Annotated[Line, Field(discriminator="event")])
 _UNKNOWN_EVENT = "union_tag_invalid"

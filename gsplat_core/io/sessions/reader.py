@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.io.recordings.findings import printable
 from gsplat_core.io.sessions.log import Line
-from gsplat_core.io.sessions.records import FrameLine, PreparedLine, ShownLine
-from gsplat_core.io.sessions.schedule import SCHEDULE_LINES, ReconstructorMade, ScheduleLine
+from gsplat_core.io.sessions.records import FrameLine, LostLine, PreparedLine, ShownLine
+from gsplat_core.io.sessions.schedule import SCHEDULE_LINES, DepthTaken, ReconstructorMade, ScheduleLine
 from gsplat_core.io.sessions.segment_reader import FIELDS, SegmentPictures, SegmentReader, mask_of_nothing
 from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SESSION_FILE, camera_of, read_session_file
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 
 MOST_ARRIVED = 64
 """Frames that came in and may still be prepared for training."""
@@ -109,9 +109,19 @@ class SessionReader:
                     count += 1
         return count
 
-    def schedule(self) -> Iterator[ScheduleLine]:
-        """What was trained, in order."""
-        return (line for _, line in self.lines() if isinstance(line, SCHEDULE_LINES))
+    def schedule(self) -> Iterator[ScheduleLine | LostLine]:
+        """What was trained, in order; lost depth in the place where training was given it."""
+        for _, line in self.lines():
+            if isinstance(line, SCHEDULE_LINES) or (isinstance(line, LostLine) and line.what == "depth"):
+                yield line
+
+    def late_depths(self) -> Iterator[dict[str, Any] | None]:
+        """For each `take_depth` line, in order, what its frame has besides: its fields by name. None: its pictures cannot be read."""
+        for segment in self.segments:
+            with segment.open() as pictures:
+                for line in segment.lines():
+                    if isinstance(line, DepthTaken):
+                        yield late_depth_of(line, pictures) if segment.there(line) else None
 
     def digests(self) -> Iterator[ShownLine]:
         """The new pictures that were shown, in order."""
@@ -176,6 +186,15 @@ def prepared_of(line: PreparedLine, arrived: Frame, pictures: SegmentPictures) -
     return _frame(line, planes, line.damage or damage)
 
 
+def late_depth_of(line: DepthTaken, pictures: SegmentPictures) -> dict[str, Any] | None:
+    """The fields that a frame got later; None where they cannot be decoded whole."""
+    planes, damage = pictures.of(line)
+    if damage is not None or "depth" not in planes:
+        return None
+    confidence, origin = planes.get("depth_confidence"), DepthOrigin(line.origin)
+    return {"depth": planes["depth"], "depth_confidence": confidence, "depth_origin": origin}
+
+
 def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], damage: str | None) -> Frame | None:
     image = planes.get("image")
     if image is None:
@@ -192,6 +211,8 @@ def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], dama
             right_image=planes.get("right_image"),
             right_camera=None if line.right_camera is None else camera_of(line.right_camera),
             depth=planes.get("depth"),
+            depth_confidence=planes.get("depth_confidence"),
+            depth_origin=None if line.depth_origin is None else DepthOrigin(line.depth_origin),
             mask=planes.get("mask"),
             loss_mask=planes.get("loss_mask"),
             rehearsal_mask=planes.get("rehearsal_mask"),

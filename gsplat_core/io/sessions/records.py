@@ -5,7 +5,7 @@
     lost         something could not be recorded     deleted    an older segment was removed
     note         a sentence                          end        the segment is complete
 
-The lines that say what was trained, `reconstructor`, `observe`, `grow`, `rehearse` and `begin_scene`, are in `schedule`. A reader leaves out
+The lines that say what was trained, `reconstructor`, `observe`, `take_depth`, `grow`, `rehearse` and `begin_scene`, are in `schedule`. A reader leaves out
 lines whose `event` it does not know.
 """
 
@@ -37,9 +37,13 @@ Pose = Annotated[tuple[Number, ...], Field(min_length=16, max_length=16), AfterV
 """[4, 4] row by row, OpenCV axes."""
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
-TrackName = Literal["image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth", "shown"]
+TrackName = Literal["image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth", "depth_confidence", "shown"]
 Tracks = dict[TrackName, Count]
 """For each track that has a picture for this line, the time in milliseconds at which it lies in the track's file."""
+
+
+Origin = Literal["measured", "stereo", "parallax", "light"]
+"""See `gsplat_core.scene.frames.DepthOrigin`."""
 
 
 class Record(BaseModel):
@@ -91,6 +95,8 @@ class _FrameLine(Record):
     """World-to-camera."""
     right_camera: CameraRecord | None = None
     """The right eye's; its pose leads from the left camera's coordinates to its own."""
+    depth_origin: Origin | None = None
+    """Absent where there is no depth, or in recordings of earlier versions."""
     arrived_ns: Nanoseconds | None = None
     exposure: tuple[Positive, Positive, Positive] | None = None
     withheld: Text | None = None
@@ -135,7 +141,7 @@ class LostLine(Record):
 
     event: Literal["lost"] = "lost"
     seq: Count
-    what: Literal["frame", "prepared", "shown"]
+    what: Literal["frame", "prepared", "shown", "depth"]
     why: Text
 
 

@@ -5,6 +5,7 @@ afterwards. The thread that owns the reconstructor writes a line for each call, 
 
     {"event":"reconstructor","device":"cpu","seed":0,"config":{…},"training":{…},"camera":{…}}   a new one is made
     {"event":"observe","seq":0,"steps":40,"train":true}      observe(frame 0) with so many steps, then publish(): what is shown of it
+    {"event":"take_depth","seq":0,"origin":"stereo",…}       take_depth(frame 0 with the depth of these tracks): found after it was trained on
     {"event":"grow","seq":0}                                 grow(frame 0): Gaussians where it showed tissue that nothing covers
     {"event":"rehearse","steps":3}                           rehearse(3): further steps on earlier frames
     {"event":"begin_scene","seq":90}                         begin_scene(frame 90), which is observed next
@@ -18,7 +19,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from gsplat_core.io.sessions.records import CameraRecord, Count, Record, Text
+from gsplat_core.io.sessions.records import CameraRecord, Count, Origin, Record, Side, Text, Tracks
 
 Steps = Annotated[int, Field(ge=0, le=10_000_000)]
 
@@ -53,6 +54,18 @@ class Observed(Record):
     train: bool
 
 
+class DepthTaken(Record):
+    """`LiveReconstructor.take_depth` was called with a frame that was observed before, and with depth that was found since."""
+
+    event: Literal["take_depth"] = "take_depth"
+    seq: Count
+    origin: Origin
+    width_px: Side
+    height_px: Side
+    tracks: Tracks
+    """`depth`, and `depth_confidence` where there is any."""
+
+
 class Grown(Record):
     """`LiveReconstructor.grow` was called with the frame that was observed last."""
 
@@ -67,5 +80,5 @@ class Rehearsed(Record):
     steps: Steps
 
 
-ScheduleLine = ReconstructorMade | SceneBegun | Observed | Grown | Rehearsed
-SCHEDULE_LINES = (ReconstructorMade, SceneBegun, Observed, Grown, Rehearsed)
+ScheduleLine = ReconstructorMade | SceneBegun | Observed | DepthTaken | Grown | Rehearsed
+SCHEDULE_LINES = (ReconstructorMade, SceneBegun, Observed, DepthTaken, Grown, Rehearsed)

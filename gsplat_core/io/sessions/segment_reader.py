@@ -16,9 +16,12 @@ from gsplat_core.io.recordings.image_files import MAX_PIXELS
 from gsplat_core.io.recordings.plain_files import UnreadableFile
 from gsplat_core.io.sessions.log import LOG_FILE, Line, read_log
 from gsplat_core.io.sessions.records import FrameLine, PreparedLine, SegmentBegins, SegmentEnds, ShownLine
+from gsplat_core.io.sessions.schedule import DepthTaken
 from gsplat_core.io.sessions.segment_writer import Stage, track_file
 from gsplat_core.io.sessions.track_reader import TrackIndex, TrackReader
 
+PictureLine = FrameLine | PreparedLine | ShownLine | DepthTaken
+"""Lines that pictures belong to."""
 FIELDS = ("right_image", "mask", "depth", "pose")
 MOST_OPEN = 128
 """Files of one segment; a log that names more is not ours."""
@@ -53,7 +56,7 @@ class SegmentReader:
         except (UnreadableFile, OSError):
             return  # as a log that is cut off at its first byte
 
-    def there(self, line: FrameLine | PreparedLine | ShownLine) -> bool:
+    def there(self, line: PictureLine) -> bool:
         """Whether every picture that a line names is in its file, whole."""
         return all(
             (index := self._index(_file(line, track))) is not None and time in index
@@ -79,7 +82,7 @@ class SegmentReader:
         named: set[str] = set()
         frames: list[FrameLine] = []
         for last in lines:
-            if isinstance(last, FrameLine | PreparedLine | ShownLine):
+            if isinstance(last, PictureLine):
                 named.update(_file(last, track) for track in last.tracks)
                 if len(named) > MOST_OPEN:
                     break
@@ -125,7 +128,7 @@ class SegmentPictures:
         self._open.close()
         self._readers.clear()
 
-    def of(self, line: FrameLine | PreparedLine | ShownLine) -> tuple[dict[str, NDArray[Any]], str | None]:
+    def of(self, line: PictureLine) -> tuple[dict[str, NDArray[Any]], str | None]:
         """The pictures of a line by track, and what is wrong with them; a picture that cannot be read at all is left out."""
         pictures: dict[str, NDArray[Any]] = {}
         damage: str | None = None
@@ -141,7 +144,7 @@ class SegmentPictures:
                 damage = damage or f"{name}: {wrong}"
         return pictures, damage
 
-    def _reader(self, name: str, track: str, line: FrameLine | PreparedLine | ShownLine) -> TrackReader:
+    def _reader(self, name: str, track: str, line: PictureLine) -> TrackReader:
         if name not in self._readers:
             index = self._indices.get(name)
             if index is None:
@@ -151,8 +154,10 @@ class SegmentPictures:
         return self._readers[name]
 
 
-def _file(line: FrameLine | PreparedLine | ShownLine, track: str) -> str:
-    stage: Stage = "prepared_" if isinstance(line, PreparedLine) else ""
+def _file(line: PictureLine, track: str) -> str:
+    stage: Stage = ""
+    if isinstance(line, PreparedLine | DepthTaken):
+        stage = "prepared_" if isinstance(line, PreparedLine) else "late_"
     return track_file(stage, track, line.height_px, line.width_px)
 
 

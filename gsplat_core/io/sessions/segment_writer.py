@@ -13,8 +13,9 @@ from gsplat_core.io.sessions.log import LOG_FILE, LogWriter
 from gsplat_core.io.sessions.records import FrameLine, Record, SegmentBegins, SegmentEnds
 from gsplat_core.io.sessions.track_writer import TrackWriter
 
-Stage = Literal["", "prepared_"]
-"""How the names of track files begin: "" for what came in and what was shown, "prepared_" for what training was given."""
+Stage = Literal["", "prepared_", "late_"]
+"""How the names of track files begin: "" for what came in and what was shown, "prepared_" for what training was given, "late_" for what it was given
+of a frame later."""
 MOST_FILES = 64
 """Tracks and sizes; a segment that needs more of them ends."""
 

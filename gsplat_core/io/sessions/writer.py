@@ -27,12 +27,13 @@ from gsplat_core.io.sessions.records import (
     TrackName,
 )
 from gsplat_core.io.sessions.retention import KeptPart, Retention, earlier_sessions, finish_removals
+from gsplat_core.io.sessions.schedule import DepthTaken
 from gsplat_core.io.sessions.segment_writer import SegmentWriter, Stage
 from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SessionInfo, camera_record, write_session_file
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DepthOrigin, Frame
 
-_PLANES: tuple[TrackName, ...] = ("image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth")
-_DTYPES = {"depth": np.float32}
+_DEPTHS: tuple[TrackName, ...] = ("depth", "depth_confidence")
+_PLANES: tuple[TrackName, ...] = ("image", "right_image", "mask", "loss_mask", "rehearsal_mask", *_DEPTHS)
 
 
 @dataclass(frozen=True)
@@ -114,8 +115,7 @@ class SessionWriter:
     def frame(self, frame: Frame) -> None:
         """A frame that came in."""
         self._go_on()
-        planes = {name: plane for name in _PLANES if (plane := getattr(frame, name)) is not None}
-        tracks = self._pictures("", planes, frame.pts_ns)
+        tracks = self._pictures("", _planes(frame, _PLANES), frame.pts_ns)
         self._segment.line(FrameLine(**_said(frame), tracks=tracks))
 
     def prepared(self, frame: Frame, arrived: Frame) -> None:
@@ -135,6 +135,16 @@ class SessionWriter:
                 planes[name] = plane
         tracks = self._pictures("prepared_", planes, frame.pts_ns)
         self._segment.line(PreparedLine(**_said(frame), tracks=tracks, same=tuple(same)))
+
+    def late_depth(self, frame: Frame) -> None:
+        """The depth of a frame, which training was given after the frame itself."""
+        self._go_on()
+        origin: Any = (frame.depth_origin or DepthOrigin.MEASURED).value
+        tracks = self._pictures("late_", _planes(frame, _DEPTHS), frame.pts_ns)
+        width_px, height_px = frame.width_px, frame.height_px
+        self._segment.line(
+            DepthTaken(seq=frame.seq, origin=origin, width_px=width_px, height_px=height_px, tracks=tracks)
+        )
 
     def shown(self, shown: Shown) -> None:
         """A picture that was shown."""
@@ -177,7 +187,9 @@ class SessionWriter:
 
     def _pictures(self, stage: Stage, planes: dict[TrackName, NDArray[Any]], pts_ns: int) -> dict[TrackName, int]:
         return {
-            name: self._segment.picture(stage, name, plane.astype(_DTYPES.get(name, np.uint8), copy=False), pts_ns)
+            name: self._segment.picture(
+                stage, name, plane.astype(np.float32 if name in _DEPTHS else np.uint8, copy=False), pts_ns
+            )
             for name, plane in planes.items()
         }
 
@@ -230,6 +242,10 @@ class SessionWriter:
         self._segment.line(NoteLine(text=f"the earlier session {session.name} {what}"[:MAX_TEXT]))
 
 
+def _planes(frame: Frame, names: tuple[TrackName, ...]) -> dict[TrackName, NDArray[Any]]:
+    return {name: plane for name in names if (plane := getattr(frame, name)) is not None}
+
+
 def _said(frame: Frame) -> dict[str, Any]:
     """What a line says of a frame beside its pictures."""
     return {
@@ -241,6 +257,7 @@ def _said(frame: Frame) -> dict[str, Any]:
         "damage": _short(frame.damage),
         "pose": None if frame.pose is None else tuple(frame.pose.ravel().tolist()),
         "right_camera": None if frame.right_camera is None else camera_record(frame.right_camera),
+        "depth_origin": None if frame.depth_origin is None else frame.depth_origin.value,
         "arrived_ns": frame.arrived_ns,
         "exposure": None if frame.exposure == (1.0, 1.0, 1.0) else tuple(map(float, frame.exposure)),
         "withheld": _short(frame.withheld),

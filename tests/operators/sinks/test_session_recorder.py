@@ -73,7 +73,7 @@ def test_a_slow_disk_loses_frames_says_so_and_makes_nobody_wait(tmp_path, gate):
     frames = [new_frame(seq) for seq in range(50)]
     size = sum(
         frames[0].__dict__[name].nbytes
-        for name in ("image", "right_image", "depth", "mask", "loss_mask", "rehearsal_mask")
+        for name in ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask")
     )
     recorder = recorder_in(tmp_path, queue_bytes=10 * size)
     begin = time.monotonic()
@@ -91,7 +91,10 @@ def test_a_slow_disk_loses_frames_says_so_and_makes_nobody_wait(tmp_path, gate):
 
 def test_shown_pictures_are_lost_before_frames(tmp_path, gate):
     frames = [
-        new_frame(seq, right_image=None, depth=None, mask=None, loss_mask=None, rehearsal_mask=None) for seq in range(8)
+        new_frame(
+            seq, right_image=None, depth=None, depth_confidence=None, mask=None, loss_mask=None, rehearsal_mask=None
+        )
+        for seq in range(8)
     ]
     recorder = recorder_in(tmp_path, queue_bytes=8 * frames[0].image.nbytes)
     for frame in frames[:4]:
@@ -107,10 +110,10 @@ def test_shown_pictures_are_lost_before_frames(tmp_path, gate):
 
 def test_what_was_prepared_of_a_lost_frame_is_lost_too(tmp_path, gate):
     frames = [new_frame(seq) for seq in range(3)]
-    recorder = recorder_in(tmp_path, queue_bytes=6000)
+    recorder = recorder_in(tmp_path, queue_bytes=8000)
     for frame in frames:
         recorder.frame(frame)
-    assert frames[2].image.nbytes < 6000
+    assert frames[2].image.nbytes < 8000
     recorder.prepared(frames[2])
     gate.set()
     recorder.close()
@@ -281,3 +284,17 @@ def test_a_disk_that_is_full_at_the_beginning_is_refused(tmp_path):
 
 def _root() -> Path:
     return Path(__file__).resolve().parents[3]
+
+
+def test_late_depth_that_finds_no_room_is_lost_in_its_place(tmp_path, gate):
+    recorder = recorder_in(tmp_path, queue_bytes=10_000)
+    recorder.frame(new_frame(0))
+    recorder.line(Observed(seq=0, steps=1, train=True))
+    recorder.depth(new_frame(0, 64, 64))
+    recorder.line(Observed(seq=1, steps=1, train=True))
+    recorder.depth(new_frame(0))
+    gate.set()
+    recorder.close()
+    assert recorder.recorded.lost == {"depth: writing is too slow": 1}
+    told = [(line.event, line.seq) for line in SessionReader(tmp_path / "s").schedule()]
+    assert told == [("observe", 0), ("lost", 0), ("observe", 1), ("take_depth", 0)]

@@ -9,7 +9,7 @@ from gsplat_core.io.sessions.schedule import Observed, Rehearsed
 from gsplat_core.io.sessions.session_file import camera_record
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 
 HEIGHT_PX, WIDTH_PX = 16, 24
 
@@ -33,6 +33,9 @@ def new_frame(seq: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX, **
         "image": rng.integers(0, 256, (*size, 3), np.uint8),
         "right_image": rng.integers(0, 256, (*size, 3), np.uint8),
         "depth": depth,
+        "depth_confidence": rng.uniform(0, 1, size).astype(np.float32),
+        "depth_origin": list(DepthOrigin)[seq % 4],
+        "right_camera": Camera.from_focal(20.0, width_px, height_px).right_eye(4.4),
         "mask": rng.integers(0, 2, size, np.uint8),
         "loss_mask": rng.integers(0, 2, size, np.uint8),
         "rehearsal_mask": rng.integers(0, 2, size, np.uint8),
@@ -50,9 +53,9 @@ def same_frame(a: Frame, b: Frame) -> bool:
     """Whether two frames have the same pictures, to the bit, and say the same; but for `arrived_ns` and `live`, which replay does not have."""
     planes = [
         (getattr(a, n), getattr(b, n))
-        for n in ("image", "right_image", "depth", "mask", "loss_mask", "rehearsal_mask", "pose")
+        for n in ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask", "pose")
     ]
-    facts = ("seq", "pts_ns", "exposure", "withheld", "new_scene", "damage")
+    facts = ("seq", "pts_ns", "exposure", "withheld", "new_scene", "damage", "depth_origin", "right_camera")
     return all(x is y is None or x.tobytes() == y.tobytes() for x, y in planes) and all(
         getattr(a, n) == getattr(b, n) for n in facts
     )

@@ -27,6 +27,7 @@ FILES = [
         "loss_mask_24x16.mkv",
         "rehearsal_mask_24x16.mkv",
         "depth_24x16.mkv",
+        "depth_confidence_24x16.mkv",
         "prepared_loss_mask_24x16.mkv",
         "shown_24x16.mkv",
     )

@@ -16,7 +16,7 @@ from gsplat_core.io.sessions.reader import prepared_of
 from gsplat_core.io.sessions.records import DeletedLine, PreparedLine, ShownLine
 from gsplat_core.io.sessions.schedule import Observed
 from gsplat_core.io.sessions.writer import Shown
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 from tests.gsplat_core.io.sessions.made import Clock, new_frame, same_frame, session_info
 
 
@@ -45,9 +45,47 @@ def test_what_training_was_given_comes_back_to_the_bit(session, frames):
                         loss_mask=np.ones_like(frames[line.seq].mask), exposure=(1.0, 2.0, 3.0)
                     )
                     assert same_frame(frame, wanted)
-                    assert line.same == ("image", "right_image", "mask", "rehearsal_mask", "depth")
+                    assert line.same == ("image", "right_image", "mask", "rehearsal_mask", "depth", "depth_confidence")
                     seen += 1
     assert seen == len(frames)
+
+
+def test_depth_that_came_late_comes_back_in_its_place(tmp_path):
+    frames = [new_frame(seq, depth=None, depth_confidence=None, depth_origin=None) for seq in range(3)]
+    late = new_frame(1, depth_origin=DepthOrigin.STEREO)
+    bare = new_frame(0, depth_confidence=None, depth_origin=DepthOrigin.LIGHT)
+    writer = SessionWriter(tmp_path / "s", session_info(), WriterOptions(segment_bytes=5000))
+    for frame, found in zip(frames, [None, bare, late], strict=True):
+        writer.frame(frame)
+        writer.line(Observed(seq=frame.seq, steps=1, train=True))
+        if found is not None:
+            writer.late_depth(found)
+    writer.close("end")
+    reader = SessionReader(tmp_path / "s")
+    assert len(reader.segments) > 1 and reader.fields >= {"mask", "right_image"} and "depth" not in reader.fields
+    told = [(line.event, line.seq) for line in reader.schedule()]
+    assert told == [("observe", 0), ("observe", 1), ("take_depth", 0), ("observe", 2), ("take_depth", 1)]
+    first, second = reader.late_depths()
+    assert first["depth"].tobytes() == bare.depth.tobytes() and first["depth_confidence"] is None
+    assert second["depth_confidence"].tobytes() == late.depth_confidence.tobytes()
+    assert (first["depth_origin"], second["depth_origin"]) == (DepthOrigin.LIGHT, DepthOrigin.STEREO)
+
+
+def test_late_depth_whose_pictures_are_gone_is_none_and_the_next_one_is_there(tmp_path):
+    writer = SessionWriter(tmp_path / "s", session_info())
+    for seq in range(3):
+        writer.frame(new_frame(seq))
+        writer.late_depth(new_frame(seq))
+    writer.close("end")
+    log = tmp_path / "s/segments/000000/log.jsonl"
+    lines = log.read_text().splitlines(keepends=True)
+    (number,) = (at for at, line in enumerate(lines) if '"take_depth","seq":1,' in line)
+    entry = json.loads(lines[number])
+    entry["tracks"]["depth_confidence"] += 1
+    lines[number] = json.dumps(entry) + "\n"
+    log.write_text("".join(lines))
+    found = list(SessionReader(tmp_path / "s").late_depths())
+    assert found[1] is None and found[2]["depth"].tobytes() == new_frame(2).depth.tobytes()
 
 
 def test_the_digest_of_a_shown_picture_is_that_of_its_bytes(session, frames):
