@@ -29,6 +29,52 @@ class FoundDepth:
     """Whether its unit is known, in all of them."""
     doubts: Mapping[str, int]
     """Why so many frames were given none though there was something to find it from, in sentences."""
+    passed_over: int = 0
+    """Frames in which none was looked for, because a newer one was there: live, where nothing waits for depth."""
+
+
+class DepthCounts:
+    """Counts where the depth of a stream's frames comes from, and says so."""
+
+    def __init__(self) -> None:
+        self.passed_over = 0
+        """See `FoundDepth`."""
+        self._frames: Counter[str] = Counter()
+        self._known, self._relative, self._dropped = 0.0, 0, 0
+
+    def __add__(self, other: DepthCounts) -> DepthCounts:
+        both = DepthCounts()
+        both.passed_over = self.passed_over + other.passed_over
+        both._frames = self._frames + other._frames
+        both._known, both._relative = self._known + other._known, self._relative + other._relative
+        both._dropped = self._dropped + other._dropped
+        return both
+
+    def take(self, frame: Frame, given: Frame) -> None:
+        """A frame as it came, and with the depth that it goes on with."""
+        if given.depth is not None:
+            origin = given.depth_origin or DepthOrigin.MEASURED
+            self._frames[origin.value] += 1
+            self._known += cv2.countNonZero(given.depth) / given.depth.size
+            self._relative += not given.depth_is_metric
+        self._dropped += given.depth is None and frame.depth is not None
+
+    def contribute(self, outcome: OutcomeBuilder, choice: str, finder: DepthFinder | None) -> None:
+        """Add `FoundDepth`, and what is to be said. choice: the setting `depth`. finder: what found it."""
+        total = sum(self._frames.values())
+        doubts = finder.doubts.counted() if finder else {}
+        share, metric = self._known / total if total else 0.0, self._relative == 0
+        outcome.add(FoundDepth(dict(sorted(self._frames.items())), share, metric, doubts, self.passed_over))
+        found = total - self._frames[DepthOrigin.MEASURED.value]
+        if found:
+            unit = "its unit is that of the calibration" if metric else "it is relative: its unit is not known"
+            outcome.note(f"the depth of {found} frames was found in them, of {share:.0%} of their pixels; {unit}")
+        for remark in finder.remarks.counted() if finder else ():
+            outcome.note(remark)
+        for doubt, frames in doubts.items():
+            outcome.note(f"{frames} frames were given no depth: {doubt}")
+        if self._dropped:
+            outcome.note(f"the depth that {self._dropped} frames came with was not used (depth is {choice!r})")
 
 
 class DepthOp(Operator):
@@ -54,51 +100,27 @@ class DepthOp(Operator):
         check_depth(choice)
         self.choice, self.camera, self.has_time, self.held_out = choice, camera, has_time, held_out
         self._finder: DepthFinder | None = None
-        self._forget()
+        self._counts = DepthCounts()
         super().__init__(fragment, *args, **kwargs)
-
-    def _forget(self) -> None:
-        self._frames: Counter[str] = Counter()
-        self._known, self._relative, self._dropped = 0.0, 0, 0
 
     def setup(self, spec: OperatorSpec) -> None:
         spec.input("frame", type=Frame)
         spec.output("frame", type=Frame)
 
     def start(self) -> None:
-        self._forget()
+        self._counts = DepthCounts()
         self._finder = DepthFinder(self.choice, self.camera, has_time=self.has_time)
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         assert self._finder is not None
         frame = op_input.receive("frame")
         given = self._finder.with_depth(frame, shown_only=self.held_out(frame))
-        if given.depth is not None:
-            origin = given.depth_origin or DepthOrigin.MEASURED
-            self._frames[origin.value] += 1
-            self._known += cv2.countNonZero(given.depth) / given.depth.size
-            self._relative += not given.depth_is_metric
-        self._dropped += given.depth is None and frame.depth is not None
+        self._counts.take(frame, given)
         op_output.emit(given, "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
-        total = sum(self._frames.values())
-        doubts = self._finder.doubts.counted() if self._finder else {}
-        share = self._known / total if total else 0.0
-        outcome.add(FoundDepth(dict(sorted(self._frames.items())), share, self._relative == 0, doubts))
-        found = total - self._frames[DepthOrigin.MEASURED.value]
-        if found:
-            unit = (
-                "its unit is that of the calibration" if not self._relative else "it is relative: its unit is not known"
-            )
-            outcome.note(f"the depth of {found} frames was found in them, of {share:.0%} of their pixels; {unit}")
-        for remark in self._finder.remarks.counted() if self._finder else ():
-            outcome.note(remark)
-        for doubt, frames in doubts.items():
-            outcome.note(f"{frames} frames were given no depth: {doubt}")
-        if self._dropped:
-            outcome.note(f"the depth that {self._dropped} frames came with was not used (depth is {self.choice!r})")
+        self._counts.contribute(outcome, self.choice, self._finder)
 
 
 def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConfig) -> str | None:

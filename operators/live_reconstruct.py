@@ -18,6 +18,7 @@ from gsplat_core.training.config import Eyes
 from gsplat_core.training.live import LiveReconstructor
 from operators.frame_clock import FrameClock
 from operators.graph import Operator, OperatorSpec
+from operators.late_depth import DepthFound, LateDepths
 from operators.messages import Reconstruction
 from operators.model_request import ModelRequest
 from operators.outcome import OutcomeBuilder
@@ -69,6 +70,7 @@ class LiveReconstructOp(Operator):
         make_reconstructor: called in `start()`; what it returns is owned by this operator alone.
         clock: when a frame has to be shown.
         listener: is told every call that changes the model, in order: with these a run can be repeated.
+        depth: where depth is found for the frames that are trained on, while training goes on; None: nowhere.
     """
 
     def __init__(
@@ -78,11 +80,13 @@ class LiveReconstructOp(Operator):
         make_reconstructor: Callable[[], LiveReconstructor],
         clock: FrameClock,
         listener: ScheduleListener | None = None,
+        depth: DepthFound | None = None,
         **kwargs: Any,
     ) -> None:
         self.make_reconstructor = make_reconstructor
         self.clock = clock
         self.listener = listener
+        self._late_depths = LateDepths(depth)
         self.newest: Model | Snapshot | None = None
         """What was published last, for showing it."""
         self.model: Model | None = None
@@ -121,6 +125,7 @@ class LiveReconstructOp(Operator):
     def start(self) -> None:
         self.counts, self.newest, self.model, self._learned = TrainingCounts(), None, None, None
         self._scene = self._since_grown = 0
+        self._late_depths.begin()
         self._reconstructor = self.make_reconstructor()
 
     def prepare_thread(self) -> None:
@@ -150,6 +155,7 @@ class LiveReconstructOp(Operator):
             self._answer_requests(frame)
             if not op_input.queued("frame"):
                 self.clock.wait_until_shown()
+            self._take_depth()
             self._rehearse(frame, lambda: bool(op_input.queued("frame")))
 
     def _observe(self, frame: Frame, behind: bool) -> Reconstruction | None:
@@ -171,6 +177,8 @@ class LiveReconstructOp(Operator):
                 )
             self._scene = frame.scene
         first = self.newest is None
+        if reason is None:
+            self._late_depths.offer(frame)
         report = self._reconstructor.observe(
             frame, budget=self.clock.budget(frame, first=first, behind=behind), train=reason is None
         )
@@ -201,6 +209,13 @@ class LiveReconstructOp(Operator):
         self.counts.places_found += self._reconstructor.begin_scene(frame)
         self._tell(ScheduleEvent("begin_scene", seq=frame.seq))
         self.newest = None
+
+    def _take_depth(self) -> None:
+        """Let the model learn depth that was found meanwhile, of a frame that was trained on before."""
+        assert self._reconstructor is not None
+        taken = self._late_depths.give(self._reconstructor, self.clock.now_ns)
+        if taken is not None:
+            self._tell(ScheduleEvent("take_depth", seq=taken.seq, frame=taken))
 
     def _rehearse(self, frame: Frame, frame_waits: Callable[[], bool]) -> None:
         """Train on the window until the next frame waits or is due."""
@@ -258,5 +273,6 @@ class LiveReconstructOp(Operator):
         counts = self.counts
         outcome.add(TrainedEyes(self._eyes))
         outcome.add(replace(counts, withheld=dict(counts.withheld), scenes=dict(counts.scenes)))
+        self._late_depths.contribute(outcome)
         if self.model is not None:
             outcome.add(ModelResult(self.model))

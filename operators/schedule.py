@@ -6,14 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from gsplat_core.scene.frames import Frame
+
 
 @dataclass(frozen=True)
 class ScheduleEvent:
     """One call of the reconstructor."""
 
-    kind: Literal["begin_scene", "observe", "grow", "rehearse"]
+    kind: Literal["begin_scene", "observe", "take_depth", "grow", "rehearse"]
     seq: int | None = None
     """The frame that it was called with; None for rehearsal."""
+    frame: Frame | None = None
+    """That frame with its depth (`take_depth`)."""
     steps: int = 0
     """Steps on the newest frame (`observe`) or on the window (`rehearse`)."""
     train: bool = True

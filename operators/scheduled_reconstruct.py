@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from gsplat_core.io.sessions.schedule import Grown, Observed, ReconstructorMade, Rehearsed, SceneBegun, ScheduleLine
+from gsplat_core.io.sessions.records import LostLine
+from gsplat_core.io.sessions.schedule import (
+    DepthTaken,
+    Grown,
+    Observed,
+    ReconstructorMade,
+    Rehearsed,
+    SceneBegun,
+    ScheduleLine,
+)
 from gsplat_core.scene.frames import Frame, FrameStatus
-from gsplat_core.training.live import LiveReconstructor
+from gsplat_core.training.live import MOST_LATE, LiveReconstructor
 from operators.messages import Reconstruction
 from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ReconstructOp
@@ -19,6 +29,7 @@ class ScheduledReconstructOp(ReconstructOp):
     Params:
         make_reconstructor: called where the schedule says that one was made.
         schedule: its lines from the beginning; called in `start()`.
+        late_depths: what the frames of its `take_depth` lines got, in their order; called in `start()`.
     """
 
     def __init__(
@@ -26,22 +37,25 @@ class ScheduledReconstructOp(ReconstructOp):
         fragment: Any,
         *args: Any,
         make_reconstructor: Callable[[], LiveReconstructor],
-        schedule: Callable[[], Iterator[ScheduleLine]],
+        schedule: Callable[[], Iterator[ScheduleLine | LostLine]],
+        late_depths: Callable[[], Iterator[dict[str, Any] | None]],
         **kwargs: Any,
     ) -> None:
-        self.make_live, self.schedule = make_reconstructor, schedule
+        self.make_live, self.schedule, self.late_depths = make_reconstructor, schedule, late_depths
         self.missing: int | None = None
-        """The first frame that was trained on in the session and is not there now: from it on pictures may differ."""
-        self._lines: Iterator[ScheduleLine] = iter(())
-        self._due: ScheduleLine | None = None
+        """The first frame that was trained on in the session and is not there now, it or its depth: from it on pictures may differ."""
+        self._lines: Iterator[ScheduleLine | LostLine] = iter(())
+        self._depths: Iterator[dict[str, Any] | None] = iter(())
+        self._due: ScheduleLine | LostLine | None = None
         self._live: LiveReconstructor | None = None
-        self._observed: Frame | None = None
-        """The frame that was observed last."""
+        self._observed: OrderedDict[int, Frame] = OrderedDict()
+        """The frames that were observed last, by number."""
         super().__init__(fragment, *args, make_reconstructor=make_reconstructor, **kwargs)
 
     def start(self) -> None:
-        self.newest = self.missing = self._live = self._observed = None
-        self._lines = self.schedule()
+        self.newest = self.missing = self._live = None
+        self._observed.clear()
+        self._lines, self._depths = self.schedule(), self.late_depths()
         self._due = next(self._lines, None)
 
     def stop(self) -> None:
@@ -50,8 +64,9 @@ class ScheduledReconstructOp(ReconstructOp):
         super().stop()
         if self._live is not None:
             self._eyes = self._live.eyes.trained
-        self._live = self._observed = None
-        self._lines = iter(())
+        self._live = None
+        self._observed.clear()
+        self._lines, self._depths = iter(()), iter(())
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         frame: Frame = op_input.receive("frame")
@@ -61,7 +76,9 @@ class ScheduledReconstructOp(ReconstructOp):
         train = observed.train and frame.status is not FrameStatus.DAMAGED
         if self.newest is None and not train:
             return
-        self._observed = frame
+        self._observed[frame.seq] = frame
+        while len(self._observed) > MOST_LATE:
+            self._observed.popitem(last=False)
         report = self._live.observe(frame, steps=observed.steps, train=train)
         self.newest = self._live.publish()
         op_output.emit(
@@ -79,24 +96,43 @@ class ScheduledReconstructOp(ReconstructOp):
             if isinstance(line, Observed):
                 if line.seq == frame.seq:
                     return line
-                self.missing = line.seq if self.missing is None else self.missing
+                self._miss(line.seq)
             elif isinstance(line, ReconstructorMade):
                 self._live, self.newest = self.make_live(), None
-            elif isinstance(line, Rehearsed):
-                if self._live is not None and self._live.gaussians:
-                    self._live.rehearse(line.steps)
-            elif isinstance(line, Grown):
-                if self._live is not None and self._observed is not None and line.seq == self._observed.seq:
-                    self._live.grow(self._observed)
-            elif line.seq == frame.seq and self._live is not None:
-                self._live.begin_scene(frame)
-                self.newest = None
+            elif isinstance(line, DepthTaken | LostLine):
+                self._take_depth(line)
+            elif self._live is not None:
+                self._call(self._live, line, frame)
         return None
+
+    def _call(self, live: LiveReconstructor, line: SceneBegun | Grown | Rehearsed, frame: Frame) -> None:
+        """Make one call of those before `frame` was observed."""
+        if isinstance(line, Rehearsed):
+            if live.gaussians:
+                live.rehearse(line.steps)
+        elif isinstance(line, Grown):
+            if self._observed and line.seq == next(reversed(self._observed)):
+                live.grow(self._observed[line.seq])
+        elif line.seq == frame.seq:
+            live.begin_scene(frame)
+            self.newest = None
+
+    def _take_depth(self, line: DepthTaken | LostLine) -> None:
+        """Give training depth that it was given after the frame itself."""
+        fields = next(self._depths, None) if isinstance(line, DepthTaken) else None
+        frame = self._observed.get(line.seq)
+        if fields is None or frame is None or self._live is None:
+            self._miss(line.seq)
+        else:
+            self._live.take_depth(frame.with_fields(**fields))
+
+    def _miss(self, seq: int) -> None:
+        self.missing = seq if self.missing is None else self.missing
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
         super().contribute(outcome)
         if self.missing is not None:
             outcome.note(
-                f"frame {self.missing} was trained on in the session and is not in its recording: later pictures may differ"
+                f"frame {self.missing} was trained on in the session and is not in its recording, or its depth is not: later pictures may differ"
             )

@@ -134,6 +134,12 @@ class DepthFinder:
         self.doubts, self.remarks = Sentences(), Sentences()
         """What spoke against a frame's depth as a whole, and what else was said about it."""
 
+    def seeks_in(self, frame: Frame) -> bool:
+        """Whether there is anything to look for in a frame, beside the depth that it came with."""
+        return any(
+            suits(frame) for estimator, suits in self._asked if not isinstance(estimator, RecordedDepth | NoDepth)
+        )
+
     def find(self, frame: Frame, *, shown_only: bool = False) -> DepthMap | None:
         """The first answer that is not doubted; None where there is none. shown_only: nothing is learned from the frame, nor about later ones."""
         camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)

@@ -30,11 +30,8 @@ from gsplat_core.transfers import HostCopy
 
 REHEARSED_IN_FLIGHT = 2
 """Rehearsal steps that may be queued on a GPU and not finished: the next frame's first step waits for them."""
-REHEARSED_CORRECTION = 0.5
-"""Share of `colour_relaxation` in a rehearsal step: what is corrected at one time shows at the times around it, which had their turn."""
-DEPTH_EVERY = 4
-"""On a GPU every so many-th rehearsal step, of the left eye's, looks at depth where a frame has it, and trains colours in place of correcting them. Steps
-of `observe` do not: what they change last is what is shown."""
+MOST_LATE = 30
+"""Depth of a frame is taken as long as there are fewer newer ones."""
 REVEALED_SHARE = 0.01
 """Of the picture's width: when so wide a strip has come into view, new tissue is looked for before the first step."""
 LONGER_STEP_DECAY = 0.1
@@ -84,8 +81,8 @@ class LiveReconstructor(Reconstructor):
         """How much of the stream is held, by what holds it; none of it grows without end."""
         columns = 0 if self._step is None else getattr(self._step.field, "bumps", 0)
         archived = 0 if self._out_of_view is None else len(self._out_of_view.archive)
-        kept = {"window_frames": len(self._window), "columns": columns, "places": len(self._places)}
-        return {**kept, "archived": archived}
+        window, places = len(self._window), len(self._places)
+        return {"window_frames": window, "columns": columns, "places": places, "archived": archived}
 
     def publish(self) -> Model | Snapshot:
         """The model as it is now, for showing the time of the newest frame that was trained on and what follows, with the next version number.
@@ -122,16 +119,24 @@ class LiveReconstructor(Reconstructor):
             # The right eye first: steps on the newest frame begin with the left one.
             self._rehearsed += 1
             observation = self._window.draw(self._live.recent_share).by_turns(self._rehearsed)
-            self._step(observation, self._live.last_rate, self._rehearsed_correction(observation))
+            or_depth = observation.depth is not None and self.device.type == "cuda"
+            self._step(observation, self._live.last_rate, self._live.rehearsed_relaxation(self._rehearsed, or_depth))
             self._unsettled = observation
             self._rehearsing.queued()
 
-    def _rehearsed_correction(self, observation: Observation) -> float:
-        """How much colours are corrected in a rehearsal step. A captured step that corrects them does not look at depth: some do not correct."""
-        looks_at_depth = (
-            self.device.type == "cuda" and observation.depth is not None and self._rehearsed % DEPTH_EVERY == 0
-        )
-        return 0.0 if looks_at_depth else REHEARSED_CORRECTION * self._live.colour_relaxation
+    def take_depth(self, frame: Frame) -> bool:
+        """Learn how far away is what `frame` shows, which was trained on before its depth was found: rehearsal looks at it from now on, and the scene
+        is placed by it. False, with nothing changed, where the frame is of another scene, was not trained on, or has `MOST_LATE` newer ones."""
+        seen = self._window.find(frame.seq, MOST_LATE)
+        if self._step is None or seen is None:
+            return False
+        self._settle()
+        observation, was_placed = seen.with_depth(frame), self._placement.is_placed
+        self._window.replace(observation)
+        self._placement.apply(self._step, frame, observation, self._learned_s)
+        placed = self._placement.is_placed and not was_placed
+        self._depth_source = DepthSource.of_first(frame) if placed else DepthSource.after(self._depth_source, frame)
+        return True
 
     def rehearsal_ns(self, steps: int) -> float:
         """How long so many rehearsal steps usually take, together with those that are still under way; 0 before anything was timed."""

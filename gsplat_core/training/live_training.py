@@ -7,6 +7,12 @@ from dataclasses import dataclass
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.colour_correction import MOST_RELAXATION
 
+REHEARSED_CORRECTION = 0.5
+"""Share of `colour_relaxation` in a rehearsal step: what is corrected at one time shows at the times around it, which had their turn."""
+DEPTH_EVERY = 4
+"""On a GPU every so many-th rehearsal step, of the left eye's, looks at depth where a frame has it, and trains colours in place of correcting them. Steps
+of `observe` do not: what they change last is what is shown."""
+
 
 @dataclass(frozen=True)
 class LiveTraining:
@@ -23,7 +29,7 @@ class LiveTraining:
     colour_relaxation: float = 0.0
     """Above 0 colours are not trained with a rate but corrected by what the picture is off by, by so many times the mean over the pixels that
     show them (`colour_correction`), where the field takes colours at one time. On a CPU with the squared error; on a GPU with harmonics of
-    degree 0, and depth is looked at by some of the rehearsal steps alone (`live.DEPTH_EVERY`)."""
+    degree 0, and depth is looked at by some of the rehearsal steps alone (`DEPTH_EVERY`)."""
 
     def __post_init__(self) -> None:
         for name in ("first_rate", "last_rate"):
@@ -42,3 +48,9 @@ class LiveTraining:
         """The factor of a frame's step, counted from 0."""
         progress = min(1.0, step / max(1, self.rate_steps - 1))
         return self.first_rate * (self.last_rate / self.first_rate) ** progress
+
+    def rehearsed_relaxation(self, number: int, or_depth: bool) -> float:
+        """How much colours are corrected in the rehearsal step with this number. or_depth: a step either corrects them or looks at depth, which its frame
+        has."""
+        looks_at_depth = or_depth and number % DEPTH_EVERY == 0
+        return 0.0 if looks_at_depth else REHEARSED_CORRECTION * self.colour_relaxation

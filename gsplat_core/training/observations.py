@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 import torch
@@ -41,6 +42,11 @@ class Observation:
         if self.rehearsal_mask is None:
             return self if right is self.right else replace(self, right=right)
         return replace(self, mask=self.mask & self.rehearsal_mask, rehearsal_mask=None, right=right)
+
+    def with_depth(self, frame: Frame) -> Observation:
+        """The same with the depth of `frame`, which is this one and whose depth was found later."""
+        depth = known_depth(believed_depth(frame), self.image.device) if _is_trained_on(frame) else None
+        return replace(self, depth=depth)
 
     def by_turns(self, turn: int) -> Observation:
         """The eye whose turn it is: the left one at even turns, the right one, if there is one, at odd ones."""
@@ -112,6 +118,19 @@ class ObservationWindow:
     def newest(self) -> Observation:
         """The frame that was added last."""
         return self._frames[-1]
+
+    def find(self, seq: int, among: int) -> Observation | None:
+        """The frame with this number, if it is there and one of so many newest ones."""
+        newest = islice(reversed(self._frames), among)
+        return next((each for each in newest if each.seq == seq), None)
+
+    def replace(self, observation: Observation) -> None:
+        """Put `observation` in the place of the frame with its number. Raises InvalidInput where there is none."""
+        for index in reversed(range(len(self._frames))):
+            if self._frames[index].seq == observation.seq:
+                self._frames[index] = observation
+                return
+        raise InvalidInput(f"frame {observation.seq} is not in the window of {len(self._frames)} frames")
 
     def forget_before(self, time_s: float) -> None:
         """Drop frames that are older, all but the newest: the field no longer tells their times apart."""

@@ -2,8 +2,8 @@
 
 Pictures of one eye hardly tell how far away tissue is, nor how it moves along the line of sight; the loss alone would take thousands of steps for that
 way. So each Gaussian is moved along its ray of the camera that shows it, which sees the same picture as before: by the first depth the whole scene, which
-had started on a plane at an arbitrary distance; then by depth that was found by parallax at all times, because that takes tissue to be at rest, and by
-measured or matched depth at the frame's own time.
+had started on a plane at an arbitrary distance, because its scope had not moved yet or its eyes had not been matched; then by depth that was found by
+parallax at all times, because that takes tissue to be at rest, and by measured or matched depth at one time.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import LOG_SCALE, POSITION
 from gsplat_core.training.coverage import UNCOVERED_ALPHA
-from gsplat_core.training.initialisation import tissue_depth
-from gsplat_core.training.observations import Observation
+from gsplat_core.training.initialisation import believed_depth, tissue_depth
+from gsplat_core.training.observations import Observation, known_depth
 from gsplat_core.training.start_on_device import filled
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import Seen, beside
@@ -27,9 +27,11 @@ from gsplat_core.transfers import tensor_of
 
 LARGEST_STEP = 1.4
 """Factor by which one frame changes the depth of one Gaussian at most, once the scene's distance is known."""
+CORRECTS_ALL_TIMES = (DepthOrigin.PARALLAX,)
+CORRECTS_ONE_TIME = (None, DepthOrigin.MEASURED, DepthOrigin.STEREO)
+"""Origins of depth that goes on correcting the scene; that of a frame which does not say is measured. Other depth is only started from."""
 SHARE = 0.5
 """Of the way that a later frame moves a Gaussian: depths of several frames are averaged."""
-
 TOGETHER_PX = 16
 """Side of the squares of a picture whose Gaussians are moved together."""
 
@@ -39,77 +41,71 @@ class Placement:
 
     def __init__(self, first: Frame | None) -> None:
         """first: the frame that the scene started from."""
-        self._first, self._is_placed = first, _tells_depth(first)
+        self._first = first
+        self.is_placed = _has_depth(first)
+        """Whether the scene is where a depth says."""
 
-    def apply(self, step: TrainingStep, frame: Frame, observation: Observation) -> None:
-        """Correct the scene by the depth of a frame, if it has any that may be learned from; the field covers its time already."""
-        if frame is self._first or observation.depth is None or not _tells_depth(frame):
+    def apply(self, step: TrainingStep, frame: Frame, observation: Observation, shown_s: float | None = None) -> None:
+        """Correct the scene by the depth of a frame, if it has any; the field covers its time already.
+
+        shown_s: the time at which motion is corrected; None: the frame's own. Later where depth is found after newer frames were trained on.
+        """
+        if frame is self._first or not _has_depth(frame) or observation.camera.model != "pinhole":
             return
-        if observation.camera.model != "pinhole":
+        if self.is_placed and frame.depth_origin not in CORRECTS_ALL_TIMES + CORRECTS_ONE_TIME:
             return
+        # Depth by light is in no observation: the loss does not see it.
+        believed = known_depth(believed_depth(frame), observation.image.device)
         with torch.no_grad():
-            deltas = step.field.deltas(observation.time_s)
-            points = step.gaussians.means + deltas[:, POSITION]
+            if self.is_placed and frame.depth_origin in CORRECTS_ONE_TIME:
+                _correct(step, observation, believed, observation.time_s if shown_s is None else shown_s)
+                return
+            points = step.gaussians.means + step.field.deltas(observation.time_s)[:, POSITION]
             seen = Seen(observation.camera, points)
             column, row = seen.pixels.long().clamp(min=0).unbind(1)
-            height, width = observation.depth.shape
+            height, width = believed.shape
             at = row.clamp(max=height - 1), column.clamp(max=width - 1)
             inside, now = seen.inside[:, 0], seen.depth[:, 0]
-            known = inside & (observation.depth[at] > 0) & (observation.mask[at] > 0)
-            if not self._is_placed:
-                if bool(known.any()):
-                    self._place(step, frame, observation, now, inside, known, at)
-                return
-            if frame.depth_origin is DepthOrigin.PARALLAX:
-                told = torch.where(known, observation.depth[at], now)
+            known = inside & (believed[at] > 0)
+            if self.is_placed:
+                told = torch.where(known, believed[at], now)
                 factor = (told / now).pow(SHARE).clamp(1 / LARGEST_STEP, LARGEST_STEP)
-                step.scale_about(observation.camera, factor)
-                return
-            factor = _moved_together(step.at(observation.time_s), observation, seen.pixels)
-            centre = beside(points, observation.camera.position)
-            deltas[:, POSITION] += (factor - 1)[:, None] * (points - centre)
-            deltas[:, LOG_SCALE] += factor.log()[:, None]
-            step.field.move_to(observation.time_s, deltas)
-
-    def _place(
-        self,
-        step: TrainingStep,
-        frame: Frame,
-        observation: Observation,
-        now: Tensor,
-        inside: Tensor,
-        known: Tensor,
-        at: tuple[Tensor, Tensor],
-    ) -> None:
-        """Move the whole scene, whose Gaussians are in depth `now` [N], to the first depth that there is."""
-        # What is not sure goes along with what is sure beside it, and what the picture does not show with all of it.
-        everywhere = tensor_of(tissue_depth(frame, float(now.median())), now.device)[at]
-        factor = everywhere / now
-        step.scale_about(observation.camera, torch.where(inside, factor, factor[known].median()))
-        step.take_distance(observation.camera)
-        self._is_placed = True
+            else:
+                if not bool(known.any()):
+                    return
+                # What is not sure goes along with what is sure beside it, and what the picture does not show with all of it.
+                everywhere = tensor_of(tissue_depth(frame, float(now.median())), points.device)[at]
+                factor = everywhere / now
+                factor = torch.where(inside, factor, (everywhere / now)[known].median())
+            step.scale_about(observation.camera, factor)
+            if not self.is_placed:
+                step.take_distance(observation.camera)
+        self.is_placed = True
 
 
-def _moved_together(now: Gaussians, observation: Observation, pixels: Tensor) -> Tensor:
-    """By which factor the depth of Gaussians at `pixels` [N, 2] changes, so that the scene comes nearer to a frame's depth [N].
+def _correct(step: TrainingStep, observation: Observation, depth: Tensor, shown_s: float) -> None:
+    """Move the scene nearer to a frame's depth [H, W] (0: unknown) at one time."""
+    camera = observation.camera
+    now = step.at(observation.time_s)
+    factor = _together(now, observation, depth, Seen(camera, now.means).pixels)
+    deltas = step.field.deltas(shown_s)
+    points = step.gaussians.means + deltas[:, POSITION]
+    deltas[:, POSITION] += (factor - 1)[:, None] * (points - beside(points, camera.position))
+    deltas[:, LOG_SCALE] += factor.log()[:, None]
+    step.field.move_to(shown_s, deltas)
 
-    Neighbours by the same one: tissue moves smoothly, and Gaussians that change their order along the line of sight change the picture.
-    """
-    assert observation.depth is not None
+
+def _together(now: Gaussians, observation: Observation, depth: Tensor, pixels: Tensor) -> Tensor:
+    """By which factor [N] the depth of Gaussians at `pixels` [N, 2] changes. It is the same for neighbours: tissue moves smoothly, and Gaussians that
+    change their order along the line of sight change the picture."""
     shown = render(now, observation.camera, depth=True)
-    known = (observation.depth > 0) & (observation.mask > 0) & (shown.alpha >= UNCOVERED_ALPHA)
-    ratio = torch.where(known, observation.depth / shown.depth, 1.0).log()
+    known = (depth > 0) & (observation.mask > 0) & (shown.alpha >= UNCOVERED_ALPHA)
+    ratio = torch.where(known, depth / shown.depth, 1.0).log()
     smooth = filled(ratio[None], known[None].to(ratio.dtype), TOGETHER_PX)
     grid = 2 * pixels / beside(pixels, [ratio.shape[1], ratio.shape[0]]) - 1
     there = grid_sample(smooth[None], grid[None, None], padding_mode="border", align_corners=False)[0, 0, 0]
     return (SHARE * there).exp().clamp(1 / LARGEST_STEP, LARGEST_STEP)
 
 
-def _tells_depth(frame: Frame | None) -> bool:
-    """Whether a frame has depth that is learned from. That of light is only started from."""
-    return (
-        frame is not None
-        and frame.depth_origin is not DepthOrigin.LIGHT
-        and frame.depth is not None
-        and bool(np.any(frame.depth))
-    )
+def _has_depth(frame: Frame | None) -> bool:
+    return frame is not None and frame.depth is not None and bool(np.any(frame.depth))

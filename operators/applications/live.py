@@ -1,9 +1,11 @@
 """Live: a stream is reconstructed and shown beside a clock, without an end.
 
-    source → analysis ─┬─► reconstruct → deform → rasterize → display ─┬─► sinks
-                       └───────────────────────► on_screen ◄───────────┘
+                          depth (beside)
+                       ┌┈┈┈┈┈┘     └┈┈┈┐
+    source → analysis ─┴┬─► reconstruct ◄┘ → deform → rasterize → display ─┬─► sinks
+                        └──────────────────────────► on_screen ◄───────────┘
 
-Each operator has a thread of its own. The newest frame wins wherever one comes too late: into `reconstruct`, into `rasterize` and into
+Each operator has a thread of its own, and so has depth, which nothing waits for: it is found for the newest frame and reaches training when it is there. The newest frame wins wherever one comes too late: into `reconstruct`, into `rasterize` and into
 `display`; every frame that is passed over is counted by the edge. What is shown says how old it is.
 """
 
@@ -26,7 +28,7 @@ from operators.applications.result import RunOutcome
 from operators.applications.session import Session
 from operators.applications.trial_run import trial_run
 from operators.deform import DeformOp
-from operators.depth import DepthOp
+from operators.depth_beside import DepthBeside, DepthBesideOp
 from operators.display import DisplayOp
 from operators.frame_clock import FrameClock
 from operators.frame_log import FRAMES_FILE, FrameLog
@@ -71,7 +73,8 @@ class LiveApplication(Application):
             self, name="source", source=self.frame_source, stop_requested=self._stop_requested, seconds=settings.seconds
         )
         recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
-        depth = DepthOp(self, name="depth", choice=settings.depth, camera=self.frame_source.description.camera)
+        beside = DepthBeside(settings.depth, self.frame_source.description.camera)
+        depth = DepthBesideOp(self, name="depth", beside=beside)
         analysis = analysis_operator(
             self, settings.tool_mask, settings.out_of_body, depth, recording.behind_gate(), recording.behind_analysis()
         )
@@ -82,6 +85,7 @@ class LiveApplication(Application):
             make_reconstructor=recording.made_by(lambda: self._parts.reconstructor),
             clock=self.clock,
             listener=recording.listener,
+            depth=beside,
         )
         deform = DeformOp(self, name="deform")
         rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer, rasterizer=self._parts.rasterizer)

@@ -29,7 +29,7 @@ def analysis_operator(
     """The operator between the source and the reconstruction; it takes and gives `frame`.
 
     Tools and highlights are looked for while the others judge the picture. tool_mask: how tools are found, a name in `TOOL_MASKS`.
-    out_of_body: what happens to pictures from outside of the body. depth: what finds it, once it is known what is tissue. behind_gate: operators that see each frame as it comes through that
+    out_of_body: what happens to pictures from outside of the body. depth: what says which depth a frame keeps. behind_gate: operators that see each frame as it comes through that
     gate. behind: those that see it at the end.
     """
     others = [name for name in PICTURE_STAGES if name != BESIDE]

@@ -92,7 +92,14 @@ class RunRecording:
         if self.recorder is None:
             return None
         recorder = self.recorder
-        return lambda event: recorder.line(_line(event))
+
+        def told(event: ScheduleEvent) -> None:
+            if event.frame is not None:
+                recorder.depth(event.frame)
+            else:
+                recorder.line(_line(event))
+
+        return told
 
     def made_by(self, make: Callable[[], LiveReconstructor]) -> Callable[[], LiveReconstructor]:
         """`make`, and write what was made."""

@@ -56,7 +56,11 @@ class FollowedSession:
     def reconstruct_op(self, graph: Application, name: str) -> ScheduledReconstructOp:
         """The operator that trains."""
         return ScheduledReconstructOp(
-            graph, name=name, make_reconstructor=self.new_reconstructor, schedule=self.reader.schedule
+            graph,
+            name=name,
+            make_reconstructor=self.new_reconstructor,
+            schedule=self.reader.schedule,
+            late_depths=self.reader.late_depths,
         )
 
     def compare_op(self, graph: Application, name: str) -> CompareShownOp:

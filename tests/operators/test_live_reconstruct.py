@@ -7,7 +7,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from gsplat_core.scene.frames import FrameStatus
 from operators.frame_clock import ClockSettings, FrameClock
+from operators.late_depth import TakenDepth
 from operators.live_reconstruct import GROWN_AT_LATEST, LiveReconstructOp
 from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ModelResult
@@ -18,6 +20,7 @@ class FakeReconstructor:
 
     def __init__(self, make_model, camera):
         self.calls, self.version, self.make_model = [], 0, make_model
+        self.gone = set()
         self.camera, self.device, self.step_ns = camera, torch.device("cpu"), 1e6
         self.eyes = SimpleNamespace(trained="both")
 
@@ -45,8 +48,26 @@ class FakeReconstructor:
     def rehearsal_ns(self, steps):
         return 1e6 * steps
 
+    def take_depth(self, frame):
+        self.calls.append(("take_depth", frame.seq))
+        return frame.seq not in self.gone
+
     def seqs(self, kind):
         return [call[1] for call in self.calls if call[0] == kind]
+
+
+class FakeDepth:
+    """Finds depth when it is told to."""
+
+    def __init__(self):
+        self.offered, self.found = [], None
+
+    def offer(self, frame):
+        self.offered.append(frame.seq)
+
+    def take(self):
+        found, self.found = self.found, None
+        return found
 
 
 @pytest.fixture
@@ -55,9 +76,10 @@ def live(model, camera, fake_time):
     fake, told = FakeReconstructor(model, camera), []
     clock = FrameClock(ClockSettings(), 30.0, fake_time)
     clock.wait_until_shown = lambda: None
-    operator = LiveReconstructOp(None, make_reconstructor=lambda: fake, clock=clock, listener=told.append)
+    depth = FakeDepth()
+    operator = LiveReconstructOp(None, make_reconstructor=lambda: fake, clock=clock, listener=told.append, depth=depth)
     operator.start()
-    return SimpleNamespace(operator=operator, fake=fake, told=told, time=fake_time)
+    return SimpleNamespace(operator=operator, fake=fake, told=told, time=fake_time, depth=depth)
 
 
 def arrived(frame, live, seq, **fields):
@@ -167,3 +189,34 @@ def test_a_model_that_cannot_be_copied_does_not_end_the_stream(live, one_by_one)
     late = live.operator.request_model()
     live.operator.stop()
     assert late.wait(0) is None and "ended" in late.refused
+
+
+def test_depth_is_looked_for_in_what_is_trained_on(live, one_by_one):
+    one_by_one((0, {}), (1, {"withheld": "blur"}), (2, {"status": FrameStatus.DAMAGED}), (3, {}))
+    assert live.depth.offered == [0, 3]
+
+
+def test_depth_that_comes_late_is_learned_after_the_next_picture_and_told(live, one_by_one, frame):
+    one_by_one((0, {}), (1, {}))
+    live.depth.found = found = arrived(frame, live, 0)
+    live.time.pass_ms(100)
+    one_by_one((2, {}))
+    kinds = [call[0] for call in live.fake.calls if call[0] != "rehearse"]
+    assert kinds[-3:] == ["observe", "take_depth", "grow"]
+    assert [event.frame for event in live.told if event.kind == "take_depth"] == [found]
+    outcome = OutcomeBuilder()
+    live.operator.contribute(outcome)
+    taken = outcome.find(TakenDepth)
+    assert (taken.frames, taken.dropped) == (1, 0) and taken.age_p50_ms == pytest.approx(133, rel=0.04)
+    assert any("the depth of 1 frames was learned" in note for note in outcome.notes)
+
+
+def test_depth_that_the_model_does_not_take_is_counted_and_not_told(live, one_by_one, frame):
+    live.fake.gone = {0}
+    one_by_one((0, {}), (1, {"new_scene": "cut", "scene": 1}))
+    live.depth.found = arrived(frame, live, 0)
+    one_by_one((2, {"scene": 1}))
+    assert live.fake.seqs("take_depth") == [0] and not [event for event in live.told if event.kind == "take_depth"]
+    outcome = OutcomeBuilder()
+    live.operator.contribute(outcome)
+    assert outcome.find(TakenDepth) == TakenDepth(0, 0.0, 1) and outcome.notes == ()

@@ -14,7 +14,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.sessions import SessionReader, WriterOptions
-from gsplat_core.io.sessions.schedule import Observed, Rehearsed, SceneBegun
+from gsplat_core.io.sessions.schedule import DepthTaken, Observed, Rehearsed, SceneBegun
 from gsplat_core.scene.frames import Frame
 from operators.applications.live import LiveApplication
 from operators.applications.live_settings import LiveSettings
@@ -23,6 +23,8 @@ from operators.applications.replay import ReplaySettings, replay
 from operators.applications.result import RunOutcome
 from operators.applications.session import Session
 from operators.compare_shown import ShownComparison
+from operators.depth import FoundDepth
+from operators.late_depth import TakenDepth
 from operators.metrics import QualityResult
 from operators.sinks.recorder import RecordingResult
 from operators.sources.source import SourceDescription
@@ -64,6 +66,17 @@ def eventful(frame: Frame) -> Frame:
     loss_mask = np.ones(frame.image.shape[:2], np.uint8)
     loss_mask[:5, frame.seq] = 0
     return frame.with_fields(exposure=(1.0 + frame.seq / 50, 0.9, 1.0), loss_mask=loss_mask)
+
+
+def of_two_eyes(frame: Frame) -> Frame:
+    """Nobody has measured depth; a cut, and at the end another size."""
+    frame = frame.with_fields(depth=None, depth_origin=None, new_scene="cut" if frame.seq == 6 else None)
+    if frame.seq < 11:
+        return frame
+    image, right = (np.ascontiguousarray(each[:40, :56]) for each in (frame.image, frame.right_image))
+    eye = frame.right_camera.resized(56, 40)
+    mask = None if frame.mask is None else np.ascontiguousarray(frame.mask[:40, :56])
+    return frame.with_fields(image=image, right_image=right, right_camera=eye, mask=mask)
 
 
 def record(folder: Path, change, options: WriterOptions | None = None) -> RunOutcome:
@@ -113,6 +126,31 @@ def test_every_picture_comes_out_again(tmp_path, change):
     assert comparison.different == 0
     assert comparison.same >= 5
     assert any("byte for byte" in note for note in outcome.notes)
+
+
+def test_depth_that_was_found_beside_the_stream_is_given_again(tmp_path):
+    live = record(tmp_path, of_two_eyes)
+    found, taken = live.find(FoundDepth), live.find(TakenDepth)
+    assert found.frames.get("stereo", 0) >= taken.frames >= 2 and found.metric
+    reader = SessionReader(tmp_path / "session")
+    lines = [line.seq for _, line in reader.lines() if isinstance(line, DepthTaken)]
+    assert len(lines) == taken.frames and any(seq >= 6 for seq in lines)
+    assert {frame.depth is None and frame.right_camera is not None for _, frame in reader.frames()} == {True}
+    outcome = replayed(tmp_path)
+    comparison = outcome.find(ShownComparison)
+    assert comparison is not None and comparison.different == 0 and comparison.same >= 5
+
+
+def test_without_the_late_depth_the_pictures_are_others(tmp_path):
+    """The comparison can fail: without one of the depths it does, and the replay says which is not there."""
+    assert record(tmp_path, of_two_eyes).find(TakenDepth).frames >= 2
+    log = next((tmp_path / "session/segments").glob("*/log.jsonl"))
+    first = re.search(r'"event":"take_depth","seq":(\d+),[^\n]*"tracks":(\{[^}]*\})', log.read_text())
+    log.write_text(log.read_text().replace(first[2], '{"depth":999999}', 1))
+    outcome = replayed(tmp_path)
+    comparison = outcome.find(ShownComparison)
+    assert comparison is not None and comparison.different > 0
+    assert any(f"frame {first[1]} was trained on" in note and "its depth" in note for note in outcome.notes)
 
 
 def leaving_the_body(frame: Frame) -> Frame:

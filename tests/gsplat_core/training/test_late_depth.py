@@ -1,0 +1,183 @@
+"""Depth that a live model learns after the frame that it is of: rehearsal looks at it, the scene goes there, and what is gone is left alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.live import MOST_LATE, LiveReconstructor
+
+WIDTH, HEIGHT = 48, 40
+CAMERA = Camera.from_focal(40.0, WIDTH, HEIGHT)
+PLANE = 60.0
+"""Where a scene without depth starts."""
+
+
+def frame_at(k: int, **fields: object) -> Frame:
+    x = np.linspace(0, 3, fields.pop("width", WIDTH))[None, :] + 0.02 * k
+    y = np.linspace(0, 2, HEIGHT)[:, None]
+    planes = np.stack([np.sin(x + y), np.cos(x - y), np.sin(2 * x) * np.cos(y)], -1)
+    return Frame(k, k * 33_000_000, ((planes + 1) * 95 + 10).astype(np.uint8), **fields)
+
+
+def found(frame: Frame, depth: float | np.ndarray = 80.0, origin: DepthOrigin = DepthOrigin.STEREO) -> Frame:
+    plane = np.broadcast_to(np.asarray(depth, np.float32), frame.image.shape[:2]).copy()
+    eye = CAMERA.right_eye(5.0) if origin is DepthOrigin.STEREO else None
+    return frame.with_fields(depth=plane, depth_confidence=np.ones_like(plane), depth_origin=origin, right_camera=eye)
+
+
+def learner(frames: int = 3, **config: object) -> LiveReconstructor:
+    settings = {"gaussians": 300, "max_gaussians": 400, "window_frames": 40, "depth_weight": 0.1, **config}
+    made = LiveReconstructor(ReconstructorConfig(**settings), CAMERA)
+    for k in range(frames):
+        made.observe(frame_at(k), steps=3)
+    return made
+
+
+def distance(made: LiveReconstructor, k: int) -> float:
+    with torch.no_grad():
+        output = render(made.snapshot().at(frame_at(k).time_s), CAMERA, depth=True)
+    return float(output.depth.median())
+
+
+def test_the_first_depth_places_the_scene_and_its_picture_stays() -> None:
+    made = learner()
+    before = render(made.snapshot().at(frame_at(1).time_s), CAMERA).image
+    assert distance(made, 2) == pytest.approx(PLANE, rel=0.02) and made.snapshot().depth_source is None
+    assert made.take_depth(found(frame_at(1)))
+    assert distance(made, 2) == pytest.approx(80, rel=0.02)
+    after = render(made.snapshot().at(frame_at(1).time_s), CAMERA).image
+    assert float((after - before).abs().mean()) < 0.03
+    assert made.snapshot().depth_source == DepthSource(DepthOrigin.STEREO, metric=True)
+
+
+def test_rehearsal_looks_at_it() -> None:
+    """The slope is what placing does not give: all of the depth but the first is left to the loss."""
+    slope = np.linspace(70, 90, WIDTH, dtype=np.float32)[None, :]
+
+    def error(late: bool) -> float:
+        made = learner(2)
+        assert made.take_depth(found(frame_at(0)))
+        if late:
+            assert made.take_depth(found(frame_at(1), slope))
+        made.rehearse(150)
+        with torch.no_grad():
+            depth = render(made.snapshot().at(frame_at(1).time_s), CAMERA, depth=True).depth.numpy()
+        return float(np.abs(depth - slope).mean())
+
+    assert error(late=True) < 0.7 * error(late=False)
+
+
+@pytest.mark.parametrize("origin", [DepthOrigin.LIGHT, DepthOrigin.PARALLAX])
+def test_depth_without_a_unit_places_a_scene_and_gives_it_none(origin: DepthOrigin) -> None:
+    made = learner()
+    assert made.take_depth(found(frame_at(0), 75.0, origin))
+    assert distance(made, 0) == pytest.approx(75, rel=0.02)
+    assert made.snapshot().depth_source == DepthSource(origin, metric=False)
+    made.take_depth(found(frame_at(1)))
+    assert made.snapshot().depth_source == DepthSource(origin, metric=False)
+
+
+def test_the_loss_does_not_see_depth_by_light() -> None:
+    made = learner()
+    made.take_depth(found(frame_at(0), 75.0, DepthOrigin.LIGHT))
+    assert made._window.find(0, MOST_LATE).depth is None
+
+
+def test_a_scene_that_started_from_depth_is_not_placed_again() -> None:
+    made = LiveReconstructor(ReconstructorConfig(gaussians=300, max_gaussians=400), CAMERA)
+    made.observe(frame_at(0, depth=np.full((HEIGHT, WIDTH), 50, np.float32)), steps=3)
+    made.observe(frame_at(1), steps=3)
+    assert made.take_depth(found(frame_at(1)))
+    assert distance(made, 1) == pytest.approx(50, rel=0.02)
+
+
+def another_scene(made: LiveReconstructor) -> None:
+    other = frame_at(3)
+    other = other.with_fields(image=255 - other.image)
+    made.begin_scene(other)
+    made.observe(other, steps=3)
+
+
+def another_size(made: LiveReconstructor) -> None:
+    wide = frame_at(3, width=2 * WIDTH)
+    made.begin_scene(wide)
+    made.observe(wide, steps=3)
+
+
+def a_scene_that_has_not_begun(made: LiveReconstructor) -> None:
+    made.begin_scene(frame_at(3))
+
+
+def withheld(made: LiveReconstructor) -> None:
+    made.observe(frame_at(3), train=False)
+    assert not made.take_depth(found(frame_at(3)))
+    made.forget()
+    made.observe(frame_at(4), steps=1)
+
+
+def long_ago(made: LiveReconstructor) -> None:
+    for k in range(3, 3 + MOST_LATE):
+        made.observe(frame_at(k), steps=1)
+
+
+@pytest.mark.parametrize("overtakes", [another_scene, another_size, a_scene_that_has_not_begun, withheld, long_ago])
+def test_depth_of_what_is_gone_changes_nothing(overtakes: Callable[[LiveReconstructor], None]) -> None:
+    made, untouched = learner(), learner()
+    overtakes(made)
+    overtakes(untouched)
+    for k in (0, 1, 2):
+        assert not made.take_depth(found(frame_at(k)))
+    for each in (made, untouched):
+        each.observe(frame_at(50, width=each.camera.width_px), steps=3)
+        each.rehearse(5)
+    assert made.snapshot().sha256() == untouched.snapshot().sha256()
+
+
+def test_the_same_calls_give_the_same_model() -> None:
+    def model() -> str:
+        made = learner()
+        made.rehearse(2)
+        made.take_depth(found(frame_at(2)))
+        made.rehearse(7)
+        made.observe(frame_at(3), steps=2)
+        made.take_depth(found(frame_at(2), 70.0))
+        made.rehearse(3)
+        return made.snapshot().sha256()
+
+    assert model() == model()
+
+
+def test_a_scene_after_a_cut_is_placed_by_its_own_depth() -> None:
+    made = learner()
+    made.take_depth(found(frame_at(1)))
+    another_scene(made)
+    assert distance(made, 3) == pytest.approx(PLANE, rel=0.02) and made.snapshot().depth_source is None
+    assert made.take_depth(found(frame_at(3), 100.0))
+    assert distance(made, 3) == pytest.approx(100, rel=0.02)
+
+
+@pytest.mark.cuda
+def test_a_gpu_learns_it_too(gpu: torch.device) -> None:
+    config = ReconstructorConfig(gaussians=300, max_gaussians=400, preallocate=True, depth_weight=0.1)
+    made = LiveReconstructor(config, CAMERA, device="cuda")
+    for k in range(3):
+        made.observe(frame_at(k), steps=3)
+    assert made.take_depth(found(frame_at(1)))
+    assert distance_on_gpu(made, 2) == pytest.approx(80, rel=0.02)
+    made.rehearse(20)
+    assert distance_on_gpu(made, 2) == pytest.approx(80, rel=0.02)
+
+
+def distance_on_gpu(made: LiveReconstructor, k: int) -> float:
+    with torch.no_grad():
+        output = render(made.snapshot().at(frame_at(k).time_s), CAMERA, depth=True)
+    return float(output.depth.median().cpu())

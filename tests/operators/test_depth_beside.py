@@ -1,0 +1,193 @@
+"""Depth beside a live stream: the newest frame is next, nothing waits, and what was found is of the frame that it says."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.depth_map import DepthMap, doubted
+from gsplat_core.geometry.registry import DEPTHS
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin
+from operators.depth import FoundDepth
+from operators.depth_beside import FEW_CORES, DepthBeside, DepthBesideOp, share_of
+from operators.outcome import OutcomeBuilder
+
+CAMERA = Camera.from_focal(30.0, 24, 16)
+PLANE = np.full((16, 24), 50, np.float32)
+SURE = np.ones((16, 24), np.float32)
+WAIT_S = 20
+
+
+class Gated:
+    """Answers when it is let, with depths of 100 + the frame's number, and keeps what it was asked."""
+
+    def __init__(self):
+        self.asked, self.begun, self.gate, self.fails = [], threading.Semaphore(0), threading.Semaphore(0), False
+
+    def estimate(self, frame, camera):
+        self.asked.append(frame)
+        self.begun.release()
+        assert self.gate.acquire(timeout=WAIT_S)
+        if self.fails:
+            raise ZeroDivisionError("the estimator")
+        if frame.seq == 99:
+            return doubted((16, 24), DepthOrigin.STEREO, "the eyes are swapped")
+        return DepthMap(PLANE + 50 + frame.seq, SURE, DepthOrigin.STEREO, metric=True)
+
+
+@pytest.fixture
+def estimator():
+    made = Gated()
+    DEPTHS.add("gated", lambda: made)
+    yield made
+    made.gate.release(1000)
+    DEPTHS.remove("gated")
+
+
+@pytest.fixture
+def beside(estimator):
+    made = DepthBeside("gated", CAMERA, share=1.0)
+    made.start()
+    yield made
+    estimator.gate.release(1000)
+    made.stop()
+
+
+def taken(beside):
+    """What is found next."""
+    until = time.monotonic() + WAIT_S
+    while (found := beside.take()) is None:
+        assert time.monotonic() < until, "no depth was found"
+        time.sleep(0.001)
+    return found
+
+
+def at_work(estimator):
+    assert estimator.begun.acquire(timeout=WAIT_S)
+
+
+def test_the_newest_frame_is_next_and_the_others_are_counted(beside, estimator, frame):
+    beside.offer(frame(0))
+    at_work(estimator)
+    for seq in (1, 2, 3):
+        beside.offer(frame(seq))
+    assert beside.take() is None
+    estimator.gate.release()
+    first = taken(beside)
+    assert (first.seq, first.depth[0, 0], first.depth_origin) == (0, 100, DepthOrigin.STEREO)
+    assert first.depth_confidence is SURE and first.image.tobytes() == frame(0).image.tobytes()
+    at_work(estimator)
+    estimator.gate.release()
+    assert taken(beside).seq == 3 and beside.take() is None
+    assert [each.seq for each in estimator.asked] == [0, 3] and beside.counts.passed_over == 2
+
+
+def test_the_newest_depth_is_taken_where_two_were_found(beside, estimator, frame):
+    for seq in (0, 1):
+        beside.offer(frame(seq))
+        at_work(estimator)
+        estimator.gate.release()
+    beside.offer(frame(2))
+    at_work(estimator)  # so that the one before is done
+    assert beside.take().seq == 1
+
+
+def test_an_estimator_learns_of_a_scene_whose_first_frame_was_passed_over(beside, estimator, frame):
+    estimator.gate.release(10)
+    found = []
+    for given in (frame(0), frame(3, scene=1), frame(4, scene=1), frame(5, scene=2, new_scene="cut")):
+        beside.offer(given)
+        found.append(taken(beside))
+    assert [each.new_scene for each in estimator.asked] == [None, "passed over", None, "cut"]
+    assert [each.new_scene for each in found] == [None, None, None, "cut"]
+
+
+@pytest.mark.parametrize(
+    ("choice", "fields"), [("gated", {"depth": PLANE}), ("none", {}), ("recorded", {}), ("auto", {})]
+)
+def test_where_there_is_nothing_to_look_for_nobody_is_asked(frame, choice, fields, estimator):
+    beside = DepthBeside(choice, CAMERA)
+    beside.start()
+    for seq in range(3):
+        beside.offer(frame(seq, **fields))
+    beside.stop()
+    assert estimator.asked == [] and beside.take() is None and beside.counts.passed_over == 0
+
+
+def test_what_is_doubted_is_not_found(beside, estimator, frame):
+    estimator.gate.release(10)
+    for seq in (99, 100):
+        beside.offer(frame(seq))
+        at_work(estimator)
+    assert taken(beside).seq == 100
+    assert beside.finder.doubts.counted() == {"the eyes are swapped": 1}
+
+
+def test_a_failure_is_raised_by_the_operator_and_once(estimator, frame, compute):
+    beside = DepthBeside("gated", CAMERA)
+    operator = DepthBesideOp(None, beside=beside)
+    operator.start()
+    estimator.fails = True
+    estimator.gate.release()
+    beside.offer(frame(0))
+    beside._thread.join(WAIT_S)
+    with pytest.raises(ZeroDivisionError, match="the estimator"):
+        compute(operator, frame=frame(1))
+    operator.stop()
+
+
+def test_it_can_be_stopped_while_it_rests_and_started_again(estimator, frame):
+    beside = DepthBeside("gated", CAMERA, share=1e-6)  # rests for hours
+    estimator.gate.release(10)
+    for seq in (0, 1):
+        beside.start()
+        beside.offer(frame(seq))
+        assert taken(beside).seq == seq
+        thread = beside._thread
+        beside.stop()
+        assert not thread.is_alive()
+    assert [each.seq for each in estimator.asked] == [0, 1]
+
+
+def test_few_cores_are_left_to_training():
+    assert share_of(2) == share_of(FEW_CORES) == 0.25 and share_of(FEW_CORES + 1) == share_of(16) == 1.0
+
+
+@pytest.mark.parametrize(("choice", "kept"), [("auto", True), ("recorded", True), ("none", False), ("stereo", False)])
+def test_recorded_depth_is_kept_or_dropped_as_the_setting_says(frame, compute, choice, kept):
+    operator = DepthBesideOp(None, beside=DepthBeside(choice, CAMERA))
+    operator.start()
+    given = frame(0, depth=PLANE, depth_origin=DepthOrigin.MEASURED)
+    (passed,) = compute(operator, frame=given)
+    operator.stop()
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    if kept:
+        assert passed is given and outcome.find(FoundDepth).frames == {"measured": 1} and outcome.notes == ()
+    else:
+        assert (passed.depth, passed.depth_origin) == (None, None)
+        assert outcome.notes == (f"the depth that 1 frames came with was not used (depth is {choice!r})",)
+
+
+def test_the_outcome_has_what_came_and_what_was_found(estimator, frame, compute):
+    operator = DepthBesideOp(None, beside=DepthBeside("gated", CAMERA))
+    operator.start()
+    compute(operator, frame=frame(0, depth=PLANE, depth_origin=DepthOrigin.MEASURED))
+    estimator.gate.release()
+    operator.beside.offer(frame(1))
+    taken(operator.beside)
+    operator.stop()
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    assert outcome.find(FoundDepth) == FoundDepth({"stereo": 1}, 1.0, False, {}, 0)
+    assert any("1 frames came with was not used" in note for note in outcome.notes)
+
+
+def test_another_name_is_refused():
+    with pytest.raises(InvalidSetting, match="depth is 'sonar'; choose auto"):
+        DepthBeside("sonar", CAMERA)
