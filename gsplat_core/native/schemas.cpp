@@ -130,6 +130,17 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // one. A camera is 18 numbers: three rows of world-to-camera, fx, fy, cx, cy, width, height. CPU only.
   m.def("surface_motion(Tensor points, Tensor flow, float[] before, float[] after, bool arrived) -> Tensor");
 
+  // Semi-global matching of two grey pictures uint8 [H, W] whose rows correspond, for the disparities lowest .. lowest + count -
+  // 1: (sixteenths of a pixel int32 [H, W], the least int32 where unknown; uint8 [H, W], 1 where neither a jump nor a hole is
+  // near).
+  m.def("match_disparities(Tensor left, Tensor right, int lowest, int count) -> (Tensor, Tensor)");
+  // Such disparities moved to where the pictures agree best around them: (pixels, their standard deviation) [H, W] each; 0 and
+  // infinite where unknown.
+  m.def("fit_disparities(Tensor left, Tensor right, Tensor sixteenths) -> (Tensor, Tensor)");
+
+  // Planes [C, H, W] smoothed where a guide uint8 [H, W] or [H, W, channels] does not change by grey_step grey values or more.
+  m.def("smooth_within_edges(Tensor planes, Tensor guide, float strength, float grey_step) -> Tensor");
+
   // Structural similarity of each pixel and channel of [H, W, C] images.
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
   m.def("ssim_map_backward(Tensor gradient, Tensor image, Tensor target) -> Tensor");

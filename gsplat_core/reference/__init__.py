@@ -15,12 +15,15 @@ from gsplat_core.reference.deformation import (
     hexplane_modulate,
     hexplane_space,
 )
+from gsplat_core.reference.disparity_fit import fit_disparities
+from gsplat_core.reference.edge_aware_filter import smooth_within_edges
 from gsplat_core.reference.frame import render_frame
 from gsplat_core.reference.image_loss import frame_loss, image_loss
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
 from gsplat_core.reference.ssim import ssim_map
+from gsplat_core.reference.stereo_matching import match_disparities
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 
 __all__ = [
@@ -30,6 +33,7 @@ __all__ = [
     "basis_field_backward",
     "basis_field_backward_adam_",
     "basis_field_move_to_",
+    "fit_disparities",
     "frame_loss",
     "fully_fused_projection",
     "hexplane_decode",
@@ -40,10 +44,12 @@ __all__ = [
     "image_loss",
     "isect_offset_encode",
     "isect_tiles",
+    "match_disparities",
     "quat_scale_to_covar_preci",
     "rasterization",
     "rasterize_to_pixels",
     "render_frame",
+    "smooth_within_edges",
     "spherical_harmonics",
     "ssim_map",
 ]

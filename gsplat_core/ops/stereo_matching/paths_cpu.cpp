@@ -1,0 +1,103 @@
+// The paths along rows and columns.
+#include "byte_rows.h"
+
+namespace GSPLAT_ISA::stereo_matching {
+namespace {
+
+constexpr int kMargin = 16;  // bytes before and after what is kept of a pixel: a change to a disparity that is not there
+
+// What is kept of the pixels of a path: by how much each disparity costs more than the best one, at most kLargeStep.
+struct Kept {
+  uint8_t* bytes;
+  int count;
+  GSPLAT_METHOD uint8_t* of(int64_t pixel) const { return bytes + pixel * stride(count) + kMargin; }
+  static GSPLAT_METHOD int64_t stride(int count) { return count + 2 * kMargin; }
+  static GSPLAT_METHOD int64_t size(int64_t pixels, int count) { return pixels * stride(count); }
+  // A path that begins here: every disparity is as good, and none is beyond the ends.
+  GSPLAT_METHOD void begin(int64_t pixel) const {
+    uint8_t* const all = of(pixel) - kMargin;
+    for (int i = 0; i < stride(count); ++i) all[i] = i < kMargin || i >= kMargin + count ? kLargeStep : 0;
+  }
+};
+
+// One pixel further. kFirst: the first path sets the messages, the others add theirs.
+template <int kWide, bool kFirst>
+GSPLAT_INLINE void step(const uint8_t* before, const uint8_t* __restrict costs, int count, uint8_t* __restrict after,
+                        uint8_t* __restrict messages) {
+  uint8_t totals[kMostDisparities], least[kWide];
+  for (int i = 0; i < kWide; ++i) least[i] = 255;
+  for (int first = 0; first < count; first += kWide) {
+    for (int i = first; i < first + kWide; ++i) {
+      const uint8_t beside = uint8_t(less(before[i - 1], before[i + 1]) + kSmallStep);
+      const uint8_t message = less(before[i], beside), total = uint8_t(costs[i] + message);
+      messages[i] = kFirst ? message : uint8_t(messages[i] + message);
+      totals[i] = total;
+      least[i - first] = less(least[i - first], total);
+    }
+  }
+  const uint8_t best = least_of<kWide>(least);
+  for (int first = 0; first < count; first += kWide)
+    for (int i = first; i < first + kWide; ++i) after[i] = less(uint8_t(totals[i] - best), uint8_t(kLargeStep));
+}
+
+// To the right and to the left by turns: neither waits for the other one's sums. Whichever comes to a pixel first sets its
+// message.
+template <int kWide>
+GSPLAT_INLINE void along_row(const uint8_t* costs, uint8_t* messages, int64_t width, int count, const Kept& kept) {
+  for (int64_t pixel = 0; pixel < 4; ++pixel) kept.begin(pixel);
+  for (int64_t k = 0; k < width; ++k) {
+    const int64_t ahead = k * count, back = (width - 1 - k) * count;
+    const bool first = 2 * k < width;
+    if (first)
+      step<kWide, true>(kept.of(k % 2), costs + ahead, count, kept.of((k + 1) % 2), messages + ahead);
+    else
+      step<kWide, false>(kept.of(k % 2), costs + ahead, count, kept.of((k + 1) % 2), messages + ahead);
+    if (first && ahead != back)
+      step<kWide, true>(kept.of(2 + k % 2), costs + back, count, kept.of(2 + (k + 1) % 2), messages + back);
+    else
+      step<kWide, false>(kept.of(2 + k % 2), costs + back, count, kept.of(2 + (k + 1) % 2), messages + back);
+  }
+}
+
+int64_t row_scratch(const Pair& pair) { return cost_scratch(pair) + Kept::size(4, pair.count); }
+
+void rows(const Pair& pair, uint8_t* costs, uint8_t* messages, int64_t begin, int64_t end, uint8_t* scratch) {
+  sum_costs(pair, costs, begin, end, scratch);
+  const int64_t row = int64_t(pair.width) * pair.count;
+  const Kept kept = {scratch, pair.count};
+  with_width(pair.count, [&](auto wide) {
+    for (int64_t y = begin; y < end; ++y)
+      along_row<decltype(wide)::value>(costs + y * row, messages + y * row, pair.width, pair.count, kept);
+  });
+}
+
+int64_t column_scratch(const Pair& pair, int64_t columns) { return 2 * Kept::size(columns, pair.count); }
+
+template <int kWide>
+GSPLAT_INLINE void along_columns(const Pair& pair, const uint8_t* costs, uint8_t* messages, int64_t begin, int64_t end, int down,
+                                 Kept before, Kept after) {
+  for (int64_t i = 0; i < end - begin; ++i) before.begin(i), after.begin(i);
+  for (int64_t k = 0; k < pair.height; ++k) {
+    const int64_t y = down ? k : pair.height - 1 - k, first = (y * pair.width + begin) * pair.count;
+    for (int64_t i = 0; i < end - begin; ++i) {
+      const int64_t at = first + i * pair.count;
+      step<kWide, false>(before.of(i), costs + at, pair.count, after.of(i), messages + at);
+    }
+    const Kept both = before;
+    before = after, after = both;
+  }
+}
+
+void columns(const Pair& pair, const uint8_t* costs, uint8_t* messages, int64_t begin, int64_t end, uint8_t* scratch) {
+  const Kept one = {scratch, pair.count}, other = {scratch + Kept::size(end - begin, pair.count), pair.count};
+  with_width(pair.count, [&](auto wide) {
+    for (int down = 1; down >= 0; --down)
+      along_columns<decltype(wide)::value>(pair, costs, messages, begin, end, down, one, other);
+  });
+}
+
+}  // namespace
+
+extern const Kernels kernels = {row_scratch, column_scratch, rows, columns, winners, drop_patches, surfaces};
+
+}  // namespace GSPLAT_ISA::stereo_matching

@@ -1,0 +1,164 @@
+"""Semi-global matching in plain torch, in whole numbers: the oracle of `gsplat_core.ops.stereo_matching`."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+SLOPE_CAP = 63
+BRIGHTNESS_MOST = 129
+WINDOW_RADIUS = 4
+COST_SHIFT = 6
+SMALL_STEP, LARGE_STEP = 12, 49
+COST_MOST = 255 - LARGE_STEP
+UNIQUENESS_PERCENT = 5
+LEFT_RIGHT_MOST = 1
+SIXTEENTHS = 16
+PATCH_PIXELS, PATCH_STEP = 100, 32
+JUMP_RADIUS, JUMP_MOST, HOLE_RADIUS = 5, 32, 2
+UNKNOWN = torch.iinfo(torch.int32).min
+
+
+def match_disparities(left: Tensor, right: Tensor, lowest: int, count: int) -> tuple[Tensor, Tensor]:
+    """Disparities in sixteenths of a pixel, int32 [H, W], and where neither a jump nor a hole is near, bool [H, W]."""
+    costs = window_costs(left.long(), right.long(), lowest, count)
+    messages = (
+        _messages_down(costs.transpose(0, 1)).transpose(0, 1)
+        + _messages_down(costs.flip(1).transpose(0, 1)).transpose(0, 1).flip(1)
+        + _messages_down(costs)
+        + _messages_down(costs.flip(0)).flip(0)
+    )
+    found = checked_winners(4 * costs + messages, lowest)
+    found = without_patches(found)
+    return found.int(), one_surface(found)
+
+
+def window_costs(left: Tensor, right: Tensor, lowest: int, count: int) -> Tensor:
+    """What each disparity costs at each pixel, [H, W, count]."""
+    height, width = left.shape
+    columns = torch.arange(width, device=left.device)[:, None] - lowest - torch.arange(count, device=left.device)
+    columns = columns.clamp(0, width - 1)  # [W, count]
+
+    def differences(a: Tensor, b: Tensor) -> Tensor:
+        (a_low, a_high), (b_low, b_high) = _range(a), _range(b)
+        a, a_low, a_high = (each[:, :, None] for each in (a, a_low, a_high))
+        b, b_low, b_high = (each[:, columns] for each in (b, b_low, b_high))
+        from_left = torch.maximum(a - b_high, b_low - a).clamp(min=0)
+        from_right = torch.maximum(b - a_high, a_low - b).clamp(min=0)
+        return torch.minimum(from_left, from_right)
+
+    pixels = differences(_slope(left), _slope(right)) + differences(left, right).clamp(max=BRIGHTNESS_MOST)
+    for size, dim in ((height, 0), (width, 1)):
+        around = torch.arange(size, device=left.device)
+        shifts = range(-WINDOW_RADIUS, WINDOW_RADIUS + 1)
+        pixels = torch.stack([pixels.index_select(dim, (around + k).clamp(0, size - 1)) for k in shifts]).sum(0)
+    return (pixels >> COST_SHIFT).clamp(max=COST_MOST)
+
+
+def _moved(plane: Tensor, down: int, right: int) -> Tensor:
+    """What lies so much further down and to the right, the outermost pixels repeated."""
+    height, width = plane.shape
+    rows = (torch.arange(height, device=plane.device) + down).clamp(0, height - 1)
+    columns = (torch.arange(width, device=plane.device) + right).clamp(0, width - 1)
+    return plane[rows][:, columns]
+
+
+def _slope(grey: Tensor) -> Tensor:
+    rise = sum(weight * (_moved(grey, down, 1) - _moved(grey, down, -1)) for down, weight in ((-1, 1), (0, 2), (1, 1)))
+    return torch.as_tensor(rise).clamp(-SLOPE_CAP, SLOPE_CAP) + SLOPE_CAP
+
+
+def _range(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and most of each value and those half a pixel beside it."""
+    before, after = (values + _moved(values, 0, -1)) // 2, (values + _moved(values, 0, 1)) // 2
+    least, most = torch.minimum(before, after), torch.maximum(before, after)
+    return torch.minimum(values, least), torch.maximum(values, most)
+
+
+def _messages_down(costs: Tensor) -> Tensor:
+    """What paths down the first dimension of [H, W, count] add to each cost."""
+    kept = torch.zeros_like(costs[0])
+    messages = torch.zeros_like(costs)
+    beyond = torch.full_like(kept[:, :1], LARGE_STEP)
+    for y in range(costs.shape[0]):
+        below, above = torch.cat([beyond, kept[:, :-1]], 1), torch.cat([kept[:, 1:], beyond], 1)
+        messages[y] = torch.minimum(kept, torch.minimum(below, above) + SMALL_STEP)
+        totals = costs[y] + messages[y]
+        kept = (totals - totals.amin(1, keepdim=True)).clamp(max=LARGE_STEP)
+    return messages
+
+
+def checked_winners(totals: Tensor, lowest: int) -> Tensor:
+    """The best disparity of each pixel in sixteenths, from totals [H, W, count], where the right eye agrees."""
+    height, width, count = totals.shape
+    numbers = torch.arange(count, device=totals.device)
+    keys = totals * 256 + numbers  # of equal totals the lowest disparity's
+    best_key = keys.amin(2)
+    best, least = best_key % 256, best_key // 256
+    rival = (totals * (100 - UNIQUENESS_PERCENT) < 100 * least[..., None]) & ((numbers - best[..., None]).abs() > 1)
+    padded = torch.nn.functional.pad(totals, (1, 1))
+    below, above = (padded.gather(2, (best + k)[..., None])[..., 0] for k in (0, 2))
+    bend = (below + above - 2 * least).clamp(min=1)
+    within = torch.div((below - above) * SIXTEENTHS + bend, 2 * bend, rounding_mode="trunc")
+    within = torch.where((best > 0) & (best < count - 1), within, 0)
+    known = ~rival.any(2)
+    found = torch.where(known, SIXTEENTHS * (best + lowest) + within, UNKNOWN)
+
+    columns = torch.arange(width, device=totals.device)
+    there = columns - lowest - best
+    inside = known & (there >= 0) & (there < width)
+    none = torch.iinfo(torch.int64).max
+    right = torch.full((height, width + 1), none, device=totals.device)
+    right.scatter_reduce_(1, torch.where(inside, there, width), torch.where(inside, best_key, none), "amin")
+
+    def differs(disparity: Tensor) -> Tensor:
+        at = columns - disparity
+        seen = (at >= 0) & (at < width)
+        key = right.gather(1, torch.where(seen, at, width))
+        return seen & (key != none) & ((key % 256 + lowest - disparity).abs() > LEFT_RIGHT_MOST)
+
+    place = SIXTEENTHS * columns - found
+    outside = (place < 0) | (place > SIXTEENTHS * (width - 1))
+    wrong = differs(found >> 4) & differs((found + SIXTEENTHS - 1) >> 4)
+    return torch.where(outside | wrong, UNKNOWN, found)
+
+
+def without_patches(found: Tensor) -> Tensor:
+    """Without the patches of few pixels that differ much from what is around them."""
+    known = found != UNKNOWN
+    labels = torch.arange(found.numel(), device=found.device).reshape(found.shape)
+    while True:
+        before = labels
+        for dim in (0, 1):
+            near, far = labels.narrow(dim, 0, labels.shape[dim] - 1), labels.narrow(dim, 1, labels.shape[dim] - 1)
+            size = labels.shape[dim] - 1
+            linked = known.narrow(dim, 0, size) & known.narrow(dim, 1, size)
+            linked &= (found.narrow(dim, 0, size) - found.narrow(dim, 1, size)).abs() <= PATCH_STEP
+            least = torch.where(linked, torch.minimum(near, far), -1)
+            labels = labels.clone()
+            labels.narrow(dim, 0, size).copy_(torch.where(linked, least, near))
+            far = labels.narrow(dim, 1, size)
+            labels.narrow(dim, 1, size).copy_(torch.where(linked, torch.minimum(least, far), far))
+        if torch.equal(labels, before):
+            break
+    sizes = torch.bincount(labels.flatten(), minlength=found.numel())
+    return torch.where(sizes[labels] > PATCH_PIXELS, found, UNKNOWN)
+
+
+def one_surface(found: Tensor) -> Tensor:
+    """Where neither a jump of disparity nor a hole is near."""
+    known = found != UNKNOWN
+    far = 1 << 40
+    most, least = torch.where(known, found, -far), torch.where(known, found, far)
+    hole = (~known).long()
+    for dim in (0, 1):
+        most, least = _most_near(most, dim, JUMP_RADIUS), -_most_near(-least, dim, JUMP_RADIUS)
+        hole = _most_near(hole, dim, HOLE_RADIUS)
+    return (hole == 0) & (most - least <= JUMP_MOST)
+
+
+def _most_near(plane: Tensor, dim: int, radius: int) -> Tensor:
+    size = plane.shape[dim]
+    around = torch.arange(size, device=plane.device)
+    shifts = range(-radius, radius + 1)
+    return torch.stack([plane.index_select(dim, (around + k).clamp(0, size - 1)) for k in shifts]).amax(0)
