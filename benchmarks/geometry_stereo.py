@@ -1,6 +1,6 @@
 """Depth from two eyes: against truth where there is one, and what it costs.
 
-    python benchmarks/geometry_stereo.py --recordings FOLDER [--pictures OUT] [--without synthetic heart …]
+    python benchmarks/geometry_stereo.py --recordings FOLDER [--pictures OUT] [--device cuda] [--without synthetic heart …]
 
 One JSON line for each: `scared_pair` (disparity against its truth), `scared_raw` and `hamlyn_pair` (rectified from their calibrations: vertical residual of
 SIFT matches, and the surface), `heart` (its measure), synthetic pairs (depth against the truth) and the time of a frame on one thread. `--pictures` writes
@@ -18,6 +18,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
 from gsplat_core.geometry.depth_map import BELIEVED, DepthMap
 from gsplat_core.geometry.stereo import StereoDepth, grey
@@ -26,12 +27,14 @@ from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
+DEVICE = "cpu"
+"""Where pictures are matched."""
 HEART_BORDER_PX, HEART_ONE_EYED_PX = 10, 110
 
 
 def estimates(frames: Iterable[Frame], camera: Camera) -> Iterator[tuple[Frame, DepthMap, float]]:
     """Each frame of a stream with its depth and the CPU time that it took, in ms."""
-    estimator = StereoDepth()
+    estimator = StereoDepth(DEVICE)
     for frame in frames:
         begun = time.process_time()
         found = estimator.estimate(frame, camera)
@@ -81,7 +84,7 @@ def heart(folder: Path) -> dict[str, Any]:
     mirrored = (
         frame.with_fields(image=flipped(frame.right_image), right_image=flipped(frame.image)) for frame in recording
     )
-    estimator, focal_px = StereoDepth(), recording.camera.K[0, 0]
+    estimator, focal_px = StereoDepth(DEVICE), recording.camera.K[0, 0]
     scores, shares, costs = [], [], []
     for index, frame in enumerate(mirrored):
         begun = time.process_time()
@@ -155,12 +158,16 @@ def picture(folder: Path, path: Path) -> None:
 
 
 def main() -> None:
+    global DEVICE
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--recordings", type=Path, required=True)
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--without", nargs="*", default=[])
+    parser.add_argument("--device", default=DEVICE)
     arguments = parser.parse_args()
+    DEVICE = arguments.device
     cv2.setNumThreads(1)
+    torch.set_num_threads(1)
     given = arguments.recordings
     small = Asked(frames=6, stereo=True)
     usual = Asked(frames=4, width_px=640, height_px=512, stereo=True, camera="moving", seed=1)

@@ -90,15 +90,17 @@ class DepthOp(Operator):
         choice: `auto`, or what `check_depth` takes. Raises InvalidSetting for another one.
         camera: that of the frames.
         has_time: whether `auto` may ask what takes longer than a frame of a camera.
+        device: where an estimator works that need not work on the CPU.
         held_out: frames of which nothing may be learned, not even about the depth of others.
     """
 
     def __init__(
-        self, fragment: Any, *args: Any, choice: str, camera: Camera, has_time: bool = False,
+        self, fragment: Any, *args: Any, choice: str, camera: Camera, has_time: bool = False, device: str = "cpu",
         held_out: Callable[[Frame], bool] = lambda frame: False, **kwargs: Any,
     ) -> None:  # fmt: skip
         check_depth(choice)
-        self.choice, self.camera, self.has_time, self.held_out = choice, camera, has_time, held_out
+        self.choice, self.camera, self.held_out = choice, camera, held_out
+        self.has_time, self.device = has_time, device
         self._finder: DepthFinder | None = None
         self._counts = DepthCounts()
         super().__init__(fragment, *args, **kwargs)
@@ -109,7 +111,7 @@ class DepthOp(Operator):
 
     def start(self) -> None:
         self._counts = DepthCounts()
-        self._finder = DepthFinder(self.choice, self.camera, has_time=self.has_time)
+        self._finder = DepthFinder(self.choice, self.camera, has_time=self.has_time, device=self.device)
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         assert self._finder is not None

@@ -28,13 +28,14 @@ class DepthBeside:
     Of the frames that are handed over while it is at work the newest is next; the others are passed over and counted.
     """
 
-    def __init__(self, choice: str, camera: Camera, *, share: float | None = None) -> None:
-        """choice: the setting `depth`. camera: that of the frames. share: of one core's time, which it takes at most; None: as suits the machine.
+    def __init__(self, choice: str, camera: Camera, *, share: float | None = None, device: str = "cpu") -> None:
+        """choice: the setting `depth`. camera: that of the frames. share: of one core's time, which it takes at most; None: as suits the machine. device:
+        where an estimator works that need not work on the CPU.
 
         Raises InvalidSetting as `check_depth`.
         """
         check_depth(choice)
-        self.choice, self._camera = choice, camera
+        self.choice, self._camera, self._device = choice, camera, device
         self._share = share if share is not None else share_of(usable_cores())
         self.counts = DepthCounts()
         self.finder: DepthFinder | None = None
@@ -48,7 +49,7 @@ class DepthBeside:
     def start(self) -> None:
         """Begin with another stream."""
         self.counts = DepthCounts()
-        self.finder = DepthFinder(self.choice, self._camera, has_time=True)
+        self.finder = DepthFinder(self.choice, self._camera, has_time=True, device=self._device)
         self._offered = self._found = self._failure = None
         self._over = False
         self._thread = threading.Thread(target=self._run, args=(self.finder,), name="depth", daemon=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -23,6 +23,15 @@ class Estimator(Protocol):
 
         A frame with `new_scene` has nothing to do with those before it.
         """
+        ...
+
+
+@runtime_checkable
+class OnDevice(Protocol):
+    """An estimator that need not work on the CPU."""
+
+    def work_on(self, device: str) -> None:
+        """From now on work on this device, beside what else goes on there."""
         ...
 
 
@@ -121,8 +130,9 @@ class Sentences:
 class DepthFinder:
     """Gives the frames of one stream the depth that a setting asks for."""
 
-    def __init__(self, choice: str, camera: Camera, *, has_time: bool = False) -> None:
-        """choice: `auto` or as `new_estimator` takes it. camera: that of the frames. has_time: what takes long may be asked by `auto`, too.
+    def __init__(self, choice: str, camera: Camera, *, has_time: bool = False, device: str = "cpu") -> None:
+        """choice: `auto` or as `new_estimator` takes it. camera: that of the frames. has_time: what takes long may be asked by `auto`, too. device: where
+        an estimator works that need not work on the CPU.
 
         Raises as `check_depth`.
         """
@@ -131,6 +141,9 @@ class DepthFinder:
         auto = AUTO_WITH_TIME if has_time else AUTO
         asked = auto if choice == "auto" else {choice: _always}
         self._asked = [(new_estimator(name), suits) for name, suits in asked.items()]
+        for estimator, _ in self._asked:
+            if isinstance(estimator, OnDevice):
+                estimator.work_on(device)
         self.doubts, self.remarks = Sentences(), Sentences()
         """What spoke against a frame's depth as a whole, and what else was said about it."""
 

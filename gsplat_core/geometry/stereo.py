@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+from contextlib import AbstractContextManager
+
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from gsplat_core.geometry.depth_map import DepthMap, doubted
-from gsplat_core.geometry.disparity import Disparity, Span, enlarged, find_disparity, shrunk, smoothed
+from gsplat_core.geometry.depth_map import BELIEVED, DepthMap, doubted
+from gsplat_core.geometry.disparity import Span, enlarged, find_disparity, shrunk, smoothed
 from gsplat_core.geometry.eye_pair import LEAST_DISPARITY_PX, PairLook, look_at
+from gsplat_core.ops.stereo_matching.stereo_matching import MOST_DISPARITIES
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.transfers import HostCopy, tensor_of
 
 LOOK_EVERY = 30
 """Frames after which the pair is looked at again: eyes do not move against each other, and what they look at comes nearer."""
@@ -22,6 +29,8 @@ MARGIN_SHARE, MARGIN_PX = 0.2, 4
 """What is looked for beyond the disparities that were seen."""
 HALF_BELIEVED_PX = 0.5
 """Standard deviation of a disparity that is believed with a confidence of a half, in pixels of the pictures that are matched."""
+SAMPLED_PX = 200
+"""Pixels along a row that are enough to know the range of a picture's depth."""
 LEAST_BELIEVED = 0.05
 """Share of the pixels that must be believed."""
 ROWS_FROM_PX = 0.05
@@ -39,11 +48,17 @@ class StereoDepth:
     """Estimates the depth of rectified pairs.
 
     Without the right eye's camera depth is relative, in units of the distance between the eyes; the pictures are then taken as those of parallel cameras
-    with one principal point.
+    with one principal point. On a GPU it works on a stream of its own: training goes on beside it, and only the thread that asks waits.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device | str = "cpu") -> None:
+        self.work_on(device)
         self._forget((0, 0))
+
+    def work_on(self, device: torch.device | str) -> None:
+        """See `OnDevice`: where pictures are matched. What looks at the pair as a whole, now and then, works on the CPU."""
+        self._device = torch.device(device)
+        self._stream = torch.cuda.Stream(self._device) if self._device.type == "cuda" else None
 
     def _forget(self, size: tuple[int, int]) -> None:
         self._size = size
@@ -69,8 +84,12 @@ class StereoDepth:
             if why is not None:
                 return doubted(shape, DepthOrigin.STEREO, why)
         self._look_in -= 1
-        found = self._matched(left, right, frame.image)
-        return self._as_depth(found, frame, camera, parallel_px)
+        span = self._span_of(frame.width_px)
+        if span.count > MOST_DISPARITIES:
+            why = f"the eyes see points at too many distances: {span.count} disparities would have to be looked through, {MOST_DISPARITIES} can be"
+            return doubted(shape, DepthOrigin.STEREO, why)
+        planes = self._planes(left, right, frame, camera, span, parallel_px)
+        return self._as_depth(planes, frame, camera, parallel_px)
 
     def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], frame: Frame, parallel_px: float) -> str | None:
         """Learn rows and disparities of the pair; why it cannot be used, in a sentence, or None."""
@@ -85,37 +104,58 @@ class StereoDepth:
         self._look_in = LOOK_EVERY
         return None
 
-    def _matched(self, left: NDArray[np.uint8], right: NDArray[np.uint8], guide: NDArray[np.uint8]) -> Disparity:
+    def _span_of(self, width_px: int) -> Span:
+        """What is looked for in pictures that were shrunk for it."""
         assert self._span is not None
         low, high = self._span
-        margin = MARGIN_PX + MARGIN_SHARE * (high - low)
-        height, width = left.shape
-        shrink = _shrink(width)
-        aligned = _with_rows_of_left(right, np.median(self._rows, axis=0), (low + high) / 2)
-        small_left, small_right, small_guide = (shrunk(each, shrink) for each in (left, aligned, guide))
-        span = Span.around((low - margin) / shrink, (high + margin) / shrink)
-        return enlarged(smoothed(find_disparity(small_left, small_right, span), small_guide), width, height)
+        margin, shrink = MARGIN_PX + MARGIN_SHARE * (high - low), _shrink(width_px)
+        return Span.around((low - margin) / shrink, (high + margin) / shrink)
 
-    def _as_depth(self, found: Disparity, frame: Frame, camera: Camera, parallel_px: float) -> DepthMap:
-        shift = found.px - np.float32(parallel_px)
-        known = found.known & (shift > LEAST_DISPARITY_PX)
-        error_px = np.hypot(found.error_px, _off_along_rows(np.median(self._rows, axis=0), found.px.shape))
-        half_px = HALF_BELIEVED_PX * _shrink(found.px.shape[1])
-        confidence = np.where(known, 1 / (1 + (error_px / half_px) ** 2), 0).astype(np.float32)
-        believed = confidence >= 0.5
-        if believed.mean() < LEAST_BELIEVED:
+    def _planes(
+        self,
+        left: NDArray[np.uint8],
+        right: NDArray[np.uint8],
+        frame: Frame,
+        camera: Camera,
+        span: Span,
+        parallel_px: float,
+    ) -> NDArray[np.float32]:
+        """Depth and confidence [2, H, W]."""
+        assert self._span is not None
+        rows = np.median(self._rows, axis=0)
+        aligned = _with_rows_of_left(right, rows, sum(self._span) / 2)
+        shrink = _shrink(frame.width_px)
+        small = [shrunk(each, shrink) for each in (left, aligned, frame.image)]
+        with self._beside():
+            here, there, guide = _tensors_of(small, self._device)
+            found = enlarged(smoothed(find_disparity(here, there, span), guide), frame.width_px, frame.height_px)
+            shift = found.px - parallel_px
+            known = found.known & (shift > LEAST_DISPARITY_PX)
+            off_px = _off_along_rows(rows, frame.height_px, frame.width_px, self._device)
+            variance = (found.error_px.square() + off_px.square()) / (HALF_BELIEVED_PX * shrink) ** 2
+            depth = torch.where(known, _reach(frame, camera) / torch.where(known, shift, 1), 0)
+            planes = HostCopy(torch.stack([depth, torch.where(known, 1 / (1 + variance), 0)]))
+        return planes.numpy()
+
+    def _beside(self) -> AbstractContextManager[object]:
+        return contextlib.nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
+
+    def _as_depth(self, planes: NDArray[np.float32], frame: Frame, camera: Camera, parallel_px: float) -> DepthMap:
+        depth, confidence = planes
+        believed = np.count_nonzero(confidence >= BELIEVED) / confidence.size
+        if believed < LEAST_BELIEVED:
             self._look_in = 0
-            why = f"too little of the picture could be matched between the eyes: {believed.mean():.1%} of its pixels, {LEAST_BELIEVED:.0%} are needed"
-            return doubted(found.px.shape, DepthOrigin.STEREO, why)
-        low, high = (float(value) for value in np.percentile(found.px[known], (0.5, 99.5)))
-        self._span = low, high
-        baseline = 1.0 if frame.right_camera is None else -float(frame.right_camera.world_to_camera[0, 3])
-        reach = float(camera.K[0, 0] * baseline)
-        depth = np.where(known, np.float32(reach) / np.where(known, shift, 1), 0).astype(np.float32)
-        middle = float(np.median(depth[believed]))
+            why = f"too little of the picture could be matched between the eyes: {believed:.1%} of its pixels, {LEAST_BELIEVED:.0%} are needed"
+            return doubted(depth.shape, DepthOrigin.STEREO, why)
+        step = max(1, frame.width_px // SAMPLED_PX)
+        some = planes[:, ::step, ::step]
+        reach = _reach(frame, camera)
+        near, far = (float(value) for value in np.percentile(some[0][some[0] > 0], (0.5, 99.5)))
+        self._span = reach / far + parallel_px, reach / near + parallel_px
+        middle = float(np.median(some[0][some[1] >= BELIEVED]))
         if frame.right_camera is not None and not PLAUSIBLE_MM[0] <= middle <= PLAUSIBLE_MM[1]:
             why = f"the distances cannot be those of a scope: {middle:.3g} mm in the middle; check the distance between the eyes and its unit"
-            return doubted(found.px.shape, DepthOrigin.STEREO, why)
+            return doubted(depth.shape, DepthOrigin.STEREO, why)
         return DepthMap(
             depth, confidence, DepthOrigin.STEREO, frame.right_camera is not None, remark=self._remark(middle, reach)
         )
@@ -175,11 +215,23 @@ def _unlike_distances(look: PairLook, parallel_px: float, *, calibrated: bool) -
     return None
 
 
-def _off_along_rows(rows: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _reach(frame: Frame, camera: Camera) -> float:
+    """Depth times disparity."""
+    baseline = 1.0 if frame.right_camera is None else -float(frame.right_camera.world_to_camera[0, 3])
+    return float(camera.K[0, 0] * baseline)
+
+
+def _tensors_of(pictures: list[NDArray[np.uint8]], device: torch.device) -> list[Tensor]:
+    """The pictures on `device`, by one copy."""
+    together = tensor_of(np.concatenate([each.ravel() for each in pictures]), device)
+    parts = together.split([each.size for each in pictures])
+    return [part.reshape(each.shape) for part, each in zip(parts, pictures, strict=True)]
+
+
+def _off_along_rows(rows: NDArray[np.float64], height: int, width: int, device: torch.device) -> Tensor:
     """How far disparities may be off, in pixels [H, W]: an eye that is turned or nearer moves points along its rows as it moves them across."""
-    height, width = shape
-    y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-1, 1, width)
-    return np.asarray(np.hypot(rows[1] * y * height / width, rows[2] * x * width / height))
+    y, x = torch.linspace(-1, 1, height, device=device)[:, None], torch.linspace(-1, 1, width, device=device)
+    return torch.hypot(float(rows[1]) * height / width * y, float(rows[2]) * width / height * x)
 
 
 def _with_rows_of_left(right: NDArray[np.uint8], rows: NDArray[np.float64], disparity_px: float) -> NDArray[np.uint8]:

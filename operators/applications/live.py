@@ -73,7 +73,7 @@ class LiveApplication(Application):
             self, name="source", source=self.frame_source, stop_requested=self._stop_requested, seconds=settings.seconds
         )
         recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
-        beside = DepthBeside(settings.depth, self.frame_source.description.camera)
+        beside = DepthBeside(settings.depth, self.frame_source.description.camera, device=settings.device)
         depth = DepthBesideOp(self, name="depth", beside=beside)
         analysis = analysis_operator(
             self, settings.tool_mask, settings.out_of_body, depth, recording.behind_gate(), recording.behind_analysis()

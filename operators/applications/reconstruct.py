@@ -121,7 +121,8 @@ def _fit(
 
     frames = FirstFrames(source, description.frame_count)
     # Offline parallax is found from all frames at once, in `fit`, and not from the frames before each.
-    finder = DepthFinder("none" if settings.depth == "parallax" else settings.depth, description.camera)
+    choice = "none" if settings.depth == "parallax" else settings.depth
+    finder = DepthFinder(choice, description.camera, device=settings.device)
     with seeded(settings.seed, settings.device), contextlib.suppress(_StopFitting):
         learning.fit((finder.with_depth(frame) for frame in frames if _trains(frame)), steps, after_step)
     for doubt, count in sorted(learning.depth_doubts.items()):

@@ -190,8 +190,10 @@ class ReplayApplication(Application):
     def _depth_op(self) -> DepthOp:
         # A session that is followed has its depth already, as training was given it. What shows a finished model learns nothing from depth.
         choice = "recorded" if self._followed is not None else self.settings.depth
-        camera, has_time = self.frame_source.description.camera, self.stage == "replay"
-        return DepthOp(self, name="depth", choice=choice, camera=camera, has_time=has_time, held_out=self._held_out)
+        return DepthOp(
+            self, name="depth", choice=choice, camera=self.frame_source.description.camera, held_out=self._held_out,
+            has_time=self.stage == "replay", device=self.settings.device,
+        )  # fmt: skip
 
     def _reconstruct_op(self) -> ReconstructOp:
         if self._followed is not None:

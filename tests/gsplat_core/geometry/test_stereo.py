@@ -7,10 +7,21 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from gsplat_core.geometry.stereo import StereoDepth
 from gsplat_core.scene.frames import DepthOrigin
-from tests.gsplat_core.geometry.pairs import BASELINE_MM, FOCAL_PX, bowl, camera, frame, right_of, texture
+from tests.gsplat_core.geometry.pairs import (
+    BASELINE_MM,
+    FOCAL_PX,
+    HEIGHT,
+    WIDTH,
+    bowl,
+    camera,
+    frame,
+    right_of,
+    texture,
+)
 
 
 @pytest.fixture
@@ -42,6 +53,23 @@ def test_a_known_surface_comes_out_in_millimetres(left, right):
     assert found.believed.dtype == np.float32 and (found.believed[found.confidence < 0.5] == 0).all()
 
 
+@pytest.mark.cuda
+@pytest.mark.parametrize("times", [1, 3])
+def test_on_a_gpu_it_is_as_on_the_cpu(left, right, gpu, times):
+    """At full size, and where pictures are shrunk to be matched."""
+    size = WIDTH * times, HEIGHT * times
+    wide = replace(camera(), K=camera().K * np.array([[times], [times], [1]]), width_px=size[0], height_px=size[1])
+    eyes = [cv2.resize(each, size, interpolation=cv2.INTER_CUBIC) for each in (left, right)]
+    estimators = StereoDepth(), StereoDepth(gpu)
+    for seq in range(3):
+        given = frame(*eyes, seq=seq).with_fields(right_camera=wide.right_eye(BASELINE_MM))
+        here, there = (each.estimate(given, wide) for each in estimators)
+        assert here.doubt is None and there.doubt is None
+        both = (here.confidence >= 0.5) & (there.confidence >= 0.5)
+        assert both.mean() > 0.75 and ((here.confidence >= 0.5) != (there.confidence >= 0.5)).mean() < 1e-3
+        assert np.abs(here.depth - there.depth)[both].max() < 1e-2 * np.median(here.depth[both])
+
+
 def test_the_range_is_found_wherever_it_is(left):
     for low, high in ((3, 8), (60, 75)):
         disparity = bowl(low, high)
@@ -65,15 +93,17 @@ def test_principal_points_may_differ_between_the_eyes(left, right):
 
 
 def test_the_same_frames_give_the_same_bytes_with_any_number_of_threads(left, right):
-    threads = cv2.getNumThreads()
+    threads = cv2.getNumThreads(), torch.get_num_threads()
     results = []
     try:
         for count in (1, 2, 4):
             cv2.setNumThreads(count)
+            torch.set_num_threads(count)
             estimator = StereoDepth()
             results.append([estimator.estimate(frame(left, right, seq=k), camera()) for k in range(2)])
     finally:
-        cv2.setNumThreads(threads)
+        cv2.setNumThreads(threads[0])
+        torch.set_num_threads(threads[1])
     for other in results[1:]:
         for one, two in zip(results[0], other, strict=True):
             assert one.depth.tobytes() == two.depth.tobytes() and one.confidence.tobytes() == two.confidence.tobytes()
@@ -177,6 +207,11 @@ def test_another_scene_is_looked_at_anew(left, right):
     near = bowl(70, 90)
     found = estimator.estimate(frame(left, right_of(left, near), seq=1, new_scene="cut"), camera())
     assert off_by(found, near)[0] < 0.02
+
+
+def test_a_pair_with_too_many_distances_is_doubted(left, right, monkeypatch):
+    monkeypatch.setattr("gsplat_core.geometry.stereo.MARGIN_PX", 200)
+    assert "too many distances: 432 disparities" in estimate(frame(left, right)).doubt
 
 
 def test_a_frame_with_one_eye_has_nothing_to_match(left, right):
