@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.training.budget import Budget
@@ -30,6 +30,7 @@ def warm_reconstructor(
     height, width = image.shape[:2]
     tissue = np.ones((height, width), np.uint8)
     tissue[height // 2 :, : width // 2] = 0  # a scene starts in another way where tools hide some of it
+    depth = np.full((height, width), reconstructor.config.default_depth_mm, np.float32)
     drawn: list[object] = []
     for frames in (WARM_FRAMES, 1):  # the second scene takes over the memory of the first one, as the stream's does
         for seq in range(frames):
@@ -39,6 +40,8 @@ def warm_reconstructor(
             # All of them are held: every snapshot and piece of page-locked memory that a run needs is made.
             model = reconstructor.publish()
             drawn.append((model, draw(frame, model)))
+            # Steps that look at depth are captured by themselves.
+            reconstructor.take_depth(frame.with_fields(depth=depth, depth_origin=DepthOrigin.STEREO))
             reconstructor.rehearse(2)
             reconstructor.grow(frame)
         reconstructor.look_after_once()
