@@ -45,6 +45,7 @@ class BasisField(BumpTensors):
     slot_type = BasisSlot
     continues = True
     takes_colours = True
+    takes_positions = True
 
     @classmethod
     def for_gaussians(cls, gaussians: Gaussians, time_window_s: tuple[float, float], **architecture: Any) -> BasisField:

@@ -43,6 +43,8 @@ class DeformationField(torch.nn.Module):
     """Whether `continuation` is looked at."""
     takes_colours: ClassVar[bool] = False
     """Whether `add_colours` is there."""
+    takes_positions: ClassVar[bool] = False
+    """Whether `deltas` is there without the Gaussians, and positions can be set by `move_to` and `scale_positions`."""
 
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__()

@@ -46,11 +46,13 @@ class Placement:
         """Whether the scene is where a depth says."""
 
     def apply(self, step: TrainingStep, frame: Frame, observation: Observation, shown_s: float | None = None) -> None:
-        """Correct the scene by the depth of a frame, if it has any; the field covers its time already.
+        """Correct the scene by the depth of a frame, if it has any and the field takes positions; the field covers its time already.
 
         shown_s: the time at which motion is corrected; None: the frame's own. Later where depth is found after newer frames were trained on.
         """
-        if frame is self._first or not _has_depth(frame) or observation.camera.model != "pinhole":
+        if frame is self._first or not _has_depth(frame):
+            return
+        if observation.camera.model != "pinhole" or not step.field.takes_positions:
             return
         if self.is_placed and frame.depth_origin not in CORRECTS_ALL_TIMES + CORRECTS_ONE_TIME:
             return

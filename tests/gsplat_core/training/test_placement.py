@@ -100,3 +100,12 @@ def test_depth_that_is_believed_nowhere_places_nothing() -> None:
     reconstructor.observe(blind, steps=1)
     depth, _ = shown(reconstructor, frames[0])
     assert np.median(depth[INSIDE]) > 50
+
+
+@pytest.mark.parametrize("origin", [DepthOrigin.STEREO, DepthOrigin.PARALLAX])
+def test_a_field_whose_positions_cannot_be_set_is_trained_as_it_is(origin) -> None:
+    config = ReconstructorConfig(field="hexplane", gaussians=200, max_gaussians=300, first_frame_steps=2)
+    reconstructor, frames = Reconstructor(config, FIRST), stream(1)
+    reconstructor.observe(frames[0])
+    reconstructor.observe(with_depth(frames[0].with_fields(seq=1), origin), steps=1)
+    reconstructor.observe(with_depth(frames[0].with_fields(seq=2), origin), steps=1)
