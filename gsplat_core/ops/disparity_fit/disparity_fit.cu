@@ -87,18 +87,21 @@ __device__ inline Sample sample(const Fit& fit, const Planes& planes, int64_t i,
   return {float(fit.left[i]) - (a + share * (b - a)), rise + share * (later - rise)};
 }
 
-__global__ void __launch_bounds__(kThreads) weigh(Fit fit, Planes planes) {
+__global__ void __launch_bounds__(kThreads) weigh(Fit fit, Planes planes, bool first) {
   __shared__ Shared shared;
   const Tile tile;
   float known[kTile / kTileRows], mean[kTile / kTileRows];
-  window(fit, tile, shared, known,
-         [&](int y, int x) { return fit.sixteenths[int64_t(y) * fit.width + x] == kUnknown ? 0.0f : 1.0f; });
+  if (first) {
+    window(fit, tile, shared, known,
+           [&](int y, int x) { return fit.sixteenths[int64_t(y) * fit.width + x] == kUnknown ? 0.0f : 1.0f; });
+  }
   window(fit, tile, shared, mean, [&](int y, int x) { return sample(fit, planes, int64_t(y) * fit.width + x, x).differs; });
   for_own(fit, tile, [&](int i, int64_t pixel) {
     const Sample own = sample(fit, planes, pixel, int(pixel % fit.width));
-    const float share = fmaxf(known[i], kLeastKnown), differs = own.differs - mean[i] / share, odd = differs * (1.0f / kOutlier);
+    const float share = first ? fmaxf(known[i], kLeastKnown) : planes.known[pixel];
+    const float differs = own.differs - mean[i] / share, odd = differs * (1.0f / kOutlier);
     const float weight = (fit.sixteenths[pixel] == kUnknown ? 0.0f : 1.0f) / (1.0f + odd * odd);
-    planes.known[pixel] = share;
+    if (first) planes.known[pixel] = share;
     planes.information[pixel] = weight * own.rise * own.rise;
     planes.pull[pixel] = weight * own.rise * differs;
     planes.difference[pixel] = weight * differs * differs;
@@ -139,7 +142,7 @@ void fit_on_device(const Fit& fit, CudaScratch& scratch, cudaStream_t stream) {
   const dim3 tiles(blocks_for(fit.width, kTile), blocks_for(fit.height, kTile));
   prepare<<<blocks_for(pixels), kThreads, 0, stream>>>(fit, planes);
   for (int step = 0; step < kSteps; ++step) {
-    weigh<<<tiles, kThreads, 0, stream>>>(fit, planes);
+    weigh<<<tiles, kThreads, 0, stream>>>(fit, planes, step == 0);
     move<<<tiles, kThreads, 0, stream>>>(fit, planes, step + 1 == kSteps);
   }
 }

@@ -49,6 +49,7 @@ struct Planes {
 // CPU: rows [begin, end); no result depends on how rows are cut. scratch: 3 * width + 2 * kRadius floats.
 struct Kernels {
   void (*prepare)(const Fit& fit, const Planes& planes, int64_t begin, int64_t end);
+  void (*share)(const Fit& fit, const Planes& planes, int64_t begin, int64_t end, float* scratch);
   void (*sample)(const Fit& fit, const Planes& planes, int64_t begin, int64_t end);
   void (*weigh)(const Fit& fit, const Planes& planes, int64_t begin, int64_t end, float* scratch);
   void (*move)(const Fit& fit, const Planes& planes, bool last, int64_t begin, int64_t end, float* scratch);

@@ -44,8 +44,19 @@ void prepare(const Fit& fit, const Planes& planes, int64_t begin, int64_t end) {
       const int64_t l = within(x - 1, width), r = within(x + 1, width), at = y * width + x;
       const int slope = 10 * (here[r] - here[l]) + 3 * (above[r] - above[l] + below[r] - below[l]);  // Scharr's, 32 for one
       planes.slope[at] = float(slope) * (1.0f / 32.0f);
-      fit.px[at] = fit.sixteenths[at] == kUnknown ? 0.0f : float(fit.sixteenths[at]) * kPerSixteenth;
+      const bool known = fit.sixteenths[at] != kUnknown;
+      planes.information[at] = known ? 1.0f : 0.0f;  // until `share`
+      fit.px[at] = known ? float(fit.sixteenths[at]) * kPerSixteenth : 0.0f;
     }
+  }
+}
+
+// The plane of what is known lies in `information`, which is not needed yet.
+void share(const Fit& fit, const Planes& planes, int64_t begin, int64_t end, float* column) {
+  for (int64_t y = begin; y < end; ++y) {
+    float* const shares = planes.known + y * fit.width;
+    window_row(fit, planes.information, y, column, shares);
+    for (int64_t x = 0; x < fit.width; ++x) shares[x] = shares[x] > kLeastKnown ? shares[x] : kLeastKnown;
   }
 }
 
@@ -63,23 +74,20 @@ void sample(const Fit& fit, const Planes& planes, int64_t begin, int64_t end) {
       const float seen = float(other[first]) + share * (float(other[next]) - float(other[first]));
       planes.differs[at] = known * (float(fit.left[at]) - seen);
       planes.rise[at] = known * (slopes[first] + share * (slopes[next] - slopes[first]));
-      planes.known[at] = known;
     }
   }
 }
 
 void weigh(const Fit& fit, const Planes& planes, int64_t begin, int64_t end, float* scratch) {
   const int64_t width = fit.width;
-  float *const share = scratch, *const mean = scratch + width, *const column = scratch + 2 * width;
+  float *const mean = scratch, *const column = scratch + width;
   for (int64_t y = begin; y < end; ++y) {
     const int64_t row = y * width;
-    window_row(fit, planes.known, y, column, share);
     window_row(fit, planes.differs, y, column, mean);
     for (int64_t x = 0; x < width; ++x) {
       const int64_t at = row + x;
-      const float known = share[x] > kLeastKnown ? share[x] : kLeastKnown;
       const float there = fit.sixteenths[at] == kUnknown ? 0.0f : 1.0f;
-      const float differs = planes.differs[at] - mean[x] / known, odd = differs * (1.0f / kOutlier);
+      const float differs = planes.differs[at] - mean[x] / planes.known[at], odd = differs * (1.0f / kOutlier);
       const float weight = there / (1.0f + odd * odd), rise = planes.rise[at];
       planes.information[at] = weight * rise * rise;
       planes.pull[at] = weight * rise * differs;
@@ -88,16 +96,13 @@ void weigh(const Fit& fit, const Planes& planes, int64_t begin, int64_t end, flo
   }
 }
 
-// other, column: scratch of `move`.
-GSPLAT_INLINE void write_error(const Fit& fit, const Planes& planes, int64_t y, const float* information, float* other,
-                               float* column) {
+GSPLAT_INLINE void write_error(const Fit& fit, const Planes& planes, int64_t y, const float* information, float* column) {
   const int64_t row = y * fit.width;
   float* const error = fit.error_px + row;
   window_row(fit, planes.difference, y, column, error);
-  window_row(fit, planes.known, y, column, other);
   for (int64_t x = 0; x < fit.width; ++x) {
-    const float least = kIndependentPixels * information[x], share = other[x] > kLeastKnown ? other[x] : kLeastKnown;
-    const float variance = (error[x] + share) / (least > 1e-6f ? least : 1e-6f);
+    const float least = kIndependentPixels * information[x];
+    const float variance = (error[x] + planes.known[row + x]) / (least > 1e-6f ? least : 1e-6f);
     const bool known = fit.sixteenths[row + x] != kUnknown;
     error[x] = known ? __builtin_sqrtf(variance) : __builtin_inff();
     if (!known) fit.px[row + x] = 0;
@@ -106,24 +111,24 @@ GSPLAT_INLINE void write_error(const Fit& fit, const Planes& planes, int64_t y, 
 
 void move(const Fit& fit, const Planes& planes, bool last, int64_t begin, int64_t end, float* scratch) {
   const int64_t width = fit.width;
-  float *const information = scratch, *const other = scratch + width, *const column = scratch + 2 * width;
+  float *const information = scratch, *const pull = scratch + width, *const column = scratch + 2 * width;
   for (int64_t y = begin; y < end; ++y) {
     const int64_t row = y * width;
     window_row(fit, planes.information, y, column, information);
-    window_row(fit, planes.pull, y, column, other);
+    window_row(fit, planes.pull, y, column, pull);
     for (int64_t x = 0; x < width; ++x) {
       const int64_t at = row + x;
       const bool known = fit.sixteenths[at] != kUnknown;
       const float start = float(known ? fit.sixteenths[at] : 0) * kPerSixteenth;
-      const float moved = fit.px[at] - clamped(other[x] / (information[x] + kResistance), kMostStep);
+      const float moved = fit.px[at] - clamped(pull[x] / (information[x] + kResistance), kMostStep);
       fit.px[at] = start + clamped(moved - start, kMostFromStart);
     }
-    if (last) write_error(fit, planes, y, information, other, column);
+    if (last) write_error(fit, planes, y, information, column);
   }
 }
 
 }  // namespace
 
-extern const Kernels kernels = {prepare, sample, weigh, move};
+extern const Kernels kernels = {prepare, share, sample, weigh, move};
 
 }  // namespace GSPLAT_ISA::disparity_fit

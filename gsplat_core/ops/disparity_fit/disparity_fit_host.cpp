@@ -35,11 +35,12 @@ void run(CpuCall& call, const Fit& fit) {
   const Kernels& k = kernels();
   const auto for_rows = [&](const auto& work) {
     torch::stable::parallel_for(0, fit.height, kGrainRows, [&](int64_t begin, int64_t end) {
-      const auto scratch = std::make_unique<float[]>(size_t(3 * fit.width + 2 * kRadius));
+      const auto scratch = std::make_unique_for_overwrite<float[]>(size_t(3 * fit.width + 2 * kRadius));
       work(begin, end, scratch.get());
     });
   };
   for_rows([&](int64_t begin, int64_t end, float*) { k.prepare(fit, planes, begin, end); });
+  for_rows([&](int64_t begin, int64_t end, float* scratch) { k.share(fit, planes, begin, end, scratch); });
   for (int step = 0; step < kSteps; ++step) {
     for_rows([&](int64_t begin, int64_t end, float*) { k.sample(fit, planes, begin, end); });
     for_rows([&](int64_t begin, int64_t end, float* scratch) { k.weigh(fit, planes, begin, end, scratch); });

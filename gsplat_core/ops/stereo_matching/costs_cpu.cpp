@@ -1,5 +1,5 @@
 // What each disparity costs at each pixel: differences of single pixels, then their sums over a window, row by row.
-#include "byte_rows.h"
+#include "disparity_vectors.h"
 
 namespace GSPLAT_ISA::stereo_matching {
 namespace {
@@ -26,78 +26,95 @@ GSPLAT_INLINE Row take_row(uint8_t*& scratch, int64_t size) {
   return {{each[0], each[1], each[2]}, {each[3], each[4], each[5]}};
 }
 
-// The range of values of a row at a column.
-GSPLAT_INLINE void put_range(const uint8_t* row, int64_t width, int64_t column, const Range& to, int64_t at) {
-  const int here = row[column], before = (here + row[within(column - 1, width)]) / 2,
-            after = (here + row[within(column + 1, width)]) / 2;
-  to.value[at] = uint8_t(here);
-  to.low[at] = uint8_t(less(here, less(before, after)));
-  to.high[at] = uint8_t(more(here, more(before, after)));
+// The ranges of a row of values.
+GSPLAT_INLINE void fill_range(const uint8_t* values, int64_t width, const Range& to) {
+  const auto fill = [&](int64_t x, int64_t l, int64_t r) {
+    const int here = values[x], before = (here + values[l]) >> 1, after = (here + values[r]) >> 1;
+    to.value[x] = uint8_t(here);
+    to.low[x] = uint8_t(less(here, less(before, after)));
+    to.high[x] = uint8_t(more(here, more(before, after)));
+  };
+  fill(0, 0, within(1, width));
+  for (int64_t x = 1; x < width - 1; ++x) fill(x, x - 1, x + 1);
+  if (width > 1) fill(width - 1, width - 2, width - 1);
 }
 
-// A row of `picture`: column(at) is which one is wanted at `at`. slopes: [width].
-template <class Column>
-GSPLAT_INLINE void fill_row(const Pair& pair, const uint8_t* picture, int64_t y, const Row& to, int64_t size, uint8_t* slopes,
-                            const Column& column) {
+// A row of `picture`. slopes: [width].
+GSPLAT_INLINE void fill_row(const Pair& pair, const uint8_t* picture, int64_t y, const Row& to, uint8_t* slopes) {
   const int64_t width = pair.width;
   const uint8_t* const here = picture + y * width;
   const uint8_t* const above = picture + within(y - 1, pair.height) * width;
   const uint8_t* const below = picture + within(y + 1, pair.height) * width;
-  for (int64_t x = 0; x < width; ++x) {
-    const int64_t l = within(x - 1, width), r = within(x + 1, width);
+  const auto fill = [&](int64_t x, int64_t l, int64_t r) {
     const int slope = 2 * (here[r] - here[l]) + above[r] - above[l] + below[r] - below[l];
     slopes[x] = uint8_t(less(more(slope, -kSlopeCap), kSlopeCap) + kSlopeCap);
-  }
-  for (int64_t at = 0; at < size; ++at) {
-    put_range(slopes, width, column(at), to.slope, at);
-    put_range(here, width, column(at), to.brightness, at);
+  };
+  fill(0, 0, within(1, width));
+  for (int64_t x = 1; x < width - 1; ++x) fill(x, x - 1, x + 1);
+  if (width > 1) fill(width - 1, width - 2, width - 1);
+  fill_range(slopes, width, to.slope);
+  fill_range(here, width, to.brightness);
+}
+
+// What matches column x with disparity number d gets to width - 1 - x + d: disparities lie one after the other.
+GSPLAT_INLINE void reverse(const Pair& pair, const Range& from, const Range& to) {
+  const int64_t last = int64_t(pair.width) - 1 - pair.lowest;
+  for (int64_t at = 0; at < pair.width - 1 + pair.count; ++at) {
+    const int64_t x = within(last - at, pair.width);
+    to.value[at] = from.value[x], to.low[at] = from.low[x], to.high[at] = from.high[x];
   }
 }
 
-GSPLAT_INLINE uint8_t beyond(uint8_t a, uint8_t b) { return uint8_t(more(a, b) - b); }
-
-// How far a value is out of the other one's range, the lesser of both ways.
-GSPLAT_INLINE uint8_t difference(uint8_t a, uint8_t a_low, uint8_t a_high, uint8_t b, uint8_t b_low, uint8_t b_high) {
-  return less(more(beyond(a, b_high), beyond(b_low, a)), more(beyond(b, a_high), beyond(a_low, b)));
+// How far values are out of the others' range, the lesser of both ways.
+template <class Bytes>
+GSPLAT_INLINE Bytes difference(const Range& left, int64_t x, const Range& right, int64_t at) {
+  const auto here = [&](const uint8_t* row) { return Bytes{} + row[x]; };
+  const auto there = [&](const uint8_t* row) { return load_as<Bytes>(row + at); };
+  const auto beyond = [](Bytes a, Bytes b) { return more(a, b) - b; };
+  const Bytes a = here(left.value), b = there(right.value);
+  const Bytes from_left = more(beyond(a, there(right.high)), beyond(there(right.low), a));
+  return less(from_left, more(beyond(b, here(left.high)), beyond(here(left.low), b)));
 }
 
-// Differences of a row's pixels [width, count]. What matches column x with disparity number d is in `right` at width - 1 - x + d.
+// Differences of a row's pixels [width, count].
 template <int kWide>
-GSPLAT_INLINE void pixel_costs(const Row& left, const Row& right, int64_t width, int count, uint8_t* __restrict costs) {
+GSPLAT_INLINE void pixel_costs(const Row& left, const Row& right, int64_t width, int count, uint8_t* costs) {
+  using Bytes = typename Vector<kWide>::Bytes;
   for (int64_t x = 0; x < width; ++x) {
-    const uint8_t s = left.slope.value[x], s_low = left.slope.low[x], s_high = left.slope.high[x];
-    const uint8_t b = left.brightness.value[x], b_low = left.brightness.low[x], b_high = left.brightness.high[x];
-    for (int first = 0; first < count; first += kWide) {
-      const int64_t at = width - 1 - x + first;
-      const Range slope = {right.slope.value + at, right.slope.low + at, right.slope.high + at};
-      const Range brightness = {right.brightness.value + at, right.brightness.low + at, right.brightness.high + at};
-      uint8_t* __restrict const to = costs + x * count + first;
-      for (int i = 0; i < kWide; ++i) {
-        const uint8_t by_slope = difference(s, s_low, s_high, slope.value[i], slope.low[i], slope.high[i]);
-        const uint8_t by_brightness = difference(b, b_low, b_high, brightness.value[i], brightness.low[i], brightness.high[i]);
-        to[i] = uint8_t(by_slope + less(by_brightness, uint8_t(kBrightnessMost)));
-      }
+    for (int d = 0; d < count; d += kWide) {
+      const int64_t at = width - 1 - x + d;
+      const Bytes brightness = difference<Bytes>(left.brightness, x, right.brightness, at);
+      const Bytes most = less(brightness, Bytes{} + uint8_t(kBrightnessMost));
+      store_as(costs + x * count + d, difference<Bytes>(left.slope, x, right.slope, at) + most);
     }
   }
 }
 
-// Sums of columns [width, count] to sums over the window.
+// Adds the pixels of one row to the sums of columns [width, count], and takes those of another away.
 template <int kWide>
-GSPLAT_INLINE void window_costs(const uint16_t* __restrict columns, int64_t width, int count, uint8_t* __restrict costs) {
-  for (int first = 0; first < count; first += kWide) {
-    uint16_t sum[kWide] = {};
-    for (int64_t x = -kWindowRadius; x <= kWindowRadius; ++x) {
-      const uint16_t* const enters = columns + within(x, width) * count + first;
-      for (int i = 0; i < kWide; ++i) sum[i] = uint16_t(sum[i] + enters[i]);
-    }
+GSPLAT_INLINE void move_down(const uint8_t* enters, const uint8_t* leaves, int64_t size, uint16_t* columns) {
+  using Bytes = typename Vector<kWide>::Bytes;
+  using Words = typename Vector<kWide>::Words;
+  for (int64_t i = 0; i < size; i += kWide) {
+    Words sum = load_as<Words>(columns + i) + __builtin_convertvector(load_as<Bytes>(enters + i), Words);
+    if (leaves != nullptr) sum -= __builtin_convertvector(load_as<Bytes>(leaves + i), Words);
+    store_as(columns + i, sum);
+  }
+}
+
+// Sums of columns [width, count] to costs: sums over the window.
+template <int kWide>
+GSPLAT_INLINE void window_costs(const uint16_t* columns, int64_t width, int count, uint8_t* costs) {
+  using Bytes = typename Vector<kWide>::Bytes;
+  using Words = typename Vector<kWide>::Words;
+  for (int d = 0; d < count; d += kWide) {
+    const auto column = [&](int64_t x) { return load_as<Words>(columns + within(x, width) * count + d); };
+    Words sum = {};
+    for (int64_t x = -kWindowRadius; x <= kWindowRadius; ++x) sum += column(x);
     for (int64_t x = 0; x < width; ++x) {
-      const uint16_t* const enters = columns + within(x + kWindowRadius + 1, width) * count + first;
-      const uint16_t* const leaves = columns + within(x - kWindowRadius, width) * count + first;
-      uint8_t* const to = costs + x * count + first;
-      for (int i = 0; i < kWide; ++i) {
-        to[i] = uint8_t(less(uint16_t(sum[i] >> kCostShift), uint16_t(kMostCost)));
-        sum[i] = uint16_t(sum[i] + enters[i] - leaves[i]);
-      }
+      const Words cost = less(sum >> kCostShift, Words{} + uint16_t(kMostCost));
+      store_as(costs + x * count + d, __builtin_convertvector(cost, Bytes));
+      sum += column(x + kWindowRadius + 1) - column(x - kWindowRadius);
     }
   }
 }
@@ -106,39 +123,37 @@ GSPLAT_INLINE void window_costs(const uint16_t* __restrict columns, int64_t widt
 
 int64_t cost_scratch(const Pair& pair) {
   const int64_t width = pair.width, row = width * pair.count;
-  return 7 * width + 6 * (width + pair.count) + (kKeptRows + 2) * row + 64;
+  return 2 * row + kKeptRows * row + 13 * width + 6 * (width + pair.count);
 }
 
 void sum_costs(const Pair& pair, uint8_t* costs, int64_t begin, int64_t end, uint8_t* scratch) {
   const int64_t width = pair.width, height = pair.height, row = width * pair.count;
-  uint16_t* const columns =
-      reinterpret_cast<uint16_t*>((reinterpret_cast<uintptr_t>(take(scratch, 2 * row + 64)) + 63) / 64 * 64);
+  uint16_t* const columns = reinterpret_cast<uint16_t*>(take(scratch, 2 * row));
   uint8_t* const kept = take(scratch, kKeptRows * row);
-  const int64_t reversed = width - 1 + pair.count;
-  const Row left = take_row(scratch, width), right = take_row(scratch, reversed);
+  const Row left = take_row(scratch, width), ahead = take_row(scratch, width), right = take_row(scratch, width + pair.count);
   uint8_t* const slopes = take(scratch, width);
-  const auto pixels_of = [&](int64_t y) { return kept + y % kKeptRows * row; };
-  const auto add_row = [&](int64_t y) {
-    fill_row(pair, pair.left, y, left, width, slopes, [](int64_t at) { return at; });
-    fill_row(pair, pair.right, y, right, reversed, slopes,
-             [&](int64_t at) { return within(width - 1 - pair.lowest - at, width); });
-    with_width(pair.count, [&](auto wide) { pixel_costs<decltype(wide)::value>(left, right, width, pair.count, pixels_of(y)); });
+  const auto pixels_of = [&](int64_t y) { return kept + within(y, height) % kKeptRows * row; };
+  const auto make_row = [&](int64_t y) {
+    fill_row(pair, pair.left, y, left, slopes);
+    fill_row(pair, pair.right, y, ahead, slopes);
+    reverse(pair, ahead.slope, right.slope);
+    reverse(pair, ahead.brightness, right.brightness);
+    with_width<kRegisterBytes>(
+        pair.count, [&](auto wide) { pixel_costs<decltype(wide)::value>(left, right, width, pair.count, pixels_of(y)); });
   };
-  const int64_t top = within(begin - kWindowRadius, height), bottom = within(begin + kWindowRadius, height);
-  for (int64_t y = top; y <= bottom; ++y) add_row(y);
+  const auto move = [&](int64_t enters, const uint8_t* leaves) {
+    with_width<kRegisterBytes / 2>(pair.count,
+                                   [&](auto wide) { move_down<decltype(wide)::value>(pixels_of(enters), leaves, row, columns); });
+  };
   for (int64_t i = 0; i < row; ++i) columns[i] = 0;
-  for (int64_t y = begin - kWindowRadius; y <= begin + kWindowRadius; ++y) {
-    const uint8_t* __restrict const pixels = pixels_of(within(y, height));
-    for (int64_t i = 0; i < row; ++i) columns[i] = uint16_t(columns[i] + pixels[i]);
-  }
+  for (int64_t y = within(begin - kWindowRadius, height); y <= within(begin + kWindowRadius, height); ++y) make_row(y);
+  for (int64_t y = begin - kWindowRadius; y <= begin + kWindowRadius; ++y) move(y, nullptr);
   for (int64_t y = begin; y < end; ++y) {
-    with_width<kMostWide / 2>(
+    with_width<kRegisterBytes / 2>(
         pair.count, [&](auto wide) { window_costs<decltype(wide)::value>(columns, width, pair.count, costs + y * row); });
     if (y + 1 == end) break;
-    if (y + 1 + kWindowRadius < height) add_row(y + 1 + kWindowRadius);
-    const uint8_t* __restrict const enters = pixels_of(within(y + 1 + kWindowRadius, height));
-    const uint8_t* __restrict const leaves = pixels_of(within(y - kWindowRadius, height));
-    for (int64_t i = 0; i < row; ++i) columns[i] = uint16_t(columns[i] + enters[i] - leaves[i]);
+    if (y + 1 + kWindowRadius < height) make_row(y + 1 + kWindowRadius);
+    move(y + 1 + kWindowRadius, pixels_of(y - kWindowRadius));
   }
 }
 

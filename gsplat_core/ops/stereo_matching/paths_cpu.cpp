@@ -1,5 +1,5 @@
 // The paths along rows and columns.
-#include "byte_rows.h"
+#include "disparity_vectors.h"
 
 namespace GSPLAT_ISA::stereo_matching {
 namespace {
@@ -22,22 +22,20 @@ struct Kept {
 
 // One pixel further. kFirst: the first path sets the messages, the others add theirs.
 template <int kWide, bool kFirst>
-GSPLAT_INLINE void step(const uint8_t* before, const uint8_t* __restrict costs, int count, uint8_t* __restrict after,
-                        uint8_t* __restrict messages) {
-  uint8_t totals[kMostDisparities], least[kWide];
-  for (int i = 0; i < kWide; ++i) least[i] = 255;
-  for (int first = 0; first < count; first += kWide) {
-    for (int i = first; i < first + kWide; ++i) {
-      const uint8_t beside = uint8_t(less(before[i - 1], before[i + 1]) + kSmallStep);
-      const uint8_t message = less(before[i], beside), total = uint8_t(costs[i] + message);
-      messages[i] = kFirst ? message : uint8_t(messages[i] + message);
-      totals[i] = total;
-      least[i - first] = less(least[i - first], total);
-    }
+GSPLAT_INLINE void step(const uint8_t* before, const uint8_t* costs, int count, uint8_t* after, uint8_t* messages) {
+  using Bytes = typename Vector<kWide>::Bytes;
+  uint8_t totals[kMostDisparities];
+  Bytes least = Bytes{} + uint8_t(255);
+  for (int d = 0; d < count; d += kWide) {
+    const Bytes beside = less(load_as<Bytes>(before + d - 1), load_as<Bytes>(before + d + 1)) + uint8_t(kSmallStep);
+    const Bytes message = less(load_as<Bytes>(before + d), beside), total = load_as<Bytes>(costs + d) + message;
+    store_as(messages + d, kFirst ? message : load_as<Bytes>(messages + d) + message);
+    store_as(totals + d, total);
+    least = less(least, total);
   }
-  const uint8_t best = least_of<kWide>(least);
-  for (int first = 0; first < count; first += kWide)
-    for (int i = first; i < first + kWide; ++i) after[i] = less(uint8_t(totals[i] - best), uint8_t(kLargeStep));
+  const uint8_t best = least_byte(least);
+  for (int d = 0; d < count; d += kWide)
+    store_as(after + d, less(load_as<Bytes>(totals + d) - best, Bytes{} + uint8_t(kLargeStep)));
 }
 
 // To the right and to the left by turns: neither waits for the other one's sums. Whichever comes to a pixel first sets its
@@ -65,7 +63,7 @@ void rows(const Pair& pair, uint8_t* costs, uint8_t* messages, int64_t begin, in
   sum_costs(pair, costs, begin, end, scratch);
   const int64_t row = int64_t(pair.width) * pair.count;
   const Kept kept = {scratch, pair.count};
-  with_width(pair.count, [&](auto wide) {
+  with_width<kRegisterBytes>(pair.count, [&](auto wide) {
     for (int64_t y = begin; y < end; ++y)
       along_row<decltype(wide)::value>(costs + y * row, messages + y * row, pair.width, pair.count, kept);
   });
@@ -90,7 +88,7 @@ GSPLAT_INLINE void along_columns(const Pair& pair, const uint8_t* costs, uint8_t
 
 void columns(const Pair& pair, const uint8_t* costs, uint8_t* messages, int64_t begin, int64_t end, uint8_t* scratch) {
   const Kept one = {scratch, pair.count}, other = {scratch + Kept::size(end - begin, pair.count), pair.count};
-  with_width(pair.count, [&](auto wide) {
+  with_width<kRegisterBytes>(pair.count, [&](auto wide) {
     for (int down = 1; down >= 0; --down)
       along_columns<decltype(wide)::value>(pair, costs, messages, begin, end, down, one, other);
   });

@@ -54,12 +54,12 @@ struct Kernels {
   void (*rows)(const Pair& pair, uint8_t* costs, uint8_t* messages, int64_t begin, int64_t end, uint8_t* scratch);
   // Adds the messages down and up the columns [begin, end).
   void (*columns)(const Pair& pair, const uint8_t* costs, uint8_t* messages, int64_t begin, int64_t end, uint8_t* scratch);
-  // The best disparities of rows [begin, end), checked from the right eye. scratch: 3 * width numbers.
+  // The best disparities of rows [begin, end), checked from the right eye. scratch: width numbers.
   void (*winners)(const Pair& pair, const uint8_t* costs, const uint8_t* messages, int32_t* sixteenths, int64_t begin,
                   int64_t end, uint32_t* scratch);
   // Drops small patches of the whole plane. scratch: 2 * height * width numbers.
   void (*drop_patches)(const Pair& pair, int32_t* sixteenths, int32_t* scratch);
-  // scratch: 3 * width numbers.
+  // scratch: 3 * (width + 2 * kJumpRadius) numbers.
   void (*surfaces)(const Pair& pair, const Matched& matched, int64_t begin, int64_t end, int32_t* scratch);
 };
 

@@ -33,11 +33,11 @@ void match(CpuCall& call, const Pair& pair, const Matched& to) {
   for_ranges<uint8_t>(
       pair.width, kBlockColumns, k.column_scratch(pair, kBlockColumns),
       [&](int64_t begin, int64_t end, uint8_t* scratch) { k.columns(pair, costs, messages, begin, end, scratch); });
-  for_ranges<uint32_t>(pair.height, kBandRows, 3 * pair.width, [&](int64_t begin, int64_t end, uint32_t* scratch) {
+  for_ranges<uint32_t>(pair.height, kBandRows, pair.width, [&](int64_t begin, int64_t end, uint32_t* scratch) {
     k.winners(pair, costs, messages, to.sixteenths, begin, end, scratch);
   });
   k.drop_patches(pair, to.sixteenths, call.array<int32_t>(2 * pixels));
-  for_ranges<int32_t>(pair.height, kBandRows, 3 * pair.width,
+  for_ranges<int32_t>(pair.height, kBandRows, 3 * (pair.width + 2 * kJumpRadius),
                       [&](int64_t begin, int64_t end, int32_t* scratch) { k.surfaces(pair, to, begin, end, scratch); });
 }
 

@@ -1,5 +1,5 @@
 // From costs and messages to disparities: the best ones, checked, without small patches.
-#include "byte_rows.h"
+#include "disparity_vectors.h"
 
 namespace GSPLAT_ISA::stereo_matching {
 namespace {
@@ -7,42 +7,42 @@ namespace {
 constexpr uint32_t kNone = ~0u;
 
 // The total of a disparity with its number: of equal totals the lowest disparity's is the least.
-GSPLAT_INLINE uint32_t key_of(uint32_t total, int disparity) { return total << 8 | uint32_t(disparity); }
+GSPLAT_INLINE uint32_t key_of(int total, int disparity) { return uint32_t(total) << 8 | uint32_t(disparity); }
 
 struct Best {
-  int disparity;
-  uint32_t key;
+  int disparity, total;
   int32_t sixteenths;  // kUnknown where another one, that is not beside it, is nearly as good
 };
 
 template <int kWide>
 GSPLAT_INLINE Best best_of(const uint8_t* costs, const uint8_t* messages, int count) {
-  uint32_t keys[kMostDisparities], least[kWide];
-  for (int i = 0; i < kWide; ++i) least[i] = kNone;
-  for (int first = 0; first < count; first += kWide) {
-    for (int i = first; i < first + kWide; ++i) {
-      keys[i] = key_of(kPaths * uint32_t(costs[i]) + messages[i], i);
-      least[i - first] = less(least[i - first], keys[i]);
-    }
+  using Bytes = typename Vector<kWide>::Bytes;
+  using Words = typename Vector<kWide>::Words;
+  uint16_t totals[kMostDisparities];
+  const Words none = Words{} + uint16_t(65535);
+  Words lanes, low = none, first_of = none, rival = none;
+  for (int i = 0; i < kWide; ++i) lanes[i] = uint16_t(i);
+  for (int d = 0; d < count; d += kWide) {
+    const Words cost = __builtin_convertvector(load_as<Bytes>(costs + d), Words);
+    const Words total = cost * uint16_t(kPaths) + __builtin_convertvector(load_as<Bytes>(messages + d), Words);
+    store_as(totals + d, total);
+    low = less(low, total);
   }
-  uint32_t key = least[0];
-  for (int i = 1; i < kWide; ++i) key = less(key, least[i]);
-  const uint32_t total = key >> 8;
-  const int best = int(key & 255);
-  const auto total_of = [&](int i) { return int(keys[i] >> 8); };
-  // Nearly as good: total * (100 - percent) < best * 100.
-  const uint32_t nearly = (total * 100 + 99 - kUniquenessPercent) / (100 - kUniquenessPercent) << 8;
-  int rivals = 0;
-  for (int first = 0; first < count; first += kWide)
-    for (int i = first; i < first + kWide; ++i) rivals += keys[i] < nearly;
-  for (int i = more(best - 1, 0); i <= less(best + 1, count - 1); ++i) rivals -= keys[i] < nearly;
+  const uint16_t least = least_word(low);
+  for (int d = 0; d < count; d += kWide)
+    first_of = less(first_of, load_as<Words>(totals + d) == least ? lanes + uint16_t(d) : none);
+  const int best = least_word(first_of);
+  for (int d = 0; d < count; d += kWide) {
+    const Words beside = lanes + uint16_t(d - best + 1);  // 0, 1, 2 for the best and its neighbours
+    rival = less(rival, beside > uint16_t(2) ? load_as<Words>(totals + d) : none);
+  }
   int sixteenths = 0;
   if (best > 0 && best < count - 1) {  // the lowest point of a parabola
-    const int bend = more(total_of(best - 1) + total_of(best + 1) - 2 * int(total), 1);
-    const int twice = (total_of(best - 1) - total_of(best + 1)) * kSixteenths + bend;
-    sixteenths = twice / (2 * bend);
+    const int below = totals[best - 1], above = totals[best + 1], bend = more(below + above - 2 * least, 1);
+    sixteenths = ((below - above) * kSixteenths + bend) / (2 * bend);
   }
-  return {best, key, rivals > 0 ? kUnknown : kSixteenths * best + sixteenths};
+  const bool unique = int(least_word(rival)) * (100 - kUniquenessPercent) >= least * 100;
+  return {best, least, unique ? kSixteenths * best + sixteenths : kUnknown};
 }
 
 GSPLAT_INLINE int floor_of(int sixteenths) { return sixteenths >> 4; }
@@ -53,6 +53,32 @@ GSPLAT_INLINE bool differs(const Pair& pair, const uint32_t* right, int64_t x, i
   if (there < 0 || there >= pair.width || right[there] == kNone) return false;
   const int other = pair.lowest + int(right[there] & 255);
   return other > disparity + kLeftRightMost || other < disparity - kLeftRightMost;
+}
+
+// The best disparities of a row, and, at the right eye's pixels that belong to them, the least key of all that are matched there.
+template <int kWide>
+GSPLAT_INLINE void find_row(const Pair& pair, const uint8_t* costs, const uint8_t* messages, int64_t y, int32_t* sixteenths,
+                            uint32_t* right) {
+  const int64_t width = pair.width;
+  for (int64_t x = 0; x < width; ++x) right[x] = kNone;
+  for (int64_t x = 0; x < width; ++x) {
+    const int64_t pixel = y * width + x, at = pixel * pair.count;
+    const Best best = best_of<kWide>(costs + at, messages + at, pair.count);
+    const bool known = best.sixteenths != kUnknown;
+    sixteenths[pixel] = known ? kSixteenths * pair.lowest + best.sixteenths : kUnknown;
+    const int64_t there = x - pair.lowest - best.disparity;
+    if (known && there >= 0 && there < width) right[there] = less(right[there], key_of(best.total, best.disparity));
+  }
+}
+
+GSPLAT_INLINE void check_row(const Pair& pair, const uint32_t* right, int32_t* row) {
+  for (int64_t x = 0; x < pair.width; ++x) {
+    if (row[x] == kUnknown) continue;
+    const int64_t there = kSixteenths * x - row[x];
+    const bool outside = there < 0 || there > kSixteenths * (int64_t(pair.width) - 1);
+    const int below = floor_of(row[x]), above = floor_of(row[x] + kSixteenths - 1);
+    if (outside || (differs(pair, right, x, below) && differs(pair, right, x, above))) row[x] = kUnknown;
+  }
 }
 
 GSPLAT_INLINE int root_of(int32_t* parents, int i) {
@@ -71,26 +97,12 @@ GSPLAT_INLINE void link(const int32_t* sixteenths, int32_t* parents, int a, int 
 
 void winners(const Pair& pair, const uint8_t* costs, const uint8_t* messages, int32_t* sixteenths, int64_t begin, int64_t end,
              uint32_t* right) {
-  const int64_t width = pair.width;
-  for (int64_t y = begin; y < end; ++y) {
-    int32_t* const row = sixteenths + y * width;
-    for (int64_t x = 0; x < width; ++x) right[x] = kNone;
-    for (int64_t x = 0; x < width; ++x) {
-      const int64_t at = (y * width + x) * pair.count;
-      const Best best = best_of<16>(costs + at, messages + at, pair.count);
-      const bool known = best.sixteenths != kUnknown;
-      row[x] = known ? kSixteenths * pair.lowest + best.sixteenths : kUnknown;
-      const int64_t there = x - pair.lowest - best.disparity;
-      if (known && there >= 0 && there < width) right[there] = less(right[there], best.key);
+  with_width<kRegisterBytes / 2>(pair.count, [&](auto wide) {
+    for (int64_t y = begin; y < end; ++y) {
+      find_row<decltype(wide)::value>(pair, costs, messages, y, sixteenths, right);
+      check_row(pair, right, sixteenths + y * pair.width);
     }
-    for (int64_t x = 0; x < width; ++x) {
-      if (row[x] == kUnknown) continue;
-      const int64_t there = kSixteenths * x - row[x];
-      const bool outside = there < 0 || there > kSixteenths * (width - 1);
-      const int below = floor_of(row[x]), above = floor_of(row[x] + kSixteenths - 1);
-      if (outside || (differs(pair, right, x, below) && differs(pair, right, x, above))) row[x] = kUnknown;
-    }
-  }
+  });
 }
 
 void drop_patches(const Pair& pair, int32_t* sixteenths, int32_t* scratch) {
@@ -107,27 +119,30 @@ void drop_patches(const Pair& pair, int32_t* sixteenths, int32_t* scratch) {
     if (sizes[root_of(parents, i)] <= kPatchPixels) sixteenths[i] = kUnknown;
 }
 
+// Least and most of the rows around, with kJumpRadius columns beside the picture, and whether a hole is among the nearest.
 void surfaces(const Pair& pair, const Matched& matched, int64_t begin, int64_t end, int32_t* scratch) {
-  const int64_t width = pair.width, height = pair.height;
-  int32_t *const least = scratch, *const most = scratch + width, *const holes = scratch + 2 * width;
+  const int64_t width = pair.width, wide = width + 2 * kJumpRadius;
+  int32_t *const least = scratch, *const most = scratch + wide, *const holes = scratch + 2 * wide;
   for (int64_t y = begin; y < end; ++y) {
-    for (int64_t x = 0; x < width; ++x) least[x] = INT32_MAX, most[x] = kUnknown, holes[x] = 0;
-    for (int64_t from = more(y - kJumpRadius, int64_t(0)); from <= less(y + kJumpRadius, height - 1); ++from) {
+    for (int64_t x = 0; x < wide; ++x) least[x] = INT32_MAX, most[x] = kUnknown, holes[x] = 0;
+    for (int64_t from = more(y - kJumpRadius, int64_t(0)); from <= less(y + kJumpRadius, int64_t(pair.height) - 1); ++from) {
       const int32_t* const row = matched.sixteenths + from * width;
-      const bool near = from >= y - kHoleRadius && from <= y + kHoleRadius;
+      const int32_t near = from >= y - kHoleRadius && from <= y + kHoleRadius;
       for (int64_t x = 0; x < width; ++x) {
-        least[x] = less(least[x], row[x] == kUnknown ? INT32_MAX : row[x]);
-        most[x] = more(most[x], row[x]);
-        holes[x] |= near && row[x] == kUnknown;
+        const int64_t at = x + kJumpRadius;
+        const bool hole = row[x] == kUnknown;
+        least[at] = less(least[at], hole ? INT32_MAX : row[x]);
+        most[at] = more(most[at], row[x]);
+        holes[at] |= hole ? near : 0;
       }
     }
+    uint8_t* const to = matched.one_surface + y * width;
     for (int64_t x = 0; x < width; ++x) {
       int32_t low = INT32_MAX, high = kUnknown, hole = 0;
-      for (int64_t from = more(x - kJumpRadius, int64_t(0)); from <= less(x + kJumpRadius, width - 1); ++from) {
-        low = less(low, least[from]), high = more(high, most[from]);
-        hole |= from >= x - kHoleRadius && from <= x + kHoleRadius ? holes[from] : 0;
-      }
-      matched.one_surface[y * width + x] = hole == 0 && high - low <= kJumpMost;
+      for (int k = 0; k <= 2 * kJumpRadius; ++k) low = less(low, least[x + k]), high = more(high, most[x + k]);
+      for (int k = -kHoleRadius; k <= kHoleRadius; ++k) hole |= holes[x + kJumpRadius + k];
+      // As numbers without a sign: where nothing is known the difference is none of theirs, and there is a hole.
+      to[x] = uint8_t((hole == 0) & (uint32_t(high) - uint32_t(low) <= uint32_t(kJumpMost)));
     }
   }
 }
