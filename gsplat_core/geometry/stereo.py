@@ -135,7 +135,7 @@ class StereoDepth:
             variance = (found.error_px.square() + off_px.square()) / (HALF_BELIEVED_PX * shrink) ** 2
             depth = torch.where(known, _reach(frame, camera) / torch.where(known, shift, 1), 0)
             planes = HostCopy(torch.stack([depth, torch.where(known, 1 / (1 + variance), 0)]))
-        return planes.numpy()
+        return planes.numpy().copy()  # frames may be kept for long, and page-locked memory is dear
 
     def _beside(self) -> AbstractContextManager[object]:
         return contextlib.nullcontext() if self._stream is None else torch.cuda.stream(self._stream)

@@ -11,6 +11,7 @@ class CudaScratch;
 
 namespace gsplat::disparity_fit {
 
+constexpr int64_t kMostSide = 1 << 20;
 constexpr int kSteps = 3;
 constexpr int kRadius = 12;               // of the Gaussian window, within which the pictures are compared
 constexpr float kSigma = 4.0f;            // pixels

@@ -58,8 +58,8 @@ std::tuple<Tensor, Tensor> fit_disparities(Tensor left, Tensor right, Tensor six
   for (const Tensor& other : {there, start})
     check(other.dim() == 2 && other.size(0) == here.size(0) && other.size(1) == here.size(1),
           "left, right and sixteenths must have one size [H, W]");
-  check(here.size(0) < INT32_MAX / 64 && here.size(1) < INT32_MAX / 64, "pictures are too large, got ", here.size(1), " x ",
-        here.size(0));
+  check(here.size(0) <= kMostSide && here.size(1) <= kMostSide, "pictures must have at most ", kMostSide,
+        " pixels on a side, got ", here.size(1), " x ", here.size(0));
   Tensor px = call.empty({here.size(0), here.size(1)}), error_px = call.empty({here.size(0), here.size(1)});
   Fit fit = {};
   fit.left = here.const_data_ptr<uint8_t>(), fit.right = there.const_data_ptr<uint8_t>();

@@ -108,10 +108,9 @@ __global__ void __launch_bounds__(kThreads) sum_down_columns(Pair pair, const ui
 
 }  // namespace
 
-void sum_costs(const Pair& pair, uint8_t* costs, CudaScratch& scratch, cudaStream_t stream) {
+void sum_costs(const Pair& pair, uint8_t* costs, uint16_t* sums, CudaScratch& scratch, cudaStream_t stream) {
   const int64_t pixels = int64_t(pair.height) * pair.width;
   Look* const looks = scratch.array<Look>(2 * pixels);
-  uint16_t* const sums = scratch.array<uint16_t>(pixels * pair.count);
   look_at<<<blocks_for(2 * pixels), kThreads, 0, stream>>>(pair, looks);
   const int64_t segments = (pair.width + kSegmentColumns - 1) / kSegmentColumns * int64_t(pair.height);
   with_each(pair.count, [&](auto each) {

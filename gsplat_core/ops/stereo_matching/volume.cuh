@@ -46,7 +46,8 @@ void with_each(int count, const Work& work) {
 }
 
 // In costs.cu, paths.cu, winners.cu: each queues its work on the stream. A volume is [height, width, count].
-void sum_costs(const Pair& pair, uint8_t* costs, CudaScratch& scratch, cudaStream_t stream);
+// sums: scratch of two bytes for each cost.
+void sum_costs(const Pair& pair, uint8_t* costs, uint16_t* sums, CudaScratch& scratch, cudaStream_t stream);
 void follow_paths(const Pair& pair, const uint8_t* costs, uint8_t* messages, cudaStream_t stream);  // kPaths volumes
 void choose(const Pair& pair, const uint8_t* costs, const uint8_t* messages, int32_t* sixteenths, CudaScratch& scratch,
             cudaStream_t stream);

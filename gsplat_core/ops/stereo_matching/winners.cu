@@ -108,7 +108,7 @@ void match_on_device(const Pair& pair, const Matched& matched, CudaScratch& scra
   const int64_t pixels = int64_t(pair.height) * pair.width;
   uint8_t* const costs = scratch.array<uint8_t>(pixels * pair.count);
   uint8_t* const messages = scratch.array<uint8_t>(kPaths * pixels * pair.count);
-  sum_costs(pair, costs, scratch, stream);
+  sum_costs(pair, costs, reinterpret_cast<uint16_t*>(messages), scratch, stream);  // there are no messages yet
   follow_paths(pair, costs, messages, stream);
   choose(pair, costs, messages, matched.sixteenths, scratch, stream);
   drop_patches(pair, matched.sixteenths, scratch, stream);
