@@ -69,6 +69,8 @@ class DepthCounts:
         if found:
             unit = "its unit is that of the calibration" if metric else "it is relative: its unit is not known"
             outcome.note(f"the depth of {found} frames was found in them, of {share:.0%} of their pixels; {unit}")
+        if self.passed_over:
+            outcome.note(f"depth was not looked for in {self.passed_over} frames, for newer ones that had come")
         for remark in finder.remarks.counted() if finder else ():
             outcome.note(remark)
         for doubt, frames in doubts.items():

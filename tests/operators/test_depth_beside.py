@@ -85,6 +85,10 @@ def test_the_newest_frame_is_next_and_the_others_are_counted(beside, estimator, 
     estimator.gate.release()
     assert taken(beside).seq == 3 and beside.take() is None
     assert [each.seq for each in estimator.asked] == [0, 3] and beside.counts.passed_over == 2
+    outcome = OutcomeBuilder()
+    beside.counts.contribute(outcome, "gated", beside.finder)
+    assert outcome.find(FoundDepth).passed_over == 2
+    assert "depth was not looked for in 2 frames, for newer ones that had come" in outcome.notes
 
 
 def test_the_newest_depth_is_taken_where_two_were_found(beside, estimator, frame):
