@@ -39,6 +39,8 @@ POSE_ERROR_PX = 0.6
 """Residual of tissue that stands still, by errors of poses and tracking."""
 FEWEST_AGREEING = 0.6
 """Share of the views whose poses have to explain their pictures."""
+CONTRADICTED = "the poses do not explain how the pictures move: they are wrong, or the tissue itself moves"
+"""What is to be said of poses with which fewer of them agree."""
 ROUNDS = 6
 """Of iteratively reweighted least squares, so that corners that move by themselves have little weight."""
 
@@ -88,7 +90,7 @@ def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | st
             break
         kept.pop(worst)
         if len(kept) < max(1, FEWEST_AGREEING * len(usable)):
-            return "the poses do not explain how the pictures move: they are wrong, or the tissue itself moves"
+            return CONTRADICTED
     if moved.max() < LEAST_PARALLAX_PX:
         return "there is too little parallax to find depth from"
     agree = (seen[kept] & (_off_px(c[kept], d[kept], focal, inverse) < 3 * MOST_LEFT_PX)).any(0)

@@ -11,7 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from gsplat_core.geometry.depth_map import DepthMap
+from gsplat_core.geometry.moving_tissue import MovingTissue
 from gsplat_core.geometry.multiview import DEFORMS, depth_of_view, view_of
+from gsplat_core.geometry.pose_check import CONTRADICTED
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.observations import Observation
@@ -21,6 +24,10 @@ MOST_KEY_FRAMES = 32
 """Frames that get depth, spread evenly over the recording."""
 WINDOW_S = 3.0
 """A frame is compared with others that are at most so long before or after it: tissue does not stay as it is."""
+MOVES = 0.5
+"""Share of the key frames whose pictures contradict tissue that stands still, from which on it is looked for how it moves."""
+MOST_PIXELS = 64_000_000
+"""Of all frames with depth together: 12 bytes each of them here, and in what is learned from."""
 
 
 def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[Frame], Counter[str]]:
@@ -28,10 +35,29 @@ def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> 
 
     `cameras` are those of the frames. Nothing is done where frames have depth already, or no camera moves.
     """
-    given, doubts = list(frames), Counter[str]()
     moves = any(not np.array_equal(camera.world_to_camera, cameras[0].world_to_camera) for camera in cameras)
     if not moves or cameras[0].model != "pinhole" or any(frame.depth is not None for frame in frames):
+        return list(frames), Counter()
+    given, doubts = _compared(frames, cameras)
+    contradicted = sum(doubts[each] for each in (DEFORMS, CONTRADICTED))
+    if contradicted < MOVES * min(MOST_KEY_FRAMES, len(frames)):
         return given, doubts
+    tissue = MovingTissue(frames, cameras)
+    count = min(len(frames), max(1, MOST_PIXELS // frames[0].image[..., 0].size))
+    breathing, uncertain = list(frames), Counter[str]()
+    for number in np.linspace(0, len(frames) - 1, count).round().astype(int).tolist():
+        found = tissue.depth_of(number)
+        if found.doubt is not None:
+            uncertain[found.doubt] += 1
+        else:
+            breathing[number] = _with(frames[number], found)
+    # Where no motion is found, a rough depth is better to start from than none.
+    return (breathing, uncertain) if uncertain.total() < count else (given, doubts)
+
+
+def _compared(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[Frame], Counter[str]]:
+    """The frames, key frames among them with depth by comparing pictures as if tissue stood still, and doubts."""
+    given, doubts = list(frames), Counter[str]()
     views = [view_of(frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
     count = min(MOST_KEY_FRAMES, len(frames))
     for number in np.linspace(0, len(frames) - 1, count).round().astype(int).tolist():
@@ -46,10 +72,12 @@ def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> 
             continue
         if not np.any(found.believed):
             doubts[DEFORMS] += 1
-        given[number] = frame.with_fields(
-            depth=found.depth, depth_confidence=found.confidence, depth_origin=found.origin
-        )
+        given[number] = _with(frame, found)
     return given, doubts
+
+
+def _with(frame: Frame, found: DepthMap) -> Frame:
+    return frame.with_fields(depth=found.depth, depth_confidence=found.confidence, depth_origin=found.origin)
 
 
 def to_fit(

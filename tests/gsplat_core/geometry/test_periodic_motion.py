@@ -1,0 +1,84 @@
+"""Breathing tissue before a swaying scope, whose distances are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.geometry.frequencies import found_in
+from gsplat_core.geometry.grid_tracks import GridTracks
+from gsplat_core.geometry.periodic_motion import PeriodicMotion, fitted, in_cameras, off_px, waves
+from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ, places, swaying, tracks_of
+
+TRUE = BREATHING_HZ, HEART_HZ
+
+
+def seen(
+    length_s: float = 5.0, breathes: float = 1.0, reach: float = 1.0, noise_px: float = 0.2
+) -> tuple[GridTracks, np.ndarray]:
+    times_s = np.arange(0, length_s, 0.1)
+    points, poses = places(times_s, breathes), swaying(times_s, reach)
+    return tracks_of(points, poses, times_s, noise_px), points
+
+
+def relative_errors(motion: PeriodicMotion, tracks: GridTracks, points: np.ndarray) -> np.ndarray:
+    """Of the distance from the camera [T, N]."""
+    found, true = in_cameras(motion.at(tracks.times_s), tracks.poses), in_cameras(points, tracks.poses)
+    return np.abs(found[..., 2] / true[..., 2] - 1)
+
+
+def test_distances_of_breathing_tissue() -> None:
+    tracks, points = seen()
+    moving = fitted(tracks, TRUE)
+    assert np.median(relative_errors(moving, tracks, points)) < 0.008
+    assert np.median(moving.error) < 0.03
+    still = fitted(tracks, ())
+    assert np.median(relative_errors(still, tracks, points)) > 0.03
+    assert moving.cost < 0.3 * still.cost
+
+
+def test_distances_are_not_shortened_by_noise() -> None:
+    tracks, points = seen(noise_px=0.5)
+    found = in_cameras(fitted(tracks, TRUE).at(tracks.times_s), tracks.poses)[..., 2]
+    assert abs(np.median(found / in_cameras(points, tracks.poses)[..., 2]) - 1) < 0.01
+
+
+def test_what_a_tool_pulls_now_and_then_decides_nothing() -> None:
+    tracks, points = seen()
+    pulled = tracks.rays.copy()
+    pulled[10:20, :60] += 0.05
+    moving = fitted(GridTracks(pulled, tracks.seen, tracks.poses, tracks.times_s, tracks.focal_px, tracks.extent), TRUE)
+    assert np.median(relative_errors(moving, tracks, points)[:, :60]) < 0.015
+    off = np.linalg.norm(off_px(moving.at(tracks.times_s), tracks), axis=2)
+    assert np.median(off) < 0.5
+
+
+def test_frequencies_are_found() -> None:
+    tracks, _ = seen()
+    found = found_in(tracks)
+    assert found.hz == pytest.approx(TRUE, abs=0.01)
+    assert found.error < 0.03
+
+
+def test_still_tissue_has_none() -> None:
+    tracks, points = seen(breathes=0.0)
+    assert found_in(tracks).hz == ()
+    assert np.median(relative_errors(fitted(tracks, ()), tracks, points)) < 0.005
+
+
+@pytest.mark.parametrize(("length_s", "reach"), [(1.2, 1.0), (5.0, 0.02)], ids=["short", "hardly moving"])
+def test_distances_that_cannot_be_told_are_said_to_be_uncertain(length_s: float, reach: float) -> None:
+    tracks, _ = seen(length_s, reach=reach)
+    found = found_in(tracks)
+    error = np.hypot(np.median(fitted(tracks, found.hz or TRUE).error), found.error)
+    assert error > 0.04
+
+
+def test_waves_begin_with_what_rests() -> None:
+    found = waves(np.array([0.0, 0.5]), (1.0,))
+    np.testing.assert_allclose(found, [[1, 1, 0], [1, -1, 0]], atol=1e-12)
+
+
+def test_the_same_tracks_give_the_same_bytes() -> None:
+    tracks, _ = seen()
+    assert fitted(tracks, TRUE, rounds=3).terms.tobytes() == fitted(tracks, TRUE, rounds=3).terms.tobytes()
