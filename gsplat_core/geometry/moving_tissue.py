@@ -19,6 +19,7 @@ from gsplat_core.geometry.depth_map import DepthMap, doubted
 from gsplat_core.geometry.frequencies import found_in
 from gsplat_core.geometry.grid_tracks import GridTracks, Seen, follow_grids, seen_by, small_camera
 from gsplat_core.geometry.periodic_motion import Array, PeriodicMotion, fitted, in_cameras, off_px
+from gsplat_core.geometry.pull import pull_of
 from gsplat_core.geometry.surface_through import surface_through
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
@@ -34,8 +35,12 @@ MOST_ERROR = 0.04
 """Relative error of a distance with which it is believed by one half."""
 MOST_OFF_PX = 1.0
 """Median distance of points from where the motion that was found has them, beyond which it is none."""
-OWN_MOTION = 2.0
+OWN_MOTION = 3.0
 """A point that is off by so much across its ray may be off along it by this many times that."""
+PULL_FRAMES = 3
+"""Frames before and after, of those that are looked at, in which a tool is taken to pull in one direction."""
+PULL_ERROR = 0.4
+"""Of how far a pull moves tissue along the line of sight: how uncertain that is."""
 TOO_SHORT = (
     "the recording is too short, or the scope moves too much as the tissue does, for depth to be told from breathing"
 )
@@ -154,10 +159,30 @@ def _surface(window: _Window, camera: Camera, time_s: float) -> tuple[NDArray[np
     pose = camera.world_to_camera[None]
     local = in_cameras(window.motion.at(np.array([time_s])), pose)[0]
     seen = seen & (local[:, 2] > 0)
-    rays = (local[:, :2] / local[:, 2:] + off)[seen]
-    own = OWN_MOTION * np.linalg.norm(off, axis=1)[seen]
-    error = np.sqrt(window.motion.error[seen] ** 2 + own**2)
+    rays, off, depth = (local[:, :2] / local[:, 2:] + off)[seen], off[seen], local[seen, 2]
+    nearer, own = _pulled(window, after, pose[0], rays, off)
+    depth, error = depth * (1 + nearer), np.sqrt(window.motion.error[seen] ** 2 + own**2)
     pixels = rays * np.diag(camera.K)[:2] + camera.K[:2, 2]
-    depth, error, support = surface_through(pixels, local[seen, 2], error, (camera.height_px, camera.width_px))
+    depth, error, support = surface_through(pixels, depth, error, (camera.height_px, camera.width_px))
     total = np.hypot(error, window.error)
     return depth, support / (1 + (total / MOST_ERROR) ** 2)
+
+
+def _pulled(window: _Window, index: int, pose: Array, rays: Array, off: Array) -> tuple[Array, Array]:
+    """By how much points are farther than their periodic motion has them, relative to their distance, and how uncertain that is."""
+    tracks = window.tracks
+    near = range(max(0, index - PULL_FRAMES), min(len(tracks.times_s), index + PULL_FRAMES))
+    seen = [tracks.seen[each] for each in near]
+    pull = pull_of(
+        [tracks.rays[each][chosen] for each, chosen in zip(near, seen, strict=True)],
+        [window.off[each][chosen] for each, chosen in zip(near, seen, strict=True)],
+        [pose[:3, :3] @ tracks.poses[each, :3, :3].T for each in near],
+        tracks.focal_px,
+    )
+    length = np.linalg.norm(off, axis=1)
+    if pull is None or pull.error_px > MOST_OFF_PX:
+        return np.zeros(len(off)), OWN_MOTION * length
+    along, unexplained = pull.along(rays, off)
+    sure = length**2 / (length**2 + (MOST_OFF_PX / tracks.focal_px) ** 2)
+    along = along * sure
+    return along, OWN_MOTION * unexplained + PULL_ERROR * np.abs(along)
