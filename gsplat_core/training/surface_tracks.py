@@ -22,8 +22,8 @@ from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import Seen, SurfaceMotion, beside
 from gsplat_core.transfers import HostCopy, tensor_of
 
-TOLD_BY = (None, DepthOrigin.MEASURED, DepthOrigin.STEREO)
-"""Depth whose differences from frame to frame are motion; that of a frame that does not say is measured."""
+NOT_TOLD_BY = (DepthOrigin.LIGHT, DepthOrigin.LEARNED)
+"""Depth whose differences from frame to frame are no motion: it is right up to a factor that no two frames need to share."""
 EDGE_PX = 2
 """Beside a tool or a hole depth is not read: a point that is followed is not exact to the pixel."""
 ROWS_AT_ONCE = 1 << 14
@@ -49,7 +49,7 @@ class SurfaceTracks:
             SurfaceMotion(tensor_of(flow, device), after.camera, before.camera)
             for flow, (before, after) in zip(_flows(frames[::-1])[::-1], pairwise(observations), strict=True)
         ]
-        told = (frame.depth_origin in TOLD_BY for frame in frames)
+        told = (frame.depth_origin not in NOT_TOLD_BY for frame in frames)
         self._depths = [SurfaceDepth.of(one) if tells else None for tells, one in zip(told, observations, strict=True)]
 
     def carry(self, step: TrainingStep, number: int, first_row: int) -> None:
@@ -126,7 +126,8 @@ def _tell_motion(frames: Sequence[Frame], observations: Sequence[Observation]) -
     """Whether half of the frames at least have depth whose differences are motion, a pinhole camera saw them, and flow can be found in pictures of
     their size."""
     told = sum(
-        one.depth is not None and frame.depth_origin in TOLD_BY for frame, one in zip(frames, observations, strict=True)
+        one.depth is not None and frame.depth_origin not in NOT_TOLD_BY
+        for frame, one in zip(frames, observations, strict=True)
     )
     sizes = {frame.image.shape[:2] for frame in frames}
     pinhole = all(one.camera.model == "pinhole" for one in observations)

@@ -92,7 +92,7 @@ def covered(mask: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "fields", [{"depth": None}, {"depth_origin": DepthOrigin.LIGHT}, {"depth_origin": DepthOrigin.PARALLAX}]
+    "fields", [{"depth": None}, {"depth_origin": DepthOrigin.LIGHT}, {"depth_origin": DepthOrigin.LEARNED}]
 )
 def test_frames_that_do_not_tell_the_motion_of_a_surface_leave_the_field_alone(fixed, fields):
     frames = [frame.with_fields(**fields) for frame in fixed]
