@@ -118,7 +118,7 @@ def _search(start: Bundle, side_px: float) -> FocalLength:
     _refine(tries, tried)
     best_px = min(tries, key=lambda focal_px: tries[focal_px].cost)
     low, high = _range(tries, best_px)
-    inside = low > focals[0] and high < focals[-1]
+    inside = bool(low > focals[0] and high < focals[-1])
     return FocalLength(start.focal_px, best_px, (low, high), inside and high / low <= WIDEST)
 
 

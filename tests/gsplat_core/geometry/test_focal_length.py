@@ -76,7 +76,7 @@ def search(monkeypatch):
 @pytest.mark.parametrize("true_px", [250.0, 400.0])
 def test_a_scope_that_turns_around_tissue_tells_it(search, true_px):
     found = search(orbit, true_px, assumed_px=288.0)
-    assert found is not None and found.known and found.assumed_px == 288
+    assert found is not None and found.known is True and found.assumed_px == 288
     assert found.best_px == pytest.approx(true_px, rel=0.05)
     low_px, high_px = found.range_px
     assert low_px < true_px < high_px and high_px / low_px < 1.3
@@ -84,7 +84,7 @@ def test_a_scope_that_turns_around_tissue_tells_it(search, true_px):
 
 def test_a_scope_that_slides_along_tells_nothing(search):
     found = search(sideways, 288.0, assumed_px=288.0)
-    assert found is not None and not found.known
+    assert found is not None and found.known is False
     assert found.range_px == pytest.approx((SHORTEST * WIDTH, LONGEST * WIDTH))
 
 
