@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Measures this machine: every figure of benchmarks/RESULTS.md, as JSON lines. Needs the real recordings for the replays.
+# Measures this machine: every figure of benchmarks/RESULTS.md and benchmarks/results, as JSON lines. Needs the real recordings for the replays.
 # Usage: benchmarks/run_all.sh [FOLDER FOR THE OUTPUT, default out/bench]
 set -euo pipefail
 cd "$(dirname "$0")/.."
