@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 
+from gsplat_core.geometry.depth_map import BELIEVED
 from gsplat_core.geometry.registry import DepthFinder, check_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
@@ -55,7 +56,8 @@ class DepthCounts:
         if given.depth is not None:
             origin = given.depth_origin or DepthOrigin.MEASURED
             self._frames[origin.value] += 1
-            self._known += cv2.countNonZero(given.depth) / given.depth.size
+            sure = given.depth if given.depth_confidence is None else given.depth * (given.depth_confidence >= BELIEVED)
+            self._known += cv2.countNonZero(sure) / sure.size
             self._relative += not given.depth_is_metric
         self._dropped += given.depth is None and frame.depth is not None
 

@@ -92,7 +92,7 @@ class DepthBeside:
                 scene = frame.scene
                 found = finder.find(frame.with_fields(new_scene="passed over") if is_new else frame)
                 if found is not None:
-                    depth = found.believed
+                    depth = found.kept
                     self._put(
                         frame.with_fields(depth=depth, depth_confidence=found.confidence, depth_origin=found.origin)
                     )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.geometry.depth_map import BELIEVED
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import ScoredMean
 
@@ -41,6 +42,8 @@ class DepthSums:
         if frame.depth is None:
             return math.nan
         known = np.isfinite(frame.depth) & (frame.depth > 0)
+        if frame.depth_confidence is not None:
+            known &= frame.depth_confidence >= BELIEVED
         if frame.mask is not None:
             known &= frame.mask != 0
         count = int(known.sum())

@@ -12,6 +12,8 @@ from gsplat_core.scene.frames import DepthOrigin
 
 BELIEVED = 0.5
 """Confidence from which a depth is used where it can only be used or left out."""
+POSSIBLE = 0.03
+"""Confidence from which a matched depth is rather started from than a guess by what lies around it."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,12 @@ class DepthMap:
     def believed(self) -> NDArray[np.float32]:
         """The depth where it is believed, 0 everywhere else."""
         return np.where(self.confidence >= BELIEVED, self.depth, np.float32(0))
+
+    @property
+    def kept(self) -> NDArray[np.float32]:
+        """The depth that a frame goes on with beside its confidence, 0 elsewhere: where it is believed, and of two eyes where it is possible."""
+        least = POSSIBLE if self.origin is DepthOrigin.STEREO else BELIEVED
+        return np.where(self.confidence >= least, self.depth, np.float32(0))
 
 
 def doubted(shape: tuple[int, int], origin: DepthOrigin, doubt: str) -> DepthMap:

@@ -179,4 +179,4 @@ class DepthFinder:
             return frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
         if found.depth is frame.depth:
             return frame
-        return frame.with_fields(depth=found.believed, depth_confidence=found.confidence, depth_origin=found.origin)
+        return frame.with_fields(depth=found.kept, depth_confidence=found.confidence, depth_origin=found.origin)

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.geometry.depth_fill import continued
-from gsplat_core.geometry.depth_map import BELIEVED
+from gsplat_core.geometry.depth_map import BELIEVED, POSSIBLE
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
@@ -23,7 +23,7 @@ THICKNESS = 0.3
 FIRST_OPACITY = 0.9
 TOOL_MARGIN_PX = 2
 """So much around a tool is painted over with it: masks end a little early."""
-HOLE_MARGIN_PX = 2
+HOLE_MARGIN_PX, BESIDE_TOOL_PX = 2, 4
 
 MAX_ANGLE_RAD = math.radians(85)
 """Widest angle from the axis at which a fisheye pixel is placed; what lies farther out is placed there."""
@@ -163,14 +163,36 @@ def believed_depth(frame: Frame) -> NDArray[np.float32]:
 
     What two eyes were matched by is not sharp at edges: beside what could not be matched, or is not believed, it is left out.
     """
+    return _depth_from(frame, BELIEVED, HOLE_MARGIN_PX)
+
+
+def possible_depth(frame: Frame) -> NDArray[np.float32]:
+    """The frame's depth [H, W] of tissue where it is better than a guess by what lies around it, 0 elsewhere: something to start from.
+
+    Of two eyes that is more than what is believed, but not what lies close to a tool, which may have been given the tool's depth.
+    """
+    if frame.depth_origin is not DepthOrigin.STEREO:
+        depth = believed_depth(frame)
+        return depth if frame.mask is None else np.where(frame.mask > 0, depth, np.float32(0))
+    depth = _depth_from(frame, POSSIBLE, HOLE_MARGIN_PX // 2)
+    return depth if frame.mask is None else np.where(_inner(frame.mask > 0, BESIDE_TOOL_PX), depth, np.float32(0))
+
+
+def _depth_from(frame: Frame, least: float, margin_px: int) -> NDArray[np.float32]:
     if frame.depth is None:
         return np.zeros(frame.image.shape[:2], np.float32)
     if frame.depth_confidence is None:
         return frame.depth
-    believed = (frame.depth_confidence >= BELIEVED).astype(np.uint8)
+    kept = frame.depth_confidence >= least
     if frame.depth_origin is DepthOrigin.STEREO:
-        believed = np.asarray(cv2.erode(believed, np.ones((2 * HOLE_MARGIN_PX + 1,) * 2, np.uint8)), np.uint8)
-    return np.where(believed > 0, frame.depth, np.float32(0))
+        kept = _inner(kept, margin_px)
+    return np.where(kept, frame.depth, np.float32(0))
+
+
+def _inner(where: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
+    """The pixels [H, W] with nothing else so near."""
+    side = 2 * margin_px + 1
+    return np.asarray(cv2.erode(where.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
@@ -178,10 +200,8 @@ def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
     height, width = frame.image.shape[:2]
     if frame.depth is None:
         return np.full((height, width), default_depth_mm, np.float32)
-    measured = believed_depth(frame)
+    measured = possible_depth(frame)
     known = np.isfinite(measured) & (measured > 0)
-    if frame.mask is not None:
-        known &= frame.mask > 0
     if not known.any():
         return np.full((height, width), default_depth_mm, np.float32)
     return np.where(known, measured, continued(measured, known))

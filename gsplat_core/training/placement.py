@@ -18,7 +18,7 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import LOG_SCALE, POSITION
 from gsplat_core.training.coverage import UNCOVERED_ALPHA
-from gsplat_core.training.initialisation import believed_depth, tissue_depth
+from gsplat_core.training.initialisation import possible_depth, tissue_depth
 from gsplat_core.training.observations import Observation, known_depth
 from gsplat_core.training.start_on_device import filled
 from gsplat_core.training.step import TrainingStep
@@ -57,20 +57,20 @@ class Placement:
         if self.is_placed and frame.depth_origin not in CORRECTS_ALL_TIMES + CORRECTS_ONE_TIME:
             return
         # Depth by light is in no observation: the loss does not see it.
-        believed = known_depth(believed_depth(frame), observation.image.device)
+        possible = known_depth(possible_depth(frame), observation.image.device)
         with torch.no_grad():
             if self.is_placed and frame.depth_origin in CORRECTS_ONE_TIME:
-                _correct(step, observation, believed, observation.time_s if shown_s is None else shown_s)
+                _correct(step, observation, possible, observation.time_s if shown_s is None else shown_s)
                 return
             points = step.gaussians.means + step.field.deltas(observation.time_s)[:, POSITION]
             seen = Seen(observation.camera, points)
             column, row = seen.pixels.long().clamp(min=0).unbind(1)
-            height, width = believed.shape
+            height, width = possible.shape
             at = row.clamp(max=height - 1), column.clamp(max=width - 1)
             inside, now = seen.inside[:, 0], seen.depth[:, 0]
-            known = inside & (believed[at] > 0)
+            known = inside & (possible[at] > 0)
             if self.is_placed:
-                told = torch.where(known, believed[at], now)
+                told = torch.where(known, possible[at], now)
                 factor = (told / now).pow(SHARE).clamp(1 / LARGEST_STEP, LARGEST_STEP)
             else:
                 if not bool(known.any()):

@@ -10,21 +10,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import cv2
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.geometry.depth_fill import continued
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.image_motion import SMALLEST_PX, Flow, ImageMotion
+from gsplat_core.training.initialisation import possible_depth
 from gsplat_core.training.motion_prior import followed
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import Seen, SurfaceMotion, beside
-from gsplat_core.transfers import HostCopy, tensor_of
+from gsplat_core.transfers import tensor_of
 
 NOT_TOLD_BY = (DepthOrigin.LIGHT, DepthOrigin.LEARNED)
 """Depth whose differences from frame to frame are no motion: it is right up to a factor that no two frames need to share."""
-EDGE_PX = 2
+EDGE_PX = 1
 """Beside a tool or a hole depth is not read: a point that is followed is not exact to the pixel."""
 ROWS_AT_ONCE = 1 << 14
 """Bounds the memory for ways: Gaussians times frames."""
@@ -49,8 +53,10 @@ class SurfaceTracks:
             SurfaceMotion(tensor_of(flow, device), after.camera, before.camera)
             for flow, (before, after) in zip(_flows(frames[::-1])[::-1], pairwise(observations), strict=True)
         ]
-        told = (frame.depth_origin not in NOT_TOLD_BY for frame in frames)
-        self._depths = [SurfaceDepth.of(one) if tells else None for tells, one in zip(told, observations, strict=True)]
+        self._depths = [
+            None if frame.depth_origin in NOT_TOLD_BY else SurfaceDepth.of(possible_depth(frame), device)
+            for frame in frames
+        ]
 
     def carry(self, step: TrainingStep, number: int, first_row: int) -> None:
         """Let the Gaussians from `first_row` on, which are where frame `number` shows the surface, go its way at all times. Nothing changes
@@ -99,18 +105,15 @@ class SurfaceDepth:
     everywhere."""
 
     @staticmethod
-    def of(one: Observation) -> SurfaceDepth | None:
-        """None where nothing is known."""
-        if one.depth is None:
+    def of(depth: NDArray[np.float32], device: torch.device) -> SurfaceDepth | None:
+        """depth: of tissue [H, W], 0 where it is not known. None where nothing is known."""
+        known = np.isfinite(depth) & (depth > 0)
+        if not known.any():
             return None
-        unknown = ((one.mask == 0) | (one.depth <= 0)).to(one.depth.dtype)
-        near = torch.nn.functional.max_pool2d(unknown[None], 2 * EDGE_PX + 1, stride=1, padding=EDGE_PX)[0]
-        inner = torch.where(near > 0, 0.0, one.depth)
-        on_host = HostCopy(inner).numpy()
-        if not on_host.any():
-            return None
-        smooth = tensor_of(continued(on_host, on_host > 0), inner.device)
-        return SurfaceDepth(torch.stack([inner, (inner > 0).to(inner.dtype), smooth]))
+        side = 2 * EDGE_PX + 1
+        inner = cv2.erode(known.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+        planes = np.stack([np.where(inner, depth, 0), inner, continued(depth, known)]).astype(np.float32)
+        return SurfaceDepth(tensor_of(planes, device))
 
     def at(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """At pixels [N, 2], bilinear: the smooth depth [N], and the share of it that the depth itself is [N], 0 where that is not known."""
