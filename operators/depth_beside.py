@@ -12,7 +12,7 @@ from gsplat_core.scene.frames import Frame
 from operators.depth import DepthCounts
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
-from operators.side_thread import step_back, usable_cores
+from operators.side_thread import step_back, usable_cores, use_one_core
 
 FEW_CORES = 4
 """With so many cores or fewer training needs all of them ..."""
@@ -44,6 +44,7 @@ class DepthBeside:
         self._found: Frame | None = None
         self._failure: BaseException | None = None
         self._over = False
+        self._begun = threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -52,8 +53,10 @@ class DepthBeside:
         self.finder = DepthFinder(self.choice, self._camera, has_time=True, device=self._device)
         self._offered = self._found = self._failure = None
         self._over = False
+        self._begun.clear()
         self._thread = threading.Thread(target=self._run, args=(self.finder,), name="depth", daemon=True)
         self._thread.start()
+        self._begun.wait()  # before others compute: see `use_one_core`
 
     def stop(self) -> None:
         """Wait until the frame under work is done, and look for nothing more. Raises what went wrong in the thread."""
@@ -83,6 +86,9 @@ class DepthBeside:
     def _run(self, finder: DepthFinder) -> None:
         """The life of the thread."""
         step_back()
+        if self._share < 1:
+            use_one_core()
+        self._begun.set()
         scene = 0
         try:
             while (frame := self._next()) is not None:

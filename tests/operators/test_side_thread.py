@@ -1,0 +1,52 @@
+"""Threads beside the graph take what it leaves."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+
+import pytest
+import torch
+
+from operators.side_thread import NICENESS, step_back, usable_cores, use_one_core
+
+
+def in_a_thread(work):
+    """What `work` answers in a thread of its own."""
+    answers = []
+    thread = threading.Thread(target=lambda: answers.append(work()))
+    thread.start()
+    thread.join()
+    return answers[0]
+
+
+def test_one_core_is_for_the_thread_that_asks_and_for_no_other():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+
+        def alone():
+            use_one_core()
+            torch.ones(1_000_000).exp_()
+            return torch.get_num_threads()
+
+        assert in_a_thread(alone) == 1
+        assert torch.get_num_threads() == 3 and in_a_thread(torch.get_num_threads) == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="priorities of threads are those of Linux")
+def test_a_thread_steps_back_alone():
+    def stepped():
+        step_back()
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    assert in_a_thread(stepped) == NICENESS
+    assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == before
+
+
+def test_a_process_may_use_at_least_one_core():
+    assert 1 <= usable_cores() <= (os.cpu_count() or 1)
