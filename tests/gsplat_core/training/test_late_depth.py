@@ -92,12 +92,13 @@ def test_the_loss_does_not_see_depth_by_light() -> None:
     assert made._window.find(0, MOST_LATE).depth is None
 
 
-def test_a_scene_that_started_from_depth_is_not_placed_again() -> None:
+@pytest.mark.parametrize(("origin", "goes_to"), [(DepthOrigin.STEREO, (50 * 80) ** 0.5), (DepthOrigin.LIGHT, 50.0)])
+def test_a_scene_that_started_from_depth_is_corrected_and_not_placed_again(origin: DepthOrigin, goes_to: float) -> None:
     made = LiveReconstructor(ReconstructorConfig(gaussians=300, max_gaussians=400), CAMERA)
     made.observe(frame_at(0, depth=np.full((HEIGHT, WIDTH), 50, np.float32)), steps=3)
     made.observe(frame_at(1), steps=3)
-    assert made.take_depth(found(frame_at(1)))
-    assert distance(made, 1) == pytest.approx(50, rel=0.02)
+    assert made.take_depth(found(frame_at(1), 80.0, origin))
+    assert distance(made, 1) == pytest.approx(goes_to, rel=0.02)
 
 
 def another_scene(made: LiveReconstructor) -> None:
