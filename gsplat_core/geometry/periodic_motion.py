@@ -26,7 +26,7 @@ OUTSIDE = 0.15
 """How far that grid goes beyond the picture, as a share of its side."""
 AMPLITUDE = 0.04
 """How far tissue may be expected to move, relative to its distance (standard deviation)."""
-BEND = 0.02
+BEND = 0.008
 """How far a vector may be expected to differ from what its neighbours on either side say, relative to the distance."""
 RELIEF = 0.5
 """How far points may be expected from their median distance, relative to it."""
