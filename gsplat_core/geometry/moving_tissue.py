@@ -30,6 +30,8 @@ RATE_HZ = 12.5
 """Frames that are looked at in a second, at most: a heart beat has several."""
 KEY_EVERY_S = 1.2
 SHORTEST_S = 1.0
+LEAST_CYCLES = 1.0
+"""Of breathing: less of it can be any motion of the scope."""
 FEWEST_POINTS = 100
 MOST_ERROR = 0.04
 """Relative error of a distance with which it is believed by one half."""
@@ -136,7 +138,8 @@ def _found(pictures: list[Seen], times_s: Array) -> _Window | str:
     off = off_px(motion.at(times_s), tracks)
     if float(np.median(np.linalg.norm(off, axis=2)[tracks.seen])) > MOST_OFF_PX:
         return OTHERWISE
-    if float(np.hypot(np.median(motion.error), frequencies.error)) > MOST_ERROR:
+    cycles = frequencies.hz[0] * length_s
+    if cycles < LEAST_CYCLES or float(np.hypot(np.median(motion.error), frequencies.error)) > MOST_ERROR:
         return TOO_SHORT
     return _Window(float(times_s.mean()), tracks, motion, -off / tracks.focal_px, frequencies.error)
 
