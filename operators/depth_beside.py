@@ -50,7 +50,7 @@ class DepthBeside:
     def start(self) -> None:
         """Begin with another stream."""
         self.counts = DepthCounts()
-        self.finder = DepthFinder(self.choice, self._camera, has_time=True, device=self._device)
+        self.finder = DepthFinder(self.choice, self._camera, device=self._device)
         self._offered = self._found = self._failure = None
         self._over = False
         self._begun.clear()

@@ -1,7 +1,7 @@
 """Depth where none is known: the surface around it, continued.
 
-A plane's inverse depth is linear in the picture. So planes are fitted to the inverse depths that are known, weighted by a Gaussian window round each pixel:
-first in a window as wide as the picture, then in smaller ones to what is left, where enough is known.
+A plane's inverse depth is linear in the picture. So planes are fitted to the inverse depths that are known: one to the whole picture, then to what is
+left one round each pixel, weighted by a Gaussian window, wide and then narrow, where enough is known.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 Plane = NDArray[np.float32]
 
 CELL_PX = 4
-"""Side of the cells in which it is worked out."""
-WINDOWS = (0.5, 0.12, 0.03)
+"""Side of the cells in which it is worked out, at least."""
+WINDOWS = (0.12, 0.03)
 """Standard deviations of the windows, as shares of the picture's width."""
+CELLS_A_WINDOW = 4.0
+"""Standard deviation of a window in cells: a wide one takes large cells, or its sums take longer than a frame of a live stream has."""
 LEAST_KNOWN = 0.02
 """Share of a window that has to be known for its plane to count half."""
 TILT_DOUBT = 0.003
@@ -32,16 +34,31 @@ def continued(depth: Plane, known: NDArray[np.bool_]) -> Plane:
         return np.zeros((height, width), np.float32)
     size = max(1, round(width / CELL_PX)), max(1, round(height / CELL_PX))
     weight = np.asarray(cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)
-    inverse = np.where(known, 1 / np.where(known, depth, 1), 0).astype(np.float32)
-    mean = np.asarray(cv2.resize(inverse, size, interpolation=cv2.INTER_AREA), np.float32)
-    values = np.asarray(mean / np.maximum(weight, 1e-6), np.float32)
-    found = np.full_like(values, np.average(values, weights=weight))
+    mean = np.asarray(cv2.resize(np.where(known, depth, 0), size, interpolation=cv2.INTER_AREA), np.float32)
+    some = weight > 0
+    values = np.where(some, weight / np.where(some, mean, 1), 0).astype(np.float32)
+    found = _whole_plane(values, weight)
     for share in WINDOWS:
-        left = np.asarray(values - found, np.float32)
-        found += _local_plane(left, weight, max(1.0, share * size[0]))
-    whole = np.asarray(cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR))
-    nearest, farthest = float(inverse.max()), float(inverse[known].min())
-    return np.asarray(1 / np.clip(whole, farthest / 2, nearest * 2), np.float32)
+        cells = min(size[0], max(1, round(CELLS_A_WINDOW / share)))
+        grid = cells, max(1, round(cells * size[1] / size[0]))
+        counted = np.asarray(cv2.resize(weight, grid, interpolation=cv2.INTER_AREA), np.float32)
+        total = np.asarray(cv2.resize((values - found) * weight, grid, interpolation=cv2.INTER_AREA), np.float32)
+        left = np.asarray(total / np.maximum(counted, 1e-6), np.float32)
+        plane = _local_plane(left, counted, max(1.0, share * cells))
+        found += cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
+    nearest, farthest = float(values.max()), float(values[some].min())
+    found = np.clip(found, farthest / 2, nearest * 2)
+    return np.asarray(1 / cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def _whole_plane(values: Plane, weight: Plane) -> Plane:
+    """The plane that fits all weighted values best, in each cell; the less steep, the fewer there are."""
+    rows, columns = (np.linspace(-1, 1, n) for n in values.shape)
+    terms = np.stack([np.ones(values.shape), *np.broadcast_arrays(columns, rows[:, None])], axis=-1).reshape(-1, 3)
+    weighted = terms * weight.reshape(-1, 1)
+    normal = weighted.T @ terms + np.diag([1e-9, TILT_DOUBT, TILT_DOUBT]) * len(terms) * TILT_DOUBT
+    slopes = np.linalg.solve(normal, weighted.T @ values.ravel())
+    return np.asarray((terms @ slopes).reshape(values.shape), np.float32)
 
 
 def _local_plane(values: Plane, weight: Plane, sigma: float) -> Plane:

@@ -204,4 +204,4 @@ def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
     known = np.isfinite(measured) & (measured > 0)
     if not known.any():
         return np.full((height, width), default_depth_mm, np.float32)
-    return np.where(known, measured, continued(measured, known))
+    return measured if known.all() else np.where(known, measured, continued(measured, known))
