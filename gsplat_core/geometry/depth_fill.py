@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.geometry.local_planes import at_middles, terms_of
+
 Plane = NDArray[np.float32]
 
 CELL_PX = 4
@@ -24,7 +26,7 @@ TILT_DOUBT = 0.003
 """As `LEAST_KNOWN`, for the plane's slope, when what is known is spread like the window; beside one edge alone the slope counts less."""
 
 
-def continued(depth: Plane, known: NDArray[np.bool_]) -> Plane:
+def filled_depth(depth: Plane, known: NDArray[np.bool_]) -> Plane:
     """A smooth depth for every pixel [H, W] by the depth of those that are `known` [H, W], positive and finite; close to it where it is known.
 
     Never nearer than half the nearest known depth, nor farther than twice the farthest. Zero everywhere where nothing is known.
@@ -62,21 +64,14 @@ def _whole_plane(values: Plane, weight: Plane) -> Plane:
 
 
 def _local_plane(values: Plane, weight: Plane, sigma: float) -> Plane:
-    """At each cell the value of the plane that fits the weighted values around it best."""
-    rows, columns = (np.arange(n, dtype=np.float32) / np.float32(sigma) for n in values.shape)
+    """At each cell the value of the plane that fits the weighted values around it best; the less is known there, the nearer to zero."""
+    rows, columns = (np.arange(n, dtype=np.float64) / sigma for n in values.shape)
     x, y = np.broadcast_to(columns, values.shape), np.broadcast_to(rows[:, None], values.shape)
-    mean = lambda plane: cv2.GaussianBlur(
-        np.ascontiguousarray(plane, np.float32), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT
+    sums = tuple(
+        np.asarray(
+            cv2.GaussianBlur(np.ascontiguousarray(each), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT), np.float64
+        )
+        for each in terms_of(weight.astype(np.float64), x, y, values)
     )
-    w, wx, wy, wv = mean(weight), mean(weight * x), mean(weight * y), mean(weight * values)
-    sure = np.maximum(w, 1e-9)
-    at_x, at_y, middle = wx / sure, wy / sure, wv / sure
-    spread = lambda a, b, first, second: (mean(weight * a * b) / sure - first * second).astype(np.float64)
-    xx, xy, yy = spread(x, x, at_x, at_x), spread(x, y, at_x, at_y), spread(y, y, at_y, at_y)
-    xv, yv = spread(x, values, at_x, middle), spread(y, values, at_y, middle)
-    doubt = TILT_DOUBT / np.maximum(w, 1e-3)
-    xx, yy = xx + doubt, yy + doubt
-    determinant = np.maximum(xx * yy - xy * xy, 1e-12)
-    slope_x, slope_y = (yy * xv - xy * yv) / determinant, (xx * yv - xy * xv) / determinant
-    here = middle + slope_x * (x - at_x) + slope_y * (y - at_y)
-    return np.asarray(here * (w / (w + LEAST_KNOWN)), np.float32)
+    here = at_middles(sums, x, y, TILT_DOUBT / np.maximum(sums[0], 1e-3))
+    return np.asarray(here * (sums[0] / (sums[0] + LEAST_KNOWN)), np.float32)

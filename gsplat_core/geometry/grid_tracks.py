@@ -41,7 +41,7 @@ Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Seen:
+class TexturedPicture:
     """One picture as it is compared."""
 
     texture: Picture
@@ -84,7 +84,7 @@ def small_camera(frame: Frame, camera: Camera) -> Camera:
     return camera.scaled(min(1.0, LONGEST_PX / max(frame.image.shape[:2])))
 
 
-def seen_by(frame: Frame, camera: Camera) -> Seen:
+def seen_by(frame: Frame, camera: Camera) -> TexturedPicture:
     """A frame with no side longer than `LONGEST_PX`, its light and reflections taken out."""
     height, width = frame.image.shape[:2]
     small = small_camera(frame, camera)
@@ -109,11 +109,11 @@ def seen_by(frame: Frame, camera: Camera) -> Seen:
         tissue = np.asarray(cv2.resize(frame.mask, size, interpolation=cv2.INTER_NEAREST) != 0, np.uint8)
         margin = np.ones((2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1), np.uint8)
         usable = np.asarray(np.minimum(usable, cv2.erode(tissue, margin)), np.uint8)
-    return Seen(texture, np.asarray(cv2.erode(usable, np.ones((3, 3), np.uint8)), np.uint8), small)
+    return TexturedPicture(texture, np.asarray(cv2.erode(usable, np.ones((3, 3), np.uint8)), np.uint8), small)
 
 
 def follow_grids(
-    pictures: Sequence[Seen], times_s: NDArray[np.float64], keys: Sequence[int], spacing_px: int = SPACING_PX
+    pictures: Sequence[TexturedPicture], times_s: NDArray[np.float64], keys: Sequence[int], spacing_px: int = SPACING_PX
 ) -> GridTracks:
     """The grids of the key pictures `keys` in all `pictures`, which have one size. A point that few of them show is left out."""
     height, width = pictures[0].texture.shape
@@ -134,7 +134,7 @@ def follow_grids(
 
 
 def _from_key(
-    pictures: Sequence[Seen], key: int, start: NDArray[np.float32]
+    pictures: Sequence[TexturedPicture], key: int, start: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Where the points `start` [N, 2] of a picture are in all others [T, N, 2], and where they were found [T, N]."""
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.geometry.depth_map import DepthMap, doubted
 from gsplat_core.geometry.frequencies import found_in
-from gsplat_core.geometry.grid_tracks import GridTracks, Seen, follow_grids, seen_by, small_camera
+from gsplat_core.geometry.grid_tracks import GridTracks, TexturedPicture, follow_grids, seen_by, small_camera
 from gsplat_core.geometry.periodic_motion import Array, PeriodicMotion, fitted, in_cameras, off_px
 from gsplat_core.geometry.pull import pull_of
 from gsplat_core.geometry.surface_through import surface_through
@@ -103,12 +103,14 @@ class MovingTissue:
         return DepthMap(depth, confidence, DepthOrigin.PARALLAX, metric=False)
 
 
-def _windows(frames: Sequence[Frame], cameras: Sequence[Camera], times_s: Array) -> list[tuple[list[Seen], Array]]:
+def _windows(
+    frames: Sequence[Frame], cameras: Sequence[Camera], times_s: Array
+) -> list[tuple[list[TexturedPicture], Array]]:
     """The pictures that are looked at, and their times, of each window."""
     length_s = float(times_s[-1] - times_s[0])
     count = 1 if length_s <= WINDOW_S else int(np.ceil(2 * length_s / WINDOW_S)) - 1
     starts = times_s[0] + np.linspace(0, max(0.0, length_s - WINDOW_S), count)
-    pictures: dict[int, Seen] = {}
+    pictures: dict[int, TexturedPicture] = {}
     windows = []
     for start in starts:
         inside = np.flatnonzero((times_s >= start - 1e-9) & (times_s <= start + WINDOW_S + 1e-9))
@@ -122,7 +124,7 @@ def _windows(frames: Sequence[Frame], cameras: Sequence[Camera], times_s: Array)
     return windows
 
 
-def _found(pictures: list[Seen], times_s: Array) -> _Window | str:
+def _found(pictures: list[TexturedPicture], times_s: Array) -> _Window | str:
     """The motion in one window, or in a sentence why there is none to believe."""
     length_s = float(times_s[-1] - times_s[0])
     if length_s < SHORTEST_S:

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.geometry.local_planes import at_middles, terms_of
+
 Array = NDArray[np.float64]
 
 CELL_PX = 2
@@ -35,8 +37,7 @@ def surface_through(pixels: Array, depth: Array, error: Array, size: tuple[int, 
     cell = (np.floor(y).astype(int) * width + np.floor(x).astype(int)).astype(np.intp)
     weight = 1 / (error**2 + FLOOR**2)
     weight = weight / weight.max()
-    values = (weight, weight * x, weight * y, weight * x * x, weight * x * y, weight * y * y,
-              weight * inverse, weight * inverse * x, weight * inverse * y, np.ones_like(x), weight * error)  # fmt: skip
+    values = (*terms_of(weight, x, y, inverse), np.ones_like(x), weight * error)
     sums = np.stack([np.bincount(cell, each, height * width).reshape(height, width) for each in values], 2).astype(
         np.float64
     )
@@ -61,19 +62,8 @@ def _blurred(sums: Array, sigma: float) -> Array:
 
 def _planes(sums: Array) -> Array:
     """The value [h, w] at each cell's centre of the plane that fits best around it."""
-    height, width = sums.shape[:2]
-    row, column = np.mgrid[0:height, 0:width] + 0.5
-    w, x, y, xx, xy, yy, v, vx, vy = (sums[..., k] for k in range(9))
-    w = w + 1e-12
-    # About the mean of the points.
-    mean_x, mean_y, mean = x / w, y / w, v / w
-    xx, xy, yy = xx / w - mean_x**2, xy / w - mean_x * mean_y, yy / w - mean_y**2
-    vx, vy = vx / w - mean * mean_x, vy / w - mean * mean_y
-    level = 1.0 + LEVEL * (xx + yy)
-    xx, yy = xx + level, yy + level
-    determinant = xx * yy - xy * xy
-    by_x, by_y = (yy * vx - xy * vy) / determinant, (xx * vy - xy * vx) / determinant
-    return np.asarray(mean + by_x * (column - mean_x) + by_y * (row - mean_y))
+    row, column = np.mgrid[0 : sums.shape[0], 0 : sums.shape[1]] + 0.5
+    return np.asarray(at_middles(tuple(np.moveaxis(sums[..., :9], 2, 0)), column, row, 1.0, LEVEL), np.float64)
 
 
 def _at_full_size(values: Array, size: tuple[int, int]) -> Array:

@@ -66,9 +66,7 @@ def on_tissue(step: TrainingStep, observations: Sequence[Observation]) -> Tensor
     found = torch.zeros(step.gaussians.count, dtype=torch.bool, device=step.gaussians.device)
     for one in observations:
         seen = Seen(one.camera, step.at(one.time_s).means)
-        height, width = one.mask.shape
-        column, row = seen.pixels.long().clamp(min=0).unbind(1)
-        found |= seen.inside[:, 0] & (one.mask[row.clamp(max=height - 1), column.clamp(max=width - 1)] > 0)
+        found |= seen.inside[:, 0] & (seen.read(one.mask) > 0)
     return found
 
 

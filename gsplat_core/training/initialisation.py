@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.geometry.depth_fill import continued
+from gsplat_core.geometry.depth_fill import filled_depth
 from gsplat_core.geometry.depth_map import BELIEVED, POSSIBLE
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
@@ -23,7 +23,10 @@ THICKNESS = 0.3
 FIRST_OPACITY = 0.9
 TOOL_MARGIN_PX = 2
 """So much around a tool is painted over with it: masks end a little early."""
-HOLE_MARGIN_PX, BESIDE_TOOL_PX = 2, 4
+HOLE_MARGIN_PX = 2
+"""Beside what two eyes could not match, depth is not learned from; half as far from it a scene does not start."""
+BESIDE_TOOL_PX = 4
+"""Beside a tool matched depth may be the tool's."""
 
 MAX_ANGLE_RAD = math.radians(85)
 """Widest angle from the axis at which a fisheye pixel is placed; what lies farther out is placed there."""
@@ -204,4 +207,4 @@ def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
     known = np.isfinite(measured) & (measured > 0)
     if not known.any():
         return np.full((height, width), default_depth_mm, np.float32)
-    return measured if known.all() else np.where(known, measured, continued(measured, known))
+    return measured if known.all() else np.where(known, measured, filled_depth(measured, known))

@@ -135,10 +135,10 @@ class OfflineTraining:
         )
         shares = shares_of(self._step, chosen)
         # What a tool hides in all of the chosen pictures, or what lies outside of them, others may show.
-        unasked = ~on_tissue(self._step, chosen)
-        if bool(unasked.any()):
+        hidden = ~on_tissue(self._step, chosen)
+        if bool(hidden.any()):
             seen_px = torch.where(
-                unasked & on_tissue(self._step, others), shares.seen_px.clamp(min=UNSEEN_PX), shares.seen_px
+                hidden & on_tissue(self._step, others), shares.seen_px.clamp(min=UNSEEN_PX), shares.seen_px
             )
             shares = replace(shares, seen_px=seen_px)
         densify(self._step, shares, round(self._first_count + (self._most - self._first_count) * share))

@@ -18,9 +18,9 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import LOG_SCALE, POSITION
 from gsplat_core.training.coverage import UNCOVERED_ALPHA
+from gsplat_core.training.hole_filling import filled
 from gsplat_core.training.initialisation import possible_depth, tissue_depth
 from gsplat_core.training.observations import Observation, known_depth
-from gsplat_core.training.start_on_device import filled
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import Seen, beside
 from gsplat_core.transfers import tensor_of
@@ -32,7 +32,7 @@ CORRECTS_ONE_TIME = (None, DepthOrigin.MEASURED, DepthOrigin.STEREO)
 """Origins of depth that goes on correcting the scene; that of a frame which does not say is measured. Other depth is only started from."""
 SHARE = 0.5
 """Of the way that a later frame moves a Gaussian: depths of several frames are averaged."""
-TOGETHER_PX = 16
+CORRECTED_PX = 16
 """Side of the squares of a picture whose Gaussians are moved together."""
 
 
@@ -64,19 +64,16 @@ class Placement:
                 return
             points = step.gaussians.means + step.field.deltas(observation.time_s)[:, POSITION]
             seen = Seen(observation.camera, points)
-            column, row = seen.pixels.long().clamp(min=0).unbind(1)
-            height, width = possible.shape
-            at = row.clamp(max=height - 1), column.clamp(max=width - 1)
-            inside, now = seen.inside[:, 0], seen.depth[:, 0]
-            known = inside & (possible[at] > 0)
+            inside, now, there = seen.inside[:, 0], seen.depth[:, 0], seen.read(possible)
+            known = inside & (there > 0)
             if self.is_placed:
-                told = torch.where(known, possible[at], now)
+                told = torch.where(known, there, now)
                 factor = (told / now).pow(SHARE).clamp(1 / LARGEST_STEP, LARGEST_STEP)
             else:
                 if not bool(known.any()):
                     return
                 # What is not sure goes along with what is sure beside it, and what the picture does not show with all of it.
-                everywhere = tensor_of(tissue_depth(frame, float(now.median())), points.device)[at]
+                everywhere = seen.read(tensor_of(tissue_depth(frame, float(now.median())), points.device))
                 factor = everywhere / now
                 factor = torch.where(inside, factor, (everywhere / now)[known].median())
             step.scale_about(observation.camera, factor)
@@ -89,7 +86,7 @@ def _correct(step: TrainingStep, observation: Observation, depth: Tensor, shown_
     """Move the scene nearer to a frame's depth [H, W] (0: unknown) at one time."""
     camera = observation.camera
     now = step.at(observation.time_s)
-    factor = _together(now, observation, depth, Seen(camera, now.means).pixels)
+    factor = _smooth_factor(now, observation, depth, Seen(camera, now.means).pixels)
     deltas = step.field.deltas(shown_s)
     points = step.gaussians.means + deltas[:, POSITION]
     deltas[:, POSITION] += (factor - 1)[:, None] * (points - beside(points, camera.position))
@@ -97,17 +94,17 @@ def _correct(step: TrainingStep, observation: Observation, depth: Tensor, shown_
     step.field.move_to(shown_s, deltas)
 
 
-def _together(now: Gaussians, observation: Observation, depth: Tensor, pixels: Tensor) -> Tensor:
+def _smooth_factor(now: Gaussians, observation: Observation, depth: Tensor, pixels: Tensor) -> Tensor:
     """By which factor [N] the depth of Gaussians at `pixels` [N, 2] changes. It is the same for neighbours: tissue moves smoothly, and Gaussians that
     change their order along the line of sight change the picture."""
     shown = render(now, observation.camera, depth=True)
     known = (depth > 0) & (observation.mask > 0) & (shown.alpha >= UNCOVERED_ALPHA)
     ratio = torch.where(known, depth / shown.depth, 1.0).log()
-    smooth = filled(ratio[None], known[None].to(ratio.dtype), TOGETHER_PX)
+    smooth = filled(ratio[None], known[None].to(ratio.dtype), CORRECTED_PX)
     grid = 2 * pixels / beside(pixels, [ratio.shape[1], ratio.shape[0]]) - 1
     there = grid_sample(smooth[None], grid[None, None], padding_mode="border", align_corners=False)[0, 0, 0]
     return (SHARE * there).exp().clamp(1 / LARGEST_STEP, LARGEST_STEP)
 
 
 def _has_depth(frame: Frame | None) -> bool:
-    return frame is not None and frame.depth is not None and bool(np.any(frame.depth))
+    return frame is not None and bool(np.any(possible_depth(frame)))

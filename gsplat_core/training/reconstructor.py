@@ -222,7 +222,7 @@ class Reconstructor:
             self._depth_source = DepthSource.after(self._depth_source, frame)
             first_new = self.gaussians if number else 0
             self._grow(frame, observation, number == 0)
-            tracks.carry(self._step, number, first_new)
+            tracks.apply(self._step, number, first_new)
         most, settings = self.config.max_gaussians, settings or FitSettings()
         loss = OfflineTraining(self._step, seen, settings, most_gaussians=most, seed=self._seed)(steps, progress)
         return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)

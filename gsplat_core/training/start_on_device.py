@@ -10,11 +10,12 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
+from torch.nn.functional import max_pool2d, pad
 
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
+from gsplat_core.training.hole_filling import filled
 from gsplat_core.training.initialisation import (
     FIRST_OPACITY,
     SIGMA_IN_SPACINGS,
@@ -29,9 +30,6 @@ from gsplat_core.training.initialisation import (
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.surface_motion import beside
 from gsplat_core.transfers import tensor_of
-
-COARSE = 4
-"""What lies under a tool is filled in at this part of the size, as it is on the host."""
 
 
 class StartOnDevice:
@@ -94,31 +92,6 @@ def _without_tools(frame: Frame, image: Tensor) -> Tensor:
     tool = max_pool2d(bare, margin, stride=1, padding=TOOL_MARGIN_PX)
     tool = torch.where(tool.min() > 0, bare, tool)[0]  # with the margin no tissue would be left
     return torch.where(tool > 0, filled(picture, 1 - tool), picture)
-
-
-def filled(picture: Tensor, known: Tensor, coarse: int = COARSE) -> Tensor:
-    """`picture` [C, H, W] with the pixels whose `known` [1, H, W] is 0 taken from the known ones around them, smoothly, and all of it coarser by a factor.
-
-    A pyramid of means over what is known ("push and pull": Gortler et al., "The Lumigraph", 1996): each level fills the holes of the finer one.
-    """
-    height, width = known.shape[1:]
-    levels = [_shrunk((picture * known)[None], known[None], coarse)]
-    while max(levels[-1][1].shape[2:]) > 1:
-        levels.append(_shrunk(*levels[-1], 2))
-    total, weight = levels.pop()
-    whole = total / weight.clamp(min=1e-6)
-    for total, weight in reversed(levels):
-        coarser = interpolate(whole, size=weight.shape[2:], mode="bilinear", align_corners=False)
-        sure = (coarse * weight).clamp(max=1)
-        whole = sure * total / weight.clamp(min=1e-6) + (1 - sure) * coarser
-    return interpolate(whole, size=(height, width), mode="bilinear", align_corners=False)[0]
-
-
-def _shrunk(total: Tensor, weight: Tensor, factor: int) -> tuple[Tensor, Tensor]:
-    """Sums over what is known, and how much that is, as means over cells of `factor` squared."""
-    height, width = weight.shape[2:]
-    beyond = (0, -width % factor, 0, -height % factor)
-    return avg_pool2d(pad(total, beyond), factor), avg_pool2d(pad(weight, beyond), factor)
 
 
 def _blurred(picture: Tensor, sigma_px: float) -> Tensor:

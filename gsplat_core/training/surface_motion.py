@@ -83,6 +83,12 @@ class Seen:
         in_picture = ((self.pixels >= 0) & (self.pixels <= size)).all(dim=1, keepdim=True)
         self.inside = in_picture & (local[:, 2:] > NEAREST)
 
+    def read(self, plane: Tensor) -> Tensor:
+        """What a plane [H, W] of the camera's picture holds at the points' pixels [N]; for points that are not `inside`, what its edge holds."""
+        column, row = self.pixels.long().clamp(min=0).unbind(1)
+        height, width = plane.shape
+        return plane[row.clamp(max=height - 1), column.clamp(max=width - 1)]
+
     def to_world(self, moved_px: Tensor, inside: Tensor) -> Tensor:
         """Motion [N, 2] in pixels as motion in the world at the points' depth; none for points that are not `inside` [N, 1]."""
         moved = torch.where(inside, moved_px * self.depth / self._focal, torch.zeros_like(moved_px))

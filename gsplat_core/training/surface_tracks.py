@@ -1,4 +1,4 @@
-"""Where the surface goes over a recording of which all frames are known and have depth: a way through time for every Gaussian, before the first step.
+"""Where the surface goes over a recording of which all frames are known and have depth: a trajectory for every Gaussian, before the first step.
 
 Pictures of one eye hardly tell how tissue moves along the line of sight, so that the loss alone would leave each Gaussian about as far away as it was
 when it was made. Where its point goes across the picture is followed by optical flow from frame to frame, and how far away it is, is read there.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import cv2
@@ -16,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.geometry.depth_fill import continued
+from gsplat_core.geometry.depth_fill import filled_depth
 from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.image_motion import SMALLEST_PX, Flow, ImageMotion
 from gsplat_core.training.initialisation import possible_depth
@@ -26,52 +27,36 @@ from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import Seen, SurfaceMotion, beside
 from gsplat_core.transfers import tensor_of
 
-NOT_TOLD_BY = (DepthOrigin.LIGHT, DepthOrigin.LEARNED)
+WITHOUT_MOTION = (DepthOrigin.LIGHT, DepthOrigin.LEARNED)
 """Depth whose differences from frame to frame are no motion: it is right up to a factor that no two frames need to share."""
 EDGE_PX = 1
 """Beside a tool or a hole depth is not read: a point that is followed is not exact to the pixel."""
 ROWS_AT_ONCE = 1 << 14
-"""Bounds the memory for ways: Gaussians times frames."""
+"""Bounds the memory for trajectories: Gaussians times frames."""
 
 
 class SurfaceTracks:
-    """The motion of the surface that the frames of a recording show; nothing where they do not tell it."""
+    """The motion of the surface that the frames of a recording show; nothing where they do not show it."""
 
     def __init__(self, frames: Sequence[Frame], observations: Sequence[Observation]) -> None:
         """As many of both."""
-        self._seen = observations
+        self._frames, self._seen = frames, observations
+        self._device = observations[0].image.device
         self._times = observations[0].image.new_tensor([one.time_s for one in observations], dtype=torch.float32)
-        self._tells = _tell_motion(frames, observations)
-        if not self._tells:
-            return
-        device = observations[0].image.device
-        self._ahead = [
-            SurfaceMotion(tensor_of(flow, device), before.camera, after.camera)
-            for flow, (before, after) in zip(_flows(frames), pairwise(observations), strict=True)
-        ]
-        self._back = [
-            SurfaceMotion(tensor_of(flow, device), after.camera, before.camera)
-            for flow, (before, after) in zip(_flows(frames[::-1])[::-1], pairwise(observations), strict=True)
-        ]
-        self._depths = [
-            None if frame.depth_origin in NOT_TOLD_BY else SurfaceDepth.of(possible_depth(frame), device)
-            for frame in frames
-        ]
 
-    def carry(self, step: TrainingStep, number: int, first_row: int) -> None:
-        """Let the Gaussians from `first_row` on, which are where frame `number` shows the surface, go its way at all times. Nothing changes
-        where the field cannot follow, or the frames do not tell the motion."""
-        if not self._tells:
+    def apply(self, step: TrainingStep, number: int, first_row: int) -> None:
+        """Let the Gaussians from `first_row` on, which are where frame `number` shows the surface, follow it at all times. Nothing changes where
+        the field does not take positions, or the frames do not show the motion."""
+        if not step.field.takes_positions or not self._show_motion:
             return
         times = [one.time_s for one in self._seen]
         with torch.no_grad():
             for start in range(first_row, step.gaussians.count, ROWS_AT_ONCE):
                 rows = slice(start, min(start + ROWS_AT_ONCE, step.gaussians.count))
                 points = step.gaussians.means[rows]
-                if not step.field.follow(rows, times, self.ways(points, number) - points[:, None]):
-                    return
+                step.field.follow(rows, times, self.trajectories(points, number) - points[:, None])
 
-    def ways(self, points: Tensor, number: int) -> Tensor:
+    def trajectories(self, points: Tensor, number: int) -> Tensor:
         """Where `points` [N, 3] of the surface that frame `number` shows are in every frame [N, T, 3]."""
         pixels = self._pixels(points, number)
         nothing = points.new_zeros(len(points))
@@ -79,11 +64,47 @@ class SurfaceTracks:
             (nothing, nothing) if depth is None else depth.at(here)
             for depth, here in zip(self._depths, pixels, strict=True)
         ]
-        around, relief = (torch.stack(each, dim=1) for each in zip(*read, strict=True))
+        smooth, relief = (torch.stack(each, dim=1) for each in zip(*read, strict=True))
         # What a tool hides for a while stands out from what is around it as it did before and does afterwards.
-        depth = around * between_known(relief, torch.ones_like(relief), self._times)
+        depth = smooth * between_known(relief, torch.ones_like(relief), self._times)
         depth = between_known(depth, depth, self._times)
         return torch.stack([_world(pixels[k], depth[:, k], one) for k, one in enumerate(self._seen)], dim=1)
+
+    @cached_property
+    def _show_motion(self) -> bool:
+        """Whether half of the frames at least have depth whose differences are motion, a pinhole camera saw them, and flow can be found in
+        pictures of their size."""
+        sizes = {frame.image.shape[:2] for frame in self._frames}
+        pinhole = all(one.camera.model == "pinhole" for one in self._seen)
+        if not pinhole or len(self._frames) < 2 or len(sizes) > 1 or min(min(sizes)) < SMALLEST_PX:
+            return False
+        return 2 * sum(depth is not None for depth in self._depths) >= len(self._frames)
+
+    @cached_property
+    def _depths(self) -> list[SurfaceDepth | None]:
+        """Of each frame; None where nothing is believed, or it shows no motion."""
+        return [
+            None
+            if frame.depth_origin in WITHOUT_MOTION or one.depth is None or not bool(one.depth.any())
+            else SurfaceDepth.of(possible_depth(frame), self._device)
+            for frame, one in zip(self._frames, self._seen, strict=True)
+        ]
+
+    @cached_property
+    def _ahead(self) -> list[SurfaceMotion]:
+        """From each frame to the next."""
+        return self._motions(_flows(self._frames), self._seen)
+
+    @cached_property
+    def _back(self) -> list[SurfaceMotion]:
+        """From each frame but the first to the one before."""
+        return self._motions(_flows(self._frames[::-1]), self._seen[::-1])[::-1]
+
+    def _motions(self, flows: Sequence[Flow], seen: Sequence[Observation]) -> list[SurfaceMotion]:
+        return [
+            SurfaceMotion(tensor_of(flow, self._device), one.camera, following.camera)
+            for flow, (one, following) in zip(flows, pairwise(seen), strict=True)
+        ]
 
     def _pixels(self, points: Tensor, number: int) -> list[Tensor]:
         """Where each frame shows the points: T times [N, 2]."""
@@ -112,7 +133,7 @@ class SurfaceDepth:
             return None
         side = 2 * EDGE_PX + 1
         inner = cv2.erode(known.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
-        planes = np.stack([np.where(inner, depth, 0), inner, continued(depth, known)]).astype(np.float32)
+        planes = np.stack([np.where(inner, depth, 0), inner, filled_depth(depth, known)]).astype(np.float32)
         return SurfaceDepth(tensor_of(planes, device))
 
     def at(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
@@ -123,20 +144,6 @@ class SurfaceDepth:
             self.planes[None], grid, padding_mode="border", align_corners=False
         )[0, :, 0]
         return smooth, torch.where(known > 1 - 1e-3, found / smooth, 0.0)
-
-
-def _tell_motion(frames: Sequence[Frame], observations: Sequence[Observation]) -> bool:
-    """Whether half of the frames at least have depth whose differences are motion, a pinhole camera saw them, and flow can be found in pictures of
-    their size."""
-    told = sum(
-        one.depth is not None and frame.depth_origin not in NOT_TOLD_BY
-        for frame, one in zip(frames, observations, strict=True)
-    )
-    sizes = {frame.image.shape[:2] for frame in frames}
-    pinhole = all(one.camera.model == "pinhole" for one in observations)
-    return (
-        pinhole and len(frames) > 1 and 2 * told >= len(frames) and len(sizes) == 1 and min(min(sizes)) >= SMALLEST_PX
-    )
 
 
 def between_known(values: Tensor, otherwise: Tensor, times: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.depth_fill import continued
+from gsplat_core.geometry.depth_fill import filled_depth
 
 HEIGHT, WIDTH = 96, 128
 
@@ -24,7 +24,7 @@ def test_a_plane_goes_on_below_a_tool():
     depth, known = tilted(), np.ones((HEIGHT, WIDTH), bool)
     known[30:60, 50:90] = False
     depth[~known] = 7.0
-    found = continued(depth, known)
+    found = filled_depth(depth, known)
     assert off(found, tilted(), ~known) < 0.01 and off(found, tilted(), known) < 0.03
 
 
@@ -32,24 +32,24 @@ def test_a_plane_goes_on_beyond_the_edge_of_what_two_eyes_see():
     known = np.ones((HEIGHT, WIDTH), bool)
     known[:, :16] = False
     nearest = tilted()[:, 16]
-    found = continued(tilted(), known)
+    found = filled_depth(tilted(), known)
     assert off(found, tilted(), ~known) < 0.4 * off(np.repeat(nearest[:, None], WIDTH, 1), tilted(), ~known)
 
 
 def test_where_nothing_is_known_there_is_nothing():
-    assert not continued(tilted(), np.zeros((HEIGHT, WIDTH), bool)).any()
+    assert not filled_depth(tilted(), np.zeros((HEIGHT, WIDTH), bool)).any()
 
 
 @pytest.mark.parametrize("pixel", [(0, 0), (HEIGHT - 1, WIDTH - 1), (40, 60)])
 def test_one_known_pixel_is_everywhere(pixel):
     known = np.zeros((HEIGHT, WIDTH), bool)
     known[pixel] = True
-    assert continued(tilted(), known) == pytest.approx(np.full((HEIGHT, WIDTH), tilted()[pixel]), rel=0.01)
+    assert filled_depth(tilted(), known) == pytest.approx(np.full((HEIGHT, WIDTH), tilted()[pixel]), rel=0.01)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (33, 1), (5, 3)])
 def test_pictures_of_any_size(shape):
-    found = continued(np.full(shape, 50, np.float32), np.ones(shape, bool))
+    found = filled_depth(np.full(shape, 50, np.float32), np.ones(shape, bool))
     assert found.shape == shape and found == pytest.approx(np.full(shape, 50), rel=1e-3)
 
 
@@ -58,5 +58,5 @@ def test_it_does_not_run_away_from_what_is_known():
     known = np.zeros((HEIGHT, WIDTH), bool)
     known[:6, :6] = True
     noisy = rng.uniform(40, 80, (HEIGHT, WIDTH)).astype(np.float32)
-    found = continued(noisy, known)
+    found = filled_depth(noisy, known)
     assert found.min() >= 20 and found.max() <= 160 and np.isfinite(found).all()

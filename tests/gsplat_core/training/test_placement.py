@@ -109,3 +109,12 @@ def test_a_field_whose_positions_cannot_be_set_is_trained_as_it_is(origin) -> No
     reconstructor.observe(frames[0])
     reconstructor.observe(with_depth(frames[0].with_fields(seq=1), origin), steps=1)
     reconstructor.observe(with_depth(frames[0].with_fields(seq=2), origin), steps=1)
+
+
+def test_a_scene_whose_first_depth_is_possible_nowhere_is_placed_by_the_next_one() -> None:
+    reconstructor, frames = learner(), stream(1)
+    blind = with_depth(frames[0], DepthOrigin.STEREO)
+    reconstructor.observe(blind.with_fields(depth_confidence=np.zeros((HEIGHT, WIDTH), np.float32)))
+    reconstructor.observe(with_depth(frames[0].with_fields(seq=1), DepthOrigin.STEREO), steps=1)
+    depth, _ = shown(reconstructor, frames[0])
+    assert np.median(np.abs(depth / depth_of_surface() - 1)[INSIDE]) < 0.02

@@ -1,4 +1,4 @@
-"""Ways of the surface through a recording, against what the generator of the recording knows."""
+"""Trajectories of the surface through a recording, against what the generator of the recording knows."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def test_points_go_where_the_tissue_goes(request, camera, number):
     recording, true = request.getfixturevalue(camera), points_of(ASKED if camera == "fixed" else MOVING)
     chosen = seen_throughout(recording, true)
     assert chosen.sum() > 12
-    ways = SurfaceTracks(list(recording), observations(recording)).ways(true[number][chosen], number)
-    off = (ways - true[:, chosen].transpose(0, 1)).norm(dim=2)
+    found = SurfaceTracks(list(recording), observations(recording)).trajectories(true[number][chosen], number)
+    off = (found - true[:, chosen].transpose(0, 1)).norm(dim=2)
     moved = (true - true[number]).norm(dim=2)[:, chosen]
     assert moved.median() > 0.8, "millimetres"
     assert off.median() < 0.25 and off.quantile(0.9) < 0.8
@@ -79,8 +79,10 @@ def test_behind_a_tool_tissue_goes_with_what_is_around_it(fixed):
     hidden = [
         frame.with_fields(mask=covered(frame.mask)) if 3 <= frame.seq < 9 else frame for frame in frames
     ]  # fmt: skip
-    ways = SurfaceTracks(hidden, [Observation.of(frame, fixed.camera) for frame in hidden]).ways(true[0][chosen], 0)
-    off = (ways - true[:, chosen].transpose(0, 1)).norm(dim=2)
+    found = SurfaceTracks(hidden, [Observation.of(frame, fixed.camera) for frame in hidden]).trajectories(
+        true[0][chosen], 0
+    )
+    off = (found - true[:, chosen].transpose(0, 1)).norm(dim=2)
     still = (true - true[0]).norm(dim=2)[:, chosen]
     assert off[:, 3:9].median() < 0.6 * still.T[:, 3:9].median()
 
@@ -92,7 +94,14 @@ def covered(mask: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "fields", [{"depth": None}, {"depth_origin": DepthOrigin.LIGHT}, {"depth_origin": DepthOrigin.LEARNED}]
+    "fields",
+    [
+        {"depth": None},
+        {"depth_origin": DepthOrigin.LIGHT},
+        {"depth_origin": DepthOrigin.LEARNED},
+        {"depth_confidence": np.full((ASKED.height_px, ASKED.width_px), 0.1, np.float32)},
+    ],
+    ids=["none", "light", "learned", "not believed"],
 )
 def test_frames_that_do_not_tell_the_motion_of_a_surface_leave_the_field_alone(fixed, fields):
     frames = [frame.with_fields(**fields) for frame in fixed]
@@ -112,7 +121,7 @@ def moves_before_the_first_step(camera, frames: list[Frame]) -> bool:
     gaussians = gaussians_from_frame(frames[0], camera, 200, sh_degree=0, default_depth_mm=60.0)
     field = BasisField(gaussians.count, (0.0, 2.0), bumps=12)
     step = TrainingStep(gaussians, field, ReconstructorConfig(field="basis", gaussians=200), camera)
-    SurfaceTracks(frames, seen).carry(step, 0, 0)
+    SurfaceTracks(frames, seen).apply(step, 0, 0)
     return bool(field.weights.any())
 
 
