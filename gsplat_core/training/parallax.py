@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,18 +31,26 @@ MOST_PIXELS = 64_000_000
 """Of all frames with depth together: 12 bytes each of them here, and in what is learned from."""
 
 
-def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[Frame], Counter[str]]:
-    """The frames, key frames among them with depth in the unit of the cameras' positions, and why others of these have none, in sentences.
+class WithParallax(NamedTuple):
+    """Frames of a moving camera, and what was found out about them."""
 
-    `cameras` are those of the frames. Nothing is done where frames have depth already, or no camera moves.
-    """
+    frames: list[Frame]
+    """Key frames among them have depth in the unit of the cameras' positions."""
+    doubts: Mapping[str, int]
+    """Why others of these have none, in sentences."""
+    at_rest: bool = False
+    """Whether depth is that of tissue that stands still: frames then differ by what is uncertain, not by motion."""
+
+
+def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> WithParallax:
+    """Depth for frames that the `cameras` saw. Nothing is done where frames have depth already, or no camera moves."""
     moves = any(not np.array_equal(camera.world_to_camera, cameras[0].world_to_camera) for camera in cameras)
     if not moves or cameras[0].model != "pinhole" or any(frame.depth is not None for frame in frames):
-        return list(frames), Counter()
+        return WithParallax(list(frames), {})
     given, doubts = _compared(frames, cameras)
     contradicted = sum(doubts[each] for each in (DEFORMS, CONTRADICTED))
     if contradicted < MOVES * min(MOST_KEY_FRAMES, len(frames)):
-        return given, doubts
+        return WithParallax(given, doubts, at_rest=True)
     tissue = MovingTissue(frames, cameras)
     count = min(len(frames), max(1, MOST_PIXELS // frames[0].image[..., 0].size))
     breathing, uncertain = list(frames), Counter[str]()
@@ -52,7 +61,9 @@ def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> 
         else:
             breathing[number] = _with(frames[number], found)
     # Where no motion is found, a rough depth is better to start from than none.
-    return (breathing, uncertain) if uncertain.total() < count else (given, doubts)
+    if uncertain.total() == count:
+        return WithParallax(given, doubts, at_rest=True)
+    return WithParallax(breathing, uncertain)
 
 
 def _compared(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[Frame], Counter[str]]:
@@ -82,18 +93,18 @@ def _with(frame: Frame, found: DepthMap) -> Frame:
 
 def to_fit(
     frames: list[Frame], observation_of: Callable[[Frame], Observation], finds_depth: bool
-) -> tuple[list[Frame], list[Observation], Mapping[str, int]]:
-    """The frames that a scene starts and grows from, what is learned from them, and the doubts of `frames_with_parallax`.
+) -> tuple[WithParallax, list[Observation]]:
+    """The frames that a scene starts and grows from, and what is learned from them.
 
     finds_depth: whether depth is looked for. Raises InvalidInput where there are no frames, or they are not in order.
     """
     seen = observed(frames, observation_of)
     if not finds_depth:
-        return frames, seen, {}
-    found, doubts = frames_with_parallax(frames, [each.camera for each in seen])
+        return WithParallax(frames, {}), seen
+    found = frames_with_parallax(frames, [each.camera for each in seen])
     # What is not sure continues what is: that is something to start from, and nothing to learn.
     start = [
         frame.with_fields(depth_confidence=None) if frame.depth_origin is DepthOrigin.PARALLAX else frame
-        for frame in found
+        for frame in found.frames
     ]
-    return start, observed(found, observation_of), doubts
+    return found._replace(frames=start), observed(found.frames, observation_of)

@@ -38,8 +38,9 @@ ROWS_AT_ONCE = 1 << 14
 class SurfaceTracks:
     """The motion of the surface that the frames of a recording show; nothing where they do not show it."""
 
-    def __init__(self, frames: Sequence[Frame], observations: Sequence[Observation]) -> None:
-        """As many of both."""
+    def __init__(self, frames: Sequence[Frame], observations: Sequence[Observation], at_rest: bool = False) -> None:
+        """As many of both. at_rest: the frames' depth is that of tissue that stands still, see `WithParallax`."""
+        self._at_rest = at_rest
         self._frames, self._seen = frames, observations
         self._device = observations[0].image.device
         self._times = observations[0].image.new_tensor([one.time_s for one in observations], dtype=torch.float32)
@@ -58,6 +59,8 @@ class SurfaceTracks:
 
     def trajectories(self, points: Tensor, number: int) -> Tensor:
         """Where `points` [N, 3] of the surface that frame `number` shows are in every frame [N, T, 3]."""
+        if self._at_rest:
+            return self._across(points, number)
         pixels = self._pixels(points, number)
         nothing = points.new_zeros(len(points))
         read = [
@@ -68,7 +71,18 @@ class SurfaceTracks:
         # What a tool hides for a while stands out from what is around it as it did before and does afterwards.
         depth = smooth * between_known(relief, torch.ones_like(relief), self._times)
         depth = between_known(depth, depth, self._times)
-        return torch.stack([_world(pixels[k], depth[:, k], one) for k, one in enumerate(self._seen)], dim=1)
+        places = torch.stack([_world(pixels[k], depth[:, k], one) for k, one in enumerate(self._seen)], dim=1)
+        return held_outside(places, self._inside(pixels), number)
+
+    def _across(self, points: Tensor, number: int) -> Tensor:
+        """As `trajectories`, with motion across each picture alone: depths of tissue at rest differ from frame to frame by what is uncertain, and a
+        point that came nearer by that would stand before all others."""
+        after, before = [points], [points]
+        for motion in self._ahead[number:]:
+            after.append(after[-1] + motion.ahead(after[-1]))
+        for motion in self._back[:number][::-1]:
+            before.append(before[-1] + motion.ahead(before[-1]))
+        return torch.stack(before[:0:-1] + after, dim=1)
 
     @cached_property
     def _show_motion(self) -> bool:
@@ -116,6 +130,11 @@ class SurfaceTracks:
             before.append(before[-1] + motion.at(before[-1]))
         return before[:0:-1] + after
 
+    def _inside(self, pixels: Sequence[Tensor]) -> Tensor:
+        """Whether each frame's picture shows its pixels, bool [N, T] of T times [N, 2]."""
+        size = beside(pixels[0], [self._frames[0].width_px, self._frames[0].height_px])
+        return torch.stack([((here >= 0) & (here <= size)).all(dim=1) for here in pixels], dim=1)
+
 
 @dataclass(frozen=True)
 class SurfaceDepth:
@@ -144,6 +163,16 @@ class SurfaceDepth:
             self.planes[None], grid, padding_mode="border", align_corners=False
         )[0, :, 0]
         return smooth, torch.where(known > 1 - 1e-3, found / smooth, 0.0)
+
+
+def held_outside(places: Tensor, inside: Tensor, number: int) -> Tensor:
+    """`places` [N, T, 3] of points followed from frame `number` on, forth and back; from where one leaves the picture, `inside` [N, T], it stays
+    where it was seen last. Nothing follows it there, and a scope that comes back finds it."""
+    lasts = inside[:, number:].long().cumprod(1).cumsum(1)[:, 1:]
+    firsts = inside[:, : number + 1].flip(1).long().cumprod(1).cumsum(1)[:, 1:].flip(1)
+    start = torch.full_like(places[:, :1, 0], number, dtype=torch.int64)
+    index = torch.cat([number - (firsts - 1).clamp(min=0), start, number + (lasts - 1).clamp(min=0)], dim=1)
+    return places.gather(1, index[..., None].expand(-1, -1, 3))
 
 
 def between_known(values: Tensor, otherwise: Tensor, times: Tensor) -> Tensor:

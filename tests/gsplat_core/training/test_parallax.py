@@ -24,8 +24,9 @@ from tests.gsplat_core.geometry.moving_scope import (
 
 def test_every_frame_of_a_short_recording_gets_depth() -> None:
     frames, cameras = video(6, SIDEWAYS)
-    given, doubts = frames_with_parallax(frames, cameras)
+    given, doubts, at_rest = frames_with_parallax(frames, cameras)
     assert not doubts
+    assert at_rest
     for frame in given:
         assert frame.depth is not None
         assert frame.depth_confidence is not None
@@ -37,7 +38,7 @@ def test_every_frame_of_a_short_recording_gets_depth() -> None:
 
 def test_only_what_is_believed_is_learned_from() -> None:
     frames, cameras = video(6, SIDEWAYS)
-    frame = frames_with_parallax(frames, cameras)[0][0]
+    frame = frames_with_parallax(frames, cameras).frames[0]
     assert frame.depth is not None
     assert frame.depth_confidence is not None
     learned = Observation.of(frame, cameras[0]).depth
@@ -49,7 +50,7 @@ def test_only_what_is_believed_is_learned_from() -> None:
 def test_key_frames_are_spread_over_a_long_recording(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parallax, "MOST_KEY_FRAMES", 3)
     frames, cameras = video(9, SIDEWAYS)
-    given, _ = frames_with_parallax(frames, cameras)
+    given = frames_with_parallax(frames, cameras).frames
     assert [number for number, frame in enumerate(given) if frame.depth is not None] == [0, 4, 8]
 
 
@@ -57,14 +58,14 @@ def test_what_is_long_ago_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(parallax, "WINDOW_S", 0.05)
     frames, cameras = video(6, SIDEWAYS)
     apart = [frame.with_fields(pts_ns=number * 100_000_000) for number, frame in enumerate(frames)]
-    given, doubts = frames_with_parallax(apart, cameras)
+    given, doubts, _ = frames_with_parallax(apart, cameras)
     assert doubts == {"the scope stands still": 6}
     assert all(frame.depth is None for frame in given)
 
 
 def test_wrong_poses_are_said() -> None:
     frames, _ = video(6, SIDEWAYS)
-    given, doubts = frames_with_parallax(frames, [camera_at((0.0, 0.02 * number, 0.0)) for number in range(6)])
+    given, doubts, _ = frames_with_parallax(frames, [camera_at((0.0, 0.02 * number, 0.0)) for number in range(6)])
     assert all(frame.depth is None for frame in given)
     assert sum(doubts.values()) == 6
     assert any("poses" in doubt for doubt in doubts)
@@ -72,9 +73,9 @@ def test_wrong_poses_are_said() -> None:
 
 def test_still_cameras_known_depth_and_other_projections_are_left_alone() -> None:
     frames, cameras = video(4, SIDEWAYS)
-    assert frames_with_parallax(frames, [FIRST] * 4) == (frames, {})
+    assert frames_with_parallax(frames, [FIRST] * 4) == (frames, {}, False)
     known = [frames[0].with_fields(depth=depth_of_surface()), *frames[1:]]
-    assert frames_with_parallax(known, cameras) == (known, {})
+    assert frames_with_parallax(known, cameras) == (known, {}, False)
     for model in ("fisheye", "ortho"):
         others = [Camera(each.K, WIDTH, HEIGHT, each.world_to_camera, model) for each in cameras]  # type: ignore[arg-type]
-        assert frames_with_parallax(frames, others) == (frames, {})
+        assert frames_with_parallax(frames, others) == (frames, {}, False)
