@@ -86,7 +86,9 @@ class Scores:
         with torch.no_grad():
             left = render(now, self._camera.with_pose(pose))
             if eye is not None:
-                self._views[frame.seq] = render(now, eye.with_pose(eye.world_to_camera @ pose)).image.cpu().numpy()
+                self._views[frame.seq] = (
+                    render(now.seen_by_right(), eye.with_pose(eye.world_to_camera @ pose)).image.cpu().numpy()
+                )
         value = psnr_tissue_db((left.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu(), frame.image, frame.mask)
         self._left.append(value)
         if frame.time_s >= 1:
@@ -121,7 +123,7 @@ def live(asked: Asked, eyes: str, camera: Camera) -> LiveReconstructor:
     settings = LiveSettings(source="", out=Path(), device=asked.device, eyes=eyes)  # type: ignore[arg-type]
     config = replace(settings.reconstructor_config(camera.width_px * camera.height_px), **asked.set)
     learning = LiveReconstructor(config, camera, live=settings.chosen_training, device=asked.device)
-    warm_reconstructor(learning)
+    warm_reconstructor(learning, stereo=eyes == "both")
     return learning
 
 

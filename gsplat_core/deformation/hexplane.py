@@ -288,4 +288,5 @@ class HexPlaneField(DeformationField):
             log_scales=gaussians.log_scales + log_scale,
             logit_opacities=gaussians.logit_opacities + opacity[:, 0],
             sh=gaussians.sh,
+            right_sh=gaussians.right_sh,
         )

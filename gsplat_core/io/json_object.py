@@ -69,6 +69,13 @@ class JsonObject:
             raise BundleCorrupt(f"{self.name}: {key} must be one of {', '.join(choices)}, got {shortened(value)}")
         return value
 
+    def boolean(self, key: str) -> bool:
+        """True or false."""
+        value = self.values.get(key)
+        if not isinstance(value, bool):
+            raise BundleCorrupt(f"{self.name}: {key} must be true or false, got {shortened(value)}")
+        return value
+
     def digest(self, key: str) -> str:
         """A SHA-256."""
         value = self.values.get(key)

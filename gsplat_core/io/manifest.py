@@ -18,7 +18,7 @@ from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from gsplat_core.scene.model import Model
-from gsplat_core.value_ranges import IntegerIn, NumberIn, shortened
+from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 FORMAT_VERSION = 1
 MAX_MANIFEST_BYTES = 1 << 20
@@ -62,6 +62,8 @@ class Manifest:
     tensors_sha256: str
     parameters: int | None
     depth_source: DepthSource | None = None
+    right_eye: bool = False
+    """Whether the right eye sees other colours."""
 
     def skeleton(self) -> tuple[Gaussians, DeformationField | None]:
         """Gaussians and field of the described shapes on the meta device: no memory is taken for them."""
@@ -69,7 +71,7 @@ class Manifest:
             n, k = self.count, (self.sh_degree + 1) ** 2
             gaussians = Gaussians(
                 torch.empty(n, 3), torch.empty(n, 4), torch.empty(n, 3), torch.empty(n), torch.empty(n, k, 3)
-            )
+            ).with_right(self.right_eye)
             return gaussians, None if self.field is None else field_from_config(self.field, gaussians)
 
 
@@ -114,14 +116,13 @@ def parse_manifest(text: bytes, name: str) -> Manifest:
         tensors_sha256=tensors.digest("sha256"),
         parameters=root.integer("parameters", PARAMETERS) if "parameters" in root.values else None,
         depth_source=None if root.values.get("depth") is None else _depth_source(root.nested("depth")),
+        right_eye=gaussians.boolean("right_eye") if "right_eye" in gaussians.values else False,
     )
 
 
 def _depth_source(reader: JsonObject) -> DepthSource:
     origin = DepthOrigin(reader.choice("origin", DEPTH_ORIGINS))
-    metric = reader.values.get("metric")
-    if not isinstance(metric, bool):
-        raise BundleCorrupt(f"{reader.name}: metric must be true or false, got {shortened(metric)}")
+    metric = reader.boolean("metric")
     if metric and origin in UNITLESS:
         raise BundleCorrupt(f"{reader.name}: depth of origin {origin.value!r} has no unit, and metric is true")
     return DepthSource(origin, metric)

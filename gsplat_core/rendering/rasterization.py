@@ -63,7 +63,7 @@ def render(gaussians: Gaussians, camera: Camera, background: Tensor | None = Non
         require_shape("background", background, (3,), "[3]")
     viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
     followed = torch.is_grad_enabled() and any(
-        t.requires_grad for t in (*gaussians.tensors().values(), background) if t is not None
+        t.requires_grad for t in (*gaussians.left_tensors, background) if t is not None
     )
     if gaussians.device.type == "cuda" and gaussians.dtype == torch.float32 and not followed:
         return _render_frame(gaussians, camera, viewmat, intrinsics, background, depth)
@@ -90,7 +90,7 @@ def _render_frame(
     capacity = INSTANCES_PER_GAUSSIAN * max(gaussians.count, SMALLEST_SCENE)
     view = View(viewmat, intrinsics, camera.width_px, camera.height_px, background, camera.model)
     while True:
-        frame = render_frame(tuple(gaussians.tensors().values()), None, view, capacity)
+        frame = render_frame(gaussians.left_tensors, None, view, capacity)
         status = HostCopy(frame.status).numpy()
         if not status[STATUS_OVERFLOW]:
             z = frame.image[..., 3] if depth else torch.zeros_like(frame.alphas)

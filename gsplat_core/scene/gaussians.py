@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -33,6 +33,8 @@ class Gaussians:
     """Logit of the opacities [N]."""
     sh: Tensor
     """Spherical-harmonics coefficients [N, K, 3], K = (degree + 1)²; the colour is their sum plus 0.5, at least 0."""
+    right_sh: Tensor | None = None
+    """What the right eye of a stereo scope sees otherwise: to be added to `sh` for it, of the same shape. None: nothing."""
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.dim() else -1
@@ -46,6 +48,10 @@ class Gaussians:
         if self.sh.dim() != 3 or self.sh.shape[0] != n or self.sh.shape[1] not in bases or self.sh.shape[2] != 3:
             raise InvalidInput(
                 f"gaussians: sh must be [N, K, 3] with N = {n} and K one of {bases}, got {list(self.sh.shape)}"
+            )
+        if self.right_sh is not None and self.right_sh.shape != self.sh.shape:
+            raise InvalidInput(
+                f"gaussians: right_sh must be {list(self.sh.shape)} as sh is, got {list(self.right_sh.shape)}"
             )
         kinds = {(tensor.dtype, tensor.device) for tensor in self.tensors().values()}
         if len(kinds) != 1 or not self.means.is_floating_point():
@@ -87,17 +93,34 @@ class Gaussians:
         return self.means.dtype
 
     def tensors(self) -> dict[str, Tensor]:
-        """The five tensors by name, in the order of the fields."""
+        """The tensors by name, in the order of the fields; five, and `right_sh` where there is one."""
+        right = {} if self.right_sh is None else {"right_sh": self.right_sh}
         return {
             "means": self.means,
             "quats": self.quats,
             "log_scales": self.log_scales,
             "logit_opacities": self.logit_opacities,
             "sh": self.sh,
+            **right,
         }
 
+    @property
+    def left_tensors(self) -> tuple[Tensor, ...]:
+        """The five tensors that a picture is rendered from, in the order of the fields."""
+        return self.means, self.quats, self.log_scales, self.logit_opacities, self.sh
+
+    def seen_by_right(self) -> Gaussians:
+        """As the right eye sees them: Gaussians whose `sh` is what it sees."""
+        return self if self.right_sh is None else replace(self, sh=self.sh + self.right_sh, right_sh=None)
+
+    def with_right(self, wanted: bool = True) -> Gaussians:
+        """With a `right_sh`, 0 where there was none; or without it."""
+        if (self.right_sh is not None) == wanted:
+            return self
+        return replace(self, right_sh=torch.zeros_like(self.sh) if wanted else None)
+
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
-        """The Gaussians with `function` applied to each of the five tensors."""
+        """The Gaussians with `function` applied to each of the tensors."""
         return Gaussians(**{name: function(tensor) for name, tensor in self.tensors().items()})
 
     def detach(self) -> Gaussians:
@@ -113,7 +136,7 @@ class Gaussians:
         return self.map(lambda tensor: tensor.to(device=device, dtype=dtype))
 
     def requires_grad_(self, requires_grad: bool = True) -> Gaussians:
-        """Mark the five tensors as leaves to differentiate; returns self."""
+        """Mark the tensors as leaves to differentiate; returns self."""
         for tensor in self.tensors().values():
             tensor.requires_grad_(requires_grad)
         return self
@@ -123,12 +146,13 @@ class Gaussians:
         return self.map(lambda tensor: tensor[index])
 
     def append(self, other: Gaussians) -> Gaussians:
-        """These followed by the others; both must have the same SH degree, dtype and device."""
+        """These followed by the others; both must have the same SH degree, dtype and device. `right_sh` is there where these have it, 0 where the
+        others do not."""
         if other.sh_degree != self.sh_degree:
             raise InvalidInput(f"gaussians: cannot append SH degree {other.sh_degree} to degree {self.sh_degree}")
         if (other.dtype, other.device) != (self.dtype, self.device):
             raise InvalidInput(
                 f"gaussians: cannot append {other.dtype} on {other.device} to {self.dtype} on {self.device}"
             )
-        theirs = other.tensors()
+        theirs = other.with_right(self.right_sh is not None).tensors()
         return Gaussians(**{name: torch.cat([tensor, theirs[name]]) for name, tensor in self.tensors().items()})

@@ -132,6 +132,12 @@ class Model:
         object.__setattr__(self, "_last", (time_s, deformed))
         return deformed
 
+    def seen_by_right(self) -> Model:
+        """As the right eye of a stereo scope sees it: itself, unless both eyes were trained on, which see other colours."""
+        if self.gaussians.right_sh is None:
+            return self
+        return dataclasses.replace(self, gaussians=self.gaussians.seen_by_right())
+
     def render(
         self, time_s: float, camera: Camera | None = None, background: Tensor | None = None, depth: bool = True
     ) -> RenderOutput:
@@ -150,8 +156,9 @@ class Model:
         source = self.depth_source
         # Left out where it is not known: such a model has the digest that it had before this was kept.
         depth = {} if source is None else {"depth": {"origin": source.origin.value, "metric": source.metric}}
+        right = {} if self.gaussians.right_sh is None else {"right_eye": True}
         return {
-            "gaussians": {"count": self.gaussians.count, "sh_degree": self.gaussians.sh_degree},
+            "gaussians": {"count": self.gaussians.count, "sh_degree": self.gaussians.sh_degree, **right},
             "field": None if self.field is None else self.field.config(),
             "camera": {
                 "K": self.camera.K.tolist(),

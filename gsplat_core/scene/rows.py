@@ -7,6 +7,7 @@ scene may become. The rows in use come first; those behind them are inert: opaci
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -79,7 +80,7 @@ class GaussianRows:
     def replace(self, gaussians: Gaussians) -> None:
         """Let other Gaussians take the place of all."""
         self._use(gaussians.count)
-        for tensor, values in zip(self.used.tensors().values(), gaussians.tensors().values(), strict=True):
+        for tensor, values in self._beside(gaussians):
             tensor.copy_(values)
         self._make_inert(gaussians.count)
 
@@ -87,7 +88,7 @@ class GaussianRows:
         """Write Gaussians into the rows behind those in use."""
         first = self.used.count
         self._use(first + added.count)
-        for tensor, values in zip(self.used.tensors().values(), added.tensors().values(), strict=True):
+        for tensor, values in self._beside(added):
             tensor[first:] = values
 
     def close_gaps(self, moves: RowMoves) -> None:
@@ -96,6 +97,11 @@ class GaussianRows:
             moves.apply(tensor, 0.0)
         self._make_inert(moves.count)
         self._use(moves.count)
+
+    def _beside(self, others: Gaussians) -> Iterator[tuple[Tensor, Tensor]]:
+        """Each tensor in use beside that of others."""
+        others = others.with_right(self.used.right_sh is not None)
+        return zip(self.used.tensors().values(), others.tensors().values(), strict=True)
 
     def _use(self, count: int) -> None:
         if count > self.capacity:

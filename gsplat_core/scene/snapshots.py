@@ -290,4 +290,5 @@ class _DeviceOrder:
 
 
 def _fits(gaussians: Gaussians, capacity: Gaussians) -> bool:
-    return gaussians.count <= capacity.count and gaussians.sh_degree == capacity.sh_degree
+    same_kind = gaussians.sh_degree == capacity.sh_degree and gaussians.tensors().keys() == capacity.tensors().keys()
+    return gaussians.count <= capacity.count and same_kind

@@ -42,7 +42,7 @@ def shares_of(step: TrainingStep, observations: Sequence[Observation]) -> Shares
     count = step.gaussians.count
     seen, error = (step.gaussians.means.new_zeros(count) for _ in range(2))
     for one in observations:
-        now = step.at(one.time_s)
+        now = step.seen_by(one)
         with torch.no_grad():
             picture = render(now, one.camera).image
             tissue = (one.mask > 0).to(picture.dtype)

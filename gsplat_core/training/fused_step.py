@@ -20,6 +20,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import COLOUR
 from gsplat_core.training.colour_correction import ResidualTarget
+from gsplat_core.training.eye_gradients import LEFT, RIGHT
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
 from gsplat_core.training.photometric import LossWeights
@@ -64,9 +65,11 @@ class FusedStep:
         self._status = FrameStatusCopy()
         self._memory = GraphMemory(device)
         self._capacity = capacity_for(4 * gaussians.count)
-        self._captured: dict[bool, CapturedSequence[Tensor]] = {}
-        """By whether colours are corrected. One never runs beside the other, and neither reads what the other left in the memory that they share."""
-        self._warm = False
+        self._captured: dict[tuple[bool, bool], CapturedSequence[Tensor]] = {}
+        """By whether colours are corrected, and whether they are the right eye's own. One never runs beside another, and none reads what another left
+        in the memory that they share."""
+        self._warm: set[tuple[bool, bool]] = set()
+        self._of_right = False
 
     def __call__(
         self,
@@ -90,19 +93,21 @@ class FusedStep:
         """
         corrects = colour_relaxation > 0
         self._take(observation, corrects)
-        rates = [gaussian_rates[name] for name in GAUSSIAN_TENSORS]
+        self._of_right = observation.of_right and gaussians.right_sh is not None
+        rates = [gaussian_rates[name] for name in self._names]
         in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
         self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates, colour_relaxation])
         self._gaussians = gaussians
         self._adam.steps += 1
-        if not self._warm:  # kernels are loaded by their first launch, which is not possible during a capture
-            self._warm = True
+        kind = corrects, self._of_right
+        if kind not in self._warm:  # kernels are loaded by their first launch, which is not possible during a capture
+            self._warm.add(kind)
             return self._sequence()
         if self._was_replaced():
             self._captured.clear()  # their memory serves the next captures
-        if corrects not in self._captured:
-            self._captured[corrects] = CapturedSequence(self._sequence, self._image.device, self._memory, warm_up=False)
-        return self._captured[corrects].replay().clone()
+        if kind not in self._captured:
+            self._captured[kind] = CapturedSequence(self._sequence, self._image.device, self._memory, warm_up=False)
+        return self._captured[kind].replay().clone()
 
     def restart(self) -> None:
         """The tensors hold another scene and Adam counts its steps from 1 again; nothing is captured anew."""
@@ -154,7 +159,9 @@ class FusedStep:
         counts = [len(GAUSSIAN_TENSORS), 1, self._field.rates, 1]
         in_frame, of_means, of_field, relaxation = self._controls.rates.split(counts)
         scene, controls = self._gaussians, self._controls
-        gaussians = tuple(scene.tensors().values())
+        right_sh = scene.right_sh if self._of_right else None
+        seen = scene if right_sh is None else scene.seen_by_right()
+        gaussians = seen.left_tensors
         deltas = self._field.deltas(scene, controls.time)
         camera = self._camera
         view = View(controls.viewmat, controls.intrinsics, camera.width_px, camera.height_px, camera_model=camera.model)
@@ -176,19 +183,30 @@ class FusedStep:
         change = None
         if correction is not None:
             change = gradient[:, COLOUR].clone()
+        if right_sh is not None:
+            right_sh.copy_(seen.sh - scene.sh)  # with what Adam added
+        if correction is not None or right_sh is not None:
             gradient[:, COLOUR].zero_()
         self._field.update(gradient, controls.time, of_field, self._step, frame.status)
         if change is not None:
-            self._field.add_colours(change, controls.time)
+            if right_sh is None:
+                self._field.add_colours(change, controls.time)
+            else:
+                right_sh[:, 0].add_(change)
         if self._field.reads_positions:
             self._move(scene.means, gradient, of_means, fits)
         return loss.loss
 
+    @property
+    def _names(self) -> tuple[str, ...]:
+        """Of the tensors that a step trains, as the ops take them: with the colours of its eye."""
+        return (*GAUSSIAN_TENSORS[:-1], RIGHT if self._of_right else LEFT)
+
     def _moments(self) -> tuple[list[Tensor], list[Tensor]]:
         """Adam's moments of the Gaussians in the frame's pass. Where the field has a part in the positions' gradient, they do not move
         there: their rate is 0, and the moments are others that nobody reads."""
-        first = [self._adam.first_moments[name] for name in GAUSSIAN_TENSORS]
-        second = [self._adam.second_moments[name] for name in GAUSSIAN_TENSORS]
+        first = [self._adam.first_moments[name] for name in self._names]
+        second = [self._adam.second_moments[name] for name in self._names]
         if self._field.reads_positions:
             if self._unread is None or self._unread[0].shape != first[0].shape:
                 self._unread = torch.zeros_like(first[0]), torch.zeros_like(second[0])

@@ -23,6 +23,7 @@ from gsplat_core.training.observe_report import ObserveReport
 from gsplat_core.training.out_of_view import OutOfView
 from gsplat_core.training.places import Place, Places
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.right_eye import for_eyes
 from gsplat_core.training.start_on_device import StartOnDevice
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.upkeep import Upkeep
@@ -255,13 +256,11 @@ class LiveReconstructor(Reconstructor):
         if self._out_of_view is not None:
             self._out_of_view.restart()
         camera = observation.camera
-        self._upkeep = None
-        if self.config.history_s is not None:
-            self._upkeep = Upkeep(camera, self.config)
+        self._upkeep = None if self.config.history_s is None else Upkeep(camera, self.config)
         same_size = self._kept_size == (camera.width_px, camera.height_px)
         self._kept_size = camera.width_px, camera.height_px
         if kept is not None and same_size and end_s is None:
-            gaussians = self._first_gaussians(frame, observation)
+            gaussians = for_eyes(self._first_gaussians(frame, observation), observation)
             if kept.restart(gaussians, observation.time_s, self.camera):
                 self._step = kept
                 if self._prior is not None:

@@ -214,4 +214,6 @@ def newest_state(step: TrainingStep, prior: MotionPrior, learned_s: float) -> tu
         continuation.write(still if velocity is None else velocity, learned_s, prior.horizon_s)
         now = displaced(step.gaussians, deltas)
         # The field adds nothing to opacities, so that these are still those that training changes.
-        return replace(now, logit_opacities=now.logit_opacities.clone()), NewestState(learned_s, continuation)
+        right = None if now.right_sh is None else now.right_sh.clone()
+        own = replace(now, logit_opacities=now.logit_opacities.clone(), right_sh=right)
+        return own, NewestState(learned_s, continuation)

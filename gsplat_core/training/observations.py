@@ -35,6 +35,8 @@ class Observation:
     """uint8 [H, W]; 0 = left out when the frame is trained on again later."""
     right: Observation | None = None
     """What the right eye saw at the same time, where it is trained on as well (`BothEyes`)."""
+    of_right: bool = False
+    """Whether it is such an observation of the right eye."""
 
     def to_rehearse(self) -> Observation:
         """The frame as it is trained on again later."""

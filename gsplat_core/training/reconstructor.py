@@ -30,7 +30,7 @@ from gsplat_core.training.observe_report import ObserveReport
 from gsplat_core.training.offline import FitSettings, OfflineTraining
 from gsplat_core.training.parallax import to_fit
 from gsplat_core.training.placement import Placement
-from gsplat_core.training.right_eye import BothEyes
+from gsplat_core.training.right_eye import BothEyes, for_eyes
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_tracks import SurfaceTracks
 from gsplat_core.transfers import HostCopy
@@ -263,7 +263,7 @@ class Reconstructor:
         ).to(self.device)
 
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
-        gaussians = self._first_gaussians(frame, observation)
+        gaussians = for_eyes(self._first_gaussians(frame, observation), observation)
         wanted = NewField(gaussians, observation.time_s, end_s, self.config.bump_spacing_s, self.config.history_s)
         with torch.random.fork_rng(devices=[]):  # planes and layers start random
             torch.manual_seed(self._seed)

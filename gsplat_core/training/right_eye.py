@@ -13,6 +13,7 @@ from gsplat_core.endoscope.highlights import HighlightFinder
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import Eyes
 from gsplat_core.training.eye_colours import EyeColours
 from gsplat_core.training.initialisation import believed_depth, unprojected
@@ -70,6 +71,7 @@ class BothEyes:
                 image=tensor_of(image, self._device),
                 mask=tensor_of(mask, self._device),
                 depth=None,
+                of_right=True,
                 rehearsal_mask=None if steady is None else tensor_of(steady, self._device),
             ),
         )
@@ -77,6 +79,11 @@ class BothEyes:
     def _tissue(self, frame: Frame, camera: Camera, right: Camera) -> NDArray[np.uint8]:
         shift = self._colours.shift or 0.0
         return right_tissue(frame, camera, right, shift * frame.width_px)
+
+
+def for_eyes(gaussians: Gaussians, observation: Observation) -> Gaussians:
+    """What a scene starts with: Gaussians with colours for the right eye, where it is trained on."""
+    return gaussians.with_right(observation.right is not None)
 
 
 def right_tissue(frame: Frame, camera: Camera, right: Camera, shift_px: float) -> NDArray[np.uint8]:

@@ -15,6 +15,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.rows import GaussianRows, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.eye_gradients import LEFT, RIGHT, RIGHT_RATE, with_eye
 from gsplat_core.training.field_training import AutogradTraining
 from gsplat_core.training.fused_step import FusedStep
 from gsplat_core.training.observations import Observation
@@ -95,11 +96,19 @@ class TrainingStep:
             return self._captured_step(self._captured, observation, rate_scale)
         deformed = self._training.deform(self.gaussians, observation.time_s)
         relaxation = colour_relaxation if self.field.takes_colours else 0.0
-        compared = loss_and_gradients(deformed, observation, self._weights, relaxation)
-        own = self._training.update(compared.gradients, self._field_rates.scaled(self._mm_per_px, rate_scale))
+        right_sh = self.gaussians.right_sh
+        of_right = observation.of_right and right_sh is not None
+        compared = loss_and_gradients(_seen_by(deformed, observation), observation, self._weights, relaxation)
+        gradients = compared.gradients if right_sh is None else with_eye(compared.gradients, of_right)
+        own = self._training.update(gradients, self._field_rates.scaled(self._mm_per_px, rate_scale))
+        if right_sh is not None:
+            own = {**own, LEFT if of_right else RIGHT: None}  # the other eye's colours stay as they are
         self._adam.step(self.gaussians.tensors(), own, self._gaussian_rates(rate_scale))
         if compared.colour_change is not None:
-            self.field.add_colours(observation.time_s, compared.colour_change)
+            if of_right and right_sh is not None:
+                right_sh[:, 0] += compared.colour_change
+            else:
+                self.field.add_colours(observation.time_s, compared.colour_change)
         return compared.loss
 
     def scale_about(self, camera: Camera, factor: Tensor) -> None:
@@ -164,6 +173,10 @@ class TrainingStep:
             deformed: Gaussians = self.field(self.gaussians, time_s)
         return deformed
 
+    def seen_by(self, observation: Observation) -> Gaussians:
+        """The scene at an observation's time, in the colours that its eye sees."""
+        return _seen_by(self.at(observation.time_s), observation)
+
     def copy(self) -> tuple[Gaussians, DeformationField]:
         """Gaussians and field with memory of their own, free of training state."""
         return self.gaussians.detach().clone(), self.field.detached_copy()
@@ -207,6 +220,8 @@ class TrainingStep:
     def restart(self, gaussians: Gaussians, time_s: float, camera: Camera) -> bool:
         """Begin with another scene of the same camera size in the same memory; False, with nothing changed, where that cannot be."""
         count = gaussians.count
+        if gaussians.tensors().keys() != self.gaussians.tensors().keys():
+            return False
         if self._rows is None or count > self._rows.capacity or not self.field.restart(time_s, count):
             return False
         self._rows.replace(gaussians)
@@ -238,10 +253,16 @@ class TrainingStep:
 
     def _gaussian_rates(self, rate_scale: float) -> dict[str, float]:
         rates = self._rates
+        right = {} if self.gaussians.right_sh is None else {RIGHT: RIGHT_RATE * rates.sh * rate_scale}
         return {
             "means": rates.means_px * self._mm_per_px * rate_scale,
             "quats": rates.quats * rate_scale,
             "log_scales": rates.log_scales * rate_scale,
             "logit_opacities": rates.logit_opacities * rate_scale,
-            "sh": rates.sh * rate_scale,
+            LEFT: rates.sh * rate_scale,
+            **right,
         }
+
+
+def _seen_by(scene: Gaussians, observation: Observation) -> Gaussians:
+    return scene.seen_by_right() if observation.of_right else scene

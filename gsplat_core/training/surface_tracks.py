@@ -71,8 +71,7 @@ class SurfaceTracks:
         # What a tool hides for a while stands out from what is around it as it did before and does afterwards.
         depth = smooth * between_known(relief, torch.ones_like(relief), self._times)
         depth = between_known(depth, depth, self._times)
-        places = torch.stack([_world(pixels[k], depth[:, k], one) for k, one in enumerate(self._seen)], dim=1)
-        return held_outside(places, self._inside(pixels), number)
+        return torch.stack([_world(pixels[k], depth[:, k], one) for k, one in enumerate(self._seen)], dim=1)
 
     def _across(self, points: Tensor, number: int) -> Tensor:
         """As `trajectories`, with motion across each picture alone: depths of tissue at rest differ from frame to frame by what is uncertain, and a
@@ -130,11 +129,6 @@ class SurfaceTracks:
             before.append(before[-1] + motion.at(before[-1]))
         return before[:0:-1] + after
 
-    def _inside(self, pixels: Sequence[Tensor]) -> Tensor:
-        """Whether each frame's picture shows its pixels, bool [N, T] of T times [N, 2]."""
-        size = beside(pixels[0], [self._frames[0].width_px, self._frames[0].height_px])
-        return torch.stack([((here >= 0) & (here <= size)).all(dim=1) for here in pixels], dim=1)
-
 
 @dataclass(frozen=True)
 class SurfaceDepth:
@@ -163,16 +157,6 @@ class SurfaceDepth:
             self.planes[None], grid, padding_mode="border", align_corners=False
         )[0, :, 0]
         return smooth, torch.where(known > 1 - 1e-3, found / smooth, 0.0)
-
-
-def held_outside(places: Tensor, inside: Tensor, number: int) -> Tensor:
-    """`places` [N, T, 3] of points followed from frame `number` on, forth and back; from where one leaves the picture, `inside` [N, T], it stays
-    where it was seen last. Nothing follows it there, and a scope that comes back finds it."""
-    lasts = inside[:, number:].long().cumprod(1).cumsum(1)[:, 1:]
-    firsts = inside[:, : number + 1].flip(1).long().cumprod(1).cumsum(1)[:, 1:].flip(1)
-    start = torch.full_like(places[:, :1, 0], number, dtype=torch.int64)
-    index = torch.cat([number - (firsts - 1).clamp(min=0), start, number + (lasts - 1).clamp(min=0)], dim=1)
-    return places.gather(1, index[..., None].expand(-1, -1, 3))
 
 
 def between_known(values: Tensor, otherwise: Tensor, times: Tensor) -> Tensor:

@@ -129,7 +129,9 @@ class Upkeep:
         scene.log_scales.add_(part[:, None] * (math.log(usual) - scene.log_scales))
         scene.log_scales.clamp_(math.log(THINNEST_PX * pixel), math.log(WIDEST * usual))
         scene.logit_opacities.sub_(part * scene.logit_opacities)
-        scene.sh.sub_(part[:, None, None] * scene.sh)
+        for colours in (scene.sh, scene.right_sh):
+            if colours is not None:
+                colours.sub_(part[:, None, None] * colours)
 
     def _towards_surface(self, step: TrainingStep, seen: Seen, since: int, observation: Observation) -> Tensor:
         """Factors [N] of the distances from the camera that bring what is shown nearer to the depth of what lies around it, `since` so many steps.

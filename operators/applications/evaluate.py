@@ -117,7 +117,7 @@ class _Work:
         asked = name in self.settings.protocols
         if not asked and (self.settings.protocols or name not in WITHOUT_LEARNING):
             return False
-        if not asked and name == "second_eye" and not self._is_stereo:
+        if not asked and name == "second_eye" and not self.source.description.is_stereo:
             return False
         reason = self._why_not(name)
         if reason is None:
@@ -133,7 +133,7 @@ class _Work:
                 self.notes.append("nothing says whether the held-out frames were kept from the model's training")
             elif not self.run.heldout:
                 return "the run trained on the held-out frames; make it with --heldout, or by reconstruct"
-        if name == "second_eye" and not self._is_stereo:
+        if name == "second_eye" and not self.source.description.is_stereo:
             return "the recording has no right eye"
         if name == "live":
             if self.run is None:
@@ -221,12 +221,8 @@ class _Work:
             settings.poses,
         )
 
-    @property
-    def _is_stereo(self) -> bool:
-        return "right_image" in self.source.description.fields
-
     def _second_eye(self) -> SecondEye | None:
-        shown = self._of_final_model()
+        shown = self._of_final_model(right=True)
         with self._log("second_eye") as record:
             found = evaluate_second_eye(
                 self._frames("second_eye"),
@@ -254,11 +250,13 @@ class _Work:
             if name in ("live", "causal")
         }
 
-    def _of_final_model(self):  # type: ignore[no-untyped-def]
-        """What the final model shows for a frame."""
+    def _of_final_model(self, right: bool = False):  # type: ignore[no-untyped-def]
+        """What the final model shows for a frame, in the colours that the left or the right eye sees."""
         settings, camera = self.settings, self.camera
         self._require_memory_of_picture()
         model = self.model.to(settings.device)
+        if right:
+            model = model.seen_by_right()
         pictures = PictureMaker(camera, settings.device, settings.renderer)
         return lambda frame, eye=None: pictures(model, frame, eye)
 

@@ -65,7 +65,7 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
         return scene, parts.rasterizer.draw(scene)
 
     with seeded(settings.seed, settings.device):
-        warm_reconstructor(parts.reconstructor, draw)
+        warm_reconstructor(parts.reconstructor, draw, stereo=source.description.is_stereo)
     return parts
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +76,10 @@ def render_model(
     shown = view_of(model, camera, view)
     check_width(shown.across * camera.width_px)
     frames = frames_to_render(shown.window_s, fps)
-    pictures = _Pictures(model, new_renderer(renderer, camera, device), shown)
+    eyes = [(model, new_renderer(renderer, camera, device))]
+    if shown.across == 2 and model.gaussians.right_sh is not None:
+        eyes.append((model.seen_by_right(), new_renderer(renderer, camera, device)))
+    pictures = _Pictures(eyes, shown)
     images = _images(pictures, frames, fps, progress, stop_requested)
     if not to_video:
         return _write_images(images, bundle, out)
@@ -87,19 +91,22 @@ def render_model(
 class _Pictures:
     """Draws a model from a view; for one thread."""
 
-    def __init__(self, model: Model, renderer: Renderer, view: View) -> None:
-        self._renderer, self.view = renderer, view
-        renderer.prepare(model)
+    def __init__(self, eyes: Sequence[tuple[Model, Renderer]], view: View) -> None:
+        """eyes: the model as each eye sees it, and its renderer; one for all of the view's pictures, or one for each."""
+        self._renderers, self.view = [renderer for _, renderer in eyes], view
+        for model, renderer in eyes:
+            renderer.prepare(model)
 
     def at(self, time_s: float) -> NDArray[np.uint8]:
         """RGB uint8 [H, W, 3]: the view's pictures side by side."""
         with torch.inference_mode():
-            return np.hstack([self._picture(camera, time_s) for camera in self.view.cameras(time_s)])
+            drawn = zip(cycle(self._renderers), self.view.cameras(time_s), strict=False)
+            return np.hstack([self._picture(renderer, camera, time_s) for renderer, camera in drawn])
 
-    def _picture(self, camera: Camera, time_s: float) -> NDArray[np.uint8]:
+    def _picture(self, renderer: Renderer, camera: Camera, time_s: float) -> NDArray[np.uint8]:
         if not self.view.is_virtual:
-            return displayed(self._renderer.render(camera, time_s, ("image",)).result().image)
-        output = self._renderer.render(camera, time_s, ("image", "alpha")).result()
+            return displayed(renderer.render(camera, time_s, ("image",)).result().image)
+        output = renderer.render(camera, time_s, ("image", "alpha")).result()
         image, alpha = np.array(displayed(output.image)), HostCopy(output.alpha).numpy()
         mark_unobserved(image, alpha)
         return image

@@ -17,12 +17,17 @@ from gsplat_core.training.live import LiveReconstructor
 WARM_FRAMES = 4
 WARM_STEPS = {"cpu": 3, "cuda": 40}
 """Optimiser steps on each picture before the first frame."""
+EYES_APART = 0.07
+"""Of the scene's distance, where nothing is known of the stream's eyes yet."""
 
 
 def warm_reconstructor(
-    reconstructor: LiveReconstructor, draw: Callable[[Frame, Model | Snapshot], object] = lambda *_: None
+    reconstructor: LiveReconstructor,
+    draw: Callable[[Frame, Model | Snapshot], object] = lambda *_: None,
+    *,
+    stereo: bool = False,
 ) -> None:
-    """Train on noise and forget it; `draw` is given each picture and its model.
+    """Train on noise and forget it; `draw` is given each picture and its model. stereo: as in a stream that has pictures of a right eye.
 
     Replay of a recorded session does the same: a GPU's tile lists, which noise has made longer, decide which steps are taken again.
     """
@@ -35,6 +40,9 @@ def warm_reconstructor(
     for frames in (WARM_FRAMES, 1):  # the second scene takes over the memory of the first one, as the stream's does
         for seq in range(frames):
             frame = Frame(seq, seq * 33_000_000, image, mask=tissue)
+            if stereo:
+                right = reconstructor.camera.right_eye(EYES_APART * reconstructor.config.default_depth_mm)
+                frame = frame.with_fields(right_image=image, right_camera=right)
             # Budgets in time, so that the length of a step is known.
             reconstructor.observe(frame, budget=Budget.until(0.0, at_least=WARM_STEPS[reconstructor.device.type]))
             # All of them are held: every snapshot and piece of page-locked memory that a run needs is made.

@@ -44,6 +44,11 @@ class SourceDescription:
     notes: tuple[str, ...] = ()
     """Fallbacks that were taken, in sentences."""
 
+    @property
+    def is_stereo(self) -> bool:
+        """Whether frames have a picture of the right eye."""
+        return "right_image" in self.fields
+
 
 @runtime_checkable
 class FrameSource(Protocol):

@@ -112,7 +112,7 @@ def test_steps_that_correct_colours_do_not_look_at_depth_and_others_between_them
         for turn in range(40):
             step(gaussians, one, 0.0, rates, [], 0.0 if turn % 2 else 1.5)
         assert step.settle() == 0
-        assert sorted(step._captured) == [False, True]
+        assert sorted(step._captured) == [(False, False), (True, False)]
         depths[with_depth] = float(gaussians.means[:, 2].median())
     assert depths[True] > depths[False] + 0.01
     corrected = []
@@ -124,6 +124,35 @@ def test_steps_that_correct_colours_do_not_look_at_depth_and_others_between_them
         corrected.append(gaussians)
     for name, tensor in corrected[0].tensors().items():
         assert torch.equal(tensor, corrected[1].tensors()[name]), name
+
+
+@pytest.mark.parametrize("relaxation", [0.0, 1.5])
+def test_the_right_eye_trains_its_own_colours_as_on_the_cpu(make_gaussians, observation, relaxation):
+    """Several steps of both eyes by turns, whose pictures differ in colour: the same as without a captured graph."""
+    from gsplat_core.training.eye_gradients import with_eye
+    from gsplat_core.training.photometric import loss_and_gradients
+
+    left = dataclasses.replace(observation, depth=None)
+    right = dataclasses.replace(left, image=255 - left.image, of_right=True)
+    start, weights = make_gaussians(600, sh_degree=0).with_right(), LossWeights(squared=True)
+    rates = RATES | {"right_sh": 0.5e-2}
+    shown, field = start.clone().to("cuda"), NoField()
+    step = FusedStep(shown, field, FusedAdam(shown.tensors()), weights, left.camera)
+    expected = start.clone()
+    adam = FusedAdam(expected.tensors())
+    for turn in range(8):
+        one = right if turn % 2 else left
+        step(shown, one, 0.0, rates, [], relaxation)
+        compared = loss_and_gradients(expected.seen_by_right() if turn % 2 else expected, one, weights, relaxation)
+        own = with_eye(compared.gradients, bool(turn % 2)) | {"sh" if turn % 2 else "right_sh": None}
+        adam.step(expected.tensors(), own, rates)
+        if compared.colour_change is not None and turn % 2:
+            expected.right_sh[:, 0] += compared.colour_change
+    assert step.settle() == 0
+    assert expected.right_sh.abs().max() > 0.01
+    for name, tensor in expected.tensors().items():
+        change = (tensor - start.tensors()[name]).norm()
+        assert (shown.tensors()[name].cpu() - tensor).norm() <= 0.02 * change + 1e-6, name
 
 
 def test_one_captured_step_serves_two_cameras_by_turns(make_gaussians, observation):

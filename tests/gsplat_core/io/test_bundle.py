@@ -45,6 +45,21 @@ def test_the_round_trip_is_exact(kind, count, make_gaussians, tmp_path):
     assert torch.equal(loaded.at(1.0).means, model.at(1.0).means)
 
 
+def test_colours_of_the_right_eye_are_kept_and_part_of_the_digest(make_gaussians, tmp_path):
+    left = make_gaussians(4, sh_degree=1)
+    model = make_model(replace(left, right_sh=torch.randn_like(left.sh)))
+    save_bundle(model, tmp_path)
+    loaded = load_bundle(tmp_path)
+    assert loaded.sha256() == model.sha256() != make_model(left).sha256()
+    torch.testing.assert_close(loaded.seen_by_right().at(1.0).sh, model.at(1.0).sh + model.gaussians.right_sh)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    for claim, said in ((1, "right_eye must be true or false"), (False, "parameters")):
+        other = {**manifest, "gaussians": {**manifest["gaussians"], "right_eye": claim}}
+        (tmp_path / "manifest.json").write_text(json.dumps(other))
+        with pytest.raises(BundleCorrupt, match=said):
+            load_bundle(tmp_path)
+
+
 @pytest.mark.parametrize("source", [None, *(DepthSource(origin, metric=False) for origin in DepthOrigin)])
 def test_where_depth_comes_from_is_kept_and_part_of_the_digest(source, make_gaussians, tmp_path):
     model = replace(make_model(make_gaussians(4)), depth_source=source)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -74,3 +76,27 @@ def test_wrong_shapes_are_refused(change, message):
         Gaussians(**(gaussians().tensors() | change))
     with pytest.raises(InvalidInput, match="floating-point"):
         gaussians().map(lambda tensor: tensor.int())
+
+
+def test_the_right_eye_sees_the_sum():
+    left = gaussians()
+    assert left.seen_by_right() is left and len(left.tensors()) == 5
+    both = dataclasses.replace(left, right_sh=torch.full_like(left.sh, 0.25))
+    assert list(both.tensors()) == [*left.tensors(), "right_sh"] and both.left_tensors == left.left_tensors
+    right = both.seen_by_right()
+    assert right.right_sh is None and torch.equal(right.sh, left.sh + 0.25)
+    assert torch.equal(both.select(slice(1, 3)).seen_by_right().sh, right.sh[1:3])
+
+
+def test_appended_gaussians_take_the_eyes_of_the_others():
+    left = gaussians()
+    both = dataclasses.replace(left, right_sh=torch.ones_like(left.sh))
+    assert both.append(left).right_sh[:, 0, 0].tolist() == [1] * 5 + [0] * 5
+    assert left.append(both).right_sh is None
+    assert left.with_right().with_right(False).tensors().keys() == left.tensors().keys()
+
+
+def test_colours_of_the_right_eye_have_the_shape_of_the_left_ones():
+    left = gaussians()
+    with pytest.raises(InvalidInput, match="right_sh must be"):
+        dataclasses.replace(left, right_sh=left.sh[:, :1, :2])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -79,3 +81,13 @@ def test_more_than_fit_are_refused_and_nothing_changes(make_gaussians):
     assert rows.used.count == 20
     with pytest.raises(InvalidInput, match="do not fit"):
         GaussianRows(make_gaussians(20), 19)
+
+
+def test_colours_of_the_right_eye_come_and_go_with_their_gaussians(make_gaussians):
+    first = make_gaussians(6)
+    rows = GaussianRows(dataclasses.replace(first, right_sh=torch.arange(6.0)[:, None, None].expand_as(first.sh)), 9)
+    at = addresses(rows)
+    rows.append(make_gaussians(2, seed=9))
+    rows.close_gaps(RowMoves.without(torch.arange(8) == 1))
+    assert rows.used.right_sh[:, 0, 0].tolist() == [0, 0, 2, 3, 4, 5, 0]
+    assert addresses(rows) == at and len(at) == 6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -71,6 +72,18 @@ def test_deforming_in_a_slot_gives_the_same_bits(make_gaussians, device):
         expected = model_of(gaussians, field).at(time_s).tensors()
         for name, tensor in snapshot.at(time_s).tensors().items():
             assert torch.equal(tensor, expected[name]), (time_s, name)
+
+
+def test_colours_of_the_right_eye_lie_in_the_slot_too(make_gaussians, device):
+    slots, left = SnapshotSlots(device), make_gaussians(40).to(device)
+    both = dataclasses.replace(left, right_sh=torch.randn_like(left.sh))
+    layout = publish(slots, left, None).slot.layout
+    for version, scene in ((2, both), (3, left)):
+        snapshot = publish(slots, scene, None, version=version)
+        layout += 1
+        assert snapshot.slot.layout == layout, "memory with and without them is not the same"
+        assert snapshot.as_model().sha256() == model_of(scene, None).sha256()
+        del snapshot
 
 
 def test_spare_rows_are_never_seen(make_gaussians, device):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.live_training import LiveTraining
@@ -193,6 +194,49 @@ def test_the_same_frames_give_the_same_bytes():
 def test_a_frame_without_a_right_eye_trains_as_ever():
     alone = trained("both", frames=3, right_image=None).snapshot()
     assert alone.sha256() == trained("left", frames=3, right_image=None).snapshot().sha256()
+
+
+def tinted(seq: int) -> Frame:
+    """A frame whose right picture has highlights, and is darker in places, where the left one is not."""
+    frame = stereo_frame(seq, with_depth=True)
+    right = frame.right_image.astype(np.int64)
+    right[10:20, 20:30] += 90
+    right[30:40, 34:50] //= 2
+    return frame.with_fields(right_image=right.clip(0, 255).astype(np.uint8))
+
+
+@pytest.mark.parametrize(("way", "better_db"), [("online", 0.2), ("offline", 0.2), ("live", 4)])
+def test_each_eye_keeps_its_own_colours(way, better_db):
+    """What one eye alone sees does not come into the other one's picture, and comes into its own: at once where colours are corrected."""
+    frames = [tinted(seq) for seq in range(4)]
+    if way == "live":
+        config = dataclasses.replace(CONFIG, squared_error=True, history_s=2.0, preallocate=True)
+        learning = LiveReconstructor(config, LEFT, live=LiveTraining(colour_relaxation=1.5))
+        for frame in frames:
+            learning.observe(frame, steps=20)
+            learning.grow(frame)
+            learning.rehearse(10)
+    else:
+        learning = Reconstructor(dataclasses.replace(CONFIG, depth_from_motion=False), LEFT)
+        if way == "offline":
+            learning.fit(frames, 300, settings=FitSettings(densify_rounds=1))
+        else:
+            for frame in frames:
+                learning.observe(frame)
+    model = learning.snapshot()
+    left, right = model.at(0.1), model.seen_by_right().at(0.1)
+    bright, dark = np.s_[12:18, 22:28], np.s_[32:38, 37:47]
+    true = BothEyes("both").observation(frames[-1], LEFT).right.image.numpy()
+    for place in (bright, dark):
+        assert psnr(seen(LEFT, left)[0][place], frames[-1].image[place]) > 22
+        own = psnr(seen(RIGHT, right)[0][place], true[place])
+        assert own > psnr(seen(RIGHT, left)[0][place], true[place]) + better_db
+    assert model.at(0.1).right_sh is not None and right.right_sh is None
+
+
+def test_a_scene_of_one_eye_has_no_colours_for_the_other():
+    assert trained("left", frames=1).snapshot().gaussians.right_sh is None
+    assert trained("both", frames=1, right_image=None).snapshot().gaussians.right_sh is None
 
 
 def test_live_the_eyes_take_turns_and_the_left_one_begins(monkeypatch):

@@ -19,7 +19,7 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import Seen
-from gsplat_core.training.surface_tracks import SurfaceTracks, between_known, held_outside
+from gsplat_core.training.surface_tracks import SurfaceTracks, between_known
 
 FRAMES, FPS = 12, 8.0
 ASKED = Asked(FRAMES, 192, 160, FPS, seed=1)
@@ -166,12 +166,3 @@ def test_depth_that_is_uncertain_from_frame_to_frame_does_not_move_tissue_at_res
     assert (found - points[:, None]).norm(dim=2)[:, [0, FRAMES - 1]].median() > 0.2, (
         "across the picture they go with the flow"
     )
-
-
-def test_a_point_that_left_the_picture_stays_where_it_was_seen_last():
-    places = torch.arange(6.0)[None, :, None].expand(2, 6, 3)
-    inside = torch.tensor([[False, True, True, True, False, True], [True] * 6])
-    held = held_outside(places, inside, 2)
-    assert held[0, :, 0].tolist() == [1, 1, 2, 3, 3, 3]
-    assert held[1, :, 0].tolist() == [0, 1, 2, 3, 4, 5]
-    assert torch.equal(held_outside(places, torch.zeros(2, 6, dtype=torch.bool), 2)[:, :, 0], torch.full((2, 6), 2.0))
