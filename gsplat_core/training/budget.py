@@ -20,6 +20,11 @@ MAX_IN_FLIGHT = 4
 """Steps that may be queued on a GPU and not finished while a deadline is watched: enough to keep it busy between two."""
 
 
+TURNS, SECOND_EYE = 4, 2
+"""Where two eyes are trained on, the third of four steps is on the second one: the first one's picture is what is shown, and the host prepares the second
+one's while a GPU works on the first steps."""
+
+
 @dataclass(frozen=True)
 class Budget:
     """The work that one frame may take; made by `of_steps` or `until`."""
@@ -85,6 +90,8 @@ class Spending:
         self._expected_s = step_s or 0.0
         self._in_flight = 0
         self._has_queued = False
+        self._was_last = False
+        """Whether the step that was allowed is the last one."""
         self._started_s = budget.clock() if budget.is_timed else 0.0
         self._first: tuple[int, float] | None = None
         """Of queued steps: how many were finished when the first was seen to be, and when that was."""
@@ -92,25 +99,35 @@ class Spending:
         """Steps made or queued so far."""
 
     def allows_step(self, by_turns: bool = False) -> bool:
-        """Whether another step is to be made. by_turns: two eyes take turns (`turn`), and a step on the second one is begun where there is time for one
+        """Whether another step is to be made. by_turns: two eyes take turns (`turn`), and a step on the second one is made where there is time for one
         on the first after it, which is made then in any case: the newest step is on what is shown."""
         budget = self._budget
         if budget.steps is not None:
             return self.made < budget.steps
-        if by_turns and self.made and self.turn == 0:
+        if self._was_last:
+            return False
+        if by_turns and self.made % TURNS == SECOND_EYE + 1:
             return True
-        ahead = 2 if by_turns and self.made else 1
-        if self.made < budget.at_least:
+        wanted = 2 if by_turns and self.turn else 1
+        if self._has_room_for(wanted):
             return True
-        if budget.at_most is not None and self.made + ahead > budget.at_most:
+        # A recorded session knows the number of steps alone: one of the first eye in the second one's place is the last.
+        needed = self.made < budget.at_least
+        self._was_last = wanted == 2 and (self.made + 2 > budget.at_least if needed else self._has_room_for(1))
+        return needed or self._was_last
+
+    def _has_room_for(self, steps: int) -> bool:
+        budget = self._budget
+        if budget.at_most is not None and self.made + steps > budget.at_most:
             return False
         # Steps that are queued come first; the next ones must be over in time as well.
-        return budget.clock() + (self._in_flight + ahead) * self.step_s <= budget.deadline_s
+        return budget.clock() + (self._in_flight + steps) * self.step_s <= budget.deadline_s
 
     @property
     def turn(self) -> int:
-        """Whose turn the next step is where two take turns: 0 for the first one, which also has the last one of a given number of steps."""
-        return 0 if self.made + 1 == self._budget.steps else self.made % 2
+        """Whose turn the next step is where two eyes take turns, see `TURNS`: 0 for the first one, which also has the last step."""
+        is_last = self._was_last or self.made + 1 == self._budget.steps
+        return int(self.made % TURNS == SECOND_EYE and not is_last)
 
     def step_made(self, in_flight: int = 0) -> None:
         """One more step was made, or queued; `in_flight` queued ones are not finished."""

@@ -82,8 +82,8 @@ class LiveReconstructor(Reconstructor):
         """How much of the stream is held, by what holds it; none of it grows without end."""
         columns = 0 if self._step is None else getattr(self._step.field, "bumps", 0)
         archived = 0 if self._out_of_view is None else len(self._out_of_view.archive)
-        window, places = len(self._window), len(self._places)
-        return {"window_frames": window, "columns": columns, "places": places, "archived": archived}
+        held = {"window_frames": len(self._window), "columns": columns, "places": len(self._places)}
+        return {**held, "archived": archived}
 
     def publish(self) -> Model | Snapshot:
         """The model as it is now, for showing the time of the newest frame that was trained on and what follows, with the next version number.
@@ -106,10 +106,9 @@ class LiveReconstructor(Reconstructor):
     @property
     def parameter_count(self) -> int:
         """Numbers in all tensors of the whole model; 0 before there is one."""
-        step = self._step
-        if step is None:
+        if self._step is None:
             return 0
-        return sum(tensor.numel() for tensor in step.gaussians.tensors().values()) + step.field.parameter_count
+        return sum(t.numel() for t in self._step.gaussians.tensors().values()) + self._step.field.parameter_count
 
     def rehearse(self, steps: int) -> None:
         """So many steps on frames of the window. On a GPU they are queued, and at most `REHEARSED_IN_FLIGHT` of them are not finished when
@@ -150,10 +149,11 @@ class LiveReconstructor(Reconstructor):
         return (self._step_s or 0.0) * 1e9
 
     def grow(self, frame: Frame) -> None:
-        """What `observe` leaves for the time after `frame`, the newest one that was trained on, was shown: Gaussians are added where it
-        shows tissue that the model does not cover, those out of view make room and come back."""
+        """What `observe` leaves for the time after `frame`, the newest one that was trained on, was shown: its depth corrects the scene, Gaussians are
+        added where it shows tissue that the model does not cover, those out of view make room and come back."""
         assert self._step is not None
         observation = self._window.newest
+        self._placement.catch_up(self._step)
         if self._out_of_view is not None:
             self._out_of_view.follow(self._step, observation)
         if self._upkeep is not None:
@@ -284,9 +284,10 @@ class LiveReconstructor(Reconstructor):
 
     def _train_on(self, observation: Observation, budget: Budget, first: bool) -> ObserveReport:
         assert self._step is not None
+        self._placement.postpones = True  # from the second frame on, until `grow`
         spending = Spending(budget, self._step_s)
         loss = None
-        while spending.allows_step(by_turns=observation.right is not None):
+        while spending.allows_step(by_turns=observation.right_eye is not None):
             rate = 1.0 if first else self._live.rate_at(spending.made)
             loss = self._step(observation.by_turns(spending.turn), rate, self._live.colour_relaxation)
             spending.step_made(self._in_flight.queued() if budget.is_timed else 0)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import islice
 
 import numpy as np
@@ -33,17 +35,22 @@ class Observation:
     """float32 [H, W] in millimetres; 0 = unknown."""
     rehearsal_mask: Tensor | None = None
     """uint8 [H, W]; 0 = left out when the frame is trained on again later."""
-    right: Observation | None = None
+    right_eye: RightEye | None = None
     """What the right eye saw at the same time, where it is trained on as well (`BothEyes`)."""
     of_right: bool = False
     """Whether it is such an observation of the right eye."""
 
+    @property
+    def right(self) -> Observation | None:
+        """The right eye's observation; made when it is first asked for, which takes the host as long as some steps take a GPU."""
+        return None if self.right_eye is None else self.right_eye.observation
+
     def to_rehearse(self) -> Observation:
         """The frame as it is trained on again later."""
-        right = None if self.right is None else self.right.to_rehearse()
+        right = None if self.right_eye is None else self.right_eye.to_rehearse()
         if self.rehearsal_mask is None:
-            return self if right is self.right else replace(self, right=right)
-        return replace(self, mask=self.mask & self.rehearsal_mask, rehearsal_mask=None, right=right)
+            return self if right is None else replace(self, right_eye=right)
+        return replace(self, mask=self.mask & self.rehearsal_mask, rehearsal_mask=None, right_eye=right)
 
     def with_depth(self, frame: Frame) -> Observation:
         """The same with the depth of `frame`, which is this one and whose depth was found later."""
@@ -52,7 +59,7 @@ class Observation:
 
     def by_turns(self, turn: int) -> Observation:
         """The eye whose turn it is: the left one at even turns, the right one, if there is one, at odd ones."""
-        return self if self.right is None or turn % 2 == 0 else self.right
+        return self if self.right_eye is None or turn % 2 == 0 else self.right_eye.observation
 
     def as_frame(self) -> Frame:
         """The frame as training sees it. Waits for the device."""
@@ -82,6 +89,22 @@ class Observation:
             depth=known_depth(believed_depth(frame), device) if _is_trained_on(frame) else None,
             rehearsal_mask=None if frame.rehearsal_mask is None else tensor_of(frame.rehearsal_mask, device),
         )
+
+
+class RightEye:
+    """An observation of the right eye that is made when it is first asked for."""
+
+    def __init__(self, make: Callable[[], Observation]) -> None:
+        self._make = make
+
+    @cached_property
+    def observation(self) -> Observation:
+        """It."""
+        return self._make()
+
+    def to_rehearse(self) -> RightEye:
+        """As it is trained on again later."""
+        return RightEye(lambda: self.observation.to_rehearse())
 
 
 def scene_colours(image: NDArray[np.uint8], exposure: tuple[float, float, float]) -> NDArray[np.uint8]:

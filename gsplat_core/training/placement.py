@@ -44,12 +44,25 @@ class Placement:
         self._first = first
         self.is_placed = _has_depth(first)
         """Whether the scene is where a depth says."""
+        self.postpones = False
+        """Whether depth that a frame comes with corrects the scene when `catch_up` is called: pictures do not wait for it then."""
+        self._postponed: tuple[Frame, Observation] | None = None
+
+    def catch_up(self, step: TrainingStep) -> None:
+        """What the newest frame's depth corrects, if that was postponed."""
+        if self._postponed is not None:
+            frame, observation = self._postponed
+            self._postponed = None
+            self.apply(step, frame, observation, observation.time_s)
 
     def apply(self, step: TrainingStep, frame: Frame, observation: Observation, shown_s: float | None = None) -> None:
         """Correct the scene by the depth of a frame, if it has any and the field takes positions; the field covers its time already.
 
         shown_s: the time at which motion is corrected; None: the frame's own. Later where depth is found after newer frames were trained on.
         """
+        if self.postpones and self.is_placed and shown_s is None:
+            self._postponed = frame, observation
+            return
         if frame is self._first or not _has_depth(frame):
             return
         if observation.camera.model != "pinhole" or not step.field.takes_positions:

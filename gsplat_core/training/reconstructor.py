@@ -283,8 +283,8 @@ class Reconstructor:
         made from."""
         if not first:
             self._cover(observation, lambda: frame)
-        if observation.right is not None:
-            self._cover(observation.right, observation.right.as_frame)
+        if (right := observation.right) is not None:
+            self._cover(right, right.as_frame)
 
     def _cover(self, observation: Observation, frame: Callable[[], Frame]) -> None:
         """Add Gaussians where one eye sees tissue that the model does not cover."""

@@ -17,7 +17,7 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import Eyes
 from gsplat_core.training.eye_colours import EyeColours
 from gsplat_core.training.initialisation import believed_depth, unprojected
-from gsplat_core.training.observations import Observation, scene_colours
+from gsplat_core.training.observations import Observation, RightEye, scene_colours
 from gsplat_core.training.unseen import pixels_of
 from gsplat_core.transfers import tensor_of
 
@@ -57,23 +57,23 @@ class BothEyes:
                 f"frame {frame.seq}: the right camera is {right.model}, the left one {left.camera.model}; training takes two of one model"
             )
         self.trained = "both"
+        return replace(left, right_eye=RightEye(lambda: self._of_right(left, frame, right)))
+
+    def _of_right(self, left: Observation, frame: Frame, right: Camera) -> Observation:
         image = scene_colours(self._colours.corrected(frame), frame.exposure)
         mask = self._tissue(frame, left.camera, right)
         if frame.loss_mask is not None:
             mask = mask & frame.loss_mask
         steady = None if frame.rehearsal_mask is None else self._highlights.without(image)
-        return replace(
-            left,
-            right=Observation(
-                seq=frame.seq,
-                time_s=left.time_s,
-                camera=right.with_pose(right.world_to_camera @ left.camera.world_to_camera),
-                image=tensor_of(image, self._device),
-                mask=tensor_of(mask, self._device),
-                depth=None,
-                of_right=True,
-                rehearsal_mask=None if steady is None else tensor_of(steady, self._device),
-            ),
+        return Observation(
+            seq=frame.seq,
+            time_s=left.time_s,
+            camera=right.with_pose(right.world_to_camera @ left.camera.world_to_camera),
+            image=tensor_of(image, self._device),
+            mask=tensor_of(mask, self._device),
+            depth=None,
+            of_right=True,
+            rehearsal_mask=None if steady is None else tensor_of(steady, self._device),
         )
 
     def _tissue(self, frame: Frame, camera: Camera, right: Camera) -> NDArray[np.uint8]:
@@ -83,7 +83,7 @@ class BothEyes:
 
 def for_eyes(gaussians: Gaussians, observation: Observation) -> Gaussians:
     """What a scene starts with: Gaussians with colours for the right eye, where it is trained on."""
-    return gaussians.with_right(observation.right is not None)
+    return gaussians.with_right(observation.right_eye is not None)
 
 
 def right_tissue(frame: Frame, camera: Camera, right: Camera, shift_px: float) -> NDArray[np.uint8]:
