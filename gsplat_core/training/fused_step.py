@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field_slots import copy_each
 from gsplat_core.deformation.kind import CapturedTraining
 from gsplat_core.ops.adam.adam import adam_step_at_
 from gsplat_core.ops.frame.frame import GAUSSIAN_TENSORS, FrameMode, View, accumulate_status_, render_frame
@@ -19,11 +18,11 @@ from gsplat_core.rendering.tile_capacity import FrameStatusCopy, capacity_for
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import COLOUR
-from gsplat_core.training.colour_correction import ResidualTarget
 from gsplat_core.training.eye_gradients import LEFT, RIGHT
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.optimiser import FusedAdam
 from gsplat_core.training.photometric import LossWeights
+from gsplat_core.training.step_inputs import StepInputs
 
 
 class FusedStep:
@@ -44,18 +43,13 @@ class FusedStep:
         self._in_use: tuple[object, object, object] = None, None, None
         self._addresses: tuple[int, ...] = ()
         """Of all tensors when the graph was captured."""
-        self._taken: Observation | None = None
         self._weights = weights
         self._camera = camera
-        shape = (camera.height_px, camera.width_px)
-        self._image = torch.zeros(*shape, 3, dtype=torch.uint8, device=device)
-        self._mask = torch.ones(shape, dtype=torch.uint8, device=device)
-        self._depth = torch.zeros(shape, device=device) if weights.depth > 0 else None
+        self._inputs = {False: StepInputs(camera, device, with_depth=weights.depth > 0)}
+        """What graphs read, by whether they are the right eye's own: eyes that take turns are each copied once."""
         self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + 1 + field.rates + 1)
         """Among them the learning rates: of the Gaussians in the frame's backward pass, of the positions after it, of the field; and how
         much of the residual colours take."""
-        self._target: ResidualTarget | None = None
-        """Once colours were corrected."""
         self._corrects = False
         self._step = torch.full((1,), adam.steps, dtype=torch.int64, device=device)
         self._skipped = torch.zeros(len(GAUSSIAN_TENSORS), dtype=torch.int64, device=device)
@@ -91,9 +85,11 @@ class FusedStep:
             colour_relaxation: above 0 colours are corrected (`colour_correction`), which a field that takes no colours does not allow, and depth
                 is not compared: the channel of its gradient is taken by what the correction needs.
         """
-        corrects = colour_relaxation > 0
-        self._take(observation, corrects)
+        self._corrects = corrects = colour_relaxation > 0
         self._of_right = observation.of_right and gaussians.right_sh is not None
+        if self._of_right not in self._inputs:
+            self._inputs[True] = StepInputs(self._camera, gaussians.device, with_depth=False)
+        self._inputs[self._of_right].take(observation, corrects)
         rates = [gaussian_rates[name] for name in self._names]
         in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
         self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates, colour_relaxation])
@@ -106,28 +102,12 @@ class FusedStep:
         if self._was_replaced():
             self._captured.clear()  # their memory serves the next captures
         if kind not in self._captured:
-            self._captured[kind] = CapturedSequence(self._sequence, self._image.device, self._memory, warm_up=False)
+            self._captured[kind] = CapturedSequence(self._sequence, self._step.device, self._memory, warm_up=False)
         return self._captured[kind].replay().clone()
 
     def restart(self) -> None:
         """The tensors hold another scene and Adam counts its steps from 1 again; nothing is captured anew."""
         self._step.fill_(self._adam.steps)
-
-    def _take(self, observation: Observation, corrects: bool) -> None:
-        """Copy an observation to where the graph of this kind reads it."""
-        if corrects and self._target is None:
-            self._target = ResidualTarget(self._image)
-        if observation is self._taken and corrects == self._corrects:
-            return
-        self._taken, self._corrects = observation, corrects
-        copy_each([self._image, self._mask], [observation.image, observation.mask])
-        if corrects and self._target is not None:
-            self._target.take(self._image, self._mask)
-        elif self._depth is not None:
-            if observation.depth is None:
-                self._depth.zero_()  # unknown everywhere: the term is 0
-            else:
-                self._depth.copy_(observation.depth, non_blocking=True)
 
     def settle(self) -> int:
         """Wait for the steps since the last call; returns how many of them changed nothing because their splats did not fit.
@@ -166,9 +146,10 @@ class FusedStep:
         camera = self._camera
         view = View(controls.viewmat, controls.intrinsics, camera.width_px, camera.height_px, camera_model=camera.model)
         frame = render_frame(gaussians, deltas, view, self._capacity, FrameMode.TRAINING)
-        target = self._target if self._corrects else None
+        inputs = self._inputs[self._of_right]
+        target = inputs.target if self._corrects else None
         loss = frame_loss(
-            frame.image, frame.alphas, self._image, self._mask, None if target is not None else self._depth,
+            frame.image, frame.alphas, inputs.image, inputs.mask, None if target is not None else inputs.depth,
             self._weights.ssim, self._weights.depth, self._weights.squared,
         )  # fmt: skip
         fits = accumulate_status_(frame.status, self._totals, self._step)

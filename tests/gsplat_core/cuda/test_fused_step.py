@@ -9,7 +9,7 @@ import torch
 
 from gsplat_core import Camera, Gaussians, render
 from gsplat_core.training.fused_step import FusedStep
-from gsplat_core.training.observations import Observation
+from gsplat_core.training.observations import Observation, RightEye
 from gsplat_core.training.optimiser import FusedAdam
 from gsplat_core.training.photometric import LossWeights
 
@@ -168,7 +168,7 @@ def test_one_captured_step_serves_two_cameras_by_turns(make_gaussians, observati
         picture = render(make_gaussians(600, seed=4), eye).image
     image = (picture.clamp(0, 1) * 255).round().to(torch.uint8)
     right = dataclasses.replace(left, camera=eye, image=image, mask=torch.ones_like(left.mask))
-    pair = dataclasses.replace(left, right=right)
+    pair = dataclasses.replace(left, right_eye=RightEye(lambda: right))
     weights, start = LossWeights(squared=True), make_gaussians(800, sh_degree=0)
     gaussians = start.clone().to("cuda")
     step = FusedStep(gaussians, NoField(), FusedAdam(gaussians.tensors()), weights, left.camera)
