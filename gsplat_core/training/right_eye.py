@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -27,12 +30,27 @@ NEAREST, FARTHEST = 2.0, 0.75
 """Where a tool's depth is not known, its disparity is between these multiples of what is typical of the picture: tools are nearer than tissue."""
 
 
+class PreparedPicture(NamedTuple):
+    """A right picture in the left one's colours, on the host."""
+
+    image: NDArray[np.uint8]
+    """RGB [H, W, 3]."""
+    mask: NDArray[np.uint8]
+    """[H, W]; 1 = tissue."""
+    steady: NDArray[np.uint8] | None
+    """[H, W]; 0 = left out of rehearsal; None: nothing is."""
+
+
 class BothEyes:
     """What is trained on of each frame of one stream: the left eye's picture, and beside it the right one's, where that is wanted and can be."""
 
     def __init__(self, eyes: Eyes, device: torch.device | str = "cpu") -> None:
         self._with_right, self._device = eyes == "both", device
         self._highlights = HighlightFinder()
+        self._beside: ThreadPoolExecutor | None = None
+        """Makes right pictures ready, one after another, where steps are launched meanwhile."""
+        if self._with_right and torch.device(device).type == "cuda":
+            self._beside = ThreadPoolExecutor(1, thread_name_prefix="right eye")
         self.trained: Eyes = "left"
         """Which eyes there was something of so far."""
         self.forget()
@@ -57,16 +75,28 @@ class BothEyes:
                 f"frame {frame.seq}: the right camera is {right.model}, the left one {left.camera.model}; training takes two of one model"
             )
         self.trained = "both"
-        return replace(left, right_eye=RightEye(lambda: self._of_right(left, frame, right)))
+        prepared = self._prepared(frame, left.camera, right)
+        return replace(left, right_eye=RightEye(lambda: self._on_device(prepared(), left, right)))
 
-    def _of_right(self, left: Observation, frame: Frame, right: Camera) -> Observation:
-        image = scene_colours(self._colours.corrected(frame), frame.exposure)
-        mask = self._tissue(frame, left.camera, right)
+    def _prepared(self, frame: Frame, camera: Camera, right: Camera) -> Callable[[], PreparedPicture]:
+        """What the right picture is made into, once it is asked for. For a GPU it is made meanwhile, beside the thread that launches steps."""
+        colours = self._colours  # of this stream, also if another one begins meanwhile
+        if self._beside is None:
+            return lambda: self._prepare(frame, camera, right, colours)
+        return self._beside.submit(self._prepare, frame, camera, right, colours).result
+
+    def _prepare(self, frame: Frame, camera: Camera, right: Camera, colours: EyeColours) -> PreparedPicture:
+        image = scene_colours(colours.corrected(frame), frame.exposure)
+        mask = right_tissue(frame, camera, right, (colours.shift or 0.0) * frame.width_px)
         if frame.loss_mask is not None:
             mask = mask & frame.loss_mask
         steady = None if frame.rehearsal_mask is None else self._highlights.without(image)
+        return PreparedPicture(image, mask, steady)
+
+    def _on_device(self, picture: PreparedPicture, left: Observation, right: Camera) -> Observation:
+        image, mask, steady = picture
         return Observation(
-            seq=frame.seq,
+            seq=left.seq,
             time_s=left.time_s,
             camera=right.with_pose(right.world_to_camera @ left.camera.world_to_camera),
             image=tensor_of(image, self._device),
@@ -75,10 +105,6 @@ class BothEyes:
             of_right=True,
             rehearsal_mask=None if steady is None else tensor_of(steady, self._device),
         )
-
-    def _tissue(self, frame: Frame, camera: Camera, right: Camera) -> NDArray[np.uint8]:
-        shift = self._colours.shift or 0.0
-        return right_tissue(frame, camera, right, shift * frame.width_px)
 
 
 def for_eyes(gaussians: Gaussians, observation: Observation) -> Gaussians:
