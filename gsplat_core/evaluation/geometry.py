@@ -29,6 +29,8 @@ from gsplat_core.evaluation.scores import why_left_out
 from gsplat_core.evaluation.tracking import Tracking
 from gsplat_core.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
 from gsplat_core.evaluation.views import Pose, Shown, ViewSums
+from gsplat_core.geometry.depth_map import BELIEVED
+from gsplat_core.geometry.measured_depth import measured_confidence
 from gsplat_core.io.recordings.truth import GroundTruth
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
@@ -92,6 +94,8 @@ def evaluate_geometry(
             picture, true = shown(own(frame), frame), truth.depth_of(frame)
             if true is not None:
                 known = np.isfinite(true) & (true > 0) & _tissue(frame)
+                if true is frame.depth:
+                    known &= _believed(frame)
                 depth.add(camera, true, picture.depth, known)
                 normals.add(camera, true, picture.depth, known)
             if followed is not None:
@@ -117,6 +121,13 @@ def evaluate_geometry(
         trajectory=_trajectory(ways),
         parts=None if parts is None else parts.shares,
     )
+
+
+def _believed(frame: Frame) -> NDArray[np.bool_]:
+    """Where the depth that a frame came with is not doubted: what lies on neither side of an edge is no truth to compare with."""
+    assert frame.depth is not None
+    confidence = frame.depth_confidence
+    return np.asarray((measured_confidence(frame.depth) if confidence is None else confidence) >= BELIEVED)
 
 
 def _trajectory(ways: list[tuple[Pose, Pose]]) -> TrajectoryErrors | None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.depth_map import DepthMap
+from gsplat_core.geometry.measured_depth import measured_confidence
 from gsplat_core.registry import Registry
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
@@ -36,7 +37,7 @@ class OnDevice(Protocol):
 
 
 class RecordedDepth:
-    """The depth that a frame came with."""
+    """The depth that a frame came with. Where no confidence came with it, single pixels are doubted (`measured_confidence`)."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """See `Estimator`."""
@@ -44,7 +45,7 @@ class RecordedDepth:
             return None
         confidence = frame.depth_confidence
         if confidence is None:
-            confidence = (frame.depth > 0).astype(np.float32)
+            confidence = measured_confidence(frame.depth)
         return DepthMap(frame.depth, confidence, frame.depth_origin or DepthOrigin.MEASURED, frame.depth_is_metric)
 
 
@@ -178,5 +179,7 @@ class DepthFinder:
         if found is None:
             return frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
         if found.depth is frame.depth:
-            return frame
+            # What is believed wherever it is known needs no second plane.
+            doubts = bool(np.any((found.confidence == 0) & (frame.depth > 0)))
+            return frame.with_fields(depth_confidence=found.confidence) if doubts else frame
         return frame.with_fields(depth=found.kept, depth_confidence=found.confidence, depth_origin=found.origin)

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 from gsplat_core.deformation.rates import FieldRates, check_rates
 from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.motion_priors import MOTION_PRIORS
 
@@ -21,6 +22,11 @@ def check_eyes(eyes: str) -> None:
     """Raises InvalidSetting for something else than the name of a choice."""
     if eyes not in get_args(Eyes):
         raise InvalidSetting(f"eyes is {eyes!r}; choose {' or '.join(get_args(Eyes))}")
+
+
+MEASURED_WEIGHS = 10.0
+"""How many times more depth counts that was measured than depth that was found in pictures. With less of it, colours move Gaussians along the line of
+sight, which pictures hardly show, by more than a measured depth is off."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,8 @@ class ReconstructorConfig:
     ssim_weight: float = 0.0
     """Weight of 1 - SSIM beside L1 or the squared error, 0..1."""
     depth_weight: float = 0.1
-    """Weight of the inverse-depth term, where frames have depth, times the distance at which the scene starts: in any unit of length the same."""
+    """Weight of the inverse-depth term, where frames have depth, times the distance at which the scene starts: in any unit of length the same.
+    `MEASURED_WEIGHS` times as much where a scene with an end starts from measured depth."""
     default_depth_mm: float = 60.0
     """Distance of the plane on which a recording without depth starts."""
     eyes: Eyes = "both"
@@ -143,6 +150,13 @@ class ReconstructorConfig:
             squared_error=True,
             depth_from_motion=True,
         )
+
+    def starting_from(self, frame: Frame) -> ReconstructorConfig:
+        """The same for a scene that starts from `frame`. A stream without an end keeps its weights from scene to scene, whatever these start from."""
+        measured = frame.depth is not None and frame.depth_origin in (None, DepthOrigin.MEASURED)
+        if not measured or self.history_s is not None:
+            return self
+        return dataclasses.replace(self, depth_weight=MEASURED_WEIGHS * self.depth_weight)
 
     @property
     def chosen_field(self) -> str:

@@ -1,11 +1,15 @@
 """Settings that make no sense are refused with the name and the value."""
 
+import dataclasses
+
+import numpy as np
 import pytest
 
 from gsplat_core.deformation.basis_kind import BasisLearningRates
 from gsplat_core.deformation.hexplane_kind import HexPlaneLearningRates
 from gsplat_core.errors import InvalidSetting, UserError
-from gsplat_core.training.config import LearningRates, ReconstructorConfig
+from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.training.config import MEASURED_WEIGHS, LearningRates, ReconstructorConfig
 
 
 @pytest.mark.parametrize(
@@ -76,3 +80,18 @@ def test_offline_there_are_more_gaussians_finer_motion_and_the_error_that_psnr_m
     assert offline.bump_spacing_s < online.bump_spacing_s
     assert offline.squared_error
     assert not online.squared_error
+
+
+@pytest.mark.parametrize("origin", [None, *DepthOrigin])
+def test_measured_depth_counts_more_than_depth_that_was_found(make_frame, origin):
+    config = ReconstructorConfig(depth_weight=0.2)
+    frame = make_frame(depth=np.full((40, 48), 60.0, np.float32), depth_origin=origin)
+    measured = origin in (None, DepthOrigin.MEASURED)
+    assert config.starting_from(frame).depth_weight == pytest.approx(0.2 * MEASURED_WEIGHS if measured else 0.2)
+
+
+def test_without_depth_and_without_an_end_weights_stay_as_they_are(make_frame):
+    config, deep = ReconstructorConfig(), make_frame(depth=np.full((40, 48), 60.0, np.float32))
+    assert config.starting_from(make_frame()) is config
+    endless = dataclasses.replace(config, history_s=10.0)
+    assert endless.starting_from(deep) is endless

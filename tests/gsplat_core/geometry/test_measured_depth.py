@@ -1,0 +1,104 @@
+"""Which pixels of a measured depth map are believed: not those that lie on neither side of an edge, nor those about zero."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.geometry.measured_depth import measured_confidence
+from gsplat_core.geometry.registry import DepthFinder
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin, Frame
+
+ROWS, COLUMNS = 40, 48
+
+
+def slope(nearest=45.0, farthest=75.0) -> np.ndarray:
+    """Tissue that goes away to the right [ROWS, COLUMNS]."""
+    return np.tile(np.linspace(nearest, farthest, COLUMNS, dtype=np.float32), (ROWS, 1))
+
+
+def one_by_one(depth: np.ndarray) -> np.ndarray:
+    """The same as `measured_confidence`, a pixel at a time."""
+    known = np.isfinite(depth) & (depth > 0)
+    sampled = known[2::4, 2::4]
+    found = depth[2::4, 2::4][sampled] if sampled.any() else depth[known]
+    known &= np.where(known, depth, 0) >= 0.1 * (np.median(found) if found.size else 0)
+    believed = np.zeros(depth.shape, np.float32)
+    for row, column in np.argwhere(known):
+        votes = 0
+        for y in range(max(0, row - 1), min(depth.shape[0], row + 2)):
+            for x in range(max(0, column - 1), min(depth.shape[1], column + 2)):
+                if (y, x) != (row, column) and known[y, x]:
+                    here, there = depth[row, column], depth[y, x]
+                    votes += 1 if abs(here - there) <= np.float32(0.1) * max(here, there) else -1
+        believed[row, column] = votes >= 0
+    return believed
+
+
+def test_a_smooth_surface_and_both_sides_of_a_clean_edge_are_believed():
+    depth = slope()
+    depth[:, 20:] *= 2.5
+    assert measured_confidence(depth).all()
+
+
+def test_what_lies_between_two_sides_is_not():
+    depth = slope()
+    depth[:, 21:] *= 2.5
+    depth[:, 20] = 80.0
+    believed = measured_confidence(depth)
+    assert not believed[:, 20].any()
+    assert believed[:, :20].all() and believed[:, 21:].all()
+
+
+@pytest.mark.parametrize("border", [np.s_[:, -1], np.s_[0, :]])
+def test_a_border_of_something_else_is_not(border):
+    depth = slope()
+    depth[border] = 229.0
+    believed = measured_confidence(depth)
+    assert not believed[border].any()
+    assert believed.sum() == believed.size - believed[border].size
+
+
+def test_blends_with_what_is_unknown_and_noise_about_zero_are_not():
+    depth = slope()
+    depth[:, :10] = 0
+    depth[10:20, :8] = 2.0  # a patch that agrees with itself
+    depth[:, 10] = 25.0
+    believed = measured_confidence(depth)
+    assert not believed[:, :11].any()
+    assert believed[:, 11:].all()
+
+
+def test_single_points_of_a_sparse_sensor_are_believed():
+    depth = np.zeros((ROWS, COLUMNS), np.float32)
+    depth[1::4, 1::4] = 60.0
+    assert np.array_equal(measured_confidence(depth) > 0, depth > 0)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (2, 2), (23, 31)])
+def test_any_shape_and_any_value_as_pixel_by_pixel(shape):
+    random = np.random.default_rng(0)
+    depth = np.exp(random.normal(4, 0.08, shape)).astype(np.float32)
+    depth[random.random(shape) < 0.15] = 0
+    for value in (np.nan, np.inf, -np.inf, -3.0, 1e-3):
+        depth[random.random(shape) < 0.03] = value
+    assert np.array_equal(measured_confidence(depth), one_by_one(depth))
+
+
+def test_nothing_known_is_nothing_believed():
+    for value in (0, np.nan, -1):
+        assert not measured_confidence(np.full((9, 9), value, np.float32)).any()
+
+
+def test_recorded_depth_keeps_its_values_and_says_which_it_doubts():
+    depth = slope()
+    depth[:, -1] = 229.0
+    frame = Frame(0, 0, np.zeros((ROWS, COLUMNS, 3), np.uint8), depth=depth, depth_origin=DepthOrigin.MEASURED)
+    finder = DepthFinder("recorded", Camera.from_focal(50.0, COLUMNS, ROWS))
+    given = finder.with_depth(frame)
+    assert given.depth is depth and given.depth_origin is DepthOrigin.MEASURED
+    assert np.array_equal(given.depth_confidence, measured_confidence(depth))
+    sure = np.full_like(depth, 0.7)
+    frame = frame.with_fields(depth_confidence=sure)
+    assert finder.with_depth(frame) is frame, "a confidence that came with it is kept"
