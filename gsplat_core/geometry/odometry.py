@@ -5,7 +5,8 @@ camera starts where the one before was and is moved until the points fit, and bu
 points together, at frame 3 and whenever their number has grown by a third. Small motions of a near-planar scene, as a scope shows them, need no
 other start (Yu and Gallup, "3D Reconstruction from Accidental Motion", 2014); an essential matrix of two frames is ill-conditioned there.
 
-Tissue that moves by itself looks like motion of the scope as far as it moves as a whole. What is left of it counts little (a robust loss).
+Tissue that moves by itself looks like motion of the scope as far as it moves as a whole. What is left of it counts little (a robust loss), and where it
+repeats itself, as breathing does, and long enough to be told from the scope's way, cameras are refined against points that move (`breathing_way`).
 Lengths have no scale: the median depth of the first frame's points is taken to be `DISTANCE`.
 """
 
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from gsplat_core.endoscope.highlights import without_highlights
 from gsplat_core.errors import InvalidInput
+from gsplat_core.geometry.breathing_way import BreathingWay, Sight, breathing_way
 from gsplat_core.geometry.bundle import Bundle, adjust, errors_px
 from gsplat_core.geometry.tracks import FeatureTracks, Observations
 from gsplat_core.scene.cameras import Camera
@@ -44,6 +46,16 @@ GROWTH = 1.3
 
 
 @dataclass(frozen=True)
+class Breathing:
+    """How tissue moves that was told from the scope's way."""
+
+    frequencies_hz: tuple[float, ...]
+    """Of breathing, or of breathing and the heart."""
+    uncertain: float
+    """How much of the way may be the tissue's all the same, or the other way round: root mean square, in the unit of the trajectory."""
+
+
+@dataclass(frozen=True)
 class Trajectory:
     """The scope's way through a recording."""
 
@@ -57,6 +69,8 @@ class Trajectory:
     """The same for a scope that had not moved at all."""
     lost: tuple[int, ...]
     """Frames that share too few points with the others, or none; each stands where the frame before it stood."""
+    breathing: Breathing | None = None
+    """None: the tissue is taken to be at rest; if it breathes, its breathing is in the poses."""
 
     @property
     def path(self) -> float:
@@ -66,7 +80,7 @@ class Trajectory:
 
     @property
     def explained(self) -> float:
-        """Share of the pictures' motion, as a typical square, that the scope's motion explains; the rest moves by itself."""
+        """Share of the pictures' motion, as a typical square, that the scope's motion explains, and the breathing that was found; the rest moves otherwise."""
         return 1 - (self.error_px / max(self.still_error_px, 1e-9)) ** 2
 
 
@@ -81,10 +95,12 @@ def trajectory_of(frames: Iterable[Frame], camera: Camera) -> Trajectory:
             f"poses are estimated for pinhole cameras, this one is {camera.model}: undistort the pictures"
         )
     tracks, count = FeatureTracks(), 0
+    times_s = []
     for count, frame in enumerate(frames, start=1):
         if count > MOST_FRAMES:
             raise InvalidInput(f"poses are estimated for at most {MOST_FRAMES} frames at once: read fewer of them")
         tracks.follow(frame.image, followed_part(frame))
+        times_s.append(frame.time_s)
     if count < 3:
         raise InvalidInput(f"poses are estimated from at least 3 frames, got {count}")
     seen = tracks.observations(LEAST_SEEN if count > LEAST_SEEN else 3)
@@ -92,7 +108,7 @@ def trajectory_of(frames: Iterable[Frame], camera: Camera) -> Trajectory:
         raise InvalidInput(
             f"only {len(seen.frame)} observations of tissue could be followed over {count} frames: the pictures show too little that can be recognised"
         )
-    return _Odometry(seen, camera, count).run()
+    return _Odometry(seen, camera, times_s).run()
 
 
 def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
@@ -104,9 +120,9 @@ def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
 class _Odometry:
     """One recording's estimate, while it is made. Everything float64 on the CPU; the same observations give the same bytes."""
 
-    def __init__(self, seen: Observations, camera: Camera, count: int) -> None:
-        K = camera.K
-        self._count = count
+    def __init__(self, seen: Observations, camera: Camera, times_s: list[float]) -> None:
+        K, count = camera.K, len(times_s)
+        self._count, self._times_s = count, torch.tensor(times_s, dtype=torch.float64)
         self._frame, self._point = torch.from_numpy(seen.frame), torch.from_numpy(seen.point)
         self._rays = torch.from_numpy((seen.pixels - K[:2, 2]) / [K[0, 0], K[1, 1]])
         self._focal = float(K[0, 0])
@@ -139,9 +155,12 @@ class _Odometry:
         for frame in range(1, self._count):
             if not self._is_key[frame]:
                 self._place(frame)
+        moving = self._before_breathing_tissue()
+        if moving is not None:
+            self._poses = moving.poses
         for frame in self._lost:
             self._poses[frame] = self._poses[frame - 1]
-        return self._result()
+        return self._result(moving)
 
     def _of(self, frame: int) -> slice:
         return slice(int(self._bounds[frame]), int(self._bounds[frame + 1]))
@@ -198,16 +217,30 @@ class _Odometry:
             self._points /= unit
             self._poses[:, :3, 3] /= unit
 
-    def _result(self) -> Trajectory:
+    def _before_breathing_tissue(self) -> BreathingWay | None:
+        placed = torch.ones(self._count, dtype=torch.bool)
+        placed[self._lost] = False
         chosen = self._known[self._point]
-        points, poses = self._points * DISTANCE, self._poses.clone()
+        sight = Sight(
+            self._frame[chosen], self._point[chosen], self._rays[chosen], self._times_s, self._poses, self._points
+        )
+        return breathing_way(sight, placed)
+
+    def _result(self, moving: BreathingWay | None) -> Trajectory:
+        poses = self._poses.clone()
         poses[:, :3, 3] *= DISTANCE
+        still_error_px = float(self._still_errors_px().median())
+        if moving is not None:
+            breathing = Breathing(moving.frequencies_hz, moving.uncertain * DISTANCE)
+            tissue, error_px = (moving.points * DISTANCE).numpy(), moving.error * self._focal
+            return Trajectory(poses.numpy(), tissue, error_px, still_error_px, tuple(self._lost), breathing)
+        chosen, points = self._known[self._point], self._points * DISTANCE
         whole = Bundle(poses, points, self._frame[chosen], self._point[chosen], self._rays[chosen], self._focal)
         return Trajectory(
             poses.numpy(),
             points[self._known].numpy(),
             float(errors_px(whole).median()),
-            float(self._still_errors_px().median()),
+            still_error_px,
             tuple(self._lost),
         )
 

@@ -26,6 +26,8 @@ from services.cli.streams import printable
 
 MOSTLY = 0.75
 """Share of the motion that the scope has to explain, or it is said that it may well stand still."""
+OFF = 0.002
+"""Of the focal length: where points are off by more, as a median, than errors of following them, tissue moves by itself."""
 
 
 def poses_command(recording: Path, out: Path, max_frames: int | None, *, overwrite: bool, as_json: bool) -> int:
@@ -84,6 +86,22 @@ def _about_focal_length(focal: FocalLength | None, camera: Camera) -> str:
     )
 
 
+def _about_breathing(found: Trajectory, focal_px: float) -> list[str]:
+    """What is known of tissue that moves by itself."""
+    if found.breathing is not None:
+        told = " and ".join(f"{hz:.2f}" for hz in found.breathing.frequencies_hz)
+        share = found.breathing.uncertain / max(found.path, 1e-9)
+        return [
+            f"the tissue moves by itself, {told} times a second, which was told from the scope's way; {share:.1%} of the way may be the tissue's all the same"
+        ]
+    if found.error_px > OFF * focal_px:
+        return [
+            f"points are off by {found.error_px:.2g} px: the tissue moves by itself. What it moves as a whole is in the poses; to tell breathing from the scope's way"
+            " the recording has to show one and a half breaths, better five"
+        ]
+    return []
+
+
 def _say(found: Trajectory, focal: FocalLength | None, recording: FileRecording, out: Path, as_json: bool) -> None:
     notes = [f"lengths have no scale: the first frame's tissue is taken to be {DISTANCE:g} away", *recording.notes]
     if recording.camera_is_assumed:
@@ -92,6 +110,7 @@ def _say(found: Trajectory, focal: FocalLength | None, recording: FileRecording,
         notes.append(
             f"the scope's motion explains only {found.explained:.0%} of how the pictures move: it may stand still before tissue that moves"
         )
+    notes += _about_breathing(found, float(recording.camera.K[0, 0]))
     if found.lost:
         notes.append(
             f"{len(found.lost)} frames could not be placed and stand where the one before stands, from frame {found.lost[0]} on"
@@ -105,6 +124,8 @@ def _say(found: Trajectory, focal: FocalLength | None, recording: FileRecording,
         "error_px_of_a_still_scope": round(found.still_error_px, 4),
         "explained": round(found.explained, 4),
         "not_placed": list(found.lost),
+        "breathing_hz": [round(hz, 3) for hz in found.breathing.frequencies_hz] if found.breathing else [],
+        "uncertain": round(found.breathing.uncertain / max(found.path, 1e-9), 4) if found.breathing else None,
         "focal_px": round(focal.best_px if focal and focal.known else float(recording.camera.K[0, 0]), 2),
         "focal_px_from": "pictures"
         if focal and focal.known
@@ -118,6 +139,6 @@ def _say(found: Trajectory, focal: FocalLength | None, recording: FileRecording,
         return
     width = max(map(len, facts))
     for name, value in facts.items():
-        typer.echo(f"{name:{width}}  {value if value != [] else '-'}")
+        typer.echo(f"{name:{width}}  {value if value not in ([], None) else '-'}")
     for note in notes:
         typer.echo(f"note: {printable(note)}")

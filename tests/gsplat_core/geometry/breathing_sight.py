@@ -1,0 +1,48 @@
+"""What a swaying scope sees of a sheet that breathes, and the poses that come out when it is taken to be at rest; exact, without pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsplat_core.geometry.breathing_way import Sight
+from gsplat_core.geometry.moving_bundle import MovingBundle
+from gsplat_core.geometry.surface_field import SurfaceField
+from tests.gsplat_core.geometry.breathing_points import DISTANCE, places, swaying, tracks_of
+
+
+def seen_for(
+    length_s: float, breathes: float = 1.0, rate_hz: float = 10.0, noise_px: float = 0.2, pulled: int = 0
+) -> tuple[Sight, NDArray[np.float64]]:
+    """What is seen, and the true poses. pulled: so many points are dragged about, never twice alike."""
+    times_s = np.arange(0, length_s, 1 / rate_hz)
+    poses, points = swaying(times_s), places(times_s, breathes)
+    points[:, :pulled] += 6 * np.clip(np.sin(times_s**1.7), 0, 1)[:, None, None] * np.array([0.5, 0.3, -0.8])
+    tracks = tracks_of(points, poses, times_s, noise_px)
+    frame, point = np.nonzero(tracks.seen)
+    taken = np.stack([pose @ rigid(points[0], each) for pose, each in zip(poses, points, strict=True)])
+    taken[:, :3, 3] /= DISTANCE
+    sight = Sight(
+        torch.from_numpy(frame), torch.from_numpy(point), torch.from_numpy(tracks.rays[frame, point]),
+        torch.from_numpy(times_s), torch.from_numpy(taken), torch.from_numpy(points[0] / DISTANCE),
+    )  # fmt: skip
+    return sight, poses
+
+
+def rigid(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rigid motion [4, 4] that brings points nearest to others [N, 3]: of tissue, what is taken for the scope's."""
+    a, b = first - first.mean(0), second - second.mean(0)
+    u, _, vt = np.linalg.svd(b.T @ a)
+    motion = np.eye(4)
+    motion[:3, :3] = (u * [1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    motion[:3, 3] = second.mean(0) - motion[:3, :3] @ first.mean(0)
+    return motion
+
+
+def bundle_of(sight: Sight, waves: torch.Tensor, most_nodes: int = 30) -> MovingBundle:
+    """All of it in one bundle, without any motion."""
+    field = SurfaceField.over(sight.points, most_nodes)
+    swing = torch.zeros(len(field.nodes), 3, waves.shape[1], dtype=torch.float64)
+    influence = field.influence(sight.points)
+    return MovingBundle(sight.poses, sight.points, swing, sight.frame, sight.point, sight.rays, waves, influence, field)

@@ -1,0 +1,80 @@
+"""Bundle adjustment before tissue that moves: exact data, and against the one for tissue at rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+
+from gsplat_core.geometry.breathing_frequencies import waves
+from gsplat_core.geometry.bundle import Bundle, errors_px
+from gsplat_core.geometry.bundle import adjust as adjust_still
+from gsplat_core.geometry.moving_bundle import _cost, _step, adjust, with_waves
+from gsplat_core.geometry.pose import exp
+from gsplat_core.geometry.way_prior import learned_from
+from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ
+from tests.gsplat_core.geometry.breathing_sight import bundle_of, seen_for
+
+
+def breathing(length_s=9.0, rate_hz=4.0, noise_px=0.0):
+    sight, _ = seen_for(length_s, rate_hz=rate_hz, noise_px=noise_px)
+    return bundle_of(sight, waves(sight.times_s, (BREATHING_HZ, HEART_HZ))), sight.times_s
+
+
+def test_exact_sightings_are_explained_to_a_tenth_of_a_pixel():
+    bundle, _ = breathing()
+    before = float(bundle.off().norm(dim=1).median())
+    found, _ = adjust(bundle, 0.004, 12)
+    assert float(found.off().norm(dim=1).median()) < min(0.1 / 280, 0.1 * before)
+
+
+def test_without_waves_it_is_the_bundle_of_tissue_at_rest():
+    sight, _ = seen_for(5.0, breathes=0.0, rate_hz=4.0)
+    start = bundle_of(sight, waves(sight.times_s, ()))
+    start = replace(
+        start, poses=exp(1e-3 * torch.sin(torch.arange(6 * len(start.poses)).view(-1, 6).double())) @ start.poses
+    )
+    found, _ = adjust(start, 0.004, 15)
+    still = Bundle(start.poses, start.rest, start.camera, start.point, start.rays, 1 / 0.004)
+    fixed = torch.arange(len(start.poses)) == 0
+    expected = errors_px(adjust_still(still, fixed=fixed, rounds=30)) * 0.004
+    assert float((found.off().norm(dim=1) - expected).abs().median()) < 2e-6
+
+
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_a_step_that_nothing_holds_back_goes_down_the_slope(with_prior):
+    """Far from the optimum, along the step the cost falls as fast as its slope says: numerically, for cameras, places and swings together."""
+    bundle, times_s = breathing(5.0, noise_px=0.5)
+    way = learned_from(bundle.poses, times_s, bundle.waves) if with_prior else None
+    far = replace(bundle, rest=bundle.rest * (1 + 0.02 * torch.sin(torch.arange(len(bundle.rest)))[:, None]))
+    step = _step(far, 1.0, 1e-9, way)
+    begin, end = _cost(far, 1.0, way), _cost(step, 1.0, way)
+    assert end < begin
+    # The quadratic model of nearly quadratic costs: a second step gains next to nothing beside the first.
+    again = _cost(_step(step, 1.0, 1e-9, way), 1.0, way)
+    assert end - again < 0.05 * (begin - end)
+
+
+def test_no_step_makes_it_worse():
+    bundle, times_s = breathing(5.0, noise_px=1.0)
+    way = learned_from(bundle.poses, times_s, bundle.waves)
+    costs = [adjust(bundle, 0.004, rounds, way)[1] for rounds in range(5)]
+    assert all(after <= before for before, after in pairwise(costs)) and costs[-1] < costs[0]
+
+
+def test_the_first_camera_stays():
+    bundle, _ = breathing(5.0)
+    found, _ = adjust(bundle, 0.004, 3)
+    turn = found.poses[0, :3, :3]
+    torch.testing.assert_close(turn, bundle.poses[0, :3, :3])
+
+
+def test_more_waves_start_at_nothing_and_leave_the_others():
+    bundle, times_s = breathing(5.0)
+    none = replace(bundle, swing=bundle.swing[:, :, :0])
+    one, _ = adjust(with_waves(none, waves(times_s, (BREATHING_HZ,))), 0.004, 1)
+    both = with_waves(one, waves(times_s, (BREATHING_HZ, HEART_HZ)))
+    torch.testing.assert_close(both.off(), one.off())
+    assert not both.swing[:, :, 2:].any()
