@@ -17,7 +17,7 @@ can be used.
     depth       one eye at rest, with depth
 
 Usage: python benchmarks/geometry_synthetic.py [CASE...] [--scene open|colon] [--steps 400 | --replay 10] [--frames 36] [--width 160] [--height 128]
-       [--device cuda] [--work FOLDER] [--depth-noise MM] [--smoke S] [--exposure-changes] [--json]
+       [--depth CHOICE] [--device cuda] [--work FOLDER] [--depth-noise MM] [--smoke S] [--exposure-changes] [--json]
 On two CPU cores a case takes one to three minutes with these defaults. On a GPU: --device cuda --width 640 --height 512 --steps 3000.
 """
 
@@ -96,6 +96,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--width", type=int, default=160)
     parser.add_argument("--height", type=int, default=128)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--depth", default="auto", help="as --depth of replay and reconstruct: light for one fixed eye")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--work", type=Path, help="keep recordings and runs here, and take recordings from here")
     parser.add_argument("--depth-noise", type=float, default=0.0)
@@ -114,7 +115,9 @@ def measured(name: str, case: Case, arguments: argparse.Namespace, work: Path) -
     if case.camera == "moving" and not case.poses:
         blind = open_recording(given)
         write_poses(given / POSES_FILE, trajectory_of(blind, blind.camera).poses)
-    settings = ReplaySettings(given, work / f"{name}-run", device=arguments.device, sinks=(), seed=arguments.seed)
+    settings = ReplaySettings(
+        given, work / f"{name}-run", device=arguments.device, sinks=(), seed=arguments.seed, depth=arguments.depth
+    )
     if arguments.replay:
         replay(replace(settings, steps_per_frame=arguments.replay))
     else:

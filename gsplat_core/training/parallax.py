@@ -1,4 +1,4 @@
-"""Depth for the frames of a recording whose camera moves, before training on all of them.
+"""Depth for the frames of a recording before training on all of them, most of all where its camera moves.
 
 Without depth a scene starts on a plane. Where the camera moves, a plane at the wrong distance makes the camera's motion look like motion of
 the tissue, which has to be learned anew for every time and says nothing about times between.
@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsplat_core.geometry.depth_map import DepthMap
+from gsplat_core.geometry.light_of_recording import frames_with_light
 from gsplat_core.geometry.moving_tissue import MovingTissue
 from gsplat_core.geometry.multiview import DEFORMS, depth_of_view, view_of
 from gsplat_core.geometry.pose_check import CONTRADICTED
@@ -91,20 +92,34 @@ def _with(frame: Frame, found: DepthMap) -> Frame:
     return frame.with_fields(depth=found.depth, depth_confidence=found.confidence, depth_origin=found.origin)
 
 
-def to_fit(
-    frames: list[Frame], observation_of: Callable[[Frame], Observation], finds_depth: bool
-) -> tuple[WithParallax, list[Observation]]:
-    """The frames that a scene starts and grows from, and what is learned from them.
+class ToFit(NamedTuple):
+    """What a recording is trained on."""
 
-    finds_depth: whether depth is looked for. Raises InvalidInput where there are no frames, or they are not in order.
+    frames: list[Frame]
+    """Those that a scene starts and grows from."""
+    seen: list[Observation]
+    """What is learned from them."""
+    doubts: Mapping[str, int]
+    """Of `frames_with_parallax`, as `at_rest`."""
+    at_rest: bool = False
+    light_shows_motion: bool = False
+    """Of `frames_with_light`."""
+
+
+def to_fit(frames: list[Frame], observation_of: Callable[[Frame], Observation], finds_depth: bool) -> ToFit:
+    """What to train on. Depth by light is found anew from all frames; by parallax, if `finds_depth`, where there is no other.
+
+    Raises InvalidInput where there are no frames, or they are not in order.
     """
     seen = observed(frames, observation_of)
+    cameras = [each.camera for each in seen]
+    frames, light_shows_motion = frames_with_light(frames, cameras)
     if not finds_depth:
-        return WithParallax(frames, {}), seen
-    found = frames_with_parallax(frames, [each.camera for each in seen])
+        return ToFit(frames, seen, {}, light_shows_motion=light_shows_motion)
+    found = frames_with_parallax(frames, cameras)
     # What is not sure continues what is: that is something to start from, and nothing to learn.
     start = [
         frame.with_fields(depth_confidence=None) if frame.depth_origin is DepthOrigin.PARALLAX else frame
         for frame in found.frames
     ]
-    return found._replace(frames=start), observed(found.frames, observation_of)
+    return ToFit(start, observed(found.frames, observation_of), found.doubts, found.at_rest, light_shows_motion)

@@ -212,12 +212,12 @@ class Reconstructor:
         """
         if steps < 1:
             raise InvalidInput(f"steps is {steps}; it must be at least 1")
-        observed = partial(self.eyes.observation, camera=self.camera)
-        (frames, self.depth_doubts, at_rest), seen = to_fit(list(frames), observed, self.config.depth_from_motion)
+        given = to_fit(list(frames), partial(self.eyes.observation, camera=self.camera), self.config.depth_from_motion)
+        frames, seen, self.depth_doubts = given.frames, given.seen, given.doubts
         self._start(frames[0], seen[0], end_s=seen[-1].time_s)
         assert self._step is not None
         self._last_time_s = seen[-1].time_s
-        tracks = SurfaceTracks(frames, seen, at_rest)
+        tracks = SurfaceTracks(frames, seen, given.at_rest, given.light_shows_motion)
         for number, (frame, observation) in enumerate(zip(frames, seen, strict=True)):
             self._depth_source = DepthSource.after(self._depth_source, frame)
             first_new = self.gaussians if number else 0

@@ -27,8 +27,9 @@ from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import Seen, SurfaceMotion, beside
 from gsplat_core.transfers import tensor_of
 
-WITHOUT_MOTION = (DepthOrigin.LIGHT, DepthOrigin.LEARNED)
-"""Depth whose differences from frame to frame are no motion: it is right up to a factor that no two frames need to share."""
+OF_ONE_PICTURE = (DepthOrigin.LIGHT, DepthOrigin.LEARNED)
+"""Depth whose differences from frame to frame are no motion: it is right up to a factor that no two frames need to share. Depth by light is more where the
+tissue was followed (`light_of_recording`)."""
 EDGE_PX = 1
 """Beside a tool or a hole depth is not read: a point that is followed is not exact to the pixel."""
 ROWS_AT_ONCE = 1 << 14
@@ -38,9 +39,16 @@ ROWS_AT_ONCE = 1 << 14
 class SurfaceTracks:
     """The motion of the surface that the frames of a recording show; nothing where they do not show it."""
 
-    def __init__(self, frames: Sequence[Frame], observations: Sequence[Observation], at_rest: bool = False) -> None:
-        """As many of both. at_rest: the frames' depth is that of tissue that stands still, see `WithParallax`."""
-        self._at_rest = at_rest
+    def __init__(
+        self,
+        frames: Sequence[Frame],
+        observations: Sequence[Observation],
+        at_rest: bool = False,
+        light_shows_motion: bool = False,
+    ) -> None:
+        """As many of both. at_rest: the frames' depth is that of tissue that stands still, see `WithParallax`. light_shows_motion: depth by light was
+        found by following the tissue through all frames."""
+        self._at_rest, self._followed = at_rest, (DepthOrigin.LIGHT,) if light_shows_motion else ()
         self._frames, self._seen = frames, observations
         self._device = observations[0].image.device
         self._times = observations[0].image.new_tensor([one.time_s for one in observations], dtype=torch.float32)
@@ -97,11 +105,14 @@ class SurfaceTracks:
     def _depths(self) -> list[SurfaceDepth | None]:
         """Of each frame; None where nothing is believed, or it shows no motion."""
         return [
-            None
-            if frame.depth_origin in WITHOUT_MOTION or one.depth is None or not bool(one.depth.any())
-            else SurfaceDepth.of(possible_depth(frame), self._device)
+            None if not self._shows_surface(frame, one) else SurfaceDepth.of(possible_depth(frame), self._device)
             for frame, one in zip(self._frames, self._seen, strict=True)
         ]
+
+    def _shows_surface(self, frame: Frame, one: Observation) -> bool:
+        if frame.depth_origin in self._followed:  # the loss does not see it, so that it is in no observation
+            return frame.depth is not None and bool(frame.depth.any())
+        return frame.depth_origin not in OF_ONE_PICTURE and one.depth is not None and bool(one.depth.any())
 
     @cached_property
     def _ahead(self) -> list[SurfaceMotion]:

@@ -8,8 +8,7 @@ import pytest
 
 from gsplat_core.geometry.light import FLAT, UNSEEN, LightDepth
 from gsplat_core.geometry.registry import DEPTHS
-from gsplat_core.geometry.relief import find_relief
-from gsplat_core.geometry.shading import LEAST_DETAIL, Shading, shading_of
+from gsplat_core.geometry.shading import shading_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 
@@ -73,14 +72,6 @@ def test_a_lambertian_surface_is_found():
     assert (found.origin, found.metric) == (DepthOrigin.LIGHT, False)
     assert error(found.depth, true) < 0.4 * error(plane(), true)
     assert found.confidence.min() > 0.5
-
-
-def test_the_model_of_brightness_is_exact_where_nothing_is_unknown_but_relief():
-    rows, columns = 32, 40
-    x, y = (cv2.resize(ray, (columns, rows), interpolation=cv2.INTER_AREA) for ray in rays())
-    brightness = cv2.resize(np.log(lit(bowl())), (columns, rows), interpolation=cv2.INTER_AREA)
-    shading = Shading(brightness, np.ones((rows, columns)), LEAST_DETAIL)
-    assert find_relief(shading, x, y, (FOCAL / 4, FOCAL / 4)).share > 0.95
 
 
 def test_twice_the_light_shows_the_same_relief():

@@ -112,16 +112,21 @@ def test_one_frame_tells_no_motion(fixed):
     assert not moves_before_the_first_step(fixed.camera, list(fixed)[:1])
 
 
+def test_depth_by_light_tells_the_motion_where_it_followed_the_tissue(fixed):
+    frames = [frame.with_fields(depth_origin=DepthOrigin.LIGHT) for frame in fixed]
+    assert moves_before_the_first_step(fixed.camera, frames, light_shows_motion=True)
+
+
 def test_frames_with_depth_tell_the_motion_before_the_first_step(fixed):
     assert moves_before_the_first_step(fixed.camera, list(fixed))
 
 
-def moves_before_the_first_step(camera, frames: list[Frame]) -> bool:
+def moves_before_the_first_step(camera, frames: list[Frame], **shows) -> bool:
     seen = [Observation.of(frame, camera) for frame in frames]
     gaussians = gaussians_from_frame(frames[0], camera, 200, sh_degree=0, default_depth_mm=60.0)
     field = BasisField(gaussians.count, (0.0, 2.0), bumps=12)
     step = TrainingStep(gaussians, field, ReconstructorConfig(field="basis", gaussians=200), camera)
-    SurfaceTracks(frames, seen).apply(step, 0, 0)
+    SurfaceTracks(frames, seen, **shows).apply(step, 0, 0)
     return bool(field.weights.any())
 
 

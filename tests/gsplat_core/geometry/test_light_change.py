@@ -1,0 +1,64 @@
+"""Tissue that is followed: how its light changed is found, whatever pigment and reflections it has."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.geometry.light_change import Follower, look_at
+from gsplat_core.scene.frames import Frame
+from tests.gsplat_core.geometry.lit_sheet import CAMERA, HEIGHT, WIDTH, facing_and_distance, frame, noise, pigment, rays
+
+PLANE = np.full((HEIGHT, WIDTH), 60.0)
+
+
+def change(first, second):
+    return Follower(look_at(first, CAMERA)).change_to(look_at(second, CAMERA))
+
+
+def test_tissue_that_tilts_changes_its_light_by_that_and_not_by_its_pigment():
+    tilted = 60 * np.exp(0.06 * rays()[0])
+    found = change(frame(0, PLANE, pigment()), frame(1, tilted, pigment()))
+    light = [np.log(facing / distance**2) for facing, distance in map(facing_and_distance, (PLANE, tilted))]
+    true = cv2.resize(light[1] - light[0], (40, 32), interpolation=cv2.INTER_AREA)
+    assert found.is_followed and found.known.mean() > 0.7
+    assert np.abs((found.brighter - true)[found.known]).mean() < 0.2 * np.abs(true[found.known]).mean()
+
+
+def test_glints_that_come_and_go_hardly_change_anything():
+    first, second = (frame(seed, PLANE, pigment(), noise(seed, 3) > 1.6) for seed in (11, 12))
+    found = change(first, second)
+    blue = [
+        cv2.resize(each.image[..., 2].astype(np.float32), (40, 32), interpolation=cv2.INTER_AREA)
+        for each in (first, second)
+    ]
+    assert np.abs(found.brighter[found.known]).mean() < 0.2 * np.abs(2.2 * np.log(blue[1] / blue[0])).mean()
+
+
+def test_where_it_went_is_found():
+    picture = frame(0, PLANE, pigment()).image
+    moved = cv2.warpAffine(picture, np.float32([[1, 0, 3], [0, 1, -2]]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
+    found = change(Frame(0, 0, picture), Frame(1, 1, moved))
+    assert np.allclose(np.median(found.moved[found.known], axis=0), [3 * 40 / WIDTH, -2 * 32 / HEIGHT], atol=0.05)
+
+
+@pytest.mark.parametrize("other", ["unlike", "darker here and there"])
+def test_another_view_is_not_followed(other):
+    first = frame(0, PLANE, pigment())
+    second = {
+        "unlike": frame(1, PLANE, pigment(seed=8)),
+        "darker here and there": frame(1, 60 * np.exp(0.8 * np.abs(rays()[0])), pigment()),
+    }[other]
+    assert not change(first, second).is_followed
+
+
+def test_below_a_tool_nothing_is_known():
+    mask = np.ones((HEIGHT, WIDTH), np.uint8)
+    mask[:, 100:] = 0
+    found = change(frame(0, PLANE, pigment()), frame(1, PLANE, pigment(), mask=mask))
+    assert not found.known[:, 26:].any() and found.known[:, 4:20].all()
+
+
+def test_a_black_frame_is_not_followed():
+    assert not change(frame(0, PLANE, pigment()), Frame(1, 1, np.zeros((HEIGHT, WIDTH, 3), np.uint8))).is_followed
