@@ -18,6 +18,8 @@ LOOK_EVERY = 10
 """Frames from one comparison to the next."""
 FOLLOWS = 0.2
 """How fast the line follows a new comparison."""
+SHIFT_STAYS = 4
+"""So far from the shift of the last comparison the next one is looked for first."""
 LEAST_OVERLAP = 0.4
 """Of the picture's width, which both eyes see at least."""
 QUANTILES = (10, 50, 90)
@@ -56,7 +58,8 @@ class EyeColours:
         tissue = (
             np.ones(size[::-1], bool) if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0
         )
-        shift = best_shift(first.mean(-1), second.mean(-1))
+        before = None if self.shift is None else round(self.shift * size[0])
+        shift = best_shift(first.mean(-1), second.mean(-1), before)
         self.shift = shift / size[0]
         ours, theirs = overlap(first, second, shift)
         kept = overlap(tissue, tissue, shift)[0]
@@ -82,11 +85,18 @@ def _small(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def best_shift(left: NDArray[np.float32], right: NDArray[np.float32]) -> int:
-    """By how many pixels the right picture [h, w] shows the same farther to the left: where the two correlate best."""
+def best_shift(left: NDArray[np.float32], right: NDArray[np.float32], before: int | None = None) -> int:
+    """By how many pixels the right picture [h, w] shows the same farther to the left: where the two correlate best. before: what it was lately; it is
+    looked for around it then, and everywhere where the best is at the end of that."""
     width = left.shape[1]
     most = int((1 - LEAST_OVERLAP) * width)
-    return max(range(-most, most + 1), key=lambda shift: _correlation(*overlap(left, right, shift)))
+    correlation = lambda shift: _correlation(*overlap(left, right, shift))
+    if before is not None:
+        first, last = max(-most, before - SHIFT_STAYS), min(most, before + SHIFT_STAYS)
+        best = max(range(first, last + 1), key=correlation)
+        if first < best < last:
+            return best
+    return max(range(-most, most + 1), key=correlation)
 
 
 def overlap(left: NDArray, right: NDArray, shift: int) -> tuple[NDArray, NDArray]:

@@ -63,14 +63,17 @@ class Placement:
         if self.postpones and self.is_placed and shown_s is None:
             self._postponed = frame, observation
             return
-        if frame is self._first or not _has_depth(frame):
+        if frame is self._first or frame.depth is None:
             return
         if observation.camera.model != "pinhole" or not step.field.takes_positions:
             return
         if self.is_placed and frame.depth_origin not in CORRECTS_ALL_TIMES + CORRECTS_ONE_TIME:
             return
         # Depth by light is in no observation: the loss does not see it.
-        possible = known_depth(possible_depth(frame), observation.image.device)
+        there_is = possible_depth(frame)
+        if not there_is.any():
+            return
+        possible = known_depth(there_is, observation.image.device)
         with torch.no_grad():
             if self.is_placed and frame.depth_origin in CORRECTS_ONE_TIME:
                 _correct(step, observation, possible, observation.time_s if shown_s is None else shown_s)

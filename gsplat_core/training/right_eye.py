@@ -26,6 +26,8 @@ from gsplat_core.transfers import tensor_of
 
 CELL_PX = 4
 """Tools are looked for in the right picture by cells of so many pixels."""
+TYPICAL_OF = 500
+"""The typical disparity is the median of so many cells, or up to twice as many."""
 NEAREST, FARTHEST = 2.0, 0.75
 """Where a tool's depth is not known, its disparity is between these multiples of what is typical of the picture: tools are nearer than tissue."""
 
@@ -123,15 +125,22 @@ def right_tissue(frame: Frame, camera: Camera, right: Camera, shift_px: float) -
     if frame.mask is None or frame.mask.all():
         return np.ones((height, width), np.uint8)
     rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
-    tool = cv2.resize((frame.mask == 0).astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA) > 0
-    depth = cv2.resize(believed_depth(frame), (columns, rows), interpolation=cv2.INTER_NEAREST)
+    size = columns, rows
+    tool = cv2.resize(np.equal(frame.mask, 0).view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > 0
+    if frame.depth is None:
+        depth = np.zeros((rows, columns), np.float32)
+    else:
+        depth = np.asarray(cv2.resize(believed_depth(frame), size, interpolation=cv2.INTER_NEAREST), np.float32)
     known = np.isfinite(depth) & (depth > 0)
     centres = (np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1) + 0.5) * (width / columns, height / rows)
     hidden = np.zeros((rows, columns), np.uint8)
     if known.any():
-        places = _seen_by_right(centres[known], depth[known], replace(camera, world_to_camera=np.eye(4)), right)
-        shift_px = float(np.median(centres[known][:, 0] - places[:, 0]))
-        of_tools = np.floor(places[tool[known]] * (columns / width, rows / height)).astype(np.int64)
+        own = replace(camera, world_to_camera=np.eye(4))
+        some = np.flatnonzero(known)[:: max(1, int(np.count_nonzero(known)) // TYPICAL_OF)]
+        places, typical, tools = centres.reshape(-1, 2), depth.ravel(), tool & known
+        shift_px = float(np.median((places[some] - _seen_by_right(places[some], typical[some], own, right))[:, 0]))
+        of_tools = _seen_by_right(centres[tools], depth[tools], own, right)
+        of_tools = np.floor(of_tools * (columns / width, rows / height)).astype(np.int64)
         inside = ((of_tools >= 0) & (of_tools < (columns, rows))).all(1)
         hidden[of_tools[inside, 1], of_tools[inside, 0]] = 1
     hidden |= _smeared(
