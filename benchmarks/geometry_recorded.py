@@ -3,7 +3,8 @@
     python benchmarks/geometry_recorded.py RECORDING [--depth recorded light none] [--steps 2000] [--device cuda] [--scale 1]
 
 A JSON line for each choice, trained offline on all frames and frame by frame: root mean square error over the median depth, as it is and after one scale, beside the
-best tilted plane and the median of each frame; median of the absolute error after that scale. Every third frame is compared.
+best tilted plane and the median of each frame; median of the absolute error after that scale. Every third frame is compared, where its own depth is
+not doubted (`measured_confidence`); `all_pixels` is the error after one scale with what is doubted.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 
 from gsplat_core.evaluation.depth_share import DepthShareSums
+from gsplat_core.geometry.measured_depth import measured_confidence
 from gsplat_core.geometry.registry import DepthFinder
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.rendering.rasterization import render
@@ -60,7 +62,7 @@ def main() -> None:
         finder = DepthFinder(choice, camera, has_time=True)
         given = [finder.with_depth(frame) for frame in frames]
         for offline in (True, False):
-            sums = DepthShareSums()
+            sums, of_all = DepthShareSums(), DepthShareSums()
             for frame, model in zip(frames, models(offline, choice, given, camera, asked), strict=True):
                 if frame.seq % EVERY or frame.depth is None:
                     continue
@@ -68,10 +70,13 @@ def main() -> None:
                 with torch.no_grad():
                     shown = render(model.at(frame.time_s), pose, depth=True).depth.cpu().numpy()
                 known = np.isfinite(frame.depth) & (frame.depth > 0)
-                sums.add(camera, frame.depth, shown, known if frame.mask is None else known & (frame.mask > 0))
-            errors = sums.errors
-            assert errors is not None, "the recording has no depth to compare with"
+                known = known if frame.mask is None else known & (frame.mask > 0)
+                of_all.add(camera, frame.depth, shown, known)
+                sums.add(camera, frame.depth, shown, known & (measured_confidence(frame.depth) > 0))
+            errors, everywhere = sums.errors, of_all.errors
+            assert errors is not None and everywhere is not None, "the recording has no depth to compare with"
             figures = {
+                "all_pixels": everywhere.scaled_rmse_share,
                 "rmse": errors.rmse_share, "scaled": errors.scaled_rmse_share, "plane": errors.plane_rmse_share,
                 "level": errors.level_rmse_share, "median": errors.median_share, "covered": errors.covered,
             }  # fmt: skip
