@@ -21,6 +21,7 @@ from gsplat_core.geometry.grid_tracks import GridTracks, TexturedPicture, follow
 from gsplat_core.geometry.periodic_motion import Array, PeriodicMotion, fitted, in_cameras, off_px
 from gsplat_core.geometry.pull import pull_of
 from gsplat_core.geometry.surface_through import surface_through
+from gsplat_core.geometry.undisturbed import fitted_undisturbed
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 
@@ -137,13 +138,14 @@ def _found(pictures: list[TexturedPicture], times_s: Array) -> _Window | str:
     if not frequencies.hz:
         return OTHERWISE
     motion = fitted(tracks, frequencies.hz)
-    off = off_px(motion.at(times_s), tracks)
-    if float(np.median(np.linalg.norm(off, axis=2)[tracks.seen])) > MOST_OFF_PX:
+    if float(np.median(np.linalg.norm(off_px(motion.at(times_s), tracks), axis=2)[tracks.seen])) > MOST_OFF_PX:
         return OTHERWISE
+    motion = fitted_undisturbed(tracks, motion)
     cycles = frequencies.hz[0] * length_s
     if cycles < LEAST_CYCLES or float(np.hypot(np.median(motion.error), frequencies.error)) > MOST_ERROR:
         return TOO_SHORT
-    return _Window(float(times_s.mean()), tracks, motion, -off / tracks.focal_px, frequencies.error)
+    off = -off_px(motion.at(times_s), tracks) / tracks.focal_px
+    return _Window(float(times_s.mean()), tracks, motion, off, frequencies.error)
 
 
 def _share(window: _Window, time_s: float) -> float:

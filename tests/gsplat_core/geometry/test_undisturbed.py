@@ -1,0 +1,81 @@
+"""Tissue that breathes and is pulled for a while: the pull takes no part in the motion that repeats itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.geometry.grid_tracks import GridTracks
+from gsplat_core.geometry.periodic_motion import PeriodicMotion, fitted, off_px
+from gsplat_core.geometry.undisturbed import fitted_undisturbed, together_px
+from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ, places, swaying, tracks_of
+
+TIMES_S = np.arange(0, 5, 0.08)
+HZ = (BREATHING_HZ, HEART_HZ)
+PULL = np.array([2.3, 1.5, -6.0])
+GRASPED = np.array([6.0, -3.0])
+
+
+def pulled(points: np.ndarray) -> np.ndarray:
+    """The points [T, N, 3], of which some near one place are pulled from 1.5 s to 3 s."""
+    strength = np.sin(np.pi * np.clip((TIMES_S - 1.5) / 1.5, 0, 1)) ** 2
+    near = np.exp(-0.5 * (((points[0, :, :2] - GRASPED) / 12) ** 2).sum(1))
+    return points + (strength[:, None] * near)[..., None] * PULL
+
+
+def distance_errors(motion: PeriodicMotion, points: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Relative errors of z [T, N]."""
+    z = [np.einsum("j,tnj->tn", [0, 0, 1], each @ poses[0, :3, :3].T) for each in (motion.at(TIMES_S), points)]
+    return z[0] / z[1] - 1
+
+
+@pytest.fixture(scope="module")
+def breathing() -> np.ndarray:
+    return places(TIMES_S, count=600)
+
+
+def test_a_pull_does_not_disturb_what_repeats_itself(breathing) -> None:
+    poses = swaying(TIMES_S)
+    tracks = tracks_of(pulled(breathing), poses, TIMES_S)
+    first = fitted(tracks, HZ)
+    again = fitted_undisturbed(tracks, first)
+    # Of the tissue as it would be without the pull, and at the times at which it is not pulled.
+    before, after = (np.sqrt((distance_errors(each, breathing, poses) ** 2).mean()) for each in (first, again))
+    assert after < 0.6 * before
+    undisturbed = fitted(tracks_of(breathing, poses, TIMES_S), HZ)
+    assert after < 1.6 * np.sqrt((distance_errors(undisturbed, breathing, poses) ** 2).mean())
+    assert again.error.max() < 0.2, "each point keeps sightings that say how far away it is"
+
+
+def test_without_a_pull_hardly_anything_changes(breathing) -> None:
+    tracks = tracks_of(breathing, swaying(TIMES_S), TIMES_S)
+    first = fitted(tracks, HZ, rounds=16)
+    again = fitted_undisturbed(tracks, first)
+    off = np.linalg.norm(first.at(TIMES_S) - again.at(TIMES_S), axis=2)
+    assert np.median(off) < 0.02, "of 70"
+
+
+def test_how_far_neighbours_are_off_together() -> None:
+    random = np.random.default_rng(0)
+    rays = random.uniform(-0.5, 0.5, (2, 400, 2)) * [1.1, 0.9]
+    seen = random.random((2, 400)) > 0.2
+    tracks = GridTracks(rays, seen, np.tile(np.eye(4), (2, 1, 1)), np.arange(2.0), 280.0, (0.57, 0.45))
+    off = random.normal(0, 0.5, (2, 400, 2))
+    left = rays[..., 0] < 0
+    off[1][left[1]] += [2.0, -1.0]
+    off[:, ::40] = 60.0  # not found
+    far = np.abs(rays[..., 0]) > 0.25
+    together = together_px(off, tracks)
+    assert together.shape == (2, 400)
+    assert np.median(together[1][left[1] & far[1]]) == pytest.approx(np.hypot(2, 1), rel=0.1)
+    assert together[0].max() < 0.9 and together[1][~left[1] & far[1]].max() < 0.9
+
+
+def test_a_point_that_is_always_off_keeps_its_sightings() -> None:
+    """All points there move otherwise than breathing does: there is nothing else to know them by."""
+    points = places(TIMES_S)
+    points[:, points[0, :, 0] > 20] += np.linspace(0, 9, len(TIMES_S))[:, None, None] ** 1.5 * [0.0, 1.0, 0.0]
+    tracks = tracks_of(points, swaying(TIMES_S), TIMES_S)
+    motion = fitted_undisturbed(tracks, fitted(tracks, HZ))
+    assert np.isfinite(motion.terms).all() and np.isfinite(motion.error).all()
+    assert np.isfinite(off_px(motion.at(TIMES_S), tracks)).all()
