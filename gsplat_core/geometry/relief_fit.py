@@ -2,8 +2,8 @@
 
 What is looked for is the relief at a key time, and how it differs at each other time. Three things are held against it:
 
-* **Brightness** of each picture. Pigment that is left in it is another sum of cosines; lamp and lens darken towards the border by a power of the
-  cosine of the angle to the axis.
+* **Brightness** of each picture, by a mixture of its channels and by what is not mirrored. Pigment that is left in it is another sum of cosines; lamp
+  and lens darken towards the border by a power of the cosine of the angle to the axis.
 * **Change of brightness of tissue that is followed** from the key time on: pigment plays no part in it. How much light there is may change.
 * **Glints** on wet tissue: the rarer, the more the surface turns away from the lamp, exponentially. How rare is not known.
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from gsplat_core.geometry.light_change import Change
 from gsplat_core.geometry.relief import Appearance, Array, Grid, Places, appearance
-from gsplat_core.geometry.shading import Shading
+from gsplat_core.geometry.shading import Cells, Shading
 
 RELIEF, RELIEF_COUNT = 0.05, 100
 """Prior standard deviation of the coefficients of coarse cosines, and the weight of that value while it is estimated: as if so many had shown it."""
@@ -91,7 +91,8 @@ class Equations:
 class Brightness:
     """That of several pictures, with the pigment and the light that they share."""
 
-    def __init__(self, grid: Grid, shadings: Sequence[Shading], times: Sequence[int]) -> None:
+    def __init__(self, grid: Grid, shadings: Sequence[Cells], times: Sequence[int], counts: float) -> None:
+        """times: of the pictures. counts: what share of the pictures' brightness this is."""
         self._known = [shading.known.ravel() for shading in shadings]
         self._times = times
         column, row = grid.middles()
@@ -100,8 +101,8 @@ class Brightness:
         self._seen = np.concatenate([each.brightness.ravel()[known] for each, known in pairs])
         detail = float(np.median([each.detail for each in shadings]))
         self._noise = 2 / detail**2
-        self._weight = (
-            np.concatenate([each.share.ravel()[known] for each, known in pairs]) / len(shadings) * self._noise
+        self._weight = np.concatenate([each.share.ravel()[known] for each, known in pairs]) * (
+            counts * self._noise / len(shadings)
         )
         pigment = PIGMENT * detail / (1 + grid.half_waves / PIGMENT_HALF_WAVES) ** 2
         self._prior = np.concatenate([pigment**-2, [1e-6, FALL_OFF_DEVIATION**-2]])
@@ -199,21 +200,25 @@ def find_reliefs(grid: Grid, shadings: Sequence[Shading], followed: Sequence[Cha
     """The most probable reliefs of several times, of which each has a `Shading`, and how brightness changed since the key time; None at that time
     and where nothing could be followed: the relief is taken to be as at the key time."""
     times = np.unique(np.linspace(0, len(shadings) - 1, BRIGHTNESS_LOOKS).round().astype(int)).tolist()
-    brightness, glints = Brightness(grid, [shadings[k] for k in times], times), Glints(grid, shadings)
+    kinds: list[list[Cells]] = [[shadings[k] for k in times]]
+    diffuse = [each for k in times if (each := shadings[k].diffuse) is not None]
+    kinds += [diffuse] if len(diffuse) == len(times) else []
+    brightness, glints = [Brightness(grid, each, times, 1 / len(kinds)) for each in kinds], Glints(grid, shadings)
     changing = {time: Followed(grid, change) for time, change in enumerate(followed) if change is not None}
     finer, width = _finer(grid), RELIEF
     key, changes = np.zeros(len(finer)), np.zeros((len(shadings), len(finer)))
     for number in range(ROUNDS):
         slopes, with_glints = min(1.0, number / ROUNDS_TO_SLOPES), number >= ROUNDS_TO_SLOPES
         prior = (width * finer) ** -2
-        parts = [brightness.equations(key, changes, slopes)]
+        parts = [each.equations(key, changes, slopes) for each in brightness]
         parts += [each.equations(key, changes[time], slopes) for time, each in changing.items()]
         parts += [glints.equations(key, changes)] if with_glints else []
         information = np.diag(prior) + sum(each.information for each in parts)
         step = np.asarray(np.linalg.solve(information, sum(each.pull for each in parts) - prior * key), np.float64)
         step = step * (DAMPING if with_glints else 1.0)
         key = key + step
-        brightness.take(step)
+        for kind in brightness:
+            kind.take(step)
         for time, each in changing.items():
             changes[time] += each.take(step)
         if with_glints:

@@ -46,8 +46,8 @@ BESIDE_TOOL_EDGE = 0.0125
 
 
 @dataclass(frozen=True)
-class Shading:
-    """What a picture tells about its light, in cells."""
+class Cells:
+    """How brightly the cells of a picture are lit."""
 
     brightness: NDArray[np.float64]
     """Logarithm [h, w] of how bright the cell would be without its pigment, up to one summand; meaningless where `share` is too small."""
@@ -55,15 +55,23 @@ class Shading:
     """[h, w]: share of the cell's pixels that could be used."""
     detail: float
     """Standard deviation of `brightness` between neighbouring cells: pigment that is left, and noise."""
-    glints: NDArray[np.float64]
-    """[h, w]: share of the cell's pixels that are glints of wet tissue."""
-    wet_share: NDArray[np.float64]
-    """[h, w]: share in which glints could be seen."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
         """The cells of which enough could be used [h, w]."""
         return self.share >= LEAST_KNOWN
+
+
+@dataclass(frozen=True)
+class Shading(Cells):
+    """What a picture tells about its light; its brightness is that of the mixture of channels."""
+
+    glints: NDArray[np.float64]
+    """[h, w]: share of the cell's pixels that are glints of wet tissue."""
+    wet_share: NDArray[np.float64]
+    """[h, w]: share in which glints could be seen."""
+    diffuse: Cells | None = None
+    """By what comes out of the tissue (`log_diffuse`): it errs otherwise than the mixture. None where it is not known of any cell."""
 
 
 @dataclass(frozen=True)
@@ -107,17 +115,29 @@ def shading_of(frame: Frame) -> Shading:
 def shading_in(picture: SmallPicture) -> Shading:
     """The shading of the tissue in a small picture."""
     cells, share = picture.averaged(_LOG_LIGHT[picture.levels], picture.usable)
-    known = share >= LEAST_KNOWN
-    steps = np.concatenate(
-        [
-            (cells[:, 1:] - cells[:, :-1])[known[:, 1:] & known[:, :-1]],
-            (cells[1:] - cells[:-1])[known[1:] & known[:-1]],
-        ]
-    )
-    weights = _least_pigment(steps)
-    spread = 1.4826 * float(np.median(np.abs(steps @ weights))) if len(steps) else 0.0
+    weights = _least_pigment(_steps(cells, share))
     glints, wet_share = picture.averaged(_glints(picture), picture.tissue.astype(np.float32))
-    return Shading(cells @ weights, share, max(spread, LEAST_DETAIL), glints * wet_share, wet_share)
+    diffuse, known = log_diffuse(picture)
+    red, red_share = picture.averaged(diffuse, known.astype(np.float32))
+    return Shading(
+        cells @ weights,
+        share,
+        _spread(_steps(cells, share) @ weights),
+        glints * wet_share,
+        wet_share,
+        Cells(red, red_share, _spread(_steps(red, red_share))) if np.any(red_share >= LEAST_KNOWN) else None,
+    )
+
+
+def _steps(cells: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Differences between neighbouring cells [N] or [N, channels], of those of which enough is known."""
+    known = share >= LEAST_KNOWN
+    across = (cells[:, 1:] - cells[:, :-1])[known[:, 1:] & known[:, :-1]]
+    return np.concatenate([across, (cells[1:] - cells[:-1])[known[1:] & known[:-1]]])
+
+
+def _spread(steps: NDArray[np.float64]) -> float:
+    return max(1.4826 * float(np.median(np.abs(steps))), LEAST_DETAIL) if len(steps) else LEAST_DETAIL
 
 
 def log_diffuse(picture: SmallPicture) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
