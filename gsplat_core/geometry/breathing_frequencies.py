@@ -22,8 +22,9 @@ SPREAD = 0.007
 ROUNDS = 2
 UNEXPLAINED = 1.0
 """Cost of an observation from which on there is something to explain: errors as they are expected cost one half to one."""
-BREATHES, BEATS = 0.75, 0.96
-"""What is left of the cost with a frequency, relative to without, from which on the tissue is taken to move with it."""
+BREATHES, BEATS = 0.75, 0.94
+"""What is left of the cost with a frequency from which on the tissue is taken to move with it: of breathing relative to tissue at rest, of the heart to
+the median of all frequencies that are tried, since any explains a little."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,8 @@ def frequencies_of(start: MovingBundle, times_s: Tensor, fastest_hz: float = HEA
         for hz in _between(HEART_HZ[0], min(HEART_HZ[1], fastest_hz), 2 * step)
     ]
     alone = _tried(best.bundle, times_s, best.hz, 1)
-    best = _best([alone, *(each for each in beats if each.cost < BEATS * alone.cost)])
+    usual = float(np.median([each.cost for each in beats])) if beats else 0.0
+    best = _best([alone, *(each for each in _valleys(beats) if each.cost < BEATS * usual)])
     bundle, hz = best.bundle, best.hz
     for part in (1.0, 0.5, 0.25, 0.125):
         bundle, hz = sharpened(bundle, times_s, hz, part * STEP_CYCLES, SPREAD)
@@ -102,6 +104,12 @@ def _tried(
 
 def _best(tries: Sequence[_Try]) -> _Try:
     return min(tries, key=lambda each: each.cost)
+
+
+def _valleys(tries: Sequence[_Try]) -> list[_Try]:
+    """Those that are better than both neighbours: the best one at an end of the band is the flank of something outside."""
+    inner = zip(tries, tries[1:], tries[2:], strict=False)
+    return [each for before, each, after in inner if each.cost <= min(before.cost, after.cost)]
 
 
 def _between(slowest: float, fastest: float, step: float) -> list[float]:
