@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,7 +12,9 @@ import pytest
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.geometry import focal_length
 from gsplat_core.geometry.focal_length import FocalLength
+from gsplat_core.geometry.odometry import Breathing
 from gsplat_core.io.recordings import open_recording
+from services.cli import poses
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK
 from tests.gsplat_core.geometry.moving_scope import FOCAL, HEIGHT, SIDEWAYS, WIDTH, video
@@ -54,9 +57,9 @@ def test_the_file_goes_beside_the_pictures_and_the_recording_is_read_with_it(cli
     assert (said["path"], said["frames"], said["not_placed"]) == (str(folder / "poses.npy"), COUNT, [])
     assert said["way"] > 0 and said["points"] > 50 and said["explained"] > 0.9
     assert 0 < said["error_px"] < said["error_px_of_a_still_scope"]
-    poses = np.stack([frame.pose for frame in open_recording(folder)])
+    read = np.stack([frame.pose for frame in open_recording(folder)])
     _, cameras = video(COUNT, SIDEWAYS)
-    errors = evaluate_trajectory(poses, np.stack([camera.world_to_camera for camera in cameras]))
+    errors = evaluate_trajectory(read, np.stack([camera.world_to_camera for camera in cameras]))
     assert errors is not None and errors.similarity_share < 0.05
 
 
@@ -108,6 +111,27 @@ def test_a_scope_that_may_stand_still_is_said(clip, capsys):
     said = said_of(capsys, clip(STILL))
     assert said["explained"] < 0.75
     assert any("it may stand still before tissue that moves" in note for note in said["notes"])
+
+
+def test_breathing_that_was_told_from_the_way_is_said(clip, capsys, monkeypatch):
+    plain = poses.trajectory_of
+
+    def told(frames, camera):
+        found = plain(frames, camera)
+        return replace(found, breathing=Breathing((0.294, 1.11), 0.02 * found.path))
+
+    monkeypatch.setattr(poses, "trajectory_of", told)
+    said = said_of(capsys, clip())
+    assert (said["breathing_hz"], said["uncertain"]) == ([0.294, 1.11], 0.02)
+    assert any("0.29 and 1.11 times a second" in note and "2.0% of the way" in note for note in said["notes"])
+
+
+def test_tissue_that_moves_otherwise_is_said(clip, capsys, monkeypatch):
+    plain = poses.trajectory_of
+    monkeypatch.setattr(poses, "trajectory_of", lambda *given: replace(plain(*given), error_px=1.5))
+    said = said_of(capsys, clip())
+    assert (said["breathing_hz"], said["uncertain"]) == ([], None)
+    assert any("points are off by 1.5 px: the tissue moves by itself" in note for note in said["notes"])
 
 
 def test_frames_that_show_nothing_are_named(clip, capsys):
