@@ -63,7 +63,7 @@ class RunRecording:
         self, graph: Application, settings: LiveSettings, source: SourceDescription, room: Callable[[], int]
     ) -> None:
         """room: bytes on the disk that finishing the run needs."""
-        self._graph, self._settings = graph, settings
+        self._graph, self._settings, self._is_stereo = graph, settings, source.is_stereo
         self.recorder: SessionRecorder | None = None
         if settings.record is not None:
             self.recorder = new_recorder(settings.record, source, settings, room)
@@ -117,6 +117,7 @@ class RunRecording:
                     config=_json(reconstructor.config),
                     training=_json(settings.chosen_training),
                     camera=camera_record(reconstructor.camera),
+                    stereo=self._is_stereo,
                 )
             )
             return reconstructor

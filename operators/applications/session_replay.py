@@ -50,7 +50,7 @@ class FollowedSession:
                 recording_digest=self.source.description.digest,
                 device=self.device,
             )
-            warm_reconstructor(reconstructor, stereo=self.source.description.is_stereo)
+            warm_reconstructor(reconstructor, stereo=self.made.stereo)
         return reconstructor
 
     def reconstruct_op(self, graph: Application, name: str) -> ScheduledReconstructOp:

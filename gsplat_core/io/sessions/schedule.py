@@ -36,6 +36,8 @@ class ReconstructorMade(Record):
     training: dict[str, Any]
     """The fields of `LiveTraining`."""
     camera: CameraRecord
+    stereo: bool = False
+    """Whether it was prepared for frames of two eyes."""
 
 
 class SceneBegun(Record):
