@@ -16,6 +16,7 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.config import ReconstructorConfig
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
+from operators.sources.source import SourceDescription
 
 
 @dataclass(frozen=True)
@@ -129,10 +130,17 @@ class DepthOp(Operator):
         self._counts.contribute(outcome, self.choice, self._finder)
 
 
+def offline_choice(choice: str, source: SourceDescription) -> str:
+    """The setting `depth` for a recording of which all frames are known: where nothing else shows how far away tissue is, `auto` is by the scope's own
+    light."""
+    fields = source.fields if source.moves else source.fields - {"pose"}
+    return "light" if choice == "auto" and not fields & {"depth", "right_image", "pose"} else choice
+
+
 def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConfig) -> str | None:
     """What is to be said where frames with these fields are given no recorded depth, and there is time to find it; None where they keep it.
 
-    choice: the setting `depth`.
+    choice: the setting `depth`, or `offline_choice` of it.
     """
     if "depth" in fields and choice in ("auto", "recorded"):
         return None

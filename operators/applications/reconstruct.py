@@ -26,6 +26,7 @@ from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplayApplication, ReplaySettings, new_reconstructor, prepare
 from operators.applications.result import RunOutcome
 from operators.applications.session import Session, Start
+from operators.depth import offline_choice
 from operators.sources.source import FrameSource
 
 
@@ -65,6 +66,7 @@ def reconstruct(
 
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
         source = prepare(inside, notes, offline=True)
+        inside = replace(inside, depth=offline_choice(inside.depth, source.description))
         start = Start.now()
         model, eyes, done = _fit(source, inside, steps, progress, stop_requested, notes)
         if done < steps:

@@ -35,7 +35,7 @@ from operators.applications.result import RunOutcome, RunSettings
 from operators.applications.session import Session
 from operators.applications.session_replay import FollowedSession, followed_session
 from operators.deform import DeformOp
-from operators.depth import DepthOp, without_depth
+from operators.depth import DepthOp, offline_choice, without_depth
 from operators.frame_log import FRAMES_FILE, FrameLog
 from operators.graph import Application, Engine
 from operators.ingest import SourceOp
@@ -261,8 +261,7 @@ def replay(
 
 
 def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False) -> FrameSource:
-    """Check everything that can be checked before the first frame; returns the source, and adds what is to be said about it to `notes`.
-    offline: whether all frames are kept for training.
+    """Check all that can be checked before the first frame; returns the source, and adds what is to be said of it to `notes`. offline: for `fit`.
 
     Raises as `replay` does before anything is written.
     """
@@ -282,7 +281,8 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
             "give a smaller --scale or --max-frames",
         )
     notes.extend(description.notes)
-    if (note := without_depth(settings.depth, description.fields, config)) is not None:
+    choice = offline_choice(settings.depth, description) if offline else settings.depth
+    if (note := without_depth(choice, description.fields, config)) is not None:
         notes.append(note)
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
     return source

@@ -12,8 +12,9 @@ from gsplat_core.geometry.registry import DEPTHS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, FrameStatus
 from gsplat_core.training.config import ReconstructorConfig
-from operators.depth import DepthOp, FoundDepth, without_depth
+from operators.depth import DepthOp, FoundDepth, offline_choice, without_depth
 from operators.outcome import OutcomeBuilder
+from operators.sources.source import SourceDescription
 
 CAMERA = Camera.from_focal(20.0, 24, 16)
 PLANE = np.full((16, 24), 50, np.float32)
@@ -145,6 +146,18 @@ def test_a_scene_that_depth_by_light_starts_is_not_said_to_start_on_a_plane_for_
     assert "unless light and shade show how far away it is" in said
     said = without_depth("onnx:net.onnx", frozenset(), ReconstructorConfig())
     assert "unless answers of the depth network show how far away it is" in said
+
+
+@pytest.mark.parametrize(
+    ("choice", "fields", "moves", "expected"),
+    [
+        ("auto", {"mask"}, True, "light"), ("auto", {"pose"}, False, "light"), ("auto", {"pose"}, True, "auto"), ("auto", {"depth"}, False, "auto"),
+        ("auto", {"right_image"}, False, "auto"), ("none", set(), False, "none"), ("stereo", set(), False, "stereo"),
+    ],
+)  # fmt: skip
+def test_offline_light_is_asked_where_nothing_else_shows_how_far_away_tissue_is(choice, fields, moves, expected):
+    source = SourceDescription("it", 8, 6, 30.0, Camera.from_focal(8.0, 8, 6), frozenset(fields), moves=moves)
+    assert offline_choice(choice, source) == expected
 
 
 @pytest.mark.parametrize(("has_time", "asked"), [(True, [0, 2, 3]), (False, [])])
