@@ -66,8 +66,9 @@ class LiveSettings:
     field: str = "auto"
     renderer: str = "alpha"
     seed: int = 0
-    eyes: Eyes = "both"
-    """Which pictures of a stereo scope are trained on; `both` where the right one's camera is known."""
+    eyes: Eyes = "left"
+    """Which pictures of a stereo scope are trained on; `both` where the right one's camera is known. Depth is found from both in either case, and what is
+    shown is the left one's: the right one takes steps from it."""
     scale: float = 1.0
     max_frames: int | None = None
     seconds: float | None = None

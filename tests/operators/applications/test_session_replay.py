@@ -83,7 +83,12 @@ def record(folder: Path, change, options: WriterOptions | None = None) -> RunOut
     recording = open_recording(synthesize(folder / "synthetic", frames=FRAMES, width_px=64, height_px=48))
     (folder / "live").mkdir()
     settings = LiveSettings(
-        source="scope", out=folder / "live", record=folder / "session", recording=options or WriterOptions(), seed=3
+        source="scope",
+        out=folder / "live",
+        record=folder / "session",
+        recording=options or WriterOptions(),
+        seed=3,
+        eyes="both",
     )
     source = _Scope(recording, change)
     graph = LiveApplication(source, settings, warm_up(settings, source))
