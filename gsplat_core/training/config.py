@@ -24,9 +24,10 @@ def check_eyes(eyes: str) -> None:
         raise InvalidSetting(f"eyes is {eyes!r}; choose {' or '.join(get_args(Eyes))}")
 
 
-MEASURED_WEIGHS = 10.0
-"""How many times more depth counts that was measured than depth that was found in pictures. With less of it, colours move Gaussians along the line of
-sight, which pictures hardly show, by more than a measured depth is off."""
+MEASURED_WEIGHS, MEASURED_WEIGHS_ONLINE = 10.0, 3.0
+"""How many times more depth counts that was measured than depth that was found in pictures, where all frames are known and where they come one after
+another. With less of it, colours move Gaussians along the line of sight, which pictures hardly show, by more than a measured depth is off; with more, the
+few steps of a frame leave less for its picture."""
 
 
 @dataclass(frozen=True)
@@ -151,12 +152,14 @@ class ReconstructorConfig:
             depth_from_motion=True,
         )
 
-    def starting_from(self, frame: Frame) -> ReconstructorConfig:
-        """The same for a scene that starts from `frame`. A stream without an end keeps its weights from scene to scene, whatever these start from."""
+    def starting_from(self, frame: Frame, all_known: bool) -> ReconstructorConfig:
+        """The same for a scene that starts from `frame`. all_known: whether all frames are there. A stream without an end keeps its weights from scene to
+        scene, whatever these start from."""
         measured = frame.depth is not None and frame.depth_origin in (None, DepthOrigin.MEASURED)
         if not measured or self.history_s is not None:
             return self
-        return dataclasses.replace(self, depth_weight=MEASURED_WEIGHS * self.depth_weight)
+        factor = MEASURED_WEIGHS if all_known else MEASURED_WEIGHS_ONLINE
+        return dataclasses.replace(self, depth_weight=factor * self.depth_weight)
 
     @property
     def chosen_field(self) -> str:

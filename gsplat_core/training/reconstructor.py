@@ -268,7 +268,7 @@ class Reconstructor:
         with torch.random.fork_rng(devices=[]):  # planes and layers start random
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
-        self._step = TrainingStep(gaussians, field, self.config.starting_from(frame), self.camera)
+        self._step = TrainingStep(gaussians, field, self.config.starting_from(frame, end_s is not None), self.camera)
         self._prior = None if end_s is not None else new_motion_prior(self.config, field)
         if self.device.type == "cuda" and SnapshotSlots.can_hold(field):
             self._coverage = CapturedCoverage(self.camera, self.device, self._fixed_rows)

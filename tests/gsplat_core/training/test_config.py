@@ -9,7 +9,7 @@ from gsplat_core.deformation.basis_kind import BasisLearningRates
 from gsplat_core.deformation.hexplane_kind import HexPlaneLearningRates
 from gsplat_core.errors import InvalidSetting, UserError
 from gsplat_core.scene.frames import DepthOrigin
-from gsplat_core.training.config import MEASURED_WEIGHS, LearningRates, ReconstructorConfig
+from gsplat_core.training.config import MEASURED_WEIGHS, MEASURED_WEIGHS_ONLINE, LearningRates, ReconstructorConfig
 
 
 @pytest.mark.parametrize(
@@ -87,11 +87,13 @@ def test_measured_depth_counts_more_than_depth_that_was_found(make_frame, origin
     config = ReconstructorConfig(depth_weight=0.2)
     frame = make_frame(depth=np.full((40, 48), 60.0, np.float32), depth_origin=origin)
     measured = origin in (None, DepthOrigin.MEASURED)
-    assert config.starting_from(frame).depth_weight == pytest.approx(0.2 * MEASURED_WEIGHS if measured else 0.2)
+    for all_known, factor in ((True, MEASURED_WEIGHS), (False, MEASURED_WEIGHS_ONLINE)):
+        weight = config.starting_from(frame, all_known).depth_weight
+        assert weight == pytest.approx(0.2 * factor if measured else 0.2)
 
 
 def test_without_depth_and_without_an_end_weights_stay_as_they_are(make_frame):
     config, deep = ReconstructorConfig(), make_frame(depth=np.full((40, 48), 60.0, np.float32))
-    assert config.starting_from(make_frame()) is config
+    assert config.starting_from(make_frame(), True) is config
     endless = dataclasses.replace(config, history_s=10.0)
-    assert endless.starting_from(deep) is endless
+    assert endless.starting_from(deep, False) is endless
