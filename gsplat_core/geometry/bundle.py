@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gsplat_core.geometry.levenberg_marquardt import descend, diagonal_of, ray_derivatives, summed
 from gsplat_core.geometry.pose import exp
 
 NEAREST = 1e-3
 """Of the median depth: what is nearer, or behind the camera, is taken to be there."""
-DONE = 1e-6
-"""Of the cost: when a step gains less than this share of it, the last one was made."""
 
 
 @dataclass(frozen=True)
@@ -53,20 +52,8 @@ def adjust(
         spread_px: errors well above this decide little (Cauchy's scale).
         points_move: False: only cameras do, each by itself.
     """
-    damping, cost = 1e-4, _cost(bundle, spread_px)
-    for _ in range(rounds):
-        step = _step(bundle, fixed, spread_px, damping, points_move)
-        new_cost = _cost(step, spread_px)
-        if new_cost < cost:
-            done = cost - new_cost < DONE * cost
-            bundle, cost, damping = step, new_cost, max(damping / 5, 1e-9)
-            if done:
-                break
-        else:
-            damping *= 8
-            if damping > 1e4:
-                break
-    return bundle
+    step = lambda bundle, damping: _step(bundle, fixed, spread_px, damping, points_move)
+    return descend(bundle, step, lambda bundle: _cost(bundle, spread_px), rounds)[0]
 
 
 def _cost(bundle: Bundle, spread_px: float) -> float:
@@ -87,26 +74,23 @@ def _residuals(bundle: Bundle) -> tuple[Tensor, Tensor, Tensor]:
 def _step(bundle: Bundle, fixed: Tensor, spread_px: float, damping: float, points_move: bool) -> Bundle:
     residual, local, rotation = _residuals(bundle)
     weight = 1 / (1 + (residual / spread_px).square().sum(1))
-    x, y, z = local.unbind(1)
-    zero = torch.zeros_like(z)
-    by_local = bundle.focal_px * torch.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], 1).reshape(-1, 2, 3)
-    # A twist moves the point in its camera by t + w x p.
-    cross = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
-    by_pose = torch.cat([by_local, by_local @ cross], 2)
+    by_local, by_rotation = ray_derivatives(local)
+    by_local = bundle.focal_px * by_local
+    by_pose = torch.cat([by_local, by_local @ by_rotation], 2)
     weighted = by_pose * weight[:, None, None]
     cameras, points = bundle.poses.shape[0], bundle.points.shape[0]
-    H = _summed(weighted.transpose(1, 2) @ by_pose, bundle.camera, cameras)
-    g = _summed((weighted.transpose(1, 2) @ residual[:, :, None])[:, :, 0], bundle.camera, cameras)
-    H = H + damping * _diagonal(H)
+    H = summed(weighted.transpose(1, 2) @ by_pose, bundle.camera, cameras)
+    g = summed((weighted.transpose(1, 2) @ residual[:, :, None])[:, :, 0], bundle.camera, cameras)
+    H = H + damping * diagonal_of(H)
     free = ~fixed
     if not points_move:
         twist = -torch.linalg.solve(H[free], g[free][:, :, None])[:, :, 0]
         return replace(bundle, poses=_moved(bundle.poses, free, twist))
     by_point = by_local @ rotation
     weighted_point = (by_point * weight[:, None, None]).transpose(1, 2)
-    V = _summed(weighted_point @ by_point, bundle.point, points)
-    h = _summed((weighted_point @ residual[:, :, None])[:, :, 0], bundle.point, points)
-    V = V + damping * _diagonal(V)
+    V = summed(weighted_point @ by_point, bundle.point, points)
+    h = summed((weighted_point @ residual[:, :, None])[:, :, 0], bundle.point, points)
+    V = V + damping * diagonal_of(V)
     inverse = torch.linalg.inv(V)
     # Cameras by points, dense: a few hundred cameras and some thousand points are small for that.
     W = torch.zeros(cameras * points, 6, 3, dtype=local.dtype)
@@ -126,11 +110,3 @@ def _moved(poses: Tensor, free: Tensor, twist: Tensor) -> Tensor:
     poses = poses.clone()
     poses[free] = exp(twist) @ poses[free]
     return poses
-
-
-def _summed(parts: Tensor, index: Tensor, count: int) -> Tensor:
-    return torch.zeros(count, *parts.shape[1:], dtype=parts.dtype).index_add_(0, index, parts)
-
-
-def _diagonal(blocks: Tensor) -> Tensor:
-    return torch.diag_embed(blocks.diagonal(dim1=-2, dim2=-1) + 1e-9)

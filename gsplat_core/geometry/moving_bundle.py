@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gsplat_core.geometry.levenberg_marquardt import descend, diagonal_of, ray_derivatives, summed
 from gsplat_core.geometry.pose import exp
 from gsplat_core.geometry.surface_field import SurfaceField
 from gsplat_core.geometry.way_prior import WayPrior
@@ -24,8 +25,6 @@ NEAREST = 0.05
 """What is nearer is taken to be there."""
 HELD = 1e3
 """Where no prior of the way decides: how firmly the tissue's common rigid motion stays as it is."""
-DONE = 1e-6
-"""Of the cost: when a step gains less than this share of it, the last one was made."""
 
 
 @dataclass(frozen=True)
@@ -73,20 +72,8 @@ def adjust(bundle: MovingBundle, spread: float, rounds: int, way: WayPrior | Non
 
     spread: rays that are off by well more than this decide little (Cauchy's scale).
     """
-    damping, cost = 1e-4, _cost(bundle, spread, way)
-    for _ in range(rounds):
-        step = _in_unit(_step(bundle, spread, damping, way))
-        new_cost = _cost(step, spread, way)
-        if new_cost < cost:
-            done = cost - new_cost < DONE * cost
-            bundle, cost, damping = step, new_cost, max(damping / 5, 1e-9)
-            if done:
-                break
-        else:
-            damping *= 8
-            if damping > 1e4:
-                break
-    return bundle, cost
+    step = lambda bundle, damping: _in_unit(_step(bundle, spread, damping, way))
+    return descend(bundle, step, lambda bundle: _cost(bundle, spread, way), rounds)
 
 
 def _cost(bundle: MovingBundle, spread: float, way: WayPrior | None) -> float:
@@ -133,19 +120,15 @@ def _step(bundle: MovingBundle, spread: float, damping: float, way: WayPrior | N
     """One step. Unknowns: twists of all cameras but the first, then swings in the order (axis, wave, node)."""
     residual, local, rotation = _residuals(bundle)
     weight = 1 / (SIGMA**2 * (1 + (residual / spread).square().sum(1)))
-    x, y, z = local.unbind(1)
-    zero = torch.zeros_like(z)
-    by_local = torch.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], 1).reshape(-1, 2, 3)
-    # A twist moves the point in its camera by t + w x p.
-    cross = torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
-    by_pose, by_place = torch.cat([by_local, by_local @ cross], 2), by_local @ rotation
+    by_local, by_rotation = ray_derivatives(local)
+    by_pose, by_place = torch.cat([by_local, by_local @ by_rotation], 2), by_local @ rotation
     weighted = (by_pose * weight[:, None, None]).transpose(1, 2)
     cameras, count = len(bundle.poses), len(bundle.rest)
-    H = _summed(weighted @ by_pose, bundle.camera, cameras)
-    g = _summed((weighted @ residual[:, :, None])[:, :, 0], bundle.camera, cameras)
-    H = H + damping * _diagonal(H)
+    H = summed(weighted @ by_pose, bundle.camera, cameras)
+    g = summed((weighted @ residual[:, :, None])[:, :, 0], bundle.camera, cameras)
+    H = H + damping * diagonal_of(H)
     index = bundle.camera * count + bundle.point
-    by_camera = _summed(weighted @ by_place, index, cameras * count).view(cameras, count, 6, 3)
+    by_camera = summed(weighted @ by_place, index, cameras * count).view(cameras, count, 6, 3)
     weighted = (by_place * weight[:, None, None]).transpose(1, 2)
     square, pull = weighted @ by_place, (weighted @ residual[:, :, None])[:, :, 0]
     places = _eliminated(bundle, square, pull, by_camera, damping)
@@ -170,12 +153,12 @@ def _step(bundle: MovingBundle, spread: float, damping: float, way: WayPrior | N
 
 def _eliminated(bundle: MovingBundle, square: Tensor, pull: Tensor, by_camera: Tensor, damping: float) -> _Places:
     count, waves = len(bundle.rest), bundle.waves[bundle.camera]
-    V, slope = _summed(square, bundle.point, count), _summed(pull, bundle.point, count)
+    V, slope = summed(square, bundle.point, count), summed(pull, bundle.point, count)
     depth = bundle.rest[:, 2]
     V[:, 2, 2] += 1 / RELIEF**2
     slope[:, 2] += (depth - depth.median()) / RELIEF**2
-    V = V + damping * _diagonal(V)
-    by_swing = _summed((square[:, :, :, None] * waves[:, None, None, :]).flatten(2), bundle.point, count)
+    V = V + damping * diagonal_of(V)
+    by_swing = summed((square[:, :, :, None] * waves[:, None, None, :]).flatten(2), bundle.point, count)
     return _Places(torch.linalg.inv(V), slope, by_camera, by_swing)
 
 
@@ -187,8 +170,8 @@ def _swing_terms(
     cameras, wave_count, nodes = len(bundle.poses), waves.shape[1], bundle.influence.shape[1]
     size = 3 * wave_count
     pairs = square[:, :, None, :, None] * (waves[:, :, None] * waves[:, None, :])[:, None, :, None, :]
-    own = _summed(pairs.reshape(len(pairs), size, size), bundle.point, count)
-    slope = _summed((pull[:, :, None] * waves[:, None, :]).flatten(1), bundle.point, count)
+    own = summed(pairs.reshape(len(pairs), size, size), bundle.point, count)
+    slope = summed((pull[:, :, None] * waves[:, None, :]).flatten(1), bundle.point, count)
     back = places.by_swing.transpose(1, 2) @ places.inverse
     own = own - back @ places.by_swing
     slope = slope - (back @ places.slope[:, :, None])[:, :, 0]
@@ -223,11 +206,3 @@ def _rigid(bundle: MovingBundle, wave_count: int) -> Tensor:
     block = HELD / SIGMA * torch.einsum("mik,njk->imjn", modes, modes)
     each = torch.eye(wave_count, dtype=block.dtype)
     return torch.einsum("imjn,ab->iamjbn", block, each).reshape(3 * wave_count, len(at), 3 * wave_count, len(at))
-
-
-def _summed(parts: Tensor, index: Tensor, count: int) -> Tensor:
-    return torch.zeros(count, *parts.shape[1:], dtype=parts.dtype).index_add_(0, index, parts)
-
-
-def _diagonal(blocks: Tensor) -> Tensor:
-    return torch.diag_embed(blocks.diagonal(dim1=-2, dim2=-1) + 1e-9)

@@ -11,26 +11,12 @@ from gsplat_core.geometry.registry import DEPTHS
 from gsplat_core.geometry.shading import shading_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
-
-WIDTH, HEIGHT, FOCAL = 160, 128, 140.0
-CAMERA = Camera.from_focal(FOCAL, WIDTH, HEIGHT)
-PINK = np.array([0.6, 0.2, 0.15])
-
-
-def rays():
-    column, row = np.arange(WIDTH) + 0.5 - CAMERA.K[0, 2], np.arange(HEIGHT) + 0.5 - CAMERA.K[1, 2]
-    return np.meshgrid(column / FOCAL, row / FOCAL)
+from tests.gsplat_core.geometry.lit_sheet import CAMERA, HEIGHT, PINK, WIDTH, error, facing_and_distance, rays
 
 
 def lit(z):
     """Brightness of a Lambertian surface of depth z [H, W] in a lamp at the camera, from points and normals, 1 at distance 60."""
-    x, y = rays()
-    points = np.stack([x * z, y * z, z], axis=-1)
-    by_row, by_column = np.gradient(points, axis=(0, 1))
-    normal = np.cross(by_column, by_row)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    distance = np.linalg.norm(points, axis=-1)
-    facing = np.abs(np.einsum("hwi,hwi->hw", normal, points)) / distance
+    facing, distance = facing_and_distance(z)
     return facing * (60 / distance) ** 2
 
 
@@ -49,12 +35,6 @@ def bowl():
 
 def plane():
     return np.full((HEIGHT, WIDTH), 60.0)
-
-
-def error(found, true):
-    """Root mean square after one factor, by the median depth."""
-    scaled = found * np.median(true / found)
-    return float(np.sqrt(np.mean((scaled - true) ** 2)) / np.median(true))
 
 
 def look(image, **fields):
