@@ -1,4 +1,4 @@
-"""At which frequencies tissue breathes and its heart beats, before a scope whose way is not known either."""
+"""At which frequencies tissue breathes and its heart beats, before a scope whose trajectory is not known either."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from gsplat_core.geometry.moving_bundle import MovingBundle, adjust, with_waves
-from gsplat_core.geometry.way_prior import WayPrior
+from gsplat_core.geometry.trajectory_prior import TrajectoryPrior
 
 BREATHING_HZ, HEART_HZ = (0.1, 0.8), (0.8, 3.0)
 LEAST_CYCLES, FEWEST_TRIED = 1.5, 0.5
-"""Of breathing: with less of it, a smooth way of the scope does as well. Less is looked for all the same, or its double would be found in its place."""
+"""Of breathing: with less of it, a smooth trajectory of the scope does as well. Less is looked for all the same, or its double would be found in its place."""
 STEP_CYCLES = 0.25
 """From one frequency that is tried to the next, in cycles over the recording; twice that for the heart."""
 SPREAD = 0.007
@@ -66,7 +66,7 @@ def frequencies_of(start: MovingBundle, times_s: Tensor, fastest_hz: float = HEA
     ]
     alone = _tried(best.bundle, times_s, best.hz, 1)
     usual = float(np.median([each.cost for each in beats])) if beats else 0.0
-    best = _best([alone, *(each for each in _valleys(beats) if each.cost < BEATS * usual)])
+    best = _best([alone, *(each for each in _local_minima(beats) if each.cost < BEATS * usual)])
     bundle, hz = best.bundle, best.hz
     for part in (1.0, 0.5, 0.25, 0.125):
         bundle, hz = sharpened(bundle, times_s, hz, part * STEP_CYCLES, SPREAD)
@@ -79,13 +79,13 @@ def sharpened(
     hz: tuple[float, ...],
     cycles: float,
     spread: float,
-    way: WayPrior | None = None,
+    prior: TrajectoryPrior | None = None,
 ) -> tuple[MovingBundle, tuple[float, ...]]:
     """The bundle after a step for each frequency, with those that are right to about so many cycles over the recording."""
     part = cycles / float(times_s[-1] - times_s[0])
     for which in range(len(hz)):
         around = [_changed(hz, which, change) for change in (-part, 0.0, part)]
-        best = _best([_tried(bundle, times_s, each, 1, spread, way) for each in around])
+        best = _best([_tried(bundle, times_s, each, 1, spread, prior) for each in around])
         bundle, hz = best.bundle, best.hz
     return bundle, hz
 
@@ -96,17 +96,17 @@ def _tried(
     hz: tuple[float, ...],
     rounds: int,
     spread: float = SPREAD,
-    way: WayPrior | None = None,
+    prior: TrajectoryPrior | None = None,
 ) -> _Try:
     """From a start with all of these frequencies, or with those before the last one."""
-    return _Try(hz, *adjust(with_waves(start, waves(times_s, hz)), spread, rounds, way))
+    return _Try(hz, *adjust(with_waves(start, waves(times_s, hz)), spread, rounds, prior))
 
 
 def _best(tries: Sequence[_Try]) -> _Try:
     return min(tries, key=lambda each: each.cost)
 
 
-def _valleys(tries: Sequence[_Try]) -> list[_Try]:
+def _local_minima(tries: Sequence[_Try]) -> list[_Try]:
     """Those that are better than both neighbours: the best one at an end of the band is the flank of something outside."""
     inner = zip(tries, tries[1:], tries[2:], strict=False)
     return [each for before, each, after in inner if each.cost <= min(before.cost, after.cost)]

@@ -2,7 +2,7 @@
 
 A point is at its place at rest and, for each wave w(t), w(t) times a vector that changes smoothly over the surface (`surface_field`). Cameras, places and
 vectors follow together from where points were seen: Levenberg-Marquardt with Cauchy's weights, places eliminated (Schur complement). What tissue and
-scope do alike cannot be told by any picture; the prior of the way (`way_prior`) decides that. The unit of length is the tissue's median distance.
+scope do alike cannot be told by any picture; the prior of the trajectory (`trajectory_prior`) decides that. The unit of length is the tissue's median distance.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 from gsplat_core.geometry.levenberg_marquardt import descend, diagonal_of, ray_derivatives, summed
 from gsplat_core.geometry.pose import exp
 from gsplat_core.geometry.surface_field import SurfaceField
-from gsplat_core.geometry.way_prior import WayPrior
+from gsplat_core.geometry.trajectory_prior import TrajectoryPrior
 
 SIGMA = 0.002
 """Standard deviation of a ray (x / z): 0.6 pixels of a picture that is 320 wide, as neighbours in time err alike."""
@@ -24,7 +24,7 @@ RELIEF = 0.3
 NEAREST = 0.05
 """What is nearer is taken to be there."""
 HELD = 1e3
-"""Where no prior of the way decides: how firmly the tissue's common rigid motion stays as it is."""
+"""Where no prior of the trajectory decides: how firmly the tissue's common rigid motion stays as it is."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class MovingBundle:
     """World to camera [C, 4, 4]; the first one stays."""
     rest: Tensor
     """Places at rest [P, 3] in the world."""
-    swing: Tensor
+    amplitudes: Tensor
     """Vectors at the nodes [M, 3, B], one for each wave."""
     camera: Tensor
     """int64 [K]: which camera saw ..."""
@@ -52,8 +52,8 @@ class MovingBundle:
 
     def places(self) -> Tensor:
         """Where each point was when it was seen [K, 3]."""
-        swings = torch.einsum("pm,mjb->pjb", self.influence, self.swing)
-        return self.rest[self.point] + torch.einsum("kjb,kb->kj", swings[self.point], self.waves[self.camera])
+        amplitudes_at = torch.einsum("pm,mjb->pjb", self.influence, self.amplitudes)
+        return self.rest[self.point] + torch.einsum("kjb,kb->kj", amplitudes_at[self.point], self.waves[self.camera])
 
     def off(self) -> Tensor:
         """Rays from where points were seen to where they would be [K, 2]."""
@@ -62,27 +62,29 @@ class MovingBundle:
 
 def with_waves(bundle: MovingBundle, waves: Tensor) -> MovingBundle:
     """The same with other waves [C, B]: what more there are than before is still to be found."""
-    swing = torch.zeros(len(bundle.field.nodes), 3, waves.shape[1], dtype=torch.float64)
-    swing[:, :, : bundle.swing.shape[2]] = bundle.swing
-    return replace(bundle, waves=waves, swing=swing)
+    amplitudes = torch.zeros(len(bundle.field.nodes), 3, waves.shape[1], dtype=torch.float64)
+    amplitudes[:, :, : bundle.amplitudes.shape[2]] = bundle.amplitudes
+    return replace(bundle, waves=waves, amplitudes=amplitudes)
 
 
-def adjust(bundle: MovingBundle, spread: float, rounds: int, way: WayPrior | None = None) -> tuple[MovingBundle, float]:
+def adjust(
+    bundle: MovingBundle, spread: float, rounds: int, prior: TrajectoryPrior | None = None
+) -> tuple[MovingBundle, float]:
     """The bundle after at most `rounds` steps, of which each lessens the cost, and the cost.
 
     spread: rays that are off by well more than this decide little (Cauchy's scale).
     """
-    step = lambda bundle, damping: _in_unit(_step(bundle, spread, damping, way))
-    return descend(bundle, step, lambda bundle: _cost(bundle, spread, way), rounds)
+    step = lambda bundle, damping: _in_unit(_step(bundle, spread, damping, prior))
+    return descend(bundle, step, lambda bundle: _cost(bundle, spread, prior), rounds)
 
 
-def _cost(bundle: MovingBundle, spread: float, way: WayPrior | None) -> float:
+def _cost(bundle: MovingBundle, spread: float, prior: TrajectoryPrior | None) -> float:
     residual, _, _ = _residuals(bundle)
     seen = 0.5 * (spread / SIGMA) ** 2 * torch.log1p((residual / spread).square().sum(1)).sum()
     depth = bundle.rest[:, 2]
     relief = 0.5 * ((depth - depth.median()) / RELIEF).square().sum()
-    swing = 0.5 * torch.einsum("mjb,mn,njb->", bundle.swing, bundle.field.stiffness, bundle.swing)
-    return float(seen + relief + swing) + (way.cost(bundle.poses) if way is not None else 0.0)
+    motion = 0.5 * torch.einsum("mjb,mn,njb->", bundle.amplitudes, bundle.field.stiffness, bundle.amplitudes)
+    return float(seen + relief + motion) + (prior.cost(bundle.poses) if prior is not None else 0.0)
 
 
 def _in_unit(bundle: MovingBundle) -> MovingBundle:
@@ -90,7 +92,7 @@ def _in_unit(bundle: MovingBundle) -> MovingBundle:
     unit = bundle.rest[:, 2].median().abs()
     poses = bundle.poses.clone()
     poses[:, :3, 3] /= unit
-    return replace(bundle, poses=poses, rest=bundle.rest / unit, swing=bundle.swing / unit)
+    return replace(bundle, poses=poses, rest=bundle.rest / unit, amplitudes=bundle.amplitudes / unit)
 
 
 def _residuals(bundle: MovingBundle) -> tuple[Tensor, Tensor, Tensor]:
@@ -112,12 +114,12 @@ class _Places:
     """[P, 3]."""
     by_camera: Tensor
     """[C, P, 6, 3]."""
-    by_swing: Tensor
+    by_amplitude: Tensor
     """[P, 3, 3 B]."""
 
 
-def _step(bundle: MovingBundle, spread: float, damping: float, way: WayPrior | None) -> MovingBundle:
-    """One step. Unknowns: twists of all cameras but the first, then swings in the order (axis, wave, node)."""
+def _step(bundle: MovingBundle, spread: float, damping: float, prior: TrajectoryPrior | None) -> MovingBundle:
+    """One step. Unknowns: twists of all cameras but the first, then amplitudes in the order (axis, wave, node)."""
     residual, local, rotation = _residuals(bundle)
     weight = 1 / (SIGMA**2 * (1 + (residual / spread).square().sum(1)))
     by_local, by_rotation = ray_derivatives(local)
@@ -132,23 +134,23 @@ def _step(bundle: MovingBundle, spread: float, damping: float, way: WayPrior | N
     weighted = (by_place * weight[:, None, None]).transpose(1, 2)
     square, pull = weighted @ by_place, (weighted @ residual[:, :, None])[:, :, 0]
     places = _eliminated(bundle, square, pull, by_camera, damping)
-    told = torch.einsum("cpij,pjk->cpik", by_camera, places.inverse)
+    eliminated = torch.einsum("cpij,pjk->cpik", by_camera, places.inverse)
     flat = lambda blocks: blocks.permute(0, 2, 1, 3).reshape(6 * cameras, 3 * count)
-    S = torch.block_diag(*H) - flat(told) @ flat(by_camera).T
-    right = (g - torch.einsum("cpij,pj->ci", told, places.slope)).reshape(-1)
-    if way is not None:
-        more, slope = way.terms(bundle.poses)
+    S = torch.block_diag(*H) - flat(eliminated) @ flat(by_camera).T
+    right = (g - torch.einsum("cpij,pj->ci", eliminated, places.slope)).reshape(-1)
+    if prior is not None:
+        more, slope = prior.terms(bundle.poses)
         S, right = S + more, right + slope
-    cross_terms, swings, slopes = _swing_terms(bundle, square, pull, places, told, held=way is None)
-    whole = torch.cat([torch.cat([S, cross_terms], 1), torch.cat([cross_terms.T, swings], 1)])[6:, 6:]
+    cross_terms, own_terms, slopes = _amplitude_terms(bundle, square, pull, places, eliminated, held=prior is None)
+    whole = torch.cat([torch.cat([S, cross_terms], 1), torch.cat([cross_terms.T, own_terms], 1)])[6:, 6:]
     found = -torch.linalg.solve(whole, torch.cat([right, slopes])[6:])
     twist = torch.cat([torch.zeros(6, dtype=found.dtype), found[: 6 * cameras - 6]]).view(cameras, 6)
     change = found[6 * cameras - 6 :].view(3, bundle.waves.shape[1], bundle.influence.shape[1]).permute(2, 0, 1)
     at_points = torch.einsum("pm,mjb->pjb", bundle.influence, change).flatten(1)
     moved = places.slope + torch.einsum("cpij,ci->pj", by_camera, twist)
-    moved = moved + torch.einsum("pia,pa->pi", places.by_swing, at_points)
+    moved = moved + torch.einsum("pia,pa->pi", places.by_amplitude, at_points)
     rest = bundle.rest - (places.inverse @ moved[:, :, None])[:, :, 0]
-    return replace(bundle, poses=exp(twist) @ bundle.poses, rest=rest, swing=bundle.swing + change)
+    return replace(bundle, poses=exp(twist) @ bundle.poses, rest=rest, amplitudes=bundle.amplitudes + change)
 
 
 def _eliminated(bundle: MovingBundle, square: Tensor, pull: Tensor, by_camera: Tensor, damping: float) -> _Places:
@@ -158,12 +160,12 @@ def _eliminated(bundle: MovingBundle, square: Tensor, pull: Tensor, by_camera: T
     V[:, 2, 2] += 1 / RELIEF**2
     slope[:, 2] += (depth - depth.median()) / RELIEF**2
     V = V + damping * diagonal_of(V)
-    by_swing = summed((square[:, :, :, None] * waves[:, None, None, :]).flatten(2), bundle.point, count)
-    return _Places(torch.linalg.inv(V), slope, by_camera, by_swing)
+    by_amplitude = summed((square[:, :, :, None] * waves[:, None, None, :]).flatten(2), bundle.point, count)
+    return _Places(torch.linalg.inv(V), slope, by_camera, by_amplitude)
 
 
-def _swing_terms(
-    bundle: MovingBundle, square: Tensor, pull: Tensor, places: _Places, told: Tensor, *, held: bool
+def _amplitude_terms(
+    bundle: MovingBundle, square: Tensor, pull: Tensor, places: _Places, eliminated: Tensor, *, held: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """What swings have to do with cameras [6 C, n] and with one another [n, n], and their slopes [n], without the places."""
     count, waves = len(bundle.rest), bundle.waves[bundle.camera]
@@ -172,8 +174,8 @@ def _swing_terms(
     pairs = square[:, :, None, :, None] * (waves[:, :, None] * waves[:, None, :])[:, None, :, None, :]
     own = summed(pairs.reshape(len(pairs), size, size), bundle.point, count)
     slope = summed((pull[:, :, None] * waves[:, None, :]).flatten(1), bundle.point, count)
-    back = places.by_swing.transpose(1, 2) @ places.inverse
-    own = own - back @ places.by_swing
+    back = places.by_amplitude.transpose(1, 2) @ places.inverse
+    own = own - back @ places.by_amplitude
     slope = slope - (back @ places.slope[:, :, None])[:, :, 0]
     influence = bundle.influence
     by_camera = (places.by_camera.permute(0, 2, 3, 1) @ influence)[:, :, :, None, :] * bundle.waves[
@@ -181,7 +183,7 @@ def _swing_terms(
     ]
     cross = by_camera.reshape(6 * cameras, size, nodes)
     for term in range(size):
-        through = torch.einsum("cpij,pj->cip", told, places.by_swing[:, :, term])
+        through = torch.einsum("cpij,pj->cip", eliminated, places.by_amplitude[:, :, term])
         cross[:, term] -= through.reshape(6 * cameras, count) @ influence
     whole = torch.zeros(size, nodes, size, nodes, dtype=own.dtype)
     for row in range(size):
@@ -190,7 +192,7 @@ def _swing_terms(
             whole[column, :, row] = whole[row, :, column].T
         whole[row, :, row] += bundle.field.stiffness
     slopes = torch.einsum("pa,pm->am", slope, influence)
-    slopes = slopes + torch.einsum("mn,njb->jbm", bundle.field.stiffness, bundle.swing).reshape(size, nodes)
+    slopes = slopes + torch.einsum("mn,njb->jbm", bundle.field.stiffness, bundle.amplitudes).reshape(size, nodes)
     if held and wave_count:
         whole = whole + _rigid(bundle, wave_count)
     return cross.reshape(6 * cameras, size * nodes), whole.reshape(size * nodes, size * nodes), slopes.reshape(-1)

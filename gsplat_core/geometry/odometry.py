@@ -6,7 +6,7 @@ points together, at frame 3 and whenever their number has grown by a third. Smal
 other start (Yu and Gallup, "3D Reconstruction from Accidental Motion", 2014); an essential matrix of two frames is ill-conditioned there.
 
 Tissue that moves by itself looks like motion of the scope as far as it moves as a whole. What is left of it counts little (a robust loss), and where it
-repeats itself, as breathing does, and long enough to be told from the scope's way, cameras are refined against points that move (`breathing_way`).
+repeats itself, as breathing does, and long enough to be told from the scope's trajectory, cameras are refined against points that move (`breathing_trajectory`).
 Lengths have no scale: the median depth of the first frame's points is taken to be `DISTANCE`.
 """
 
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gsplat_core.endoscope.highlights import without_highlights
 from gsplat_core.errors import InvalidInput
-from gsplat_core.geometry.breathing_way import BreathingWay, Sight, breathing_way
+from gsplat_core.geometry.breathing_trajectory import BreathingTrajectory, Sightings, breathing_trajectory
 from gsplat_core.geometry.bundle import Bundle, adjust, errors_px
 from gsplat_core.geometry.tracks import FeatureTracks, Observations
 from gsplat_core.scene.cameras import Camera
@@ -47,17 +47,17 @@ GROWTH = 1.3
 
 @dataclass(frozen=True)
 class Breathing:
-    """How tissue moves that was told from the scope's way."""
+    """How tissue moves that was told from the scope's trajectory."""
 
     frequencies_hz: tuple[float, ...]
     """Of breathing, or of breathing and the heart."""
     uncertain: float
-    """How much of the way may be the tissue's all the same, or the other way round: root mean square, in the unit of the trajectory."""
+    """How much of the trajectory may be the tissue's all the same, or the other way round: root mean square, in the unit of the trajectory."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The scope's way through a recording."""
+    """The scope's trajectory through a recording."""
 
     poses: NDArray[np.float64]
     """World to camera [N, 4, 4]; the first one is the identity."""
@@ -74,7 +74,7 @@ class Trajectory:
 
     @property
     def path(self) -> float:
-        """Length of the scope's way, in the unit in which the first frame's tissue is `DISTANCE` away."""
+        """Length of the scope's trajectory, in the unit in which the first frame's tissue is `DISTANCE` away."""
         centres = -np.einsum("nji,nj->ni", self.poses[:, :3, :3], self.poses[:, :3, 3])
         return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
 
@@ -155,7 +155,7 @@ class _Odometry:
         for frame in range(1, self._count):
             if not self._is_key[frame]:
                 self._place(frame)
-        moving = self._before_breathing_tissue()
+        moving = self._refined_for_breathing()
         if moving is not None:
             self._poses = moving.poses
         for frame in self._lost:
@@ -217,16 +217,16 @@ class _Odometry:
             self._points /= unit
             self._poses[:, :3, 3] /= unit
 
-    def _before_breathing_tissue(self) -> BreathingWay | None:
+    def _refined_for_breathing(self) -> BreathingTrajectory | None:
         placed = torch.ones(self._count, dtype=torch.bool)
         placed[self._lost] = False
         chosen = self._known[self._point]
-        sight = Sight(
+        sightings = Sightings(
             self._frame[chosen], self._point[chosen], self._rays[chosen], self._times_s, self._poses, self._points
         )
-        return breathing_way(sight, placed)
+        return breathing_trajectory(sightings, placed)
 
-    def _result(self, moving: BreathingWay | None) -> Trajectory:
+    def _result(self, moving: BreathingTrajectory | None) -> Trajectory:
         poses = self._poses.clone()
         poses[:, :3, 3] *= DISTANCE
         still_error_px = float(self._still_errors_px().median())

@@ -92,11 +92,11 @@ def _about_breathing(found: Trajectory, focal_px: float) -> list[str]:
         told = " and ".join(f"{hz:.2f}" for hz in found.breathing.frequencies_hz)
         share = found.breathing.uncertain / max(found.path, 1e-9)
         return [
-            f"the tissue moves by itself, {told} times a second, which was told from the scope's way; {share:.1%} of the way may be the tissue's all the same"
+            f"the tissue moves by itself, {told} times a second, which was told from the scope's trajectory; {share:.1%} of the trajectory may be the tissue's all the same"
         ]
     if found.error_px > OFF * focal_px:
         return [
-            f"points are off by {found.error_px:.2g} px: the tissue moves by itself. What it moves as a whole is in the poses; to tell breathing from the scope's way"
+            f"points are off by {found.error_px:.2g} px: the tissue moves by itself. What it moves as a whole is in the poses; to tell breathing from the scope's trajectory"
             " the recording has to show one and a half breaths, better five"
         ]
     return []

@@ -13,14 +13,14 @@ from gsplat_core.geometry.bundle import Bundle, errors_px
 from gsplat_core.geometry.bundle import adjust as adjust_still
 from gsplat_core.geometry.moving_bundle import _cost, _step, adjust, with_waves
 from gsplat_core.geometry.pose import exp
-from gsplat_core.geometry.way_prior import learned_from
+from gsplat_core.geometry.trajectory_prior import learned_from
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ
-from tests.gsplat_core.geometry.breathing_sight import bundle_of, seen_for
+from tests.gsplat_core.geometry.breathing_sightings import bundle_of, seen_for
 
 
 def breathing(length_s=9.0, rate_hz=4.0, noise_px=0.0):
-    sight, _ = seen_for(length_s, rate_hz=rate_hz, noise_px=noise_px)
-    return bundle_of(sight, waves(sight.times_s, (BREATHING_HZ, HEART_HZ))), sight.times_s
+    sightings, _ = seen_for(length_s, rate_hz=rate_hz, noise_px=noise_px)
+    return bundle_of(sightings, waves(sightings.times_s, (BREATHING_HZ, HEART_HZ))), sightings.times_s
 
 
 def test_exact_sightings_are_explained_to_a_tenth_of_a_pixel():
@@ -31,8 +31,8 @@ def test_exact_sightings_are_explained_to_a_tenth_of_a_pixel():
 
 
 def test_without_waves_it_is_the_bundle_of_tissue_at_rest():
-    sight, _ = seen_for(5.0, breathes=0.0, rate_hz=4.0)
-    start = bundle_of(sight, waves(sight.times_s, ()))
+    sightings, _ = seen_for(5.0, breathes=0.0, rate_hz=4.0)
+    start = bundle_of(sightings, waves(sightings.times_s, ()))
     start = replace(
         start, poses=exp(1e-3 * torch.sin(torch.arange(6 * len(start.poses)).view(-1, 6).double())) @ start.poses
     )
@@ -73,8 +73,8 @@ def test_the_first_camera_stays():
 
 def test_more_waves_start_at_nothing_and_leave_the_others():
     bundle, times_s = breathing(5.0)
-    none = replace(bundle, swing=bundle.swing[:, :, :0])
+    none = replace(bundle, amplitudes=bundle.amplitudes[:, :, :0])
     one, _ = adjust(with_waves(none, waves(times_s, (BREATHING_HZ,))), 0.004, 1)
     both = with_waves(one, waves(times_s, (BREATHING_HZ, HEART_HZ)))
     torch.testing.assert_close(both.off(), one.off())
-    assert not both.swing[:, :, 2:].any()
+    assert not both.amplitudes[:, :, 2:].any()

@@ -1,4 +1,4 @@
-"""The scope's way from pictures alone, against that of a rendered scene."""
+"""The scope's trajectory from pictures alone, against that of a rendered scene."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def found(rigid: RenderedRecording) -> Trajectory:
 
 
 def off_share(found: Trajectory, frames: list[Frame]) -> float:
-    """The way's error after rotation and scale, as a share of the true way's length."""
+    """The trajectory's error after rotation and scale, as a share of the true trajectory's length."""
     errors = evaluate_trajectory(found.poses, np.stack([frame.pose for frame in frames]))
     assert errors is not None
     return errors.similarity_share

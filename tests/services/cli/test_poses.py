@@ -123,7 +123,7 @@ def test_breathing_that_was_told_from_the_way_is_said(clip, capsys, monkeypatch)
     monkeypatch.setattr(poses, "trajectory_of", told)
     said = said_of(capsys, clip())
     assert (said["breathing_hz"], said["uncertain"]) == ([0.294, 1.11], 0.02)
-    assert any("0.29 and 1.11 times a second" in note and "2.0% of the way" in note for note in said["notes"])
+    assert any("0.29 and 1.11 times a second" in note and "2.0% of the trajectory" in note for note in said["notes"])
 
 
 def test_tissue_that_moves_otherwise_is_said(clip, capsys, monkeypatch):

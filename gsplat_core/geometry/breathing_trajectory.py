@@ -1,8 +1,8 @@
-"""The scope's way before tissue that breathes: cameras refined against points that repeat their motion.
+"""The scope's trajectory before tissue that breathes: cameras refined against points that repeat their motion.
 
 Poses that take tissue to be at rest have its breathing in them. Here the frequencies of breathing and heart beat are looked for that explain better where
 points were seen (`breathing_frequencies`), and cameras, points and their motion are found together (`moving_bundle`), with what may be expected of a
-scope's way (`way_prior`), learned anew as the way gets better. Nothing is said where no frequency explains clearly more, or less than one and a half
+scope's trajectory (`trajectory_prior`), learned anew as the trajectory gets better. Nothing is said where no frequency explains clearly more, or less than one and a half
 breaths are seen.
 """
 
@@ -20,7 +20,7 @@ from gsplat_core.geometry.bundle import adjust as adjust_still
 from gsplat_core.geometry.moving_bundle import MovingBundle, adjust, with_waves
 from gsplat_core.geometry.pose import exp, inverse, log
 from gsplat_core.geometry.surface_field import MOST_NODES, SurfaceField
-from gsplat_core.geometry.way_prior import WayPrior, learned_from
+from gsplat_core.geometry.trajectory_prior import TrajectoryPrior, learned_from
 
 EVERY_S = 0.4
 """Between the frames that are looked at, on average."""
@@ -42,7 +42,7 @@ STAGES = (
     *((FINEST, 4, 0.0),) * 9,
 )
 """Rays (x / z) that are off by well more than the first number decide little; after so many steps frequencies are sharpened to so many cycles over the
-recording, and the way's prior is learned anew."""
+recording, and the trajectory's prior is learned anew."""
 FEW_POINTS, FEW_FRAMES, FEW_NODES = 200, 40, 16
 """With which frequencies are looked for."""
 SAMPLED = 0.4
@@ -53,7 +53,7 @@ GOLDEN = 0.5 * (5**0.5 - 1)
 
 
 @dataclass(frozen=True)
-class Sight:
+class Sightings:
     """Where points were seen, and what follows when they are taken to be at rest; the unit of length is about their distance."""
 
     frame: Tensor
@@ -71,7 +71,7 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class BreathingWay:
+class BreathingTrajectory:
     """What was found."""
 
     poses: Tensor
@@ -81,47 +81,47 @@ class BreathingWay:
     frequencies_hz: tuple[float, ...]
     """Of breathing, or of breathing and the heart."""
     uncertain: float
-    """How much of the way, root mean square, may be the tissue's own."""
+    """How much of the trajectory, root mean square, may be the tissue's own."""
     error: float
     """Median of how far rays are off."""
 
 
-def breathing_way(sight: Sight, placed: Tensor) -> BreathingWay | None:
-    """The way before breathing tissue, or None where there is none to be told.
+def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTrajectory | None:
+    """The trajectory before breathing tissue, or None where there is none to be told.
 
     placed: bool [N]: frames whose pose is known.
     """
-    length_s = float(sight.times_s[-1] - sight.times_s[0])
+    length_s = float(sightings.times_s[-1] - sightings.times_s[0])
     known = torch.nonzero(placed)[:, 0]
     if not LEAST_CYCLES / BREATHING_HZ[1] <= length_s <= LONGEST_S or len(known) < FEWEST_FRAMES:
         return None
     frames = _some(known, max(FEWEST_FRAMES, min(MOST_FRAMES, round(length_s / EVERY_S) + 1)))
     few = _some(frames, FEW_FRAMES)
-    fewer = _bundle(sight, few, FEW_POINTS, FEW_NODES)
+    fewer = _bundle(sightings, few, FEW_POINTS, FEW_NODES)
     if fewer is None:
         return None
-    fastest_hz = SAMPLED * (len(sight.times_s) - 1) / length_s
-    frequencies_hz = frequencies_of(fewer[0], sight.times_s[few], fastest_hz)
-    start = _bundle(sight, frames, POINTS, MOST_NODES)
+    fastest_hz = SAMPLED * (len(sightings.times_s) - 1) / length_s
+    frequencies_hz = frequencies_of(fewer[0], sightings.times_s[few], fastest_hz)
+    start = _bundle(sightings, frames, POINTS, MOST_NODES)
     if not frequencies_hz or start is None:
         return None
-    found, frequencies_hz, way = refined(start[0], sight.times_s[frames], frequencies_hz)
-    poses = _all_placed(sight, frames, found, start[1], frequencies_hz)
+    found, frequencies_hz, prior = refined(start[0], sightings.times_s[frames], frequencies_hz)
+    poses = _all_placed(sightings, frames, found, start[1], frequencies_hz)
     error = float(found.off().norm(dim=1).median())
-    return BreathingWay(poses, found.rest, frequencies_hz, way.uncertain, error)
+    return BreathingTrajectory(poses, found.rest, frequencies_hz, prior.uncertain, error)
 
 
 def refined(
     start: MovingBundle, times_s: Tensor, frequencies_hz: tuple[float, ...]
-) -> tuple[MovingBundle, tuple[float, ...], WayPrior]:
-    """Cameras, tissue and its motion with about these frequencies, from cameras and tissue that know no motion; the frequencies, and the prior of ways
+) -> tuple[MovingBundle, tuple[float, ...], TrajectoryPrior]:
+    """Cameras, tissue and its motion with about these frequencies, from cameras and tissue that know no motion; the frequencies, and the prior of trajectories
     like the one that was found."""
     bundle, hz = with_waves(start, waves(times_s, frequencies_hz)), frequencies_hz
     for spread, rounds, cycles in STAGES:
-        way = learned_from(bundle.poses, times_s, bundle.waves)
-        bundle, _ = adjust(bundle, spread, rounds, way)
+        prior = learned_from(bundle.poses, times_s, bundle.waves)
+        bundle, _ = adjust(bundle, spread, rounds, prior)
         if cycles:
-            bundle, hz = sharpened(bundle, times_s, hz, cycles, spread, way)
+            bundle, hz = sharpened(bundle, times_s, hz, cycles, spread, prior)
         bundle = _with_new_nodes(bundle)
     return bundle, hz, learned_from(bundle.poses, times_s, bundle.waves)
 
@@ -137,28 +137,28 @@ def _some(frames: Tensor, most: int) -> Tensor:
     return frames[torch.unique(at.round().long().clamp(0, len(frames) - 1))]
 
 
-def _bundle(sight: Sight, frames: Tensor, most: int, nodes: int) -> tuple[MovingBundle, Tensor] | None:
+def _bundle(sightings: Sightings, frames: Tensor, most: int, nodes: int) -> tuple[MovingBundle, Tensor] | None:
     """What the given frames show of the points that they show most often, at rest, and the points' numbers; None where these are too few."""
-    chosen = torch.isin(sight.frame, frames)
-    times = torch.bincount(sight.point[chosen], minlength=len(sight.points))
+    chosen = torch.isin(sightings.frame, frames)
+    times = torch.bincount(sightings.point[chosen], minlength=len(sightings.points))
     often = torch.argsort(times, descending=True, stable=True)[:most]
     often = often[times[often] >= LEAST_SEEN]
     if len(often) < FEWEST_POINTS:
         return None
-    chosen &= torch.isin(sight.point, often)
-    numbers, point = torch.unique(sight.point[chosen], return_inverse=True)
-    camera, rays = torch.searchsorted(frames, sight.frame[chosen]), sight.rays[chosen]
-    start = sight.poses[frames[0]]
-    poses = sight.poses[frames] @ inverse(start)
-    seen_from_start = sight.points[numbers] @ start[:3, :3].T + start[:3, 3]
+    chosen &= torch.isin(sightings.point, often)
+    numbers, point = torch.unique(sightings.point[chosen], return_inverse=True)
+    camera, rays = torch.searchsorted(frames, sightings.frame[chosen]), sightings.rays[chosen]
+    start = sightings.poses[frames[0]]
+    poses = sightings.poses[frames] @ inverse(start)
+    seen_from_start = sightings.points[numbers] @ start[:3, :3].T + start[:3, 3]
     rest = _limited(poses, seen_from_start, camera, point, rays)
     unit = rest[:, 2].median()
     poses[:, :3, 3] /= unit
     rest = rest / unit
     field = SurfaceField.over(rest, nodes)
     none = torch.zeros(len(frames), 0, dtype=torch.float64)
-    swing = torch.zeros(len(field.nodes), 3, 0, dtype=torch.float64)
-    bundle = MovingBundle(poses, rest, swing, camera, point, rays, none, field.influence(rest), field)
+    amplitudes = torch.zeros(len(field.nodes), 3, 0, dtype=torch.float64)
+    bundle = MovingBundle(poses, rest, amplitudes, camera, point, rays, none, field.influence(rest), field)
     return bundle, numbers
 
 
@@ -177,23 +177,25 @@ def _limited(poses: Tensor, rest: Tensor, camera: Tensor, point: Tensor, rays: T
 def _with_new_nodes(bundle: MovingBundle) -> MovingBundle:
     """The same motion, with nodes among the points where they are now."""
     field = SurfaceField.over(bundle.rest, len(bundle.field.nodes))
-    swing = torch.einsum("nm,mjb->njb", bundle.field.influence(field.nodes), bundle.swing)
-    return replace(bundle, field=field, swing=swing, influence=field.influence(bundle.rest))
+    amplitudes = torch.einsum("nm,mjb->njb", bundle.field.influence(field.nodes), bundle.amplitudes)
+    return replace(bundle, field=field, amplitudes=amplitudes, influence=field.influence(bundle.rest))
 
 
 def _all_placed(
-    sight: Sight, frames: Tensor, found: MovingBundle, numbers: Tensor, frequencies_hz: Sequence[float]
+    sightings: Sightings, frames: Tensor, found: MovingBundle, numbers: Tensor, frequencies_hz: Sequence[float]
 ) -> Tensor:
     """Poses of all frames: of those between the ones looked at, where the moving points fit."""
-    poses = _between(frames, found.poses, len(sight.times_s))
-    chosen = torch.isin(sight.point, numbers) & ~torch.isin(sight.frame, frames)
-    shared = torch.bincount(sight.frame[chosen], minlength=len(poses))
-    chosen &= shared[sight.frame] >= LEAST_SHARED
-    rest = torch.searchsorted(numbers, sight.point[chosen])
-    swings = torch.einsum("pm,mjb->pjb", found.influence, found.swing)
-    moved = torch.einsum("kjb,kb->kj", swings[rest], waves(sight.times_s, frequencies_hz)[sight.frame[chosen]])
+    poses = _between(frames, found.poses, len(sightings.times_s))
+    chosen = torch.isin(sightings.point, numbers) & ~torch.isin(sightings.frame, frames)
+    shared = torch.bincount(sightings.frame[chosen], minlength=len(poses))
+    chosen &= shared[sightings.frame] >= LEAST_SHARED
+    rest = torch.searchsorted(numbers, sightings.point[chosen])
+    amplitudes_at = torch.einsum("pm,mjb->pjb", found.influence, found.amplitudes)
+    moved = torch.einsum(
+        "kjb,kb->kj", amplitudes_at[rest], waves(sightings.times_s, frequencies_hz)[sightings.frame[chosen]]
+    )
     at = torch.arange(len(rest))
-    between = Bundle(poses, found.rest[rest] + moved, sight.frame[chosen], at, sight.rays[chosen], 1 / FINEST)
+    between = Bundle(poses, found.rest[rest] + moved, sightings.frame[chosen], at, sightings.rays[chosen], 1 / FINEST)
     fixed = shared < LEAST_SHARED
     fixed[frames] = True
     if fixed.all():

@@ -1,4 +1,4 @@
-"""What may be expected of a scope's way."""
+"""What may be expected of a scope's trajectory."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 
 from gsplat_core.geometry.breathing_frequencies import waves
 from gsplat_core.geometry.pose import exp
-from gsplat_core.geometry.way_prior import coordinates, learned_from
+from gsplat_core.geometry.trajectory_prior import coordinates, learned_from
 from tests.gsplat_core.geometry.breathing_points import DISTANCE, swaying
 
 

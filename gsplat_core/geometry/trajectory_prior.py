@@ -1,8 +1,8 @@
 """How a scope may be expected to go: smoothly, and without a line at the frequencies of breathing and heart beat.
 
 Pictures show where the scope is to the tissue. What both do as one rigid body, at a frequency of the breathing, they do not tell apart; the rest of the
-scope's way does: it is taken for a random function whose smoothness is learned from the way itself (a Gaussian process with a Matérn kernel of
-order 7/2, its length and noise by restricted maximum likelihood: what swings at the given frequencies takes no part). A way that needs no line
+scope's trajectory does: it is taken for a random function whose smoothness is learned from the trajectory itself (a Gaussian process with a Matérn kernel of
+order 7/2, its length and noise by restricted maximum likelihood: what swings at the given frequencies takes no part). A trajectory that needs no line
 there is then more likely than one with it. How much of one it may have all the same follows, and gets less the longer the recording is.
 """
 
@@ -18,19 +18,19 @@ from gsplat_core.geometry.pose import hat, log
 LENGTHS_S = (0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6, 6.0, 8.0, 12.0)
 """Of the kernel."""
 NOISES = (0.003, 0.01, 0.03, 0.1)
-"""How far a way jitters, relative to how far it goes."""
+"""How far a trajectory jitters, relative to how far it goes."""
 PLACES, TURNS = slice(0, 3), slice(3, 6)
 """Coordinates that share a kernel."""
 
 
 @dataclass(frozen=True)
-class WayPrior:
+class TrajectoryPrior:
     """What is expected of the coordinates of some cameras: where they are, and rotation vectors from the one in the middle, times the distance of the tissue."""
 
     precision: Tensor
     """[6, C, C]."""
     uncertain: float
-    """How far off the way may be (root mean square) as far as it is along the given frequencies."""
+    """How far off the trajectory may be (root mean square) as far as it is along the given frequencies."""
 
     def cost(self, poses: Tensor) -> float:
         """How unlikely poses [C, 4, 4] are."""
@@ -60,8 +60,8 @@ def coordinates(poses: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([place, vector], 1), by_twist
 
 
-def learned_from(poses: Tensor, times_s: Tensor, waves: Tensor) -> WayPrior:
-    """The prior of ways like that of `poses` [C, 4, 4], at `times_s` [C], as far as that is not along the `waves` [C, B]."""
+def learned_from(poses: Tensor, times_s: Tensor, waves: Tensor) -> TrajectoryPrior:
+    """The prior of trajectories like that of `poses` [C, 4, 4], at `times_s` [C], as far as that is not along the `waves` [C, B]."""
     y, _ = coordinates(poses)
     one = torch.ones(len(y), 1, dtype=y.dtype)
     apart = (times_s[:, None] - times_s).abs()
@@ -87,7 +87,7 @@ def learned_from(poses: Tensor, times_s: Tensor, waves: Tensor) -> WayPrior:
     places, turns = best
     assert places is not None and turns is not None
     along = torch.cat([0 * one, waves], 1)
-    return WayPrior(
+    return TrajectoryPrior(
         torch.cat([places.precision(one)[PLACES], turns.precision(one)[TURNS]]),
         float(places.variance(along)[PLACES].sum().sqrt()),
     )
@@ -95,7 +95,7 @@ def learned_from(poses: Tensor, times_s: Tensor, waves: Tensor) -> WayPrior:
 
 @dataclass(frozen=True)
 class _Smoothness:
-    """One kernel, and how likely it makes a way."""
+    """One kernel, and how likely it makes a trajectory."""
 
     likelihood: float
     factor: Tensor
@@ -106,15 +106,15 @@ class _Smoothness:
     """[6]: variance of each coordinate."""
 
     def precision(self, one: Tensor) -> Tensor:
-        """[6, C, C]; where a way begins is not known beforehand."""
+        """[6, C, C]; where a trajectory begins is not known beforehand."""
         inverse = torch.cholesky_inverse(self.factor)
         inverse = inverse - (inverse @ one) @ (one.T @ inverse) / inverse.sum()
         return inverse / self.scale[:, None, None]
 
     def variance(self, along: Tensor) -> Tensor:
         """Of each coordinate [6], of what may be along the waves, as a mean over time."""
-        told = torch.linalg.solve_triangular(self.triangle.T, along.T, upper=False)
-        return self.scale * told.square().sum(0).mean()
+        projected = torch.linalg.solve_triangular(self.triangle.T, along.T, upper=False)
+        return self.scale * projected.square().sum(0).mean()
 
 
 def _matern(apart: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The scope's way before tissue that breathes, in worlds of points."""
+"""The scope's trajectory before tissue that breathes, in worlds of points."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import torch
 
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.geometry.breathing_frequencies import frequencies_of, waves
-from gsplat_core.geometry.breathing_way import LONGEST_S, BreathingWay, breathing_way
+from gsplat_core.geometry.breathing_trajectory import LONGEST_S, BreathingTrajectory, breathing_trajectory
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ
-from tests.gsplat_core.geometry.breathing_sight import bundle_of, seen_for
+from tests.gsplat_core.geometry.breathing_sightings import bundle_of, seen_for
 
 
 def off_share(poses, true):
@@ -21,20 +21,20 @@ def off_share(poses, true):
     return errors.similarity_share
 
 
-def found_in(sight) -> BreathingWay | None:
-    return breathing_way(sight, torch.ones(len(sight.times_s), dtype=torch.bool))
+def found_in(sightings) -> BreathingTrajectory | None:
+    return breathing_trajectory(sightings, torch.ones(len(sightings.times_s), dtype=torch.bool))
 
 
 @pytest.fixture(scope="module")
 def breathing():
-    sight, true = seen_for(20.0)
-    return sight, true, found_in(sight)
+    sightings, true = seen_for(20.0)
+    return sightings, true, found_in(sightings)
 
 
 def test_breathing_and_heart_are_told_from_the_way(breathing):
-    sight, true, found = breathing
+    sightings, true, found = breathing
     assert found is not None
-    assert off_share(sight.poses, true) > 0.02
+    assert off_share(sightings.poses, true) > 0.02
     assert off_share(found.poses, true) < 0.007
     np.testing.assert_allclose(found.frequencies_hz, (BREATHING_HZ, HEART_HZ), atol=0.01)
     assert found.error < 0.002
@@ -55,27 +55,27 @@ def test_poses_start_at_the_identity_and_the_unit_is_the_distance(breathing):
 
 
 def test_the_same_is_found_again(breathing):
-    sight, _, found = breathing
-    again = found_in(sight)
+    sightings, _, found = breathing
+    again = found_in(sightings)
     assert found is not None and again is not None
     assert found.poses.numpy().tobytes() == again.poses.numpy().tobytes()
     assert found.frequencies_hz == again.frequencies_hz
 
 
 def test_what_is_pulled_about_does_not_take_the_way_with_it():
-    sight, true = seen_for(16.0, rate_hz=7.0, pulled=60)
-    found = found_in(sight)
+    sightings, true = seen_for(16.0, rate_hz=7.0, pulled=60)
+    found = found_in(sightings)
     assert found is not None
     assert off_share(found.poses, true) < 0.01
 
 
 def test_smaller_and_faster_breaths_are_told_too():
-    sight, true = seen_for(14.0, breathes=0.5)
-    faster = replace(sight, times_s=sight.times_s / 1.5)
+    sightings, true = seen_for(14.0, breathes=0.5)
+    faster = replace(sightings, times_s=sightings.times_s / 1.5)
     found = found_in(faster)
     assert found is not None
     assert found.frequencies_hz[0] == pytest.approx(1.5 * BREATHING_HZ, abs=0.02)
-    assert off_share(found.poses, true) < off_share(sight.poses, true)
+    assert off_share(found.poses, true) < off_share(sightings.poses, true)
 
 
 def test_tissue_at_rest_is_said_to_be_at_rest():
@@ -88,36 +88,39 @@ def test_less_than_one_and_a_half_breaths_tell_nothing(length_s):
 
 
 def test_a_recording_that_is_too_long_is_left_as_it_is():
-    sight, _ = seen_for(8.0)
-    assert found_in(replace(sight, times_s=sight.times_s * (LONGEST_S + 1) / 7.9)) is None
+    sightings, _ = seen_for(8.0)
+    assert found_in(replace(sightings, times_s=sightings.times_s * (LONGEST_S + 1) / 7.9)) is None
 
 
 def test_few_points_or_few_placed_frames_tell_nothing():
-    sight, _ = seen_for(12.0)
-    some = sight.point < 50
-    few = replace(sight, frame=sight.frame[some], point=sight.point[some], rays=sight.rays[some])
+    sightings, _ = seen_for(12.0)
+    some = sightings.point < 50
+    few = replace(sightings, frame=sightings.frame[some], point=sightings.point[some], rays=sightings.rays[some])
     assert found_in(few) is None
-    assert breathing_way(sight, torch.arange(len(sight.times_s)) < 30) is None
+    assert breathing_trajectory(sightings, torch.arange(len(sightings.times_s)) < 30) is None
 
 
 def test_points_that_start_behind_the_scope_or_far_away_do_no_harm():
-    sight, true = seen_for(16.0, rate_hz=7.0)
-    points = sight.points.clone()
+    sightings, true = seen_for(16.0, rate_hz=7.0)
+    points = sightings.points.clone()
     points[::9, 2] *= -1
     points[4::9] *= 1e4
-    found = found_in(replace(sight, points=points))
+    found = found_in(replace(sightings, points=points))
     assert found is not None
     assert off_share(found.poses, true) < 0.01
 
 
 def test_frames_that_are_not_placed_take_no_part_and_lie_between_the_others():
-    sight, true = seen_for(16.0, rate_hz=7.0)
-    placed = torch.ones(len(sight.times_s), dtype=torch.bool)
+    sightings, true = seen_for(16.0, rate_hz=7.0)
+    placed = torch.ones(len(sightings.times_s), dtype=torch.bool)
     placed[40:44] = False
-    poses, seen = sight.poses.clone(), ~torch.isin(sight.frame, torch.arange(40, 44))
+    poses, seen = sightings.poses.clone(), ~torch.isin(sightings.frame, torch.arange(40, 44))
     poses[40:44] = torch.nan
-    found = breathing_way(
-        replace(sight, poses=poses, frame=sight.frame[seen], point=sight.point[seen], rays=sight.rays[seen]), placed
+    found = breathing_trajectory(
+        replace(
+            sightings, poses=poses, frame=sightings.frame[seen], point=sightings.point[seen], rays=sightings.rays[seen]
+        ),
+        placed,
     )
     assert found is not None and bool(found.poses.isfinite().all())
     assert off_share(found.poses, true) < 0.01
@@ -125,6 +128,8 @@ def test_frames_that_are_not_placed_take_no_part_and_lie_between_the_others():
 
 def test_frequencies_are_found_without_knowing_the_way_and_none_at_rest():
     for breathes, expected in ((1.0, (BREATHING_HZ, HEART_HZ)), (0.0, ())):
-        sight, _ = seen_for(16.0, breathes, rate_hz=4.0)
-        found = frequencies_of(bundle_of(sight, waves(sight.times_s, ()), 12), sight.times_s, fastest_hz=1.6)
+        sightings, _ = seen_for(16.0, breathes, rate_hz=4.0)
+        found = frequencies_of(
+            bundle_of(sightings, waves(sightings.times_s, ()), 12), sightings.times_s, fastest_hz=1.6
+        )
         np.testing.assert_allclose(found, expected, atol=0.012)

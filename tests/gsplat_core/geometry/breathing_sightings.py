@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.geometry.breathing_way import Sight
+from gsplat_core.geometry.breathing_trajectory import Sightings
 from gsplat_core.geometry.moving_bundle import MovingBundle
 from gsplat_core.geometry.surface_field import SurfaceField
 from tests.gsplat_core.geometry.breathing_points import DISTANCE, places, swaying, tracks_of
@@ -14,7 +14,7 @@ from tests.gsplat_core.geometry.breathing_points import DISTANCE, places, swayin
 
 def seen_for(
     length_s: float, breathes: float = 1.0, rate_hz: float = 10.0, noise_px: float = 0.2, pulled: int = 0
-) -> tuple[Sight, NDArray[np.float64]]:
+) -> tuple[Sightings, NDArray[np.float64]]:
     """What is seen, and the true poses. pulled: so many points are dragged about, never twice alike."""
     times_s = np.arange(0, length_s, 1 / rate_hz)
     poses, points = swaying(times_s), places(times_s, breathes)
@@ -23,11 +23,11 @@ def seen_for(
     frame, point = np.nonzero(tracks.seen)
     taken = np.stack([pose @ rigid(points[0], each) for pose, each in zip(poses, points, strict=True)])
     taken[:, :3, 3] /= DISTANCE
-    sight = Sight(
+    sightings = Sightings(
         torch.from_numpy(frame), torch.from_numpy(point), torch.from_numpy(tracks.rays[frame, point]),
         torch.from_numpy(times_s), torch.from_numpy(taken), torch.from_numpy(points[0] / DISTANCE),
     )  # fmt: skip
-    return sight, poses
+    return sightings, poses
 
 
 def rigid(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -40,9 +40,19 @@ def rigid(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np
     return motion
 
 
-def bundle_of(sight: Sight, waves: torch.Tensor, most_nodes: int = 30) -> MovingBundle:
+def bundle_of(sightings: Sightings, waves: torch.Tensor, most_nodes: int = 30) -> MovingBundle:
     """All of it in one bundle, without any motion."""
-    field = SurfaceField.over(sight.points, most_nodes)
-    swing = torch.zeros(len(field.nodes), 3, waves.shape[1], dtype=torch.float64)
-    influence = field.influence(sight.points)
-    return MovingBundle(sight.poses, sight.points, swing, sight.frame, sight.point, sight.rays, waves, influence, field)
+    field = SurfaceField.over(sightings.points, most_nodes)
+    amplitudes = torch.zeros(len(field.nodes), 3, waves.shape[1], dtype=torch.float64)
+    influence = field.influence(sightings.points)
+    return MovingBundle(
+        sightings.poses,
+        sightings.points,
+        amplitudes,
+        sightings.frame,
+        sightings.point,
+        sightings.rays,
+        waves,
+        influence,
+        field,
+    )
