@@ -175,6 +175,7 @@ class SynthesizeOptions:
 class LiveOptions(RunOptions):
     """What `live` takes besides; the names are those of `LiveSettings`."""
 
+    eyes: EyesOption = "left"
     seconds: Annotated[
         float | None, typer.Option(help="End after so many seconds.", show_default="when the source ends")
     ] = None
