@@ -9,6 +9,7 @@ from typing import Any
 from gsplat_core.geometry.registry import DepthFinder, check_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.training.late_depth import LateDepth
 from operators.depth import DepthCounts
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
@@ -41,7 +42,7 @@ class DepthBeside:
         self.finder: DepthFinder | None = None
         self._changed = threading.Condition()
         self._offered: Frame | None = None
-        self._found: Frame | None = None
+        self._found: tuple[Frame, LateDepth] | None = None
         self._failure: BaseException | None = None
         self._over = False
         self._begun = threading.Event()
@@ -77,8 +78,8 @@ class DepthBeside:
             self._offered = frame
             self._changed.notify_all()
 
-    def take(self) -> Frame | None:
-        """The newest frame whose depth was found since the last call, with it."""
+    def take(self) -> tuple[Frame, LateDepth] | None:
+        """The newest frame whose depth was found since the last call, with it, and what of it is learned."""
         with self._changed:
             found, self._found = self._found, None
         return found
@@ -115,8 +116,10 @@ class DepthBeside:
 
     def _put(self, found: Frame) -> None:
         self.counts.take(found, found)
+        # Made ready here: between two pictures there is no time for it.
+        late = LateDepth.of(found, self._device)
         with self._changed:
-            self._found = found
+            self._found = found, late
 
     def _rest(self, seconds: float) -> None:
         with self._changed:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from gsplat_core.scene.frames import Frame
+from gsplat_core.training.late_depth import LateDepth
 from gsplat_core.training.live import LiveReconstructor
 from operators.graph.tracking import Histogram
 from operators.outcome import OutcomeBuilder
@@ -30,8 +31,8 @@ class DepthFound(Protocol):
     def offer(self, frame: Frame) -> None:
         """A frame that is trained on now; it may be passed over."""
 
-    def take(self) -> Frame | None:
-        """A frame that was offered, with the depth that was found of it; each once. None: there is none."""
+    def take(self) -> tuple[Frame, LateDepth] | None:
+        """A frame that was offered, with the depth that was found of it, and what of that is learned; each once. None: there is none."""
 
 
 class LateDepths:
@@ -54,10 +55,11 @@ class LateDepths:
 
     def give(self, reconstructor: LiveReconstructor, now_ns: Callable[[], int]) -> Frame | None:
         """Let the model learn what was found since the last call; returns the frame whose depth it took. now_ns: the clock of `Frame.arrived_ns`."""
-        frame = None if self._found is None else self._found.take()
-        if frame is None:
+        found = None if self._found is None else self._found.take()
+        if found is None:
             return None
-        if not reconstructor.take_depth(frame):
+        frame, late = found
+        if not reconstructor.take_depth(frame, late):
             self._dropped += 1
             return None
         self._taken += 1

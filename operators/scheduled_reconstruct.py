@@ -17,7 +17,8 @@ from gsplat_core.io.sessions.schedule import (
     ScheduleLine,
 )
 from gsplat_core.scene.frames import Frame, FrameStatus
-from gsplat_core.training.live import MOST_LATE, LiveReconstructor
+from gsplat_core.training.late_depth import MOST_LATE
+from gsplat_core.training.live import LiveReconstructor
 from operators.messages import Reconstruction
 from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ReconstructOp

@@ -165,9 +165,13 @@ class BasisField(BumpTensors):
 
     def move_to(self, time_s: float, deltas: Tensor) -> bool:
         """See `DeformationField.move_to`: each bump's weight changes in proportion to its height then, the smallest change that does it."""
-        centers, log_widths, weights = (p.data for p in self._parameters_of(self.count))
-        self._ops.basis_field_move_to_(centers, log_widths, weights, self.tau(time_s), deltas)
+        self.move_to_at(self.tau(time_s), deltas)
         return True
+
+    def move_to_at(self, tau: float | Tensor, deltas: Tensor) -> None:
+        """As `move_to`, at a `tau` of `self.tau`, which may be a float32 tensor [1] on the field's device; `deltas` [N, 13] may be those of all rows."""
+        bumps = (p.data for p in self._parameters_of(deltas.shape[0]))
+        self._ops.basis_field_move_to_(*bumps, tau, deltas)
 
     def follow(self, rows: slice, times_s: Sequence[float], offsets: Tensor) -> bool:
         """See `DeformationField.follow`: least squares over the weights of bumps as they are laid out. False for a ring."""

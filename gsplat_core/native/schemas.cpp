@@ -123,7 +123,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor(i!) v_weights, Tensor(j!) steps, Tensor rates, float beta1, float beta2, float epsilon) -> ()");
   m.def("basis_field_add_colours_(Tensor centers, Tensor log_widths, Tensor(a!) weights, Tensor tau, Tensor change) -> ()");
 
-  // Changes the weights as little as possible so that the deltas at tau are `target` [N, 13]. CPU only.
+  // Changes the weights as little as possible so that the deltas at tau are `target` [N, 13].
   m.def("basis_field_move_to_(Tensor centers, Tensor log_widths, Tensor(a!) weights, Tensor tau, Tensor target) -> ()");
 
   // How points [N, 3] move in the world as flow [h, w, 2] says, where they are in its first picture, or `arrived` in its second

@@ -16,6 +16,7 @@ from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.colour_correction import check_colours
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.into_view import fill_new_tissue, has_moved
+from gsplat_core.training.late_depth import MOST_LATE, LateDepth
 from gsplat_core.training.live_training import LiveTraining
 from gsplat_core.training.motion_prior import newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
@@ -31,8 +32,6 @@ from gsplat_core.transfers import HostCopy
 
 REHEARSED_IN_FLIGHT = 2
 """Rehearsal steps that may be queued on a GPU and not finished: the next frame's first step waits for them."""
-MOST_LATE = 30
-"""Depth of a frame is taken as long as there are fewer newer ones."""
 REVEALED_SHARE = 0.01
 """Of the picture's width: when so wide a strip has come into view, new tissue is looked for before the first step."""
 LONGER_STEP_DECAY = 0.1
@@ -124,18 +123,20 @@ class LiveReconstructor(Reconstructor):
             self._unsettled = observation
             self._rehearsing.queued()
 
-    def take_depth(self, frame: Frame) -> bool:
+    def take_depth(self, frame: Frame, late: LateDepth | None = None) -> bool:
         """Learn how far away is what `frame` shows, which was trained on before its depth was found: rehearsal looks at it from now on, and the scene
-        is placed by it. False, with nothing changed, where the frame is of another scene, was not trained on, or has `MOST_LATE` newer ones."""
-        seen = self._window.find(frame.seq, MOST_LATE)
-        if self._step is None or seen is None:
+        is placed by it. False, with nothing changed, where the frame is of another scene, was not trained on, or has `MOST_LATE` newer ones.
+        late: `LateDepth.of` the frame on this device, where another thread has made it."""
+        if self._step is None or (seen := self._window.find(frame.seq, MOST_LATE)) is None:
             return False
         self._settle()
-        observation, was_placed = seen.with_depth(frame), self._placement.is_placed
+        late = late or LateDepth.of(frame, self.device)
+        observation, was_placed = late.added_to(seen), self._placement.is_placed
         self._window.replace(observation)
-        self._placement.apply(self._step, frame, observation, self._learned_s)
-        placed = self._placement.is_placed and not was_placed
-        self._depth_source = DepthSource.of_first(frame) if placed else DepthSource.after(self._depth_source, frame)
+        if late.possible is not None:
+            self._placement.apply(self._step, frame, observation, self._learned_s, late.possible)
+        is_first = self._placement.is_placed and not was_placed
+        self._depth_source = DepthSource.of_first(frame) if is_first else DepthSource.after(self._depth_source, frame)
         return True
 
     def rehearsal_ns(self, steps: int) -> float:
@@ -162,8 +163,7 @@ class LiveReconstructor(Reconstructor):
 
     def look_after_once(self) -> None:
         """All that `grow` does from time to time, now, and as if something had to leave: what takes long the first time has been done then."""
-        assert self._step is not None
-        if self._upkeep is not None:
+        if self._step is not None and self._upkeep is not None:
             last_seen = None if self._out_of_view is None else self._out_of_view.last_seen
             self._upkeep.once(self._step, self._window.newest, last_seen)
 

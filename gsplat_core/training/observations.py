@@ -52,11 +52,6 @@ class Observation:
             return self if right is None else replace(self, right_eye=right)
         return replace(self, mask=self.mask & self.rehearsal_mask, rehearsal_mask=None, right_eye=right)
 
-    def with_depth(self, frame: Frame) -> Observation:
-        """The same with the depth of `frame`, which is this one and whose depth was found later."""
-        depth = known_depth(believed_depth(frame), self.image.device) if _is_trained_on(frame) else None
-        return replace(self, depth=depth)
-
     def by_turns(self, turn: int) -> Observation:
         """The eye whose turn it is: the left one at even turns, the right one, if there is one, at odd ones."""
         return self if self.right_eye is None or turn % 2 == 0 else self.right_eye.observation
@@ -86,7 +81,7 @@ class Observation:
             camera=camera if frame.pose is None else camera.with_pose(frame.pose),
             image=tensor_of(scene_colours(frame.image, frame.exposure), device),
             mask=tensor_of(mask.astype(np.uint8, copy=False), device),
-            depth=known_depth(believed_depth(frame), device) if _is_trained_on(frame) else None,
+            depth=learned_depth(frame, device),
             rehearsal_mask=None if frame.rehearsal_mask is None else tensor_of(frame.rehearsal_mask, device),
         )
 
@@ -114,10 +109,12 @@ def scene_colours(image: NDArray[np.uint8], exposure: tuple[float, float, float]
     return np.rint(np.clip(image / np.array(exposure, np.float32), 0, 255)).astype(np.uint8)
 
 
-def _is_trained_on(frame: Frame) -> bool:
-    """Whether the loss takes the frame's depth. The scene starts from depth of a single picture, by light or learned, and is not held to it: it is rough,
-    and right up to a factor that no two frames need to share."""
-    return frame.depth is not None and frame.depth_origin not in (DepthOrigin.LIGHT, DepthOrigin.LEARNED)
+def learned_depth(frame: Frame, device: torch.device | str = "cpu") -> Tensor | None:
+    """The frame's depth [H, W] that the loss takes, 0 where it is not believed; None where it takes none. The scene starts from depth of a single picture,
+    by light or learned, and is not held to it: it is rough, and right up to a factor that no two frames need to share."""
+    if frame.depth is None or frame.depth_origin in (DepthOrigin.LIGHT, DepthOrigin.LEARNED):
+        return None
+    return known_depth(believed_depth(frame), device)
 
 
 def known_depth(depth_mm: NDArray[np.floating], device: torch.device | str = "cpu") -> Tensor:

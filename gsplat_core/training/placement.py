@@ -11,36 +11,34 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
+from gsplat_core.deformation.basis import BasisField
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.frames import DepthOrigin, Frame
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.layout import LOG_SCALE, POSITION
+from gsplat_core.scene.layout import POSITION
+from gsplat_core.training.captured_correction import CapturedCorrection
 from gsplat_core.training.coverage import UNCOVERED_ALPHA
-from gsplat_core.training.hole_filling import filled
+from gsplat_core.training.depth_correction import LARGEST_STEP, SHARE, move_along_rays_, smooth_factor
 from gsplat_core.training.initialisation import possible_depth, tissue_depth
 from gsplat_core.training.observations import Observation, known_depth
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import Seen, beside
 from gsplat_core.transfers import tensor_of
 
-LARGEST_STEP = 1.4
-"""Factor by which one frame changes the depth of one Gaussian at most, once the scene's distance is known."""
 CORRECTS_ALL_TIMES = (DepthOrigin.PARALLAX,)
 CORRECTS_ONE_TIME = (None, DepthOrigin.MEASURED, DepthOrigin.STEREO)
 """Origins of depth that goes on correcting the scene; that of a frame which does not say is measured. Other depth is only started from."""
-SHARE = 0.5
-"""Of the way that a later frame moves a Gaussian: depths of several frames are averaged."""
-CORRECTED_PX = 16
-"""Side of the squares of a picture whose Gaussians are moved together."""
 
 
 class Placement:
-    """Of one scene: the first depth places all of it, later ones correct what they are sure of."""
+    """Of one scene after another: the first depth places all of it, later ones correct what they are sure of."""
 
-    def __init__(self, first: Frame | None) -> None:
-        """first: the frame that the scene started from."""
+    def __init__(self) -> None:
+        self._captured: CapturedCorrection | None = None
+        self.begin(None)
+
+    def begin(self, first: Frame | None) -> None:
+        """Another scene, which starts from the frame `first`."""
         self._first = first
         self.is_placed = _has_depth(first)
         """Whether the scene is where a depth says."""
@@ -55,10 +53,18 @@ class Placement:
             self._postponed = None
             self.apply(step, frame, observation, observation.time_s)
 
-    def apply(self, step: TrainingStep, frame: Frame, observation: Observation, shown_s: float | None = None) -> None:
+    def apply(
+        self,
+        step: TrainingStep,
+        frame: Frame,
+        observation: Observation,
+        shown_s: float | None = None,
+        possible: Tensor | None = None,
+    ) -> None:
         """Correct the scene by the depth of a frame, if it has any and the field takes positions; the field covers its time already.
 
         shown_s: the time at which motion is corrected; None: the frame's own. Later where depth is found after newer frames were trained on.
+        possible: `possible_depth` of the frame, where that is on the device already.
         """
         if self.postpones and self.is_placed and shown_s is None:
             self._postponed = frame, observation
@@ -70,56 +76,70 @@ class Placement:
         if self.is_placed and frame.depth_origin not in CORRECTS_ALL_TIMES + CORRECTS_ONE_TIME:
             return
         # Depth by light is in no observation: the loss does not see it.
-        there_is = possible_depth(frame)
-        if not there_is.any():
-            return
-        possible = known_depth(there_is, observation.image.device)
+        if possible is None:
+            there_is = possible_depth(frame)
+            if not there_is.any():
+                return
+            possible = known_depth(there_is, observation.image.device)
         with torch.no_grad():
             if self.is_placed and frame.depth_origin in CORRECTS_ONE_TIME:
-                _correct(step, observation, possible, observation.time_s if shown_s is None else shown_s)
-                return
-            points = step.gaussians.means + step.field.deltas(observation.time_s)[:, POSITION]
-            seen = Seen(observation.camera, points)
-            inside, now, there = seen.inside[:, 0], seen.depth[:, 0], seen.read(possible)
-            known = inside & (there > 0)
-            if self.is_placed:
-                told = torch.where(known, there, now)
-                factor = (told / now).pow(SHARE).clamp(1 / LARGEST_STEP, LARGEST_STEP)
+                self._correct(step, observation, possible, observation.time_s if shown_s is None else shown_s)
+            elif self.is_placed:
+                _correct_all_times(step, observation, possible)
             else:
-                if not bool(known.any()):
-                    return
-                # What is not sure goes along with what is sure beside it, and what the picture does not show with all of it.
-                everywhere = seen.read(tensor_of(tissue_depth(frame, float(now.median())), points.device))
-                factor = everywhere / now
-                factor = torch.where(inside, factor, (everywhere / now)[known].median())
-            step.scale_about(observation.camera, factor)
-            if not self.is_placed:
-                step.take_distance(observation.camera)
-        self.is_placed = True
+                self.is_placed = _place(step, frame, observation, possible)
+
+    def _correct(self, step: TrainingStep, observation: Observation, depth: Tensor, shown_s: float) -> None:
+        """Move the scene nearer to a frame's depth [H, W] (0: unknown) at one time."""
+        rows, field = step.fixed_rows, step.field
+        if rows is None or rows.device.type != "cuda" or not isinstance(field, BasisField):
+            _correct_at(step, observation, depth, shown_s)
+            return
+        if self._captured is None or not self._captured.fits(rows, field, observation.camera):
+            self._captured = CapturedCorrection(rows, field, observation.camera)
+        self._captured(observation, depth, shown_s)
 
 
-def _correct(step: TrainingStep, observation: Observation, depth: Tensor, shown_s: float) -> None:
-    """Move the scene nearer to a frame's depth [H, W] (0: unknown) at one time."""
+def _place(step: TrainingStep, frame: Frame, observation: Observation, possible: Tensor) -> bool:
+    """Move the whole scene to where its first depth [H, W] (0: unknown) says it is; False where the scene shows nothing of that."""
+    seen = _shown_now(step, observation)
+    inside, now, there = seen.inside[:, 0], seen.depth[:, 0], seen.read(possible)
+    known = inside & (there > 0)
+    if not bool(known.any()):
+        return False
+    # What is not sure goes along with what is sure beside it, and what the picture does not show with all of it.
+    everywhere = seen.read(tensor_of(tissue_depth(frame, float(now.median())), now.device))
+    factor = everywhere / now
+    factor = torch.where(inside, factor, factor[known].median())
+    step.scale_about(observation.camera, factor)
+    step.take_distance(observation.camera)
+    return True
+
+
+def _correct_all_times(step: TrainingStep, observation: Observation, possible: Tensor) -> None:
+    """Move each Gaussian nearer to the depth [H, W] (0: unknown) of tissue that is at rest."""
+    seen = _shown_now(step, observation)
+    now, there = seen.depth[:, 0], seen.read(possible)
+    told = torch.where(seen.inside[:, 0] & (there > 0), there, now)
+    factor = (told / now).pow(SHARE).clamp(1 / LARGEST_STEP, LARGEST_STEP)
+    step.scale_about(observation.camera, factor)
+
+
+def _shown_now(step: TrainingStep, observation: Observation) -> Seen:
+    points = step.gaussians.means + step.field.deltas(observation.time_s)[:, POSITION]
+    return Seen(observation.camera, points)
+
+
+def _correct_at(step: TrainingStep, observation: Observation, depth: Tensor, shown_s: float) -> None:
+    """As `CapturedCorrection`, launch by launch and on any device."""
     camera = observation.camera
     now = step.at(observation.time_s)
-    factor = _smooth_factor(now, observation, depth, Seen(camera, now.means).pixels)
-    deltas = step.field.deltas(shown_s)
-    points = step.gaussians.means + deltas[:, POSITION]
-    deltas[:, POSITION] += (factor - 1)[:, None] * (points - beside(points, camera.position))
-    deltas[:, LOG_SCALE] += factor.log()[:, None]
-    step.field.move_to(shown_s, deltas)
-
-
-def _smooth_factor(now: Gaussians, observation: Observation, depth: Tensor, pixels: Tensor) -> Tensor:
-    """By which factor [N] the depth of Gaussians at `pixels` [N, 2] changes. It is the same for neighbours: tissue moves smoothly, and Gaussians that
-    change their order along the line of sight change the picture."""
-    shown = render(now, observation.camera, depth=True)
+    shown = render(now, camera, depth=True)
     known = (depth > 0) & (observation.mask > 0) & (shown.alpha >= UNCOVERED_ALPHA)
-    ratio = torch.where(known, depth / shown.depth, 1.0).log()
-    smooth = filled(ratio[None], known[None].to(ratio.dtype), CORRECTED_PX)
-    grid = 2 * pixels / beside(pixels, [ratio.shape[1], ratio.shape[0]]) - 1
-    there = grid_sample(smooth[None], grid[None, None], padding_mode="border", align_corners=False)[0, 0, 0]
-    return (SHARE * there).exp().clamp(1 / LARGEST_STEP, LARGEST_STEP)
+    factor = smooth_factor(depth, shown.depth, known, Seen(camera, now.means).pixels)
+    deltas = step.field.deltas(shown_s)
+    move_along_rays_(deltas, step.gaussians.means, factor, beside(now.means, camera.position))
+    step.field.move_to(shown_s, deltas)
 
 
 def _has_depth(frame: Frame | None) -> bool:

@@ -69,7 +69,7 @@ class Reconstructor:
         self.eyes = BothEyes(config.eyes, self.device)
         self._step: TrainingStep | None = None
         self._prior: MotionPrior | None = None
-        self._placement = Placement(None)
+        self._placement = Placement()
         self._coverage: CapturedCoverage | None = None
         self._unsettled: Observation | None = None
         """The frame whose steps are queued; whether their splats fitted the tile lists is not known yet."""
@@ -122,7 +122,7 @@ class Reconstructor:
             if not train:
                 raise InvalidInput(f"frame {frame.seq} is the first one: a model can only start from a training frame")
             self._start(frame, observation)
-            self._placement = Placement(frame)
+            self._placement.begin(frame)
         elif observation.time_s < self._last_time_s:
             raise InvalidInput(
                 f"frame {frame.seq} is at {observation.time_s:.3f} s, before the last one at {self._last_time_s:.3f} s;"

@@ -233,6 +233,11 @@ class TrainingStep:
         return True
 
     @property
+    def fixed_rows(self) -> Gaussians | None:
+        """All that there is memory for, where Gaussians join and leave without a tensor moving; None where tensors are replaced."""
+        return None if self._rows is None else self._rows.all
+
+    @property
     def _all_rows(self) -> Gaussians:
         return self.gaussians if self._rows is None else self._rows.all
 

@@ -7,12 +7,14 @@ import time
 
 import numpy as np
 import pytest
+import torch
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.depth_map import DepthMap, doubted
 from gsplat_core.geometry.registry import DEPTHS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin
+from gsplat_core.training.late_depth import LateDepth
 from operators.depth import FoundDepth
 from operators.depth_beside import FEW_CORES, DepthBeside, DepthBesideOp, share_of
 from operators.outcome import OutcomeBuilder
@@ -64,7 +66,7 @@ def taken(beside):
     while (found := beside.take()) is None:
         assert time.monotonic() < until, "no depth was found"
         time.sleep(0.001)
-    return found
+    return found[0]
 
 
 def at_work(estimator):
@@ -98,7 +100,21 @@ def test_the_newest_depth_is_taken_where_two_were_found(beside, estimator, frame
         estimator.gate.release()
     beside.offer(frame(2))
     at_work(estimator)  # so that the one before is done
-    assert beside.take().seq == 1
+    assert beside.take()[0].seq == 1
+
+
+def test_what_is_learned_of_a_depth_is_made_ready_where_it_is_found(beside, estimator, frame):
+    beside.offer(frame(0))
+    at_work(estimator)
+    estimator.gate.release()
+    until = time.monotonic() + WAIT_S
+    while (found := beside.take()) is None:
+        assert time.monotonic() < until, "no depth was found"
+        time.sleep(0.001)
+    given, late = found
+    wanted = LateDepth.of(given, "cpu")
+    assert torch.equal(late.believed, wanted.believed) and torch.equal(late.possible, wanted.possible)
+    assert float(late.believed.max()) == 100
 
 
 def test_an_estimator_learns_of_a_scene_whose_first_frame_was_passed_over(beside, estimator, frame):

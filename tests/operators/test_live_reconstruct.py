@@ -48,8 +48,8 @@ class FakeReconstructor:
     def rehearsal_ns(self, steps):
         return 1e6 * steps
 
-    def take_depth(self, frame):
-        self.calls.append(("take_depth", frame.seq))
+    def take_depth(self, frame, late):
+        self.calls.append(("take_depth", frame.seq, late))
         return frame.seq not in self.gone
 
     def seqs(self, kind):
@@ -198,11 +198,12 @@ def test_depth_is_looked_for_in_what_is_trained_on(live, one_by_one):
 
 def test_depth_that_comes_late_is_learned_after_the_next_picture_and_told(live, one_by_one, frame):
     one_by_one((0, {}), (1, {}))
-    live.depth.found = found = arrived(frame, live, 0)
+    found = arrived(frame, live, 0)
+    live.depth.found = found, "ready"
     live.time.pass_ms(100)
     one_by_one((2, {}))
     kinds = [call[0] for call in live.fake.calls if call[0] != "rehearse"]
-    assert kinds[-3:] == ["observe", "take_depth", "grow"]
+    assert kinds[-3:] == ["observe", "take_depth", "grow"] and ("take_depth", 0, "ready") in live.fake.calls
     assert [event.frame for event in live.told if event.kind == "take_depth"] == [found]
     outcome = OutcomeBuilder()
     live.operator.contribute(outcome)
@@ -214,7 +215,7 @@ def test_depth_that_comes_late_is_learned_after_the_next_picture_and_told(live, 
 def test_depth_that_the_model_does_not_take_is_counted_and_not_told(live, one_by_one, frame):
     live.fake.gone = {0}
     one_by_one((0, {}), (1, {"new_scene": "cut", "scene": 1}))
-    live.depth.found = arrived(frame, live, 0)
+    live.depth.found = arrived(frame, live, 0), "ready"
     one_by_one((2, {"scene": 1}))
     assert live.fake.seqs("take_depth") == [0] and not [event for event in live.told if event.kind == "take_depth"]
     outcome = OutcomeBuilder()

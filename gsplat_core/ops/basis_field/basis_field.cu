@@ -5,12 +5,10 @@ namespace {
 
 constexpr int kFlight = 5;  // pairs of rows that a warp reads at once: bumps of width 1, one per spacing, have 8 or 9 active
 
-__global__ void __launch_bounds__(kBlock) forward(DeviceBumps field, float* __restrict__ deltas) {
-  const Place at;
-  if (at.gaussian >= field.count) return;
+// The lane's channel of what the Gaussian's bumps add up to; the same in both halves of the warp.
+__device__ __forceinline__ float delta_of(const DeviceBumps& field, const Place& at, float tau) {
   const int64_t first = at.gaussian * field.bumps;
   Timing next = timing_at(field.centers, field.log_widths, first, at.lane, field.bumps);
-  const float tau = *field.tau;
   float total = 0;
   for (int from = 0; from < field.bumps; from += 32) {
     const Bump b = bump_at(next.center, next.log_width, tau, from + at.lane < field.bumps);
@@ -35,7 +33,13 @@ __global__ void __launch_bounds__(kBlock) forward(DeviceBumps field, float* __re
       }
     }
   }
-  total += __shfl_xor_sync(kAll, total, 16);
+  return total + __shfl_xor_sync(kAll, total, 16);
+}
+
+__global__ void __launch_bounds__(kBlock) forward(DeviceBumps field, float* __restrict__ deltas) {
+  const Place at;
+  if (at.gaussian >= field.count) return;
+  const float total = delta_of(field, at, *field.tau);
   if (at.half == 0 && at.channel < field.row) deltas[at.gaussian * field.row + at.channel] = at.has_channel ? total : 0.0f;
 }
 
@@ -73,15 +77,8 @@ __global__ void __launch_bounds__(kBlock)
   }
 }
 
-// The smallest change of the weights that does it: in proportion to the heights, over the sum of their squares.
-__global__ void __launch_bounds__(kBlock)
-    add_colours(DeviceBumps field, float* __restrict__ weights, const float* __restrict__ change) {
-  const Place at;
-  if (at.gaussian >= field.count) return;
-  const float* const c = change + 3 * at.gaussian;
-  const float red = c[0], green = c[1], blue = c[2], size = red * red + green * green + blue * blue;
-  if (!(size > 0 && isfinite(size))) return;  // the same for the whole warp
-  const float tau = *field.tau;
+// The sum of the squared heights of the Gaussian's bumps, for all lanes.
+__device__ __forceinline__ float squared_heights(const DeviceBumps& field, const Place& at, float tau) {
   const int64_t first = at.gaussian * field.bumps;
   float squared = 0;
   for (int from = 0; from < field.bumps; from += 32) {
@@ -90,7 +87,20 @@ __global__ void __launch_bounds__(kBlock)
     squared = fmaf(b.height, b.height, squared);
   }
   for (int offset = 16; offset > 0; offset /= 2) squared += __shfl_xor_sync(kAll, squared, offset);
+  return squared;
+}
+
+// The smallest change of the weights that does it: in proportion to the heights, over the sum of their squares.
+__global__ void __launch_bounds__(kBlock)
+    add_colours(DeviceBumps field, float* __restrict__ weights, const float* __restrict__ change) {
+  const Place at;
+  if (at.gaussian >= field.count) return;
+  const float* const c = change + 3 * at.gaussian;
+  const float red = c[0], green = c[1], blue = c[2], size = red * red + green * green + blue * blue;
+  if (!(size > 0 && isfinite(size))) return;  // the same for the whole warp
+  const float tau = *field.tau, squared = squared_heights(field, at, tau);
   if (!(squared > kLeastSquaredHeights)) return;
+  const int64_t first = at.gaussian * field.bumps;
   for (int from = 0; from < field.bumps; from += 32) {
     const Timing t = timing_at(field.centers, field.log_widths, first, from + at.lane, field.bumps);
     const Bump b = bump_at(t.center, t.log_width, tau, from + at.lane < field.bumps);
@@ -103,11 +113,42 @@ __global__ void __launch_bounds__(kBlock)
   }
 }
 
+// The same for all channels, by what is missing to `target` [N, 13].
+__global__ void __launch_bounds__(kBlock) move_to(DeviceBumps field, float* __restrict__ weights, const float* __restrict__ target) {
+  const Place at;
+  if (at.gaussian >= field.count) return;
+  const float tau = *field.tau, now = delta_of(field, at, tau);
+  const float change = at.has_channel ? target[at.gaussian * kBasisChannels + at.channel] - now : 0.0f;
+  if (!__all_sync(kAll, isfinite(change))) return;
+  const float squared = squared_heights(field, at, tau);
+  if (!(squared > kLeastSquaredHeights)) return;
+  const int64_t first = at.gaussian * field.bumps;
+  for (int from = 0; from < field.bumps; from += 32) {
+    const Timing t = timing_at(field.centers, field.log_widths, first, from + at.lane, field.bumps);
+    const Bump b = bump_at(t.center, t.log_width, tau, from + at.lane < field.bumps);
+    const unsigned active = __ballot_sync(kAll, b.active);
+    if (active == 0) continue;
+    const Span span = span_of(active);
+    for (int pair = span.first; pair <= span.last; pair += 2) {
+      const int bump = pair + at.half;
+      const float share = __shfl_sync(kAll, b.height, bump & 31) / squared;
+      if (bump > span.last || !is_set(active, bump) || !at.has_channel) continue;
+      float* const to = weights + (first + from + bump) * kBasisChannels + at.channel;
+      *to = fmaf(share, change, *to);
+    }
+  }
+}
+
 }  // namespace
 
 void basis_field_add_colours_on_device(const DeviceBumps& field, float* weights, const float* change, cudaStream_t stream) {
   if (field.count == 0) return;
   add_colours<<<unsigned((field.count + kWarps - 1) / kWarps), kBlock, 0, stream>>>(field, weights, change);
+}
+
+void basis_field_move_to_on_device(const DeviceBumps& field, float* weights, const float* target, cudaStream_t stream) {
+  if (field.count == 0) return;
+  move_to<<<unsigned((field.count + kWarps - 1) / kWarps), kBlock, 0, stream>>>(field, weights, target);
 }
 
 void basis_field_on_device(const DeviceBumps& field, float* deltas, cudaStream_t stream) {

@@ -84,6 +84,7 @@ void basis_field_backward_on_device(const DeviceBumps& field, const float* gradi
                                     float* weights, cudaStream_t stream);
 void basis_field_adam_on_device(const DeviceBasisAdam& field, const float* gradient, cudaStream_t stream);
 void basis_field_add_colours_on_device(const DeviceBumps& field, float* weights, const float* change, cudaStream_t stream);
+void basis_field_move_to_on_device(const DeviceBumps& field, float* weights, const float* target, cudaStream_t stream);
 
 }  // namespace gsplat::basis_field
 

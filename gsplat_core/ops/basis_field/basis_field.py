@@ -17,7 +17,6 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_float32
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.ops.basis_field import plain_torch
 from gsplat_core.ops.scalars.scalars import store_scalars_
 from gsplat_core.scene.layout import BASIS_CHANNELS as CHANNELS
 from gsplat_core.scene.layout import RAW_COLUMNS
@@ -88,17 +87,13 @@ def basis_field_move_to_(
 ) -> None:
     """Change `weights` in place, as little as that can be done, so that the deltas at `tau` are `target` [N, 13].
 
-    Arguments as `gsplat_core.reference.basis_field_move_to_`; `weights` must be contiguous. Compiled for the CPU; on CUDA plain torch.
+    Arguments as `gsplat_core.reference.basis_field_move_to_`; `weights` must be contiguous.
     """
     _check(centers, log_widths, weights)
     if target.shape != (centers.shape[0], CHANNELS):
         raise InvalidInput(f"target must be [{centers.shape[0]}, {CHANNELS}], got {list(target.shape)}")
     require_float32("basis_field", centers=centers, target=target)
-    if centers.device.type == "cpu":
-        tau = _scalars("tau", tau, centers, 1)
-        torch.ops.gsplat_core.basis_field_move_to_(centers, log_widths, weights, tau, target)
-    else:
-        plain_torch.basis_field_move_to_(centers, log_widths, weights, tau, target)
+    torch.ops.gsplat_core.basis_field_move_to_(centers, log_widths, weights, _scalars("tau", tau, centers, 1), target)
 
 
 def basis_field_add_colours_(

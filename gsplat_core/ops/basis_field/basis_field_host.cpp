@@ -98,6 +98,10 @@ void add_colours(const Call& call, const Field& f, float* weights, const float* 
   basis_field_add_colours_on_device(bumps_of(f, kBasisChannels), weights, change, call.stream);
 }
 
+void move_to(const Call& call, const Field& f, float* weights, const float* target) {
+  basis_field_move_to_on_device(bumps_of(f, kBasisChannels), weights, target, call.stream);
+}
+
 #else
 
 using Adam = BasisAdam;
@@ -163,17 +167,10 @@ void add_colours(const Call&, const Field& f, float* weights, const float* chang
                               [&](int64_t begin, int64_t end) { kernels().add_colours(field, weights, change, begin, end); });
 }
 
-void basis_field_move_to_(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, Tensor target) {
-  const Call call(centers);
-  const Field f(call, centers, log_widths, weights, tau);
-  call.in_place(weights, "weights");
-  const Tensor wanted = call.floats(target, "target");
-  check(wanted.dim() == 2 && wanted.size(0) == f.count && wanted.size(1) == kBasisChannels, "the target must be [N, ",
-        kBasisChannels, "] with N = ", f.count);
+void move_to(const Call&, const Field& f, float* weights, const float* target) {
   const BasisBumps field = bumps_of(f, kBasisChannels);
-  torch::stable::parallel_for(0, f.count, kGrain, [&](int64_t begin, int64_t end) {
-    kernels().move_to(field, mutable_data(weights), data(wanted), begin, end);
-  });
+  torch::stable::parallel_for(0, f.count, kGrain,
+                              [&](int64_t begin, int64_t end) { kernels().move_to(field, weights, target, begin, end); });
 }
 
 #endif
@@ -227,6 +224,17 @@ void basis_field_add_colours_(Tensor centers, Tensor log_widths, Tensor weights,
   call.finish("basis_field_add_colours_");
 }
 
+void basis_field_move_to_(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, Tensor target) {
+  const Call call(centers);
+  const Field field(call, centers, log_widths, weights, tau);
+  call.in_place(weights, "weights");
+  const Tensor wanted = call.floats(target, "target");
+  check(wanted.dim() == 2 && wanted.size(0) == field.count && wanted.size(1) == kBasisChannels, "the target must be [N, ",
+        kBasisChannels, "] with N = ", field.count);
+  move_to(call, field, mutable_data(weights), data(wanted));
+  call.finish("basis_field_move_to_");
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, GSPLAT_DEVICE, m) {
@@ -234,9 +242,7 @@ STABLE_TORCH_LIBRARY_IMPL(gsplat_core, GSPLAT_DEVICE, m) {
   m.impl("basis_field_backward", GSPLAT_BOX(&basis_field_backward));
   m.impl("basis_field_backward_adam_", GSPLAT_BOX(&basis_field_backward_adam_));
   m.impl("basis_field_add_colours_", GSPLAT_BOX(&basis_field_add_colours_));
-#if !defined(GSPLAT_CUDA)
   m.impl("basis_field_move_to_", GSPLAT_BOX(&basis_field_move_to_));
-#endif
 }
 
 }  // namespace gsplat::basis_field

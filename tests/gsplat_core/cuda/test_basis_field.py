@@ -11,6 +11,7 @@ from gsplat_core.ops.basis_field.basis_field import (
     basis_field_add_colours_,
     basis_field_backward,
     basis_field_backward_adam_,
+    basis_field_move_to_,
 )
 from gsplat_core.scene.gaussians import Gaussians
 
@@ -65,6 +66,25 @@ def test_added_colours_equal_the_reference(gpu, n, b):
         time = torch.tensor([tau], device=gpu)
         basis_field_add_colours_(centers.to(gpu), log_widths.to(gpu), seen, time, change.to(gpu))
         near = (seen.cpu().double() - wanted).abs() <= 1e-4 + 1e-4 * wanted.abs()
+        # Bumps whose squares add up to just about the least that is asked for may fall on either side.
+        assert float(near.flatten(1).all(1).double().mean() if n else 1.0) >= 0.998
+
+
+@pytest.mark.parametrize("n", [0, 1, 2503])
+@pytest.mark.parametrize("b", [1, 4, 33, 100])
+def test_moving_to_deltas_equals_the_reference(gpu, n, b):
+    centers, log_widths, weights = bumps(n, b)
+    target = gradient_of(n)
+    target[::7, 5] = torch.nan
+    centers[3::11, 0] = torch.nan
+    weights[4::13, 0, 2] = torch.inf
+    for tau in (-9.0, 0.0, b / 2, b + 30.0):
+        wanted, seen = weights.double(), weights.to(gpu)
+        reference.basis_field_move_to_(centers.double(), log_widths.double(), wanted, tau, target.double())
+        time = torch.tensor([tau], device=gpu)
+        basis_field_move_to_(centers.to(gpu), log_widths.to(gpu), seen, time, target.to(gpu))
+        seen = seen.cpu().double()
+        near = ((seen - wanted).abs() <= 1e-4 + 1e-4 * wanted.abs()) | (seen == wanted)
         # Bumps whose squares add up to just about the least that is asked for may fall on either side.
         assert float(near.flatten(1).all(1).double().mean() if n else 1.0) >= 0.998
 

@@ -1,5 +1,7 @@
 """What a frame becomes for training, and which frames the steps take."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -122,7 +124,7 @@ def test_a_frame_is_found_by_its_number_among_the_newest_and_replaced_in_its_pla
     frames = window(make_frame, camera, 8, capacity=5)
     assert [frames.find(seq, among=3) is not None for seq in range(9)] == [False] * 5 + [True] * 3 + [False]
     assert frames.find(2, among=99) is None and frames.find(3, among=99).seq == 3
-    changed = frames.find(6, among=3).with_depth(make_frame(6, depth=np.full((40, 48), 55.0)))
+    changed = replace(frames.find(6, among=3), depth=torch.full((40, 48), 55.0))
     frames.replace(changed)
     assert frames.find(6, among=3) is changed and frames.newest.seq == 7
     with pytest.raises(InvalidInput, match="frame 2 is not in the window of 5 frames"):
