@@ -90,7 +90,7 @@ class DepthBeside:
         if self._share < 1:
             use_one_core()
         self._begun.set()
-        scene = 0
+        scene, placed = 0, -1
         try:
             while (frame := self._next()) is not None:
                 began_s = time.thread_time()
@@ -99,10 +99,9 @@ class DepthBeside:
                 scene = frame.scene
                 found = finder.find(frame.with_fields(new_scene="passed over") if is_new else frame)
                 if found is not None:
-                    depth = found.kept
-                    self._put(
-                        frame.with_fields(depth=depth, depth_confidence=found.confidence, depth_origin=found.origin)
-                    )
+                    fields = {"depth": found.kept, "depth_confidence": found.confidence, "depth_origin": found.origin}
+                    self._put(frame.with_fields(**fields), places=scene != placed)
+                    placed = scene
                 self._rest((time.thread_time() - began_s) * (1 / self._share - 1))
         except BaseException as error:  # noqa: BLE001 - carried to the operator of this thread
             self._failure = error
@@ -114,10 +113,10 @@ class DepthBeside:
             frame, self._offered = self._offered, None
             return None if self._over else frame
 
-    def _put(self, found: Frame) -> None:
+    def _put(self, found: Frame, places: bool) -> None:
         self.counts.take(found, found)
         # Made ready here: between two pictures there is no time for it.
-        late = LateDepth.of(found, self._device)
+        late = LateDepth.of(found, self._device, places=places)
         with self._changed:
             self._found = found, late
 

@@ -133,8 +133,7 @@ class LiveReconstructor(Reconstructor):
         late = late or LateDepth.of(frame, self.device)
         observation, was_placed = late.added_to(seen), self._placement.is_placed
         self._window.replace(observation)
-        if late.possible is not None:
-            self._placement.apply(self._step, frame, observation, self._learned_s, late.possible)
+        self._placement.apply(self._step, frame, observation, self._learned_s, late)
         is_first = self._placement.is_placed and not was_placed
         self._depth_source = DepthSource.of_first(frame) if is_first else DepthSource.after(self._depth_source, frame)
         return True

@@ -20,7 +20,8 @@ from gsplat_core.training.captured_correction import CapturedCorrection
 from gsplat_core.training.coverage import UNCOVERED_ALPHA
 from gsplat_core.training.depth_correction import LARGEST_STEP, SHARE, move_along_rays_, smooth_factor
 from gsplat_core.training.initialisation import possible_depth, tissue_depth
-from gsplat_core.training.observations import Observation, known_depth
+from gsplat_core.training.late_depth import LateDepth
+from gsplat_core.training.observations import Observation
 from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import Seen, beside
 from gsplat_core.transfers import tensor_of
@@ -59,12 +60,12 @@ class Placement:
         frame: Frame,
         observation: Observation,
         shown_s: float | None = None,
-        possible: Tensor | None = None,
+        late: LateDepth | None = None,
     ) -> None:
         """Correct the scene by the depth of a frame, if it has any and the field takes positions; the field covers its time already.
 
         shown_s: the time at which motion is corrected; None: the frame's own. Later where depth is found after newer frames were trained on.
-        possible: `possible_depth` of the frame, where that is on the device already.
+        late: the frame's, where that was made ready.
         """
         if self.postpones and self.is_placed and shown_s is None:
             self._postponed = frame, observation
@@ -76,18 +77,17 @@ class Placement:
         if self.is_placed and frame.depth_origin not in CORRECTS_ALL_TIMES + CORRECTS_ONE_TIME:
             return
         # Depth by light is in no observation: the loss does not see it.
+        late = late or LateDepth.to_move_by(frame, observation.image.device)
+        possible = late.possible
         if possible is None:
-            there_is = possible_depth(frame)
-            if not there_is.any():
-                return
-            possible = known_depth(there_is, observation.image.device)
+            return
         with torch.no_grad():
             if self.is_placed and frame.depth_origin in CORRECTS_ONE_TIME:
                 self._correct(step, observation, possible, observation.time_s if shown_s is None else shown_s)
             elif self.is_placed:
                 _correct_all_times(step, observation, possible)
             else:
-                self.is_placed = _place(step, frame, observation, possible)
+                self.is_placed = _place(step, frame, observation, late)
 
     def _correct(self, step: TrainingStep, observation: Observation, depth: Tensor, shown_s: float) -> None:
         """Move the scene nearer to a frame's depth [H, W] (0: unknown) at one time."""
@@ -100,16 +100,19 @@ class Placement:
         self._captured(observation, depth, shown_s)
 
 
-def _place(step: TrainingStep, frame: Frame, observation: Observation, possible: Tensor) -> bool:
-    """Move the whole scene to where its first depth [H, W] (0: unknown) says it is; False where the scene shows nothing of that."""
+def _place(step: TrainingStep, frame: Frame, observation: Observation, late: LateDepth) -> bool:
+    """Move the whole scene to where its first depth says it is; False where the scene shows nothing of that."""
+    assert late.possible is not None
     seen = _shown_now(step, observation)
-    inside, now, there = seen.inside[:, 0], seen.depth[:, 0], seen.read(possible)
+    inside, now, there = seen.inside[:, 0], seen.depth[:, 0], seen.read(late.possible)
     known = inside & (there > 0)
     if not bool(known.any()):
         return False
     # What is not sure goes along with what is sure beside it, and what the picture does not show with all of it.
-    everywhere = seen.read(tensor_of(tissue_depth(frame, float(now.median())), now.device))
-    factor = everywhere / now
+    everywhere = late.everywhere
+    if everywhere is None:
+        everywhere = tensor_of(tissue_depth(frame, float(now.median())), now.device)
+    factor = seen.read(everywhere) / now
     factor = torch.where(inside, factor, factor[known].median())
     step.scale_about(observation.camera, factor)
     step.take_distance(observation.camera)

@@ -122,19 +122,21 @@ def right_tissue(frame: Frame, camera: Camera, right: Camera, shift_px: float) -
     eye sees is not found.
     """
     height, width = frame.image.shape[:2]
-    if frame.mask is None or frame.mask.all():
+    if frame.mask is None or cv2.countNonZero(frame.mask) == frame.mask.size:
         return np.ones((height, width), np.uint8)
     rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
     size = columns, rows
-    tool = cv2.resize(np.equal(frame.mask, 0).view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > 0
+    bare = cv2.threshold(frame.mask, 0, 255, cv2.THRESH_BINARY_INV)[1]
+    tool = cv2.resize(bare, size, interpolation=cv2.INTER_AREA) > 0
     if frame.depth is None:
         depth = np.zeros((rows, columns), np.float32)
     else:
         depth = np.asarray(cv2.resize(believed_depth(frame), size, interpolation=cv2.INTER_NEAREST), np.float32)
     known = np.isfinite(depth) & (depth > 0)
-    centres = (np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1) + 0.5) * (width / columns, height / rows)
     hidden = np.zeros((rows, columns), np.uint8)
     if known.any():
+        centres = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1) + 0.5
+        centres *= (width / columns, height / rows)
         own = replace(camera, world_to_camera=np.eye(4))
         some = np.flatnonzero(known)[:: max(1, int(np.count_nonzero(known)) // TYPICAL_OF)]
         places, typical, tools = centres.reshape(-1, 2), depth.ravel(), tool & known
