@@ -2,7 +2,7 @@
 
 * `depth_share` and `normals`, where the recording has depth: beside the best flat plane.
 * `novel_view`, where it has further cameras or a right eye: beside the left picture.
-* `tracking`, where it has points of the tissue that are followed: beside no motion.
+* `tracking`, where it has points of the tissue that are followed, and `flow`, where it has the motion of each pixel to the next frame: beside no motion.
 * `trajectory`, where it has poses and the model was made with others: beside a scope that stands still.
 * `parts`: how much of the pictures' change motion, colour, and size and opacity explain.
 
@@ -25,6 +25,7 @@ from gsplat_core.evaluation.normals import NormalErrors, NormalSums
 from gsplat_core.evaluation.novel_view import NovelView
 from gsplat_core.evaluation.parts import MOST_FRAMES as PART_FRAMES
 from gsplat_core.evaluation.parts import PartShares, PartSums
+from gsplat_core.evaluation.scene_flow import FlowErrors, FlowSums
 from gsplat_core.evaluation.scores import why_left_out
 from gsplat_core.evaluation.tracking import Tracking
 from gsplat_core.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
@@ -57,6 +58,7 @@ class Geometry:
     scaled_views: tuple[NovelView, ...]
     """After the one factor of the sequence's depth."""
     tracking: Tracking | None
+    flow: FlowErrors | None
     trajectory: TrajectoryErrors | None
     """None as well where the model has the recording's own poses."""
     parts: PartShares | None
@@ -82,6 +84,7 @@ def evaluate_geometry(
     own = lambda frame: _posed(camera, model_pose(frame))
     depth, normals, views = DepthShareSums(), NormalSums(), ViewSums(camera, shown, truth)
     followed = None if truth.tracks is None else FollowedPoints(model, camera, truth.tracks)
+    flow = None if truth.motion is None else FlowSums(model, camera, truth.motion)
     parts = None if model.field is None else PartSums(model.at, sum(model.time_window_s) / 2)
     ways: list[tuple[Pose, Pose]] = []
     count = 0
@@ -89,17 +92,18 @@ def evaluate_geometry(
         pose = model_pose(frame)
         if pose is not None and frame.pose is not None:
             ways.append((pose, frame.pose))
+        if flow is not None:
+            flow.arrive(frame, own(frame))
         if _is_chosen(frame, frame_count, MOST_FRAMES):
             count += 1
             picture, true = shown(own(frame), frame), truth.depth_of(frame)
             if true is not None:
-                known = np.isfinite(true) & (true > 0) & _tissue(frame)
-                if true is frame.depth:
-                    known &= _believed(frame)
-                depth.add(camera, true, picture.depth, known)
-                normals.add(camera, true, picture.depth, known)
+                for each in (depth, normals):
+                    each.add(camera, true, picture.depth, _known(frame, true))
             if followed is not None:
                 followed.add(frame, own(frame), picture.depth)
+            if flow is not None:
+                flow.begin(frame, own(frame), picture.depth, _tissue(frame))
             views.add(frame, own(frame), picture.depth)
         if parts is not None and _is_chosen(frame, frame_count, PART_FRAMES):
             parts.add(frame, _picture_from(own(frame), frame))
@@ -108,9 +112,8 @@ def evaluate_geometry(
     scaled = views
     if abs(scale - 1) > NO_SCALING and views.scores:
         scaled = ViewSums(camera, shown, truth, scale)
-        for frame in frames:
-            if _is_chosen(frame, frame_count, MOST_FRAMES):
-                scaled.add(frame, own(frame), None)
+        for frame in (each for each in frames if _is_chosen(each, frame_count, MOST_FRAMES)):
+            scaled.add(frame, own(frame), None)
     return Geometry(
         frames=count,
         depth=errors,
@@ -118,16 +121,19 @@ def evaluate_geometry(
         views=views.scores,
         scaled_views=scaled.scores,
         tracking=None if followed is None else followed.tracking(scale),
+        flow=None if flow is None else flow.errors(scale),
         trajectory=_trajectory(ways),
         parts=None if parts is None else parts.shares,
     )
 
 
-def _believed(frame: Frame) -> NDArray[np.bool_]:
-    """Where the depth that a frame came with is not doubted: what lies on neither side of an edge is no truth to compare with."""
-    assert frame.depth is not None
-    confidence = frame.depth_confidence
-    return np.asarray((measured_confidence(frame.depth) if confidence is None else confidence) >= BELIEVED)
+def _known(frame: Frame, true: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where there is a true depth to compare with. That which the frame came with is none where it is doubted: it lies on neither side of an edge."""
+    known = np.isfinite(true) & (true > 0) & _tissue(frame)
+    if true is frame.depth:
+        confidence = frame.depth_confidence
+        known &= (measured_confidence(true) if confidence is None else confidence) >= BELIEVED
+    return np.asarray(known)
 
 
 def _trajectory(ways: list[tuple[Pose, Pose]]) -> TrajectoryErrors | None:

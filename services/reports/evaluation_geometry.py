@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 
 from services.reports.evaluation_rows import decibels
-from services.reports.evaluation_schema import EvaluationReport, GeometryFacts
+from services.reports.evaluation_schema import EndPointFacts, EvaluationReport, GeometryFacts
 
 RELATIVE_FROM = 0.05
 """A model whose lengths are off by a larger share than this is said to have no scale."""
@@ -27,7 +27,8 @@ class GeometryRow:
 
 def geometry_rows(geometry: GeometryFacts) -> list[GeometryRow]:
     """Everything that was measured, in the order of the page."""
-    return [*_depth(geometry), *_views(geometry), *_tracking(geometry), *_trajectory(geometry), *_parts(geometry)]
+    motion = [*_tracking(geometry), *_flow(geometry), *_trajectory(geometry)]
+    return [*_depth(geometry), *_views(geometry), *motion, *_parts(geometry)]
 
 
 def scale_sentence(geometry: GeometryFacts) -> str | None:
@@ -92,6 +93,22 @@ def _tracking(geometry: GeometryFacts) -> Iterator[GeometryRow]:
     )
 
 
+def _flow(geometry: GeometryFacts) -> Iterator[GeometryRow]:
+    flow = geometry.flow
+    if flow is None:
+        return
+    what, still = "from frame to frame, median and mean error", flow.still
+    yield GeometryRow(
+        f"Flow {what}",
+        f"{flow.model.median_px:.3f} px, {flow.model.mean_px:.3f} px",
+        f"no motion {still.median_px:.3f} px, {still.mean_px:.3f} px",
+        True,
+    )
+    for found, after, relative in ((flow.model, "", False), (flow.scaled, " after one scale", True)):
+        if found.median_mm is not None:
+            yield GeometryRow(f"Scene flow{after} {what}", _lengths(found), f"no motion {_lengths(still)}", relative)
+
+
 def _trajectory(geometry: GeometryFacts) -> Iterator[GeometryRow]:
     way = geometry.trajectory
     if way is None:
@@ -109,6 +126,10 @@ def _parts(geometry: GeometryFacts) -> Iterator[GeometryRow]:
         whole = f"all parts together {_percent(parts.explained)}"
         for name, share in (("motion", parts.motion), ("colour", parts.colour), ("size and opacity", parts.size)):
             yield GeometryRow(f"Change of the pictures explained by {name}", _percent(share), whole, True)
+
+
+def _lengths(errors: EndPointFacts) -> str:
+    return f"{errors.median_mm:.3f} mm, {errors.mean_mm:.3f} mm"
 
 
 def _percent(share: float) -> str:

@@ -166,6 +166,25 @@ class TrackingFacts(Part):
     compared: Count
 
 
+class EndPointFacts(Part):
+    median_px: float
+    mean_px: float
+    median_mm: float | None
+    """Null where the recording knows no scene flow."""
+    mean_mm: float | None
+
+
+class FlowFacts(Part):
+    """Where what a pixel shows goes until the next frame: distances from where it truly goes, in the picture and in space."""
+
+    model: EndPointFacts
+    scaled: EndPointFacts
+    """After the one factor of the sequence's depth: relative."""
+    still: EndPointFacts
+    """No motion."""
+    frames: Count
+
+
 class TrajectoryFacts(Part):
     """Absolute trajectory error, as a share of the true path."""
 
@@ -201,6 +220,7 @@ class GeometryFacts(Part):
     scaled_views: list[ViewFacts]
     """After the one factor of the sequence's depth: relative."""
     tracking: TrackingFacts | None
+    flow: FlowFacts | None = None
     trajectory: TrajectoryFacts | None
     parts: PartFacts | None
 

@@ -18,7 +18,7 @@ from services.reports.evaluation_schema import EvaluationReport
 @pytest.fixture(scope="module")
 def known(tmp_path_factory) -> Path:
     """Nine frames of a moving scope with everything that is known."""
-    extras = Extras(third=True, tracks=True)
+    extras = Extras(third=True, tracks=True, flow=True)
     folder = tmp_path_factory.mktemp("known") / "known"
     return synthesize(folder, frames=9, fps=9, width_px=64, height_px=48, camera="moving", extras=extras)
 
@@ -44,6 +44,7 @@ def test_everything_that_is_known_is_measured(intrasplat, known, made):
     assert 0 < found.depth.scaled_rmse_share < 0.2 and found.depth.plane_rmse_share < found.depth.level_rmse_share
     assert {view.name for view in found.views} == {"right", "third"}
     assert found.tracking is not None and found.tracking.compared > 100
+    assert found.flow is not None and found.flow.frames == 8 and found.flow.still.mean_mm is not None
     assert found.trajectory is None  # the model has the recording's own poses
 
 
@@ -51,7 +52,14 @@ def test_it_is_printed_and_written_with_units_and_marks(intrasplat, known, made,
     out = tmp_path / "out"
     done = intrasplat("evaluate", made, known, "--protocol", "geometry", "--out", out)
     assert done.code == 0, done.err
-    for said in ("Depth after one scale", "best flat plane", "View of the third camera", "left picture", "no motion"):
+    for said in (
+        "Depth after one scale",
+        "best flat plane",
+        "View of the third camera",
+        "left picture",
+        "no motion",
+        "Scene flow",
+    ):
         assert said in done.out
     page = (out / "evaluation.html").read_text()
     assert "In three dimensions" in page and "relative" in page and "absolute" in page
@@ -90,11 +98,21 @@ def test_pictures_alone_have_no_figure(intrasplat, tmp_path):
         (lambda folder: (folder / "views.json").write_text("{}"), "views.json"),
         (lambda folder: next((folder / "views/third/images").iterdir()).unlink(), "views/third"),
         (lambda folder: np.save(folder / "tracks_seen.npy", np.ones((3, 5), np.uint8)), "tracks_seen.npy"),
+        (
+            lambda folder: (folder / "flow/000000.npy").unlink() or (folder / "flow/000001.npy").unlink(),
+            "1 files for 3",
+        ),
+        (
+            lambda folder: np.save(folder / "flow/000001.npy", np.zeros((40, 48), np.float32)),
+            "000001.npy: it is [40, 48]",
+        ),
+        (lambda folder: np.save(folder / "flow/000001.npy", np.zeros((40, 40, 2), np.float32)), "the frame 48x40"),
+        (lambda folder: (folder / "scene_flow/000000.npy").write_bytes(b"no"), "000000.npy"),
         (lambda folder: np.save(folder / "tracks.npy", np.full((3, 63, 3), np.nan, np.float32)), "finite"),
     ],
 )
 def test_truth_that_cannot_be_read_is_said(intrasplat, tmp_path, break_it, said):
-    extras = Extras(third=True, tracks=True)
+    extras = Extras(third=True, tracks=True, flow=True)
     folder = synthesize(tmp_path / "x", frames=3, fps=3, width_px=48, height_px=40, stereo=False, extras=extras)
     assert run(["reconstruct", str(folder), "--out", str(tmp_path / "run"), "--steps", "5"]) == 0
     break_it(folder)

@@ -3,6 +3,7 @@
     tracks.npy          float [frames, points, 3]: points of the tissue in the recording's world
     tracks_seen.npy     [frames, points]: 1 where the left eye sees the point
     true_depth/         as depth/, where that one is not the truth
+    flow/, scene_flow/  where what each pixel shows goes until the next frame (`true_motion`)
     views.json, views/  further cameras (`views`)
 
 Nothing here is read by training, nor is it part of a recording's digest.
@@ -24,6 +25,7 @@ from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.frame_files import DepthFiles, check_sizes, resize_nearest
 from gsplat_core.io.recordings.image_files import list_images
 from gsplat_core.io.recordings.plain_files import UnreadableFile, all_stay_inside, stays_inside
+from gsplat_core.io.recordings.true_motion import MotionFiles, open_motion
 from gsplat_core.io.recordings.views import RecordedView, open_views
 from gsplat_core.scene.frames import Frame
 
@@ -48,6 +50,7 @@ class GroundTruth:
     views: tuple[RecordedView, ...] = ()
     tracks: Tracks | None = None
     true_depth: DepthFiles | None = None
+    motion: MotionFiles | None = None
 
     def depth_of(self, frame: Frame) -> NDArray[np.float32] | None:
         """The true depth of a frame of the recording, at the frame's size; the frame's own where there is no other."""
@@ -66,7 +69,8 @@ def open_truth(folder: Path, frame_count: int, scale: float = 1.0) -> GroundTrut
     if not folder.is_dir():
         return GroundTruth()
     views = open_views(folder, frame_count, scale)
-    return GroundTruth(views, _tracks(folder, frame_count), _true_depth(folder, frame_count))
+    tracks, depth = _tracks(folder, frame_count), _true_depth(folder, frame_count)
+    return GroundTruth(views, tracks, depth, open_motion(folder, frame_count))
 
 
 def _tracks(folder: Path, frame_count: int) -> Tracks | None:

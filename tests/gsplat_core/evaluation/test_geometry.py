@@ -20,14 +20,14 @@ FRAMES, FPS = 5, 4
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    extras = Extras(third=True, tracks=True)
+    extras = Extras(third=True, tracks=True, flow=True)
     path = tmp_path_factory.mktemp("geometry") / "recording"
     return synthesize(path, frames=FRAMES, fps=FPS, width_px=96, height_px=72, seed=3, stereo=True, extras=extras)
 
 
-def measured(folder: Path, **model: object) -> Geometry:
+def measured(folder: Path, moving: bool = False, **model: object) -> Geometry:
     recording = open_recording(folder)
-    scene = SyntheticScene.from_seed(3, 96, 72, FRAMES / FPS, False)
+    scene = SyntheticScene.from_seed(3, 96, 72, FRAMES / FPS, moving)
     made = true_model(scene, FRAMES / FPS, **model)  # type: ignore[arg-type]
     pictures = PictureMaker(recording.camera)
     return evaluate_geometry(
@@ -58,6 +58,30 @@ def test_a_true_model_scores_as_one(right: Geometry) -> None:
     assert right.scaled_views == right.views  # no scale is missing
 
 
+def test_a_true_model_moves_each_pixel_as_its_tissue_moves(right: Geometry, folder: Path) -> None:
+    assert right.flow is not None and right.flow.frames == FRAMES - 1  # nothing comes after the last one
+    model, still = right.flow.model, right.flow.still
+    assert model.median_px < 0.1 < 0.5 < still.median_px
+    assert model.median_mm is not None and still.median_mm is not None
+    assert model.median_mm < 0.1 * still.median_mm
+    lengths = [np.linalg.norm(np.load(folder / "scene_flow" / f"{k:06d}.npy"), axis=2) for k in range(FRAMES - 1)]
+    assert still.mean_mm == pytest.approx(np.nanmean(lengths), rel=0.05)
+
+
+def test_the_way_of_a_scope_is_part_of_the_flow_and_not_of_the_scene_flow(tmp_path: Path) -> None:
+    size = {"width_px": 96, "height_px": 72}
+    extras = Extras(flow=True)
+    folder = synthesize(
+        tmp_path / "x", frames=FRAMES, fps=FPS, seed=3, stereo=False, camera="moving", extras=extras, **size
+    )
+    found = measured(folder, moving=True)
+    assert found.flow is not None
+    model, still = found.flow.model, found.flow.still
+    assert model.median_px < 0.15 * still.median_px
+    assert model.median_mm is not None and still.median_mm is not None
+    assert model.median_mm < 0.1 * still.median_mm
+
+
 def test_views_are_scored_beside_the_left_picture(right: Geometry) -> None:
     views = {view.name: view for view in right.views}
     assert set(views) == {"right", "third"}
@@ -78,6 +102,10 @@ def test_a_model_without_scale_is_right_after_one_factor(folder: Path, right: Ge
     assert small.depth.scaled_rmse_share == pytest.approx(right.depth.scaled_rmse_share, abs=5e-4)
     assert small.tracking.model.median_mm > 20
     assert small.tracking.scaled.median_mm == pytest.approx(right.tracking.scaled.median_mm, abs=0.02)
+    assert small.flow is not None and right.flow is not None
+    assert small.flow.model.median_px == pytest.approx(right.flow.model.median_px, abs=0.01)  # a picture knows no scale
+    assert small.flow.model.median_mm == pytest.approx(0.5 * right.flow.still.median_mm, rel=0.1)
+    assert small.flow.scaled.median_mm == pytest.approx(right.flow.model.median_mm, abs=0.01)
     for scaled, as_it_is, exact in zip(small.scaled_views, small.views, right.views, strict=True):
         assert scaled.model.psnr_tissue_db == pytest.approx(exact.model.psnr_tissue_db, abs=0.3)
         assert as_it_is.model.psnr_tissue_db is not None and scaled.model.psnr_tissue_db is not None
@@ -88,6 +116,9 @@ def test_a_model_without_motion_tracks_as_no_motion_does(folder: Path) -> None:
     still = measured(folder, moves=False)
     assert still.tracking is not None
     assert still.tracking.model.median_mm == pytest.approx(still.tracking.still.median_mm, rel=0.1)
+    assert still.flow is not None and still.flow.model == still.flow.scaled
+    assert still.flow.model.median_px == pytest.approx(still.flow.still.median_px, abs=1e-4)
+    assert still.flow.model.mean_mm == pytest.approx(still.flow.still.mean_mm, abs=1e-5)
 
 
 def test_it_is_the_same_twice(folder: Path, right: Geometry) -> None:
@@ -103,5 +134,5 @@ def test_without_truth_nothing_is_measured(tmp_path: Path) -> None:
     pictures = PictureMaker(recording.camera)
     shown = lambda camera, frame: pictures(made, frame.with_fields(pose=camera.world_to_camera))
     found = evaluate_geometry(bare, 2, recording.camera, made, shown, open_truth(folder, 2))
-    assert (found.depth, found.normals, found.views, found.tracking) == (None, None, (), None)
+    assert (found.depth, found.normals, found.views, found.tracking, found.flow) == (None, None, (), None, None)
     assert np.isfinite(found.frames) and found.frames == 2
