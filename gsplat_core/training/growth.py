@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -31,30 +32,44 @@ def grid_of(height_px: int, width_px: int, spacing: float) -> tuple[NDArray[np.f
     return np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2), (len(rows), len(columns))
 
 
-def gaussians_for_uncovered_tissue(
-    frame: Frame, observation: Observation, current: Gaussians, config: ReconstructorConfig, most: int
-) -> Gaussians | None:
-    """Gaussians for the tissue pixels of `frame` that `current` (the model at the frame's time) leaves uncovered.
+@dataclass(frozen=True)
+class Uncovered:
+    """Tissue of one frame that a scene does not cover, on its way to the host."""
 
-    At most `most`, as dense as the first frame's. Their depth is measured where the frame has depth, else that of the nearest covered
-    pixel. None when there is nothing worth adding.
+    pixels: HostCopy
+    """bool [H, W]."""
+    depth: HostCopy | None
+    """What the scene shows around it, float32 [H, W]; 0 where it shows nothing. None: the frame has depth of its own."""
 
-    They are on the observation's device, which also looks for uncovered pixels; a frame that has few costs the host one number.
+    def gaussians(
+        self, frame: Frame, observation: Observation, config: ReconstructorConfig, most: int
+    ) -> Gaussians | None:
+        """Gaussians for it, at most `most`, as dense as the first frame's. Their depth is measured where the frame has depth, else that of the
+        nearest covered pixel. They are on the observation's device. Waits for the copies; None where no place is left for one."""
+        height, width = frame.image.shape[:2]
+        grid, _ = grid_of(height, width, grid_spacing(height * width, config.gaussians))
+        is_uncovered = self.pixels.numpy()
+        wanted = grid[is_uncovered[grid[:, 1].astype(np.int64), grid[:, 0].astype(np.int64)]]
+        depth_mm = frame.depth
+        if self.depth is not None:
+            depth_mm = np.asarray(cv2.medianBlur(self.depth.numpy(), 5))
+        assert depth_mm is not None
+        return gaussians_beside(wanted, frame, depth_mm, observation, config, most)
+
+
+def uncovered_tissue(observation: Observation, current: Gaussians, *, has_depth: bool = False) -> Uncovered | None:
+    """The tissue of a frame that `current`, the scene at its time, leaves uncovered; None where that is not worth filling. has_depth: the frame has it,
+    and not the scene's is taken.
+
+    It is looked for on the observation's device, and costs the host one number where there is little.
     """
     with torch.no_grad():
-        output = render(current, observation.camera, depth=frame.depth is None)
+        output = render(current, observation.camera, depth=not has_depth)
         uncovered = uncovered_pixels(output.alpha, observation.mask)
-    if not are_worth_filling(uncovered):
-        return None
-    is_uncovered = HostCopy(uncovered).numpy()
-    height, width = frame.image.shape[:2]
-    grid, _ = grid_of(height, width, grid_spacing(height * width, config.gaussians))
-    wanted = grid[is_uncovered[grid[:, 1].astype(np.int64), grid[:, 0].astype(np.int64)]]
-    depth_mm = frame.depth
-    if depth_mm is None:
-        covered = torch.where(output.alpha >= UNCOVERED_ALPHA, output.depth, 0)
-        depth_mm = np.asarray(cv2.medianBlur(HostCopy(covered).numpy(), 5))
-    return gaussians_beside(wanted, frame, depth_mm, observation, config, most)
+        if not are_worth_filling(uncovered):
+            return None
+        shown = None if has_depth else HostCopy(torch.where(output.alpha >= UNCOVERED_ALPHA, output.depth, 0))
+        return Uncovered(HostCopy(uncovered), shown)
 
 
 def gaussians_beside(

@@ -46,6 +46,8 @@ class LiveReconstructor(Reconstructor):
     depends on the seed and on the numbers of steps alone, not on the clock, so a run is repeated by giving it the same numbers again.
     """
 
+    _covers_beside = True
+
     def __init__(
         self,
         config: ReconstructorConfig,
@@ -154,10 +156,10 @@ class LiveReconstructor(Reconstructor):
         assert self._step is not None
         observation = self._window.newest
         self._placement.catch_up(self._step)
-        if self._out_of_view is not None:
-            self._out_of_view.follow(self._step, observation)
+        if (out := self._out_of_view) is not None:
+            out.follow(self._step, observation)
         if self._upkeep is not None:
-            self._upkeep(self._step, observation, None if self._out_of_view is None else self._out_of_view.last_seen)
+            self._upkeep(self._step, observation, None if out is None else out.last_seen)
         self._add_uncovered(frame, observation)
 
     def look_after_once(self) -> None:
@@ -214,6 +216,7 @@ class LiveReconstructor(Reconstructor):
         self._kept = self._step or self._kept
         self._step = self._taken_up = self._camera_before = None
         self._to_follow.clear()
+        self._covering.forget()
         self.eyes.forget()
         self._places = Places()
         self._version = self._rehearsed = 0
@@ -254,10 +257,9 @@ class LiveReconstructor(Reconstructor):
         kept, self._kept = self._kept, None
         if self._out_of_view is not None:
             self._out_of_view.restart()
-        camera = observation.camera
-        self._upkeep = None if self.config.history_s is None else Upkeep(camera, self.config)
-        same_size = self._kept_size == (camera.width_px, camera.height_px)
-        self._kept_size = camera.width_px, camera.height_px
+        self._upkeep = None if self.config.history_s is None else Upkeep(observation.camera, self.config)
+        size = observation.camera.width_px, observation.camera.height_px
+        same_size, self._kept_size = size == self._kept_size, size
         if kept is not None and same_size and end_s is None:
             gaussians = for_eyes(self._first_gaussians(frame, observation), observation)
             if kept.restart(gaussians, observation.time_s, self.camera):
@@ -265,7 +267,6 @@ class LiveReconstructor(Reconstructor):
                 if self._prior is not None:
                     self._prior.forget()
                 return
-        self._coverage = None
         super()._start(frame, observation, end_s)
 
     def _facts(self) -> dict[str, Any]:

@@ -21,8 +21,7 @@ from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.coverage import CapturedCoverage
-from gsplat_core.training.growth import gaussians_for_uncovered_tissue
+from gsplat_core.training.covering import Covering
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.motion_prior import MotionPrior, continued, new_motion_prior
 from gsplat_core.training.observations import Observation, ObservationWindow
@@ -70,7 +69,7 @@ class Reconstructor:
         self._step: TrainingStep | None = None
         self._prior: MotionPrior | None = None
         self._placement = Placement()
-        self._coverage: CapturedCoverage | None = None
+        self._covering = Covering(config, beside=self._covers_beside and self.device.type == "cuda")
         self._unsettled: Observation | None = None
         """The frame whose steps are queued; whether their splats fitted the tile lists is not known yet."""
         self._in_flight = StepsInFlight(self.device)
@@ -82,6 +81,8 @@ class Reconstructor:
         self._depth_source: DepthSource | None = None
         self.depth_doubts: Mapping[str, int] = {}  # why `fit` found no depth, and in how many frames of a moving camera
 
+    _covers_beside = False
+    """Whether new Gaussians are made beside training, where that is on a GPU."""
     _follows_at_once = True
     """Whether the motion prior sees a frame before the model is trained on it."""
 
@@ -270,8 +271,8 @@ class Reconstructor:
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config.starting_from(frame, end_s is not None), self.camera)
         self._prior = None if end_s is not None else new_motion_prior(self.config, field)
-        if self.device.type == "cuda" and SnapshotSlots.can_hold(field):
-            self._coverage = CapturedCoverage(self.camera, self.device, self._fixed_rows)
+        is_captured = self.device.type == "cuda" and SnapshotSlots.can_hold(field)
+        self._covering.begin(self.camera if is_captured else None, self.device, self._fixed_rows)
 
     def _follow(self, frame: Frame, observation: Observation) -> None:
         """Let the motion prior see the next frame."""
@@ -281,20 +282,9 @@ class Reconstructor:
     def _grow(self, frame: Frame, observation: Observation, first: bool = False) -> None:
         """Add Gaussians where the frame shows tissue that the model does not cover, each eye in turn; the first left picture is what they were
         made from."""
-        if not first:
-            self._cover(observation, lambda: frame)
-        if (right := observation.right) is not None:
-            self._cover(right, right.as_frame)
-
-    def _cover(self, observation: Observation, frame: Callable[[], Frame]) -> None:
-        """Add Gaussians where one eye sees tissue that the model does not cover."""
         assert self._step is not None
-        step, coverage = self._step, self._coverage
-        most = self.config.max_gaussians - step.gaussians.count
-        if most <= 0:
-            return
-        if coverage is not None and not coverage.leaves_much_uncovered(step.gaussians, step.field, observation):
-            return
-        added = gaussians_for_uncovered_tissue(frame(), observation, step.at(observation.time_s), self.config, most)
-        if added is not None:
-            step.append(added)
+        self._covering.join(self._step)
+        if not first:
+            self._covering.look(self._step, observation, lambda: frame, has_depth=frame.depth is not None)
+        if (right := observation.right) is not None:
+            self._covering.look(self._step, right, right.as_frame)

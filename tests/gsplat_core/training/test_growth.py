@@ -6,7 +6,7 @@ import torch
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth import gaussians_for_uncovered_tissue
+from gsplat_core.training.growth import uncovered_tissue
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
 
@@ -22,7 +22,8 @@ def left_part(frame, camera, width_px=30, depth_mm=60.0):
 
 def grown(frame, camera, current, room=10_000, config=CONFIG):
     observation = Observation.of(frame, camera, current.device)
-    return gaussians_for_uncovered_tissue(frame, observation, current, config, room)
+    found = uncovered_tissue(observation, current, has_depth=frame.depth is not None)
+    return None if found is None else found.gaussians(frame, observation, config, room)
 
 
 def columns_of(gaussians):
