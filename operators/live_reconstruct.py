@@ -186,7 +186,8 @@ class LiveReconstructOp(Operator):
             self._learned = frame
             self.counts.frames += 1
             self.counts.steps += report.steps
-            self._since_grown += 1
+            # What a scene starts from covers its first frame.
+            self._since_grown = 0 if first else self._since_grown + 1
         self._tell(ScheduleEvent("observe", seq=frame.seq, steps=report.steps, train=reason is None))
         self.newest = self._reconstructor.publish()
         published_ns = self.clock.now_ns()
@@ -227,7 +228,7 @@ class LiveReconstructOp(Operator):
             assert self._reconstructor is not None
             return not frame_waits() and self.clock.may_rehearse(made, self._reconstructor.rehearsal_ns(at_once))
 
-        if frame is self._learned and (self._since_grown >= GROWN_AT_LATEST or has_time()):
+        if frame is self._learned and self._since_grown and (self._since_grown >= GROWN_AT_LATEST or has_time()):
             self._reconstructor.grow(frame)
             self._tell(ScheduleEvent("grow", seq=frame.seq))
             self._since_grown = 0

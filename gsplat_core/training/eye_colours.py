@@ -88,15 +88,38 @@ def _small(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 def best_shift(left: NDArray[np.float32], right: NDArray[np.float32], before: int | None = None) -> int:
     """By how many pixels the right picture [h, w] shows the same farther to the left: where the two correlate best. before: what it was lately; it is
     looked for around it then, and everywhere where the best is at the end of that."""
-    width = left.shape[1]
-    most = int((1 - LEAST_OVERLAP) * width)
-    correlation = lambda shift: _correlation(*overlap(left, right, shift))
+    most = int((1 - LEAST_OVERLAP) * left.shape[1])
+    matches = _correlations(left, right, most)
     if before is not None:
         first, last = max(-most, before - SHIFT_STAYS), min(most, before + SHIFT_STAYS)
-        best = max(range(first, last + 1), key=correlation)
+        best = first + int(np.argmax(matches[first + most : last + most + 1]))
         if first < best < last:
             return best
-    return max(range(-most, most + 1), key=correlation)
+    return int(np.argmax(matches)) - most
+
+
+def _correlations(left: NDArray[np.float32], right: NDArray[np.float32], most: int) -> NDArray[np.float64]:
+    """How well the pictures [h, w] correlate where they overlap, for each shift of the right one from -`most` to `most` [2 most + 1]."""
+    a, b = left.astype(np.float64), right.astype(np.float64)
+    height, width = a.shape
+    shifts = np.arange(-most, most + 1)
+    # The products of all columns of one with all of the other; those that lie upon each other are on one diagonal.
+    products = a.T @ b
+    together = np.array([np.trace(products, offset=-shift) for shift in shifts])
+    begins = np.maximum(shifts, 0), np.maximum(-shifts, 0)
+    count = height * (width - np.abs(shifts))
+    (sum_a, squares_a), (sum_b, squares_b) = (
+        (_sums(picture, begin, width - np.abs(shifts)), _sums(picture * picture, begin, width - np.abs(shifts)))
+        for picture, begin in zip((a, b), begins, strict=True)
+    )
+    spread = (squares_a - sum_a**2 / count) * (squares_b - sum_b**2 / count)
+    return np.asarray((together - sum_a * sum_b / count) / np.sqrt(np.maximum(spread, 0) + 1e-6))
+
+
+def _sums(picture: NDArray[np.float64], begins: NDArray, widths: NDArray) -> NDArray[np.float64]:
+    """Sums over `widths` columns of a picture from `begins` on."""
+    upto = np.concatenate([[0.0], picture.sum(0).cumsum()])
+    return np.asarray(upto[begins + widths] - upto[begins])
 
 
 def overlap(left: NDArray, right: NDArray, shift: int) -> tuple[NDArray, NDArray]:
@@ -118,11 +141,6 @@ def line_between(left: NDArray[np.float32], right: NDArray[np.float32]) -> tuple
     says_something = (spread_left >= FLAT_LEVELS) & (spread_right >= FLAT_LEVELS)
     gain = np.where(says_something, spread_left / np.maximum(spread_right, 1e-6), 1.0).clip(1 / MOST_GAIN, MOST_GAIN)
     return gain, ours[1] - gain * theirs[1], theirs
-
-
-def _correlation(left: NDArray, right: NDArray) -> float:
-    a, b = left - left.mean(), right - right.mean()
-    return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum() + 1e-6))
 
 
 def _table(gain: NDArray, offset: NDArray) -> NDArray[np.uint8]:

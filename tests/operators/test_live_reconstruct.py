@@ -130,16 +130,16 @@ def test_a_scene_that_goes_on_begins_once(live, one_by_one):
     assert live.fake.seqs("begin_scene") == [1]
 
 
-def test_the_scene_grows_in_time_that_is_left(live, one_by_one):
-    one_by_one((0, {}), (1, {}))
-    assert live.fake.seqs("grow") == [0, 1]
+def test_the_scene_grows_in_time_that_is_left_but_not_by_the_frame_that_it_starts_from(live, one_by_one):
+    one_by_one((0, {}), (1, {}), (2, {}), (3, {"new_scene": "cut", "scene": 1}), (4, {"scene": 1}))
+    assert live.fake.seqs("grow") == [1, 2, 4]
 
 
 def test_the_scene_grows_now_and_then_though_no_time_is_ever_left(live, frame, compute_queued):
     for seq in range(3 * GROWN_AT_LATEST):
         live.time.pass_ms(33)
         compute_queued(live.operator, frame=[frame(seq, arrived_ns=live.time.ns - 100_000_000)])
-    assert live.fake.seqs("grow") == [GROWN_AT_LATEST * k - 1 for k in (1, 2, 3)]
+    assert live.fake.seqs("grow") == [GROWN_AT_LATEST * k for k in (1, 2)]
     assert not live.fake.seqs("rehearse")
 
 
