@@ -52,6 +52,8 @@ def live_settings(spec: EngineSpec, out: Path, source: str) -> LiveSettings:
         renderer=spec.renderer,
         seed=spec.seed,
         tool_mask=spec.tool_mask,
+        depth=spec.depth,
+        eyes=spec.eyes,
         out_of_body=spec.out_of_body,
         clock=ClockSettings(budget_ms=spec.budget_ms),
         frame_log=False,

@@ -44,6 +44,10 @@ class EngineSpec(_Strict):
     seed: int = Field(default=0, ge=0, lt=2**31)
     budget_ms: float | None = Field(default=None, gt=0, le=10_000)
     tool_mask: str = "builtin"
+    depth: Annotated[str, StringConstraints(min_length=1, max_length=4096)] = "auto"
+    """Where depth comes from, as `intrasplat live` takes it."""
+    eyes: Literal["left", "both"] = "left"
+    """Which pictures of a stereo scope are trained on."""
     out_of_body: Literal["withhold", "off"] = "withhold"
 
 

@@ -9,6 +9,7 @@ from services.control.parts import NewStream
 from services.server import stream_specs
 from services.server.stream_specs import spec_of
 from services.server.streams import overall
+from services.supervisor.engine import live_settings
 from services.supervisor.process import ProcessState
 
 
@@ -64,3 +65,13 @@ def process(state, reason="", **figures):
 )  # fmt: skip
 def test_a_stream_is_what_its_processes_are(capture, engine, expected):
     assert overall(capture, engine) == expected
+
+
+def test_what_is_asked_of_depth_and_eyes_reaches_the_reconstruction(tmp_path):
+    asked = spec_of(wanted(depth="stereo", eyes="both")).engine
+    settings = live_settings(asked, tmp_path, "a source")
+    assert (settings.depth, settings.eyes) == ("stereo", "both")
+    usual = live_settings(spec_of(wanted()).engine, tmp_path, "a source")
+    assert (usual.depth, usual.eyes) == ("auto", "left")
+    with pytest.raises(InvalidSetting, match="eyes"):
+        spec_of(wanted(eyes="right"))
