@@ -26,6 +26,12 @@ PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py
 test: native .venv/.development
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going test-of-programs test-of-parts
 
+# One thread for each of their processes: most arrays in tests are so small that more of them would mostly wait for one another. Tests of what
+# threads do ask for them.
+test-of-programs test-of-parts: export OMP_NUM_THREADS ?= 1
+test-of-programs test-of-parts: export OPENBLAS_NUM_THREADS ?= 1
+test-of-programs test-of-parts: export OPENCV_FOR_THREADS_NUM ?= 1
+
 test-of-programs:
 	$(BIN)/python -m pytest $(PROGRAM_TESTS)
 
