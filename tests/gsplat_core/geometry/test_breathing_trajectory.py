@@ -27,7 +27,7 @@ def found_in(sightings) -> BreathingTrajectory | None:
 
 @pytest.fixture(scope="module")
 def breathing():
-    sightings, true = seen_for(20.0)
+    sightings, true = seen_for(14.0, rate_hz=5.0)
     return sightings, true, found_in(sightings)
 
 
@@ -63,7 +63,7 @@ def test_the_same_is_found_again(breathing):
 
 
 def test_what_is_pulled_about_does_not_take_the_way_with_it():
-    sightings, true = seen_for(16.0, rate_hz=7.0, pulled=60)
+    sightings, true = seen_for(12.0, rate_hz=4.0, pulled=60)
     found = found_in(sightings)
     assert found is not None
     assert off_share(found.poses, true) < 0.01
@@ -101,7 +101,7 @@ def test_few_points_or_few_placed_frames_tell_nothing():
 
 
 def test_points_that_start_behind_the_scope_or_far_away_do_no_harm():
-    sightings, true = seen_for(16.0, rate_hz=7.0)
+    sightings, true = seen_for(12.0, rate_hz=4.0)
     points = sightings.points.clone()
     points[::9, 2] *= -1
     points[4::9] *= 1e4
@@ -111,7 +111,7 @@ def test_points_that_start_behind_the_scope_or_far_away_do_no_harm():
 
 
 def test_frames_that_are_not_placed_take_no_part_and_lie_between_the_others():
-    sightings, true = seen_for(16.0, rate_hz=7.0)
+    sightings, true = seen_for(12.0, rate_hz=4.0)
     placed = torch.ones(len(sightings.times_s), dtype=torch.bool)
     placed[40:44] = False
     poses, seen = sightings.poses.clone(), ~torch.isin(sightings.frame, torch.arange(40, 44))
@@ -128,7 +128,7 @@ def test_frames_that_are_not_placed_take_no_part_and_lie_between_the_others():
 
 def test_frequencies_are_found_without_knowing_the_way_and_none_at_rest():
     for breathes, expected in ((1.0, (BREATHING_HZ, HEART_HZ)), (0.0, ())):
-        sightings, _ = seen_for(16.0, breathes, rate_hz=4.0)
+        sightings, _ = seen_for(12.0, breathes, rate_hz=4.0)
         found = frequencies_of(
             bundle_of(sightings, waves(sightings.times_s, ()), 12), sightings.times_s, fastest_hz=1.6
         )

@@ -18,7 +18,7 @@ FPS = 10.0
 
 @cache
 def recording() -> RenderedRecording:
-    return render_recording(Asked(56, 224, 176, fps=FPS, seed=1, camera="moving"))
+    return render_recording(Asked(56, 192, 144, fps=FPS, seed=1, camera="moving"))
 
 
 def given(frames: slice = slice(None)) -> tuple[list[Frame], list[Camera]]:
@@ -60,7 +60,7 @@ def test_a_frame_that_is_not_looked_at_is_between_its_neighbours(monkeypatch) ->
 
 
 def test_too_short_a_recording_is_not_believed() -> None:
-    found = MovingTissue(*given(slice(0, 18)))
+    found = MovingTissue(*given(slice(0, 14)))
     assert found.doubts == (TOO_SHORT,)
     depth = found.depth_of(4)
     assert depth.doubt == TOO_SHORT
@@ -68,7 +68,7 @@ def test_too_short_a_recording_is_not_believed() -> None:
 
 
 def test_poses_of_another_way_are_not_believed() -> None:
-    frames, cameras = given()
+    frames, cameras = given(slice(0, 40))
     poses = np.random.default_rng(0).permutation(len(cameras))
     found = MovingTissue(frames, [cameras[number] for number in poses])
     assert set(found.doubts) <= {OTHERWISE, TOO_SHORT}
@@ -76,7 +76,7 @@ def test_poses_of_another_way_are_not_believed() -> None:
 
 
 def test_pictures_without_texture_are_not_believed() -> None:
-    frames, cameras = given(slice(0, 30))
+    frames, cameras = given(slice(0, 16))
     grey = [frame.with_fields(image=np.full_like(frame.image, 120)) for frame in frames]
     found = MovingTissue(grey, cameras)
     assert found.doubts

@@ -6,26 +6,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from services.registry.errors import Conflict, NotFound
+from services.registry.errors import NotFound
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
+from tests.services.registry.activating import ROUNDS, activate_together
 from tests.services.registry.made import add_ready, assert_whole, packed_model
-from tests.services.registry.stub_check import ALWAYS_READY, says
-
-ROUNDS = 5
-
-
-def activate_together(folder, database_url, version, gate, results):
-    """In a process of its own: in each round try to be the one that replaces version 1."""
-    with ModelRegistry(folder, database_url=database_url, check_program=ALWAYS_READY) as registry:
-        for _ in range(ROUNDS):
-            gate.wait()
-            try:
-                registry.activate("liver", version, 1, f"process {version}")
-                results.put(version)
-            except Conflict as error:
-                results.put(str(error))
-            gate.wait()
+from tests.services.registry.stub_check import says
 
 
 def test_of_two_processes_that_activate_at_once_one_wins(new_registry, files, database_url, tmp_path):
