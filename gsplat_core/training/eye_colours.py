@@ -36,8 +36,8 @@ class EyeColours:
 
     def __init__(self) -> None:
         self._gain, self._offset = np.ones(3), np.zeros(3)
-        self._table: NDArray[np.uint8] | None = None
-        """What becomes of each level of each channel, [1, 256, 3]; None: nothing is changed."""
+        self._line: NDArray[np.float32] | None = None
+        """Factors and offsets of the channels as a matrix [3, 4]; None: nothing is changed."""
         self._frames = 0
         self.shift: float | None = None
         """By how much of its width the right picture shows the scene farther to the left, at the newest look; None before it."""
@@ -48,9 +48,9 @@ class EyeColours:
         if self._frames % LOOK_EVERY == 0:
             self._look(frame.image, frame.right_image, frame.mask)
         self._frames += 1
-        if self._table is None:
+        if self._line is None:
             return frame.right_image
-        return np.asarray(cv2.LUT(frame.right_image, self._table), np.uint8)
+        return np.asarray(cv2.transform(frame.right_image, self._line), np.uint8)
 
     def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> None:
         first, second = _small(left), _small(right)
@@ -70,7 +70,8 @@ class EyeColours:
         self._gain += share * (gain - self._gain)
         self._offset += share * (offset - self._offset)
         off = np.abs(self._gain * off + self._offset - off).max()
-        self._table = _table(self._gain, self._offset) if off > NOISE_LEVELS else None
+        line = np.column_stack([np.diag(self._gain), self._offset]).astype(np.float32)
+        self._line = line if off > NOISE_LEVELS else None
 
 
 def typical_shift(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> float:
@@ -141,8 +142,3 @@ def line_between(left: NDArray[np.float32], right: NDArray[np.float32]) -> tuple
     says_something = (spread_left >= FLAT_LEVELS) & (spread_right >= FLAT_LEVELS)
     gain = np.where(says_something, spread_left / np.maximum(spread_right, 1e-6), 1.0).clip(1 / MOST_GAIN, MOST_GAIN)
     return gain, ours[1] - gain * theirs[1], theirs
-
-
-def _table(gain: NDArray, offset: NDArray) -> NDArray[np.uint8]:
-    levels = np.arange(256.0)[:, None] * gain + offset
-    return np.rint(levels.clip(0, 255)).astype(np.uint8)[None]
