@@ -85,12 +85,12 @@ def test_seconds_end_a_stream(scope, tmp_path, intrasplat):
 
 
 class Dying(RealtimeSource):
-    """A recording whose 150th frame does not come: by then even a busy machine has shown several."""
+    """A recording whose 90th frame does not come: by then even a busy machine has shown several."""
 
     def frames(self) -> Iterator[Frame]:
         """See `RealtimeSource`."""
         for frame in super().frames():
-            if frame.seq == 150:
+            if frame.seq == 90:
                 raise SourceLost("the scope was pulled out; plug it in again")
             yield frame
 
@@ -111,7 +111,7 @@ def test_a_device_without_memory(scope, tmp_path, monkeypatch):
     observe = LiveReconstructor.observe
 
     def observing(self, frame, **more):
-        if frame.seq >= 150:
+        if frame.seq >= 90:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
         return observe(self, frame, **more)
 

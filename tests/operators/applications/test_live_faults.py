@@ -16,6 +16,7 @@ from operators.applications.live_settings import LiveSettings
 from operators.display import COLOURS, DisplaySettings, LiveDisplayResult
 from operators.endoscope.cuts import CutCounts
 from operators.endoscope.sequence import MaskAndDepthCounts, SequenceCounts
+from operators.frame_clock import ClockSettings
 from operators.ingest import SourceResult
 from operators.live_reconstruct import TrainingCounts
 from operators.messages import PictureState
@@ -37,6 +38,8 @@ from tests.operators.applications.scripted import (
 
 SLOW = DisplaySettings(stale_after_ms=700.0, stale_after_intervals=1.0, frozen_after_ms=1400.0)
 """A busy machine shows pictures late, and that is not what is tested here."""
+FEW_STEPS = ClockSettings(at_most_steps=4, rehearse_at_most=4)
+"""Of what is learned from it matters which frames it was, not how well."""
 
 
 @pytest.fixture
@@ -49,7 +52,9 @@ def watched(tmp_path, monkeypatch) -> Callable[..., Watched]:
         played = ScriptedSource(script, watch.events.clear, **(source or {}))
         monkeypatch.setattr(live_module, "open_source", lambda address, options: played)
         monkeypatch.setattr(live_module.RunRecording, "listener", property(lambda self: watch.events.append))
-        wanted = LiveSettings("scripted", tmp_path / "out", **{"out_of_body": "off", "display": SLOW, **settings})
+        wanted = LiveSettings(
+            "scripted", tmp_path / "out", **{"out_of_body": "off", "display": SLOW, "clock": FEW_STEPS, **settings}
+        )
         watch.outcome = live(wanted, on_shown=watch.shown.append)
         assert watch.outcome.stop_reason == "end of stream"
         return watch
