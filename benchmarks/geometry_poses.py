@@ -1,11 +1,12 @@
 """Poses from pictures alone, against those that a recording came with.
 
-    python benchmarks/geometry_poses.py RECORDING... [--synthetic FRAMES] [--fps 15] [--seeds 0 1] [--rigid] [--assume F] [--depth]
+    python benchmarks/geometry_poses.py RECORDING... [--synthetic FRAMES] [--fps 15] [--seeds 0 1] [--rigid] [--back] [--causal] [--assume F] [--depth]
 
 One JSON line a recording: ATE (root mean square of the distance between both ways after the best similarity) as a share of the given way, errors in
 pixels, processor seconds, and where tissue was found to breathe the frequencies and how much of the way is said to be uncertain. `--synthetic 150` adds a
 rendered recording of so many frames, 320x256, with a moving scope before tissue that breathes and is pulled; `--rigid` the same before tissue that stands
-still. `--depth` adds the error of depth maps of tissue that breathes (`moving_tissue`) with these poses, of every fifth frame, after one scale. `--assume 0.9` does without the calibration: the focal length is assumed to be 0.9 of the longer
+still. `--back` shows the rendered frames forth and then back again, with other noise, and adds how far off the last pose is. `--causal` estimates frame by frame, as live and `replay` do, on one
+thread, and gives the processor's milliseconds a frame. `--depth` adds the error of depth maps of tissue that breathes (`moving_tissue`) with these poses, of every fifth frame, after one scale. `--assume 0.9` does without the calibration: the focal length is assumed to be 0.9 of the longer
 side, and what the pictures tell of it stands beside the true one, in the same unit.
 """
 
@@ -17,10 +18,13 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import cv2
 import numpy as np
+import torch
 
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.geometry.focal_length import trajectory_without_calibration, with_focal_length
+from gsplat_core.geometry.live_odometry import LiveOdometry
 from gsplat_core.geometry.moving_tissue import MovingTissue
 from gsplat_core.geometry.odometry import Trajectory, trajectory_of
 from gsplat_core.io.recordings import open_recording
@@ -73,6 +77,49 @@ def measured(
     return figures, found
 
 
+def measured_causally(name: str, frames: Sequence[Frame], camera: Camera) -> dict[str, Any]:
+    """One recording's figures, each frame placed by those before it."""
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+    odometry, poses, spent_ms = LiveOdometry(camera, measured=False), [], []
+    for frame in frames:
+        began_s = time.thread_time()
+        poses.append(odometry.place(frame))
+        spent_ms.append(1e3 * (time.thread_time() - began_s))
+    figures: dict[str, Any] = {
+        "recording": name,
+        "frames": len(frames),
+        "ms_a_frame": round(float(np.mean(spent_ms)), 1),
+        "ms_p95": round(float(np.percentile(spent_ms, 95)), 1),
+        "explained": round(odometry.explained, 3),
+        "not_placed": odometry.not_placed,
+        "begun": odometry.begun,
+        "key_frames": len(odometry.map.keys),
+    }
+    given = [frame.pose for frame in frames if frame.pose is not None]
+    if len(given) == len(frames):
+        errors = evaluate_trajectory(np.stack(poses), np.stack(given))
+        if errors is not None:
+            last, first = (-each[:3, :3].T @ each[:3, 3] for each in (poses[-1], poses[0]))
+            figures |= {"ate_percent": round(100 * errors.similarity_share, 3), "way": round(errors.path, 4)}
+            if np.allclose(given[-1], given[0]):
+                figures["drift_percent"] = round(
+                    100 * errors.scale * float(np.linalg.norm(last - first)) / errors.path, 3
+                )
+    return figures
+
+
+def forth_and_back(frames: Sequence[Frame]) -> list[Frame]:
+    """The frames, and then all but the last of them again in the opposite order, with other noise."""
+    random = np.random.default_rng(0)
+    back = []
+    for frame in reversed(frames[:-1]):
+        noisy = frame.image + random.normal(0, 3, frame.image.shape)
+        back.append(frame.with_fields(image=np.clip(noisy, 0, 255).astype(np.uint8)))
+    step_ns = frames[1].pts_ns - frames[0].pts_ns
+    return [frame.with_fields(seq=number, pts_ns=number * step_ns) for number, frame in enumerate([*frames, *back])]
+
+
 def depth_of(frames: Sequence[Frame], camera: Camera, found: Trajectory) -> dict[str, Any]:
     """Errors of depth with the poses that were found, after one scale."""
     blind = [frame.with_fields(depth=None, depth_origin=None, pose=None) for frame in frames]
@@ -113,6 +160,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--depth", action="store_true")
     parser.add_argument("--rigid", action="store_true")
+    parser.add_argument("--back", action="store_true")
+    parser.add_argument("--causal", action="store_true")
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--assume", type=float)
     arguments = parser.parse_args()
@@ -122,10 +171,15 @@ def main() -> None:
     for seed in arguments.seeds if arguments.synthetic else []:
         asked = Asked(arguments.synthetic, 320, 256, fps=arguments.fps, seed=seed, camera="moving")
         rendered = synthetic(asked, arguments.rigid)
-        show(f"synthetic {seed}{', rigid' * arguments.rigid}", list(rendered), rendered.camera, arguments)
+        frames = forth_and_back(list(rendered)) if arguments.back else list(rendered)
+        name = f"synthetic {seed}{', rigid' * arguments.rigid}{', forth and back' * arguments.back}"
+        show(name, frames, rendered.camera, arguments)
 
 
 def show(name: str, frames: Sequence[Frame], camera: Camera, arguments: argparse.Namespace) -> None:
+    if arguments.causal:
+        print(json.dumps(measured_causally(name, frames, camera)), flush=True)
+        return
     figures, found = measured(name, frames, camera, arguments.assume)
     if arguments.depth:
         figures |= depth_of(frames, camera, found)

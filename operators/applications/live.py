@@ -37,6 +37,7 @@ from operators.ingest import SourceOp
 from operators.live_reconstruct import LiveReconstructOp
 from operators.metrics import ScoredFrame
 from operators.on_screen import OnScreenMetricsOp
+from operators.pose import check_poses, pose_operators
 from operators.rasterize import RasterizeOp
 from operators.sinks.callback import CallbackSinkOp
 from operators.sinks.keyframes import KeyframesOp
@@ -74,7 +75,11 @@ class LiveApplication(Application):
         )
         recording = RunRecording(self, settings, self.frame_source.description, self.room_to_finish)
         beside = DepthBeside(settings.depth, self.frame_source.description.camera, device=settings.device)
-        depth = DepthBesideOp(self, name="depth", beside=beside)
+        camera = self.frame_source.description.camera
+        depth = (
+            *pose_operators(self, settings.poses, camera, settings.depth),
+            DepthBesideOp(self, name="depth", beside=beside),
+        )
         analysis = analysis_operator(
             self, settings.tool_mask, settings.out_of_body, depth, recording.behind_gate(), recording.behind_analysis()
         )
@@ -173,6 +178,7 @@ def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
         ),
     )
     check_picture(source.description.camera, settings.scale)
+    check_poses(settings.poses, source.description.camera)
     notes.extend(source.description.notes)
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
     return source

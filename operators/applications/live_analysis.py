@@ -22,14 +22,14 @@ def analysis_operator(
     fragment: Any,
     tool_mask: str,
     out_of_body: Policy,
-    depth: Operator,
+    depth: Sequence[Operator],
     behind_gate: Sequence[Operator] = (),
     behind: Sequence[Operator] = (),
 ) -> Operator:
     """The operator between the source and the reconstruction; it takes and gives `frame`.
 
     Tools and highlights are looked for while the others judge the picture. tool_mask: how tools are found, a name in `TOOL_MASKS`.
-    out_of_body: what happens to pictures from outside of the body. depth: what says which depth a frame keeps. behind_gate: operators that see each frame as it comes through that
+    out_of_body: what happens to pictures from outside of the body. depth: what gives a frame its pose, and says which depth it keeps. behind_gate: operators that see each frame as it comes through that
     gate. behind: those that see it at the end.
     """
     others = [name for name in PICTURE_STAGES if name != BESIDE]
@@ -51,7 +51,7 @@ def analysis_operator(
         ],
         then=[
             *behind_gate,
-            depth,
+            *depth,
             TissueStagesOp(
                 fragment,
                 name="tissue",

@@ -19,6 +19,7 @@ from operators.applications.result import RunSettings
 from operators.display import DisplaySettings
 from operators.frame_clock import ClockSettings
 from operators.out_of_body import Policy
+from operators.pose import Poses
 from operators.tool_mask import check_tool_mask
 
 LIVE_WINDOW_FRAMES = {"cpu": 60, "cuda": 150}
@@ -87,6 +88,8 @@ class LiveSettings:
     """How tools are found in frames that come without a mask (`operators.tool_mask.TOOL_MASKS`)."""
     depth: str = "auto"
     """Where depth comes from: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
+    poses: Poses = "given"
+    """Where the scope is: as the frames say, or as is estimated from the pictures (`operators.pose`)."""
     out_of_body: Policy = "withhold"
     """What happens to pictures from outside of the body: nothing of them goes on, or (`off`) they are not looked for."""
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)

@@ -65,6 +65,10 @@ def reconstruct(
     check_steps("steps", steps)
 
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
+        if inside.poses != "given":
+            raise InvalidSetting(
+                f"poses is {inside.poses!r}; reconstruct sees all frames at once, so write their poses with `intrasplat poses` first"
+            )
         source = prepare(inside, notes, offline=True)
         inside = replace(inside, depth=offline_choice(inside.depth, source.description))
         start = Start.now()

@@ -1,6 +1,6 @@
 """Replay: a recording, or another source with an end, is reconstructed, shown and measured frame by frame.
 
-    source → tool_mask → depth → reconstruct → deform → rasterize → video
+    source → tool_mask → (pose) → depth → reconstruct → deform → rasterize → video
                                                                   → metrics → keyframes
                                                                             → progress
 
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
 
@@ -31,16 +32,17 @@ from operators.applications.finishing import measures_baselines, saves_model
 from operators.applications.limits import check_max_frames, check_picture, check_scale, check_seed, check_steps
 from operators.applications.memory import replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
+from operators.applications.replay_analysis import lacking_depth, replay_analysis
 from operators.applications.result import RunOutcome, RunSettings
 from operators.applications.session import Session
 from operators.applications.session_replay import FollowedSession, followed_session
 from operators.deform import DeformOp
-from operators.depth import DepthOp, offline_choice, without_depth
 from operators.frame_log import FRAMES_FILE, FrameLog
 from operators.graph import Application, Engine
 from operators.ingest import SourceOp
 from operators.messages import RenderedFrame
 from operators.metrics import MetricsOp, ScoredFrame
+from operators.pose import Poses, check_poses
 from operators.rasterize import RasterizeOp
 from operators.reconstruct import ReconstructOp
 from operators.sinks.callback import CallbackSinkOp
@@ -48,7 +50,6 @@ from operators.sinks.registry import SINKS, SinkOptions, input_of
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource
 from operators.storage import StorageReserve
-from operators.tool_mask import RecordedToolMaskOp
 
 REPORT_RESERVE_BYTES = 8 * 2**20
 """Room on the disk that stays free for the video's index and the report."""
@@ -80,6 +81,8 @@ class ReplaySettings:
     """Where depth comes from: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
     eyes: Eyes = "both"
     """Which pictures of a stereo scope are trained on; `both` where the right one's camera is known."""
+    poses: Poses = "given"
+    """Where the scope was: as the recording says, or as is estimated from the pictures, frame by frame (`operators.pose`)."""
     heldout: bool = False
     """Show the protocol's held-out frames without training on them, and score them apart."""
 
@@ -161,12 +164,14 @@ class ReplayApplication(Application):
         settings, out = self.settings, self.settings.out
         reserve = StorageReserve(out, self.room_to_finish)
         source = SourceOp(self, name="source", source=self.frame_source, stop_requested=self._stop_requested)
-        tool_mask, depth = RecordedToolMaskOp(self, name="tool_mask"), self._depth_op()
+        looks = replay_analysis(
+            self, self.frame_source.description.camera, self._held_out, follows=self._followed is not None
+        )
         self.reconstruct = self._reconstruct_op()
         deform = DeformOp(self, name="deform")
         rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
         self.metrics = MetricsOp(self, name="metrics", log=FrameLog(out / FRAMES_FILE, reserve))
-        for before, after in ((source, tool_mask), (tool_mask, depth), (depth, self.reconstruct)):
+        for before, after in pairwise((source, *looks, self.reconstruct)):
             self.add_flow(before, after, {("frame", "frame")})
         self.add_flow(self.reconstruct, deform, {("reconstruction", "reconstruction")})
         self.add_flow(deform, rasterize, {("scene", "scene")})
@@ -186,14 +191,6 @@ class ReplayApplication(Application):
             self.add_flow(rasterize, self._followed.compare_op(self, "compare"), {("rendered", "rendered")})
         progress = CallbackSinkOp(self, name="progress", callback=self._report)
         self.add_flow(self.metrics, progress, {("scored", "message")})
-
-    def _depth_op(self) -> DepthOp:
-        # A session that is followed has its depth already, as training was given it. What shows a finished model learns nothing from depth.
-        choice = "recorded" if self._followed is not None else self.settings.depth
-        return DepthOp(
-            self, name="depth", choice=choice, camera=self.frame_source.description.camera, held_out=self._held_out,
-            has_time=self.stage == "replay", device=self.settings.device,
-        )  # fmt: skip
 
     def _reconstruct_op(self) -> ReconstructOp:
         if self._followed is not None:
@@ -273,6 +270,7 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
     if description.frame_count is None:
         raise InvalidSetting(f"{description.name} has no end; give --max-frames, or a recording")
     check_picture(description.camera, settings.scale)
+    check_poses(settings.poses, description.camera)
     if settings.device == "cpu":
         sized = settings.reconstructor_config(description.width_px * description.height_px, offline=offline)
         require_memory(
@@ -281,8 +279,7 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
             "give a smaller --scale or --max-frames",
         )
     notes.extend(description.notes)
-    choice = offline_choice(settings.depth, description) if offline else settings.depth
-    if (note := without_depth(choice, description.fields, config)) is not None:
+    if (note := lacking_depth(settings, description, config, offline=offline)) is not None:
         notes.append(note)
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
     return source

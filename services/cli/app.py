@@ -19,6 +19,7 @@ from services.cli.options import (
     LiveOptions,
     LiveOutOption,
     OutOption,
+    PosesFromOption,
     RecordingArgument,
     RecordKeepOption,
     RunOptions,
@@ -98,6 +99,7 @@ def replay(
             "--heldout/--no-heldout", help="Show frames 1, 9, 17, ... without training on them, and score them apart."
         ),
     ] = False,
+    poses: PosesFromOption = "given",
     ignore_schedule: Annotated[
         bool,
         typer.Option(
@@ -116,6 +118,7 @@ def replay(
         engine=engine,  # type: ignore[arg-type]
         steps_per_frame=steps_per_frame,
         heldout=heldout,
+        poses=poses,  # type: ignore[arg-type]
         ignore_schedule=ignore_schedule,
         **options.settings(),
     )

@@ -92,6 +92,12 @@ DepthOption = Annotated[
         help="Depth of the frames: auto, recorded, stereo (from the two eyes), parallax (of a moving scope with poses), light (of one fixed eye; relative), onnx:FILE (by a network of yours; relative) or none."
     ),
 ]
+PosesFromOption = Annotated[
+    str,
+    typer.Option(
+        help="Where the scope was: given (by the recording), or estimated from the pictures, frame by frame (relative; never by default, since tissue that moves looks like a scope that does)."
+    ),
+]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
 EyesOption = Annotated[str, typer.Option(help="Pictures of a stereo scope that are trained on: left or both.")]
 ScaleOption = Annotated[float, typer.Option(help="Resize the frames by this factor.")]
@@ -182,6 +188,7 @@ class LiveOptions(RunOptions):
     tool_mask: Annotated[
         str, typer.Option(help="Tools in frames without a mask: builtin, none, or another way to find them.")
     ] = "builtin"
+    poses: PosesFromOption = "given"
     out_of_body: Annotated[
         str, typer.Option(help="Pictures from outside of the body: withhold, or off to let them pass.")
     ] = "withhold"

@@ -1,0 +1,166 @@
+"""Points of the tissue followed from one picture of a stream to the next, on small pictures. Memory and time do not grow with the stream."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.endoscope.highlights import HighlightFinder
+from gsplat_core.geometry.point_flow import Points, followed
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+
+SIDE_PX = 320
+"""Longest side of the pictures in which points are followed."""
+MOST_POINTS = 220
+"""Followed at once."""
+APART = 0.03
+"""Of the picture's longer side: how far points are apart when they are taken up."""
+LEAST_QUALITY = 0.005
+"""Of a corner, beside the picture's best one."""
+PATCH_PX = 17
+"""Side of the square by which a point is recognised."""
+LEVELS = 3
+RETURN_PX = 0.5
+"""How far from its start a point may come back, when it is followed forth and back."""
+BORDER_PX = 6
+SAME_PX = 3.0
+"""Points that are nearer to each other are followed as one."""
+
+Numbers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SmallPicture:
+    """What points are followed in."""
+
+    grey: NDArray[np.uint8]
+    """[h, w]."""
+    usable: NDArray[np.uint8]
+    """[h, w]; 0 where nothing is followed: tools, reflections, the border."""
+    camera: Camera
+    """Of this size."""
+
+    def rays(self, pixels: Points) -> NDArray[np.float64]:
+        """x / z and y / z [N, 2] of points as OpenCV counts pixels."""
+        K = self.camera.K
+        return np.asarray((pixels.astype(np.float64) + 0.5 - K[:2, 2]) / [K[0, 0], K[1, 1]])
+
+    def pixels(self, local: NDArray[np.float64]) -> Points:
+        """Where points of the camera's coordinates [N, 3] are seen, as OpenCV counts pixels; those behind it far outside."""
+        K = self.camera.K
+        depth = np.where(local[:, 2] > 1e-9, local[:, 2], 1e-9)
+        return np.asarray(
+            np.clip(local[:, :2] / depth[:, None] * [K[0, 0], K[1, 1]] + K[:2, 2] - 0.5, -1e4, 1e4), np.float32
+        )
+
+    def shows(self, pixels: Points) -> NDArray[np.bool_]:
+        """Which points lie where points may be followed [N]."""
+        height, width = self.grey.shape
+        column, row = (np.rint(np.nan_to_num(pixels[:, axis], nan=-1.0)).astype(np.int64) for axis in (0, 1))
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        inside[inside] = self.usable[row[inside], column[inside]] > 0
+        return inside
+
+
+class SmallPictures:
+    """Makes small pictures of frames."""
+
+    def __init__(self, camera: Camera, side_px: int = SIDE_PX) -> None:
+        self._camera, self._side_px = camera, side_px
+        self._highlights = HighlightFinder()
+
+    def of(self, frame: Frame) -> SmallPicture:
+        """Without a colour, and with what is not to be followed left out."""
+        share = min(1.0, self._side_px / max(frame.width_px, frame.height_px))
+        size = max(1, round(share * frame.width_px)), max(1, round(share * frame.height_px))
+        small = frame.image if share == 1 else np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA))
+        usable = np.zeros(small.shape[:2], np.uint8)
+        usable[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = 255
+        masks = [frame.mask, frame.loss_mask, frame.rehearsal_mask]
+        if frame.rehearsal_mask is None:
+            masks[2] = self._highlights.without(np.asarray(small, np.uint8))
+        kept = [cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) != 0 for mask in masks if mask is not None]
+        if kept:
+            # A corner's patch reaches over the edge of a tool, which moves otherwise.
+            tissue = np.logical_and.reduce(kept).astype(np.uint8) * 255
+            usable &= np.asarray(cv2.erode(tissue, np.ones((PATCH_PX, PATCH_PX), np.uint8)), np.uint8)
+        grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
+        return SmallPicture(grey, usable, self._camera.resized(*size))
+
+
+def found_again(
+    before: SmallPicture, after: SmallPicture, points: Points, guess: Points
+) -> tuple[Points, NDArray[np.bool_]]:
+    """Where points of a picture are in another one [N, 2], and which of them can be trusted [N]."""
+    moved, misses_px = followed(before.grey, after.grey, points, guess, window_px=PATCH_PX, levels=LEVELS)
+    return moved, (misses_px < RETURN_PX) & after.shows(moved)
+
+
+class StreamTracks:
+    """Follows points; each keeps its number while it is seen. Deterministic."""
+
+    def __init__(self) -> None:
+        self.picture: SmallPicture | None = None
+        """That was followed last."""
+        self.pixels: Points = np.zeros((0, 2), np.float32)
+        """Where the points are in it."""
+        self.numbers: Numbers = np.zeros(0, np.int64)
+        """Of the points, ascending."""
+        self.first: Points = np.zeros((0, 2), np.float32)
+        """Where each was taken up."""
+        self._next = 0
+
+    def begin(self, picture: SmallPicture) -> None:
+        """Forget the points and go on from this picture."""
+        self.picture = picture
+        self.keep(np.zeros(len(self.numbers), np.bool_))
+
+    def follow(self, picture: SmallPicture, guess: Points) -> tuple[Numbers, Points]:
+        """The points that are found in the next picture; nothing is kept of it until `go_on`."""
+        assert self.picture is not None
+        if picture.grey.shape != self.picture.grey.shape:
+            return self.numbers[:0], self.pixels[:0]
+        moved, trusted = found_again(self.picture, picture, self.pixels, guess)
+        return self.numbers[trusted], moved[trusted]
+
+    def go_on(self, picture: SmallPicture, numbers: Numbers, pixels: Points) -> None:
+        """These of the points are followed from here on."""
+        self.first = self.first[np.searchsorted(self.numbers, numbers)]
+        self.picture, self.numbers, self.pixels = picture, numbers, pixels
+
+    def keep(self, kept: NDArray[np.bool_]) -> None:
+        """Give up the other points."""
+        self.numbers, self.pixels, self.first = self.numbers[kept], self.pixels[kept], self.first[kept]
+
+    def take_up(self) -> Numbers:
+        """Take up corners where there are few points; their numbers, which are larger than all before."""
+        picture, missing = self.picture, MOST_POINTS - len(self.numbers)
+        if picture is None or missing < MOST_POINTS // 10:
+            return np.zeros(0, np.int64)
+        apart = max(4, round(APART * max(picture.grey.shape)))
+        free = picture.usable.copy()
+        for x, y in np.rint(self.pixels).astype(int):
+            cv2.circle(free, (int(x), int(y)), apart, 0, -1)
+        corners = cv2.goodFeaturesToTrack(picture.grey, missing, LEAST_QUALITY, apart, mask=free)
+        if corners is None:
+            return np.zeros(0, np.int64)
+        new = np.arange(self._next, self._next + len(corners))
+        self._next += len(corners)
+        self._add(new, corners.reshape(-1, 2).astype(np.float32))
+        return new
+
+    def adopt(self, numbers: Numbers, pixels: Points) -> None:
+        """Follow these known points as well, in place of those that are as good as there."""
+        near = np.linalg.norm(self.pixels[:, None] - pixels[None], axis=2).min(1, initial=np.inf) < SAME_PX
+        self.keep(~near & ~np.isin(self.numbers, numbers))
+        self._add(numbers, pixels)
+
+    def _add(self, numbers: Numbers, pixels: Points) -> None:
+        order = np.argsort(np.concatenate([self.numbers, numbers]), kind="stable")
+        self.numbers = np.concatenate([self.numbers, numbers])[order]
+        self.pixels = np.concatenate([self.pixels, pixels])[order]
+        self.first = np.concatenate([self.first, pixels])[order]

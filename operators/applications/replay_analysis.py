@@ -1,0 +1,44 @@
+"""What is found in a frame of a replay before anything is learned from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.config import ReconstructorConfig
+from operators.depth import DepthOp, offline_choice, without_depth
+from operators.graph import Operator
+from operators.pose import pose_operators
+from operators.sources.source import SourceDescription
+from operators.tool_mask import RecordedToolMaskOp
+
+if TYPE_CHECKING:
+    from operators.applications.replay import ReplayApplication, ReplaySettings
+
+
+def replay_analysis(
+    graph: ReplayApplication, camera: Camera, held_out: Callable[[Frame], bool], *, follows: bool
+) -> Sequence[Operator]:
+    """The operators between the source and the reconstruction, in order.
+
+    follows: whether a session is followed, whose frames have their poses and their depth already, as training was given them.
+    """
+    settings = graph.settings
+    # What shows a finished model learns nothing from depth.
+    depth = DepthOp(
+        graph, name="depth", choice="recorded" if follows else settings.depth, camera=camera, held_out=held_out,
+        has_time=graph.stage == "replay", device=settings.device,
+    )  # fmt: skip
+    poses = "given" if follows else settings.poses
+    return RecordedToolMaskOp(graph, name="tool_mask"), *pose_operators(graph, poses, camera, settings.depth), depth
+
+
+def lacking_depth(
+    settings: ReplaySettings, source: SourceDescription, config: ReconstructorConfig, *, offline: bool
+) -> str | None:
+    """What is to be said where frames come without depth that is learned from; None where they have it. offline: for `fit`."""
+    choice = offline_choice(settings.depth, source) if offline else settings.depth
+    poses = {"pose"} if settings.poses == "estimated" else set()
+    return without_depth(choice, source.fields | poses, config)

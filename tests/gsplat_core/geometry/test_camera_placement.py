@@ -1,0 +1,72 @@
+"""A camera is moved to where known points are seen, as bundle adjustment would move it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.geometry.bundle import Bundle, adjust
+from gsplat_core.geometry.camera_placement import moved, placed
+from gsplat_core.geometry.pose import exp
+
+FOCAL_PX = 300.0
+TWIST = np.array([3.0, -2.0, 1.0, 0.05, -0.03, 0.1])
+
+
+def scene(count: int = 200, relief: float = 4.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points around 60 away, the pose that TWIST leads to, and where the points are seen from there."""
+    random = np.random.default_rng(0)
+    points = np.c_[random.uniform(-25, 25, (count, 2)), 60 + random.normal(0, relief, count)]
+    pose = moved(np.eye(4), TWIST)
+    return points, pose, rays_of(pose, points)
+
+
+def rays_of(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    return local[:, :2] / local[:, 2:]
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6, 0.0])
+def test_a_twist_moves_a_pose_as_the_exponential_of_the_public_module(scale):
+    start = moved(np.eye(4), -0.5 * TWIST)
+    expected = (exp(torch.from_numpy(scale * TWIST)) @ torch.from_numpy(start)).numpy()
+    np.testing.assert_allclose(moved(start, scale * TWIST), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("relief", [4.0, 0.0])
+def test_a_start_that_is_off_by_many_pixels_is_good_enough(relief):
+    points, pose, rays = scene(relief=relief)
+    found, off = placed(np.eye(4), points, rays, FOCAL_PX)
+    np.testing.assert_allclose(found, pose, atol=1e-6)
+    assert off.max() < 1e-5
+
+
+def test_points_that_move_by_themselves_decide_little():
+    points, pose, rays = scene()
+    rays[:60] += 12 / FOCAL_PX
+    found, off = placed(np.eye(4), points, rays, FOCAL_PX)
+    np.testing.assert_allclose(found, pose, atol=0.05)
+    assert np.median(off[:60]) > 11 and np.median(off[60:]) < 0.1
+
+
+def test_it_agrees_with_bundle_adjustment_of_points_that_stand():
+    points, pose, rays = scene()
+    rays += np.random.default_rng(1).normal(0, 0.5 / FOCAL_PX, rays.shape)
+    found, _ = placed(pose, points, rays, FOCAL_PX)
+    count = len(points)
+    bundle = Bundle(
+        torch.from_numpy(pose)[None], torch.from_numpy(points), torch.zeros(count, dtype=torch.int64), torch.arange(count),
+        torch.from_numpy(rays), FOCAL_PX,
+    )  # fmt: skip
+    expected = adjust(bundle, fixed=torch.zeros(1, dtype=torch.bool), rounds=30, points_move=False).poses[0].numpy()
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_rounding_errors_do_not_grow():
+    """Products of many poses are no rotations any more; what is placed is one."""
+    points, pose, rays = scene()
+    crooked = pose.copy()
+    crooked[:3, :3] += 1e-3
+    found, _ = placed(crooked, points, rays, FOCAL_PX)
+    np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-12)

@@ -1,0 +1,157 @@
+"""The scope's poses frame by frame, against those of a rendered scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.evaluation.trajectory import evaluate_trajectory
+from gsplat_core.geometry import live_odometry, local_map
+from gsplat_core.geometry.live_odometry import LiveOdometry
+from gsplat_core.geometry.odometry import DISTANCE
+from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
+from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame, FrameStatus
+
+COUNT = 24
+
+
+@pytest.fixture(scope="module")
+def rigid() -> RenderedRecording:
+    """A moving scope before tissue that stands still, seen by both eyes."""
+    moving, at_rest = Tissue.points, Tug((0.0, 0.0), (0.0, 0.0, 0.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Tissue, "points", lambda self, u, v, time_s, tug: moving(self, u, v, 0.0, at_rest))
+        return render_recording(Asked(COUNT, 256, 192, fps=10, seed=3, camera="moving", stereo=True))
+
+
+def blind(frames) -> list[Frame]:
+    """Without anything but pictures and masks."""
+    return [
+        replace(frame, pose=None, depth=None, depth_origin=None, right_image=None, right_camera=None)
+        for frame in frames
+    ]
+
+
+def placed(frames, odometry: LiveOdometry) -> np.ndarray:
+    return np.stack([odometry.place(frame) for frame in frames])
+
+
+def errors(poses: np.ndarray, rigid: RenderedRecording, chosen=slice(None)):
+    found = evaluate_trajectory(poses[chosen], np.stack([frame.pose for frame in rigid])[chosen])
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def found(rigid) -> np.ndarray:
+    return placed(blind(rigid), LiveOdometry(rigid.camera))
+
+
+def test_the_way_of_a_moving_scope_is_found_as_it_goes(rigid, found):
+    assert errors(found, rigid).similarity_share < 0.02
+
+
+def test_it_says_how_much_of_the_motion_the_poses_explain(rigid):
+    odometry = LiveOdometry(rigid.camera)
+    placed(blind(rigid), odometry)
+    assert (odometry.frames, odometry.not_placed, odometry.begun) == (COUNT, 0, 1)
+    assert odometry.explained > 0.95 and not odometry.is_measured
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_same_frames_give_the_same_bytes_whatever_comes_after(rigid, found, threads):
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        again = placed(blind(rigid)[:15], LiveOdometry(rigid.camera))
+    finally:
+        torch.set_num_threads(before)
+    assert again.tobytes() == found[:15].tobytes()
+
+
+def test_the_first_frame_stands_where_the_camera_says(rigid, found):
+    pose = np.eye(4)
+    pose[:3, 3] = 1, -2, 3
+    moved = placed(blind(rigid)[:5], LiveOdometry(rigid.camera.with_pose(pose)))
+    np.testing.assert_allclose(moved, found[:5] @ pose, atol=1e-12)
+    np.testing.assert_array_equal(found[0], np.eye(4))
+
+
+@pytest.mark.parametrize("kept", ["depth", "right_image"])
+def test_lengths_have_the_unit_of_the_depth_of_the_frames(rigid, kept):
+    fields = {"depth": ("depth", "depth_origin"), "right_image": ("right_image", "right_camera")}[kept]
+    frames = [
+        each.with_fields(**{name: getattr(frame, name) for name in fields})
+        for each, frame in zip(blind(rigid), rigid, strict=True)
+    ]
+    odometry = LiveOdometry(rigid.camera)
+    measured = errors(placed(frames, odometry), rigid)
+    assert odometry.is_measured and measured.scale == pytest.approx(1, abs=0.1) and measured.rigid_share < 0.03
+    unmeasured = LiveOdometry(rigid.camera, measured=False)
+    placed(frames[:4], unmeasured)
+    assert not unmeasured.is_measured
+
+
+def test_a_frame_that_tells_nothing_stands_where_the_one_before_stood(rigid):
+    frames = blind(rigid)
+    frames[8] = frames[8].with_fields(image=np.full_like(frames[8].image, 90))
+    frames[12] = frames[12].with_fields(withheld="blur")
+    frames[13] = frames[13].with_fields(status=FrameStatus.DAMAGED)
+    odometry = LiveOdometry(rigid.camera)
+    poses = placed(frames, odometry)
+    for index in (8, 12, 13):
+        assert np.array_equal(poses[index], poses[index - 1])
+    assert (odometry.not_placed, odometry.begun) == (3, 1)
+    others = [index for index in range(COUNT) if index not in (8, 12, 13)]
+    assert errors(poses, rigid, others).similarity_share < 0.02, "points are found again behind it"
+
+
+def test_a_stream_that_begins_with_nothing_waits(rigid):
+    frames = blind(rigid)
+    grey = np.full_like(frames[0].image, 90)
+    odometry = LiveOdometry(rigid.camera)
+    poses = placed([frame.with_fields(image=grey) for frame in frames[:3]] + frames[3:8], odometry)
+    assert np.array_equal(poses[3], np.eye(4)) and not np.array_equal(poses[7], np.eye(4))
+    assert (odometry.not_placed, odometry.begun) == (3, 1)
+
+
+def test_another_scene_is_begun_anew_after_a_while(rigid, monkeypatch):
+    monkeypatch.setattr(live_odometry, "MOST_NOT_PLACED", 3)
+    frames = blind(rigid)
+    other = [frame.with_fields(image=np.ascontiguousarray(frame.image[::-1])) for frame in frames[8:20]]
+    odometry = LiveOdometry(rigid.camera)
+    poses = placed(frames[:8] + other, odometry)
+    assert odometry.begun == 2 and 3 <= odometry.not_placed <= 5
+    assert not np.array_equal(poses[-1], poses[-2]), "poses go on in the other scene"
+
+
+def test_memory_is_bounded(rigid, monkeypatch):
+    monkeypatch.setattr(local_map, "MOST_KEY_FRAMES", 5)
+    monkeypatch.setattr(local_map, "WINDOW", 3)
+    odometry = LiveOdometry(rigid.camera)
+    there = blind(rigid)
+    sizes = []
+    for _ in range(2):
+        placed(there + there[::-1], odometry)
+        sizes.append(len(odometry.map))
+    assert len(odometry.map.keys) == 5 and sizes[1] < 1.2 * sizes[0]
+    assert odometry.map.keys[0].pose.equal(torch.eye(4, dtype=torch.float64)), "the first one says where the world is"
+
+
+def test_a_camera_that_is_no_pinhole_is_refused():
+    fisheye = Camera(np.array([[100.0, 0, 40], [0, 100, 32], [0, 0, 1]]), 80, 64, model="fisheye")
+    with pytest.raises(InvalidInput, match="this one is fisheye: undistort"):
+        LiveOdometry(fisheye)
+
+
+def test_the_unit_without_depth_is_that_of_a_scene_without_depth(rigid):
+    odometry = LiveOdometry(rigid.camera)
+    placed(blind(rigid), odometry)
+    first = odometry.map.keys[0]
+    assert float(odometry.map.points(first.numbers)[:, 2].median()) == pytest.approx(DISTANCE, rel=0.02)

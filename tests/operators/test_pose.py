@@ -1,0 +1,114 @@
+"""Frames get the pose that their pictures tell, and the report says how far it is to be believed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.live_odometry import LiveOdometry
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin
+from operators.outcome import OutcomeBuilder
+from operators.pose import EstimatedPoses, PoseOp, check_poses, pose_operators
+from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, video
+
+COUNT = 8
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Pictures of a scope that moves sideways; nobody has said where it is."""
+    return [frame.with_fields(seq=number, pose=None) for number, frame in enumerate(video(COUNT, SIDEWAYS)[0])]
+
+
+def started(**settings) -> PoseOp:
+    operator = PoseOp(None, camera=FIRST, **settings)
+    operator.start()
+    return operator
+
+
+def outcome_of(operator: PoseOp) -> OutcomeBuilder:
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    return outcome
+
+
+def test_each_frame_gets_a_pose_and_nothing_else(frames, compute):
+    operator = started()
+    for frame in frames:
+        (given,) = compute(operator, frame=frame)
+        assert given.image is frame.image and given.depth is None and given.seq == frame.seq
+        assert given.pose.shape == (4, 4) and given.pose.dtype == np.float64
+    assert given.pose[0, 3] < -1, "the scope went to the right"
+    found = outcome_of(operator).find(EstimatedPoses)
+    assert (found.frames, found.not_placed, found.begun, found.measured) == (COUNT, 0, 1, False)
+    assert found.explained > 0.95
+
+
+def test_a_pose_that_a_frame_came_with_plays_no_part(frames, compute):
+    wrong = np.eye(4)
+    wrong[:3, 3] = 7
+    plain, misled = started(), started()
+    for frame in frames[:4]:
+        (first,), (second,) = (
+            compute(plain, frame=frame),
+            compute(misled, frame=frame.with_fields(pose=wrong)),
+        )
+        assert np.array_equal(first.pose, second.pose)
+
+
+def test_every_start_begins_anew(frames, compute):
+    operator = started()
+    first = [compute(operator, frame=frame)[0].pose for frame in frames[:4]]
+    operator.start()
+    assert np.array_equal(first, [compute(operator, frame=frame)[0].pose for frame in frames[:4]])
+
+
+def test_the_report_says_that_poses_are_relative(frames, compute):
+    operator = started()
+    for frame in frames:
+        compute(operator, frame=frame)
+    (note,) = outcome_of(operator).notes
+    assert "frame by frame" in note and "have no scale" in note and "60 away" in note and "breathing" in note
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_depth_of_the_frames_gives_lengths_their_unit_where_it_may_be_used(frames, compute, measured):
+    plane = np.full((HEIGHT, WIDTH), 75, np.float32)
+    operator = started(measured=measured)
+    compute(operator, frame=frames[0].with_fields(depth=plane, depth_origin=DepthOrigin.MEASURED))
+    outcome = outcome_of(operator)
+    assert outcome.find(EstimatedPoses).measured == measured
+    assert ("the unit of the depth" in outcome.notes[0]) == measured
+
+
+def test_what_could_not_be_placed_and_what_is_explained_badly_is_said(frames, compute, monkeypatch):
+    monkeypatch.setattr(LiveOdometry, "explained", 0.5)
+    operator = started()
+    grey = np.full_like(frames[0].image, 90)
+    for frame in [*frames[:3], frames[3].with_fields(image=grey)]:
+        compute(operator, frame=frame)
+    notes = outcome_of(operator).notes
+    assert any("1 frames could not be placed" in note for note in notes)
+    assert any("the scope may stand still" in note for note in notes)
+
+
+def test_a_run_without_a_frame_has_nothing_to_say():
+    outcome = outcome_of(started())
+    assert outcome.notes == () and outcome.find(EstimatedPoses).frames == 0
+
+
+def test_given_poses_need_no_operator():
+    assert list(pose_operators(None, "given", FIRST, "auto")) == []
+    (operator,) = pose_operators(None, "estimated", FIRST, "none")
+    assert not operator.measured
+
+
+def test_what_cannot_be_estimated_is_refused_before_the_run():
+    fisheye = Camera(np.array([[100.0, 0, 40], [0, 100, 32], [0, 0, 1]]), 80, 64, model="fisheye")
+    check_poses("given", fisheye)
+    with pytest.raises(InvalidSetting, match="this one is fisheye"):
+        check_poses("estimated", fisheye)
+    with pytest.raises(InvalidSetting, match="poses is 'guessed'; choose given or estimated"):
+        check_poses("guessed", FIRST)
