@@ -54,6 +54,7 @@ def live_settings(spec: EngineSpec, out: Path, source: str) -> LiveSettings:
         tool_mask=spec.tool_mask,
         depth=spec.depth,
         eyes=spec.eyes,
+        poses=spec.poses,
         out_of_body=spec.out_of_body,
         clock=ClockSettings(budget_ms=spec.budget_ms),
         frame_log=False,

@@ -48,6 +48,8 @@ class EngineSpec(_Strict):
     """Where depth comes from, as `intrasplat live` takes it."""
     eyes: Literal["left", "both"] = "left"
     """Which pictures of a stereo scope are trained on."""
+    poses: Literal["given", "estimated"] = "given"
+    """Where the scope is: as the frames say, or as is estimated from the pictures."""
     out_of_body: Literal["withhold", "off"] = "withhold"
 
 

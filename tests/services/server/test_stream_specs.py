@@ -67,11 +67,11 @@ def test_a_stream_is_what_its_processes_are(capture, engine, expected):
     assert overall(capture, engine) == expected
 
 
-def test_what_is_asked_of_depth_and_eyes_reaches_the_reconstruction(tmp_path):
-    asked = spec_of(wanted(depth="stereo", eyes="both")).engine
+def test_what_is_asked_of_depth_eyes_and_poses_reaches_the_reconstruction(tmp_path):
+    asked = spec_of(wanted(depth="stereo", eyes="both", poses="estimated")).engine
     settings = live_settings(asked, tmp_path, "a source")
-    assert (settings.depth, settings.eyes) == ("stereo", "both")
+    assert (settings.depth, settings.eyes, settings.poses) == ("stereo", "both", "estimated")
     usual = live_settings(spec_of(wanted()).engine, tmp_path, "a source")
-    assert (usual.depth, usual.eyes) == ("auto", "left")
+    assert (usual.depth, usual.eyes, usual.poses) == ("auto", "left", "given")
     with pytest.raises(InvalidSetting, match="eyes"):
         spec_of(wanted(eyes="right"))
