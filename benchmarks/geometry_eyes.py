@@ -86,9 +86,11 @@ class Scores:
         with torch.no_grad():
             left = render(now, self._camera.with_pose(pose))
             if eye is not None:
-                self._views[frame.seq] = (
-                    render(now.seen_by_right(), eye.with_pose(eye.world_to_camera @ pose)).image.cpu().numpy()
+                eye = eye.with_pose(eye.world_to_camera @ pose)
+                seen = (
+                    model.seen_from(eye, frame.time_s).at(frame.time_s) if now.right_sh is None else now.seen_by_right()
                 )
+                self._views[frame.seq] = render(seen, eye).image.cpu().numpy()
         value = psnr_tissue_db((left.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu(), frame.image, frame.mask)
         self._left.append(value)
         if frame.time_s >= 1:

@@ -45,13 +45,18 @@ class JsonObject:
 
     def matrix(self, key: str, size: int, wanted: NumberIn) -> list[list[float]]:
         """`size` rows of as many numbers."""
-        rows = self.values.get(key)
-        if not isinstance(rows, list) or len(rows) != size:
-            raise BundleCorrupt(f"{self.name}: {key} must be {size} rows of {size} numbers, got {shortened(rows)}")
-        try:
-            return [ListOf(wanted, size, size).checked(f"{key}[{index}]", row) for index, row in enumerate(rows)]
-        except InvalidInput as error:
-            raise BundleCorrupt(f"{self.name}: {error}") from error
+        return self._matrix(key, self.values.get(key), size, wanted)
+
+    def matrices(self, key: str, size: int, wanted: NumberIn, most: int) -> list[list[list[float]]]:
+        """1 to `most` matrices, each of `size` rows of as many numbers."""
+        listed = self.values.get(key)
+        if not isinstance(listed, list) or not 1 <= len(listed) <= most:
+            raise BundleCorrupt(f"{self.name}: {key} must be a list of 1 to {most} matrices, got {shortened(listed)}")
+        return [self._matrix(f"{key}[{index}]", rows, size, wanted) for index, rows in enumerate(listed)]
+
+    def numbers(self, key: str, wanted: NumberIn, most: int) -> list[float]:
+        """1 to `most` numbers."""
+        return [float(value) for value in self._checked(key, ListOf(wanted, 1, most))]
 
     def window(self, key: str, wanted: NumberIn, longest: float) -> tuple[float, float]:
         """Two numbers in order, at most `longest` apart."""
@@ -84,6 +89,14 @@ class JsonObject:
                 f"{self.name}: {key} must be a SHA-256 in lower-case hexadecimal, got {shortened(value)}"
             )
         return value
+
+    def _matrix(self, key: str, rows: object, size: int, wanted: NumberIn) -> list[list[float]]:
+        if not isinstance(rows, list) or len(rows) != size:
+            raise BundleCorrupt(f"{self.name}: {key} must be {size} rows of {size} numbers, got {shortened(rows)}")
+        try:
+            return [ListOf(wanted, size, size).checked(f"{key}[{index}]", row) for index, row in enumerate(rows)]
+        except InvalidInput as error:
+            raise BundleCorrupt(f"{self.name}: {error}") from error
 
     def _checked(self, key: str, wanted: IntegerIn | NumberIn | ListOf) -> Any:
         try:

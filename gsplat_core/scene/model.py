@@ -14,11 +14,13 @@ from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField, checked_window, continued_window
 from gsplat_core.errors import InvalidInput
+from gsplat_core.rendering.elsewhere import SeenFromElsewhere
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.surface import Surface, certainty, render_surface
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.scope_path import ScopePath
 
 
 def clamp_time(time_s: float, window_s: tuple[float, float]) -> float:
@@ -54,8 +56,12 @@ class Model:
     depth_source: DepthSource | None = None
     """Where the depth that it was trained on comes from; None: it had none, or a bundle of an earlier version does not say."""
 
+    scope_path: ScopePath | None = None
+    """Where the scope was while it learned; None: it is not known, as after training frame by frame."""
+
     _deform: Callable[[float], Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
     _last: tuple[float, Gaussians] | None = dataclasses.field(default=None, init=False, repr=False)
+    _elsewhere: list[SeenFromElsewhere | None] = dataclasses.field(default_factory=list, init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "time_window_s", checked_window(self.time_window_s))
@@ -138,6 +144,18 @@ class Model:
             return self
         return dataclasses.replace(self, gaussians=self.gaussians.seen_by_right())
 
+    def seen_from(self, camera: Camera, time_s: float) -> Model:
+        """As `camera` sees it at `time_s`, for that time alone: highlights lie where the scope's light makes them for this camera, as far as that is
+        known. Where it is not, and where the scope's left eye was itself, what that eye sees. The first call takes as long as some dozens of pictures."""
+        if not self._elsewhere:
+            self._elsewhere.append(SeenFromElsewhere.of(self))
+        seen = self._elsewhere[0]
+        if seen is None:
+            return self
+        return dataclasses.replace(
+            self, gaussians=seen.at(camera, self.clamp_time(time_s)), field=None, scope_path=None
+        )
+
     def render(
         self, time_s: float, camera: Camera | None = None, background: Tensor | None = None, depth: bool = True
     ) -> RenderOutput:
@@ -157,6 +175,7 @@ class Model:
         # Left out where it is not known: such a model has the digest that it had before this was kept.
         depth = {} if source is None else {"depth": {"origin": source.origin.value, "metric": source.metric}}
         right = {} if self.gaussians.right_sh is None else {"right_eye": True}
+        scope = {} if self.scope_path is None else {"scope_path": self.scope_path.description()}
         return {
             "gaussians": {"count": self.gaussians.count, "sh_degree": self.gaussians.sh_degree, **right},
             "field": None if self.field is None else self.field.config(),
@@ -170,6 +189,7 @@ class Model:
             "time_window_s": list(self.time_window_s),
             "training_digest": self.training_digest,
             **depth,
+            **scope,
         }
 
     def sha256(self) -> str:

@@ -18,6 +18,7 @@ from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
+from gsplat_core.scene.scope_path import ScopePath
 from gsplat_core.scene.snapshots import Snapshot, SnapshotSlots
 from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
@@ -59,11 +60,9 @@ class Reconstructor:
         recording_digest: str | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        self.config = config
-        self.camera = camera
+        self.config, self.camera = config, camera
         self.device = torch.device(device)
-        self._seed = seed
-        self._recording_digest = recording_digest
+        self._seed, self._recording_digest = seed, recording_digest
         self._window = ObservationWindow(config.window_frames, config.newest_share, seed)
         self.eyes = BothEyes(config.eyes, self.device)
         self._step: TrainingStep | None = None
@@ -74,11 +73,11 @@ class Reconstructor:
         """The frame whose steps are queued; whether their splats fitted the tile lists is not known yet."""
         self._in_flight = StepsInFlight(self.device)
         self._step_s: float | None = None
-        self._version = 0
-        self._slots = SnapshotSlots(self.device, rows=self._fixed_rows)
+        self._slots, self._version = SnapshotSlots(self.device, rows=self._fixed_rows), 0
         self._usual_first_loss = math.inf
         self._first_time_s = self._last_time_s = self._learned_s = 0.0
         self._depth_source: DepthSource | None = None
+        self._scope_path: ScopePath | None = None
         self.depth_doubts: Mapping[str, int] = {}  # why `fit` found no depth, and in how many frames of a moving camera
 
     _covers_beside = False
@@ -225,6 +224,7 @@ class Reconstructor:
             self._grow(frame, observation, number == 0)
             tracks.apply(self._step, number, first_new)
         most, settings = self.config.max_gaussians, settings or FitSettings()
+        self._scope_path = ScopePath.of([one.time_s for one in seen], [one.camera.world_to_camera for one in seen])
         loss = OfflineTraining(self._step, seen, settings, most_gaussians=most, seed=self._seed)(steps, progress)
         return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)
 
@@ -236,7 +236,7 @@ class Reconstructor:
         self._version += 1
         with continued(self._step, self._prior, self._learned_s):
             gaussians, field = self._step.copy()
-        return Model(gaussians=gaussians, field=field, **self._facts())
+        return Model(gaussians=gaussians, field=field, scope_path=self._scope_path, **self._facts())
 
     def publish(self) -> Model | Snapshot:
         """The model as it is now, for showing it, with the next version number. As `snapshot`, but on a GPU it is copied into a slot.

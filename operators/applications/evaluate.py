@@ -251,14 +251,16 @@ class _Work:
         }
 
     def _of_final_model(self, right: bool = False):  # type: ignore[no-untyped-def]
-        """What the final model shows for a frame, in the colours that the left or the right eye sees."""
+        """What the final model shows for a frame, in the colours that the left or the right eye sees; the right one's are foretold where it was not
+        trained on."""
         settings, camera = self.settings, self.camera
         self._require_memory_of_picture()
         model = self.model.to(settings.device)
-        if right:
-            model = model.seen_by_right()
         pictures = PictureMaker(camera, settings.device, settings.renderer)
-        return lambda frame, eye=None: pictures(model, frame, eye)
+        if right and model.gaussians.right_sh is None:
+            return lambda frame, eye: pictures(model.seen_from(eye, frame.time_s), frame, eye)
+        shown = model.seen_by_right() if right else model
+        return lambda frame, eye=None: pictures(shown, frame, eye)
 
     def _require_memory_of_picture(self) -> None:
         """Raises MemoryTooSmall where no picture of the model fits into memory."""

@@ -25,12 +25,12 @@ class SeenFromAnywhere:
         self._makers: dict[Camera, PictureMaker] = {}
 
     def __call__(self, model: Model, camera: Camera, frame: Frame) -> Picture:
-        """The model at the frame's time and with its exposure, from where `camera` is."""
+        """The model at the frame's time and with its exposure, from where `camera` is, and in the colours that it sees from there."""
         lens = camera.with_pose(np.eye(4))
         maker = self._makers.get(lens)
         if maker is None:
             maker = self._makers[lens] = PictureMaker(lens, self._device, self._renderer)
-        return maker(model, frame.with_fields(pose=camera.world_to_camera))
+        return maker(model.seen_from(camera, frame.time_s), frame.with_fields(pose=camera.world_to_camera))
 
 
 def measure_geometry(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from itertools import cycle
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -76,10 +75,7 @@ def render_model(
     shown = view_of(model, camera, view)
     check_width(shown.across * camera.width_px)
     frames = frames_to_render(shown.window_s, fps)
-    eyes = [(model, new_renderer(renderer, camera, device))]
-    if shown.across == 2 and model.gaussians.right_sh is not None:
-        eyes.append((model.seen_by_right(), new_renderer(renderer, camera, device)))
-    pictures = _Pictures(eyes, shown)
+    pictures = _Pictures(model, shown, lambda: new_renderer(renderer, camera, device))
     images = _images(pictures, frames, fps, progress, stop_requested)
     if not to_video:
         return _write_images(images, bundle, out)
@@ -91,25 +87,36 @@ def render_model(
 class _Pictures:
     """Draws a model from a view; for one thread."""
 
-    def __init__(self, eyes: Sequence[tuple[Model, Renderer]], view: View) -> None:
-        """eyes: the model as each eye sees it, and its renderer; one for all of the view's pictures, or one for each."""
-        self._renderers, self.view = [renderer for _, renderer in eyes], view
-        for model, renderer in eyes:
-            renderer.prepare(model)
+    def __init__(self, model: Model, view: View, make_renderer: Callable[[], Renderer]) -> None:
+        self._model, self.view = model, view
+        self._eyes = [(seen, make_renderer()) for seen in _eyes_of(model, view)]
+        for seen, renderer in self._eyes:
+            renderer.prepare(seen or model)
 
     def at(self, time_s: float) -> NDArray[np.uint8]:
         """RGB uint8 [H, W, 3]: the view's pictures side by side."""
         with torch.inference_mode():
-            drawn = zip(cycle(self._renderers), self.view.cameras(time_s), strict=False)
-            return np.hstack([self._picture(renderer, camera, time_s) for renderer, camera in drawn])
+            drawn = zip(self._eyes, self.view.cameras(time_s), strict=True)
+            return np.hstack([self._picture(seen, renderer, camera, time_s) for (seen, renderer), camera in drawn])
 
-    def _picture(self, renderer: Renderer, camera: Camera, time_s: float) -> NDArray[np.uint8]:
+    def _picture(self, seen: Model | None, renderer: Renderer, camera: Camera, time_s: float) -> NDArray[np.uint8]:
+        if seen is None and (there := self._model.seen_from(camera, time_s)) is not self._model:
+            renderer.prepare(there)
         if not self.view.is_virtual:
             return displayed(renderer.render(camera, time_s, ("image",)).result().image)
         output = renderer.render(camera, time_s, ("image", "alpha")).result()
         image, alpha = np.array(displayed(output.image)), HostCopy(output.alpha).numpy()
         mark_unobserved(image, alpha)
         return image
+
+
+def _eyes_of(model: Model, view: View) -> list[Model | None]:
+    """The model as an eye of the scope saw it, for each of the pictures that stand side by side; None where none did."""
+    if not view.is_virtual:
+        return [model]
+    if view.across == 1:
+        return [None]
+    return [model, None if model.gaussians.right_sh is None else model.seen_by_right()]
 
 
 def _images(

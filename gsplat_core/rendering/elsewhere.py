@@ -1,0 +1,131 @@
+"""A model as it looks from where the scope never was: highlights lie elsewhere than the scope's eye saw them.
+
+The light rides with the scope. A model shows from everywhere what the scope's left eye saw, highlights included; but those move with the eye. How each Gaussian's colour
+changes with the direction between light and eye is learned from what the model itself shows over time (`sheen`), because tissue that breathes and a scope that moves turn the
+surface to and fro. Worked out on the host, the same for every device.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.rendering.sheen import Sheen, half_directions
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import SH_C0, Gaussians
+from gsplat_core.scene.scope_path import ScopePath
+from gsplat_core.scene.tangents import Tangents
+
+if TYPE_CHECKING:
+    from gsplat_core.scene.model import Model
+
+Array = NDArray[np.floating]
+
+SAME_PLACE = 1e-3
+"""A camera so near to the scope's eye, as a share of the distance to the tissue, sees what that eye sees."""
+BEHIND = 1.1
+"""What is farther away than what a picture shows by this factor is not seen in it."""
+LEAST_TIMES = 4
+"""With fewer looks nothing is learned."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the scope's eye saw of each Gaussian at one time."""
+
+    halves: Array
+    """[N, 2]."""
+    colours: Array
+    """[N, 3]."""
+    seen: NDArray[np.bool_]
+    """[N]."""
+
+
+class SeenFromElsewhere:
+    """Colours of one model for cameras that are not where the scope was."""
+
+    def __init__(self, model: Model, path: ScopePath) -> None:
+        self._model, self._path = model, path
+        first = model.at(path.times_s[0])
+        pixels, z = _projected(model.camera.with_pose(path.pose(0)), _host(first.means))
+        longer_px = max(model.camera.width_px, model.camera.height_px)
+        opacities = _host(first.opacities)
+        self._tangents = Tangents(np.where(z[:, None] > 0, pixels, np.nan), opacities, longer_px)
+        looks = [self._look(number) for number in range(len(path.times_s))]
+        halves, colours, seen = (
+            np.stack([getattr(look, name) for look in looks], 1) for name in ("halves", "colours", "seen")
+        )
+        self._sheen = Sheen(halves, colours, seen, np.array(path.times_s), opacities)
+
+    @classmethod
+    def of(cls, model: Model) -> SeenFromElsewhere | None:
+        """None where nobody knows where the scope was, where nothing moves, and for cameras that are no pinholes."""
+        path = model.scope_path
+        if path is None or len(path.times_s) < LEAST_TIMES or model.field is None:
+            return None
+        return cls(model, path) if model.camera.model == "pinhole" and model.gaussians.count else None
+
+    @property
+    def skill(self) -> float:
+        """See `Sheen`."""
+        return self._sheen.skill
+
+    def at(self, camera: Camera, time_s: float) -> Gaussians:
+        """The Gaussians at a time, with the colours that `camera` sees; those of the left eye where it is there."""
+        now = self._model.at(time_s)
+        points, light, eye = _host(now.means), self._path.centre_at(time_s), camera.position
+        if np.linalg.norm(eye - light) <= SAME_PLACE * np.median(np.linalg.norm(points - light, axis=1)):
+            return now
+        tangents = self._tangents(points)
+        theirs, own = (half_directions(tangents, points, light, place) for place in (eye, light))
+        sh = now.sh.clone()
+        sh[:, 0] += torch.from_numpy(self._sheen.difference(theirs, own) / np.float32(SH_C0)).to(sh)
+        return replace(now, sh=sh, right_sh=None)
+
+    def _look(self, number: int) -> Look:
+        """At one of the path's times; in the picture of the model from where the scope was then."""
+        camera = self._model.camera.with_pose(self._path.pose(number))
+        now = self._model.at(self._path.times_s[number])
+        with torch.no_grad():
+            picture = render(now, camera)
+        points, eye = _host(now.means), camera.position
+        pixels, z = _projected(camera, points)
+        inside = (
+            (z > 0)
+            & (pixels >= 0.5).all(axis=1)
+            & (pixels <= (camera.width_px - 0.5, camera.height_px - 0.5)).all(axis=1)
+        )
+        pixels = np.where(inside[:, None], pixels, 0.5)
+        depth = _between_pixels(_host(picture.depth)[..., None], pixels)[:, 0]
+        colours = _between_pixels(_host(picture.image).clip(0, 1), pixels)
+        halves = half_directions(self._tangents(points), points, eye, eye)
+        return Look(halves, colours, inside & (depth > 0) & (z <= BEHIND * depth))
+
+
+def _host(tensor: torch.Tensor) -> NDArray[np.float64]:
+    return np.asarray(tensor.detach().cpu().numpy(), np.float64)
+
+
+def _projected(camera: Camera, points: Array) -> tuple[Array, Array]:
+    """Pixels [N, 2] and depth [N] of points [N, 3]; pixels mean nothing where the depth is not positive."""
+    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    z = local[:, 2]
+    pixels = local[:, :2] / np.where(z > 0, z, 1.0)[:, None] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+    return np.asarray(pixels), np.asarray(z)
+
+
+def _between_pixels(plane: Array, pixels: Array) -> Array:
+    """The values of a picture [H, W, C] at positions [N, 2] in it, linear between the pixels' centres: [N, C]."""
+    height, width = plane.shape[:2]
+    at = pixels - 0.5
+    low = np.floor(at).astype(np.int64).clip(0, (max(width - 2, 0), max(height - 2, 0)))
+    (column, row), (right, down) = low.T, (at - low).T[..., None]
+    after, under = np.minimum(column + 1, width - 1), np.minimum(row + 1, height - 1)
+    above = (1 - right) * plane[row, column] + right * plane[row, after]
+    below = (1 - right) * plane[under, column] + right * plane[under, after]
+    return np.asarray((1 - down) * above + down * below)

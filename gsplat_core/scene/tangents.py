@@ -1,0 +1,70 @@
+"""How a surface that bends and turns lies at each of its points: two tangents that go with the tissue.
+
+A plane of the picture in which the surface was seen first gives every point its coordinates on the tissue. How places change with these coordinates is fitted
+locally, over some cells of a coarse grid: single points are not followed exactly enough to tell how tissue turns.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+CELLS = 20
+"""Cells along the longer side of the picture."""
+BEYOND = 0.5
+"""How far the grid goes beyond the picture, as a share of its longer side; what lies farther out belongs to its edge."""
+REACH = 1.0
+"""Standard deviation, in cells, of the weights with which other cells take part in a fit."""
+LEAST_SPREAD = 1e-3
+"""Added to the variances of coordinates in a fit, in cells squared, so that a few points in one place have an answer."""
+
+
+class Tangents:
+    """Of N points whose coordinates never change."""
+
+    def __init__(self, pixels: Array, weights: Array, longer_px: float) -> None:
+        """pixels: [N, 2] where the points were seen. weights [N]: how much each says. longer_px: of the picture's sides."""
+        low, high = -BEYOND * CELLS, (1 + BEYOND) * CELLS
+        self._size = size = int(high - low)
+        at = np.nan_to_num(pixels * (CELLS / longer_px), nan=low, posinf=high, neginf=low) - low
+        self._at = at = at.clip(0, size - 1e-6)
+        column, row = np.floor(at).astype(np.int64).T
+        self._cell, self._weights = row * size + column, weights
+        steps = np.arange(size)
+        self._spread = np.exp(-0.5 * ((steps[:, None] - steps) / REACH) ** 2)
+        # Coordinates count from the cell's middle of the grid, so that sums of their squares stay exact.
+        self._q = q = at - size / 2
+        self._total = np.maximum(self._sums(np.ones((len(q), 1))), 1e-12)
+        self._mean = self._sums(q) / self._total
+        squares = self._sums(q[:, [0, 0, 1, 1]] * q[:, [0, 1, 0, 1]]) / self._total
+        variance = squares.reshape(size, size, 2, 2) - self._mean[..., :, None] * self._mean[..., None, :]
+        self._inverse = np.linalg.inv(variance + LEAST_SPREAD * np.eye(2))
+
+    def __call__(self, points: Array) -> Array:
+        """Unit vectors [N, 2, 3] along both coordinates where the points are at [N, 3]."""
+        size = self._size
+        middle = points.mean(axis=0) if len(points) else 0.0
+        x, q = points - middle, self._q
+        place = self._sums(x) / self._total
+        product = self._sums((q[:, :, None] * x[:, None, :]).reshape(-1, 6)) / self._total
+        shared = product.reshape(size, size, 2, 3) - self._mean[..., :, None] * place[..., None, :]
+        along = self._between_cells(self._inverse @ shared)
+        return np.asarray(along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12))
+
+    def _sums(self, values: Array) -> Array:
+        """Weighted sums [rows, columns, C] of values [N, C] around each cell."""
+        size = self._size
+        sums = [np.bincount(self._cell, self._weights * each, size * size).reshape(size, size) for each in values.T]
+        return np.stack([self._spread @ each @ self._spread for each in sums], axis=-1)
+
+    def _between_cells(self, of_cells: Array) -> Array:
+        """What cells [rows, columns, ...] have, at each point [N, ...], linear between their middles."""
+        at = (self._at - 0.5).clip(0, self._size - 1 - 1e-6)
+        low = np.floor(at).astype(np.int64)
+        share = (at - low)[:, :, None, None]
+        (column, row), (right, down) = low.T, share.swapaxes(0, 1)
+        above = (1 - right) * of_cells[row, column] + right * of_cells[row, column + 1]
+        below = (1 - right) * of_cells[row + 1, column] + right * of_cells[row + 1, column + 1]
+        return np.asarray((1 - down) * above + down * below)
