@@ -46,7 +46,7 @@ def filled_depth(depth: Plane, known: NDArray[np.bool_]) -> Plane:
         counted = np.asarray(cv2.resize(weight, grid, interpolation=cv2.INTER_AREA), np.float32)
         total = np.asarray(cv2.resize((values - found) * weight, grid, interpolation=cv2.INTER_AREA), np.float32)
         left = np.asarray(total / np.maximum(counted, 1e-6), np.float32)
-        plane = _local_plane(left, counted, max(1.0, share * cells))
+        plane = local_plane(left, counted, max(1.0, share * cells))
         found += cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
     nearest, farthest = float(values.max()), float(values[some].min())
     found = np.clip(found, farthest / 2, nearest * 2)
@@ -63,8 +63,9 @@ def _whole_plane(values: Plane, weight: Plane) -> Plane:
     return np.asarray((terms @ slopes).reshape(values.shape), np.float32)
 
 
-def _local_plane(values: Plane, weight: Plane, sigma: float) -> Plane:
-    """At each cell the value of the plane that fits the weighted values around it best; the less is known there, the nearer to zero."""
+def local_plane(values: Plane, weight: Plane, sigma: float) -> Plane:
+    """At each cell [h, w] the value of the plane that fits the values around it best, weighted from 0 to 1 and by a Gaussian window of `sigma` cells; the less
+    is known there, the nearer to zero."""
     rows, columns = (np.arange(n, dtype=np.float64) / sigma for n in values.shape)
     x, y = np.broadcast_to(columns, values.shape), np.broadcast_to(rows[:, None], values.shape)
     sums = tuple(

@@ -133,7 +133,7 @@ class StereoDepth:
             known = found.known & (shift > LEAST_DISPARITY_PX)
             off_px = _off_along_rows(rows, frame.height_px, frame.width_px, self._device)
             variance = (found.error_px.square() + off_px.square()) / (HALF_BELIEVED_PX * shrink) ** 2
-            depth = torch.where(known, _reach(frame, camera) / torch.where(known, shift, 1), 0)
+            depth = torch.where(known, reach_of(frame, camera) / torch.where(known, shift, 1), 0)
             planes = HostCopy(torch.stack([depth, torch.where(known, 1 / (1 + variance), 0)]))
         return planes.numpy().copy()  # frames may be kept for long, and page-locked memory is dear
 
@@ -149,7 +149,7 @@ class StereoDepth:
             return doubted(depth.shape, DepthOrigin.STEREO, why)
         step = max(1, frame.width_px // SAMPLED_PX)
         some = planes[:, ::step, ::step]
-        reach = _reach(frame, camera)
+        reach = reach_of(frame, camera)
         near, far = (float(value) for value in np.percentile(some[0][some[0] > 0], (0.5, 99.5)))
         self._span = reach / far + parallel_px, reach / near + parallel_px
         middle = float(np.median(some[0][some[1] >= BELIEVED]))
@@ -174,6 +174,15 @@ class StereoDepth:
 def _shrink(width_px: int) -> int:
     """By which factor pictures are smaller while they are matched."""
     return -(-width_px // MATCHED_WIDTH_PX)
+
+
+def variance_px2(confidence: NDArray[np.float32], width_px: int, beside: float) -> NDArray[np.float32]:
+    """Variances of disparities by their confidence above 0 [H, W], in squares of the pixels of pictures of this width.
+
+    beside: what is added, in squares of the pixels that are matched.
+    """
+    own = HALF_BELIEVED_PX**2 * (1 / np.maximum(confidence, np.float32(1e-6)) - 1)
+    return np.asarray(_shrink(width_px) ** 2 * (own + beside), np.float32)
 
 
 def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -215,8 +224,8 @@ def _unlike_distances(look: PairLook, parallel_px: float, *, calibrated: bool) -
     return None
 
 
-def _reach(frame: Frame, camera: Camera) -> float:
-    """Depth times disparity."""
+def reach_of(frame: Frame, camera: Camera) -> float:
+    """Depth times disparity, for the left `camera` and the frame's right one; without that one depth is in distances between the eyes."""
     baseline = 1.0 if frame.right_camera is None else -float(frame.right_camera.world_to_camera[0, 3])
     return float(camera.K[0, 0] * baseline)
 

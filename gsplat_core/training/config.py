@@ -28,6 +28,8 @@ MEASURED_WEIGHS, MEASURED_WEIGHS_ONLINE = 10.0, 3.0
 """How many times more depth counts that was measured than depth that was found in pictures, where all frames are known and where they come one after
 another. With less of it, colours move Gaussians along the line of sight, which pictures hardly show, by more than a measured depth is off; with more, the
 few steps of a frame leave less for its picture."""
+MATCHED_WEIGHS = 10.0
+"""The same of depth that two eyes were matched by, where all frames are known: it is then a surface (`matched_surface`), which colours make rough."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,9 @@ class LearningRates:
     log_scales: float = 5e-3
     logit_opacities: float = 2e-2
     sh: float = 5e-3
+    right_share: float = 0.1
+    """Of the rate `sh`, for the right eye's own colours. Where depth is not known, that one colour does not fit both pictures is what moves a Gaussian to where it
+    belongs: these come after that. Where matched depth holds the Gaussians (`MATCHED_WEIGHS`), they follow at once."""
     field: FieldRates | None = None
     """Rates of the deformation field, of the type that its kind has (`FIELDS[name].rates`); None: the kind's defaults."""
 
@@ -85,7 +90,8 @@ class ReconstructorConfig:
     """Weight of 1 - SSIM beside L1 or the squared error, 0..1."""
     depth_weight: float = 0.1
     """Weight of the inverse-depth term, where frames have depth, times the distance at which the scene starts: in any unit of length the same.
-    `MEASURED_WEIGHS` times as much where a scene with an end starts from measured depth."""
+    `MEASURED_WEIGHS` times as much where a scene with an end starts from measured depth, `MATCHED_WEIGHS` times where all frames are known and two eyes were
+    matched."""
     default_depth_mm: float = 60.0
     """Distance of the plane on which a recording without depth starts."""
     eyes: Eyes = "both"
@@ -155,11 +161,15 @@ class ReconstructorConfig:
     def starting_from(self, frame: Frame, all_known: bool) -> ReconstructorConfig:
         """The same for a scene that starts from `frame`. all_known: whether all frames are there. A stream without an end keeps its weights from scene to
         scene, whatever these start from."""
-        measured = frame.depth is not None and frame.depth_origin in (None, DepthOrigin.MEASURED)
-        if not measured or self.history_s is not None:
+        if frame.depth is None or self.history_s is not None:
             return self
-        factor = MEASURED_WEIGHS if all_known else MEASURED_WEIGHS_ONLINE
-        return dataclasses.replace(self, depth_weight=factor * self.depth_weight)
+        if frame.depth_origin in (None, DepthOrigin.MEASURED):
+            factor = MEASURED_WEIGHS if all_known else MEASURED_WEIGHS_ONLINE
+            return dataclasses.replace(self, depth_weight=factor * self.depth_weight)
+        if frame.depth_origin is DepthOrigin.STEREO and all_known:
+            rates = dataclasses.replace(self.rates, right_share=1.0)
+            return dataclasses.replace(self, depth_weight=MATCHED_WEIGHS * self.depth_weight, rates=rates)
+        return self
 
     @property
     def chosen_field(self) -> str:

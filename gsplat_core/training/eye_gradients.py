@@ -13,9 +13,6 @@ from torch import Tensor
 
 LEFT, RIGHT = "sh", "right_sh"
 """Names of the tensors of `Gaussians`; the right eye sees their sum."""
-RIGHT_RATE = 0.1
-"""Of the colours' learning rate. Where depth is not known, that one colour does not fit both pictures is what moves a Gaussian to where it belongs: the
-right eye's own colours come after that."""
 
 
 def with_eye(gradients: Mapping[str, Tensor], of_right: bool) -> dict[str, Tensor]:

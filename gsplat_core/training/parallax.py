@@ -14,11 +14,13 @@ import numpy as np
 
 from gsplat_core.geometry.depth_map import DepthMap
 from gsplat_core.geometry.light_of_recording import frames_with_light
+from gsplat_core.geometry.matched_surface import with_matched_surface
 from gsplat_core.geometry.moving_tissue import MovingTissue
 from gsplat_core.geometry.multiview import DEFORMS, depth_of_view, view_of
 from gsplat_core.geometry.pose_check import CONTRADICTED
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.training.initialisation import possible_depth
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.offline import observed
 
@@ -107,12 +109,17 @@ class ToFit(NamedTuple):
 
 
 def to_fit(frames: list[Frame], observation_of: Callable[[Frame], Observation], finds_depth: bool) -> ToFit:
-    """What to train on. Depth by light is found anew from all frames; by parallax, if `finds_depth`, where there is no other.
+    """What to train on; `frames` are changed. Matched depth becomes a surface; by light it is found anew from all frames; by parallax, if `finds_depth`, where
+    there is no other.
 
     Raises InvalidInput where there are no frames, or they are not in order.
     """
     seen = observed(frames, observation_of)
     cameras = [each.camera for each in seen]
+    for number, (frame, camera) in enumerate(zip(frames, cameras, strict=True)):
+        surface = with_matched_surface(frame, camera, possible_depth(frame) > 0)
+        if surface is not frame:
+            frames[number], seen[number] = surface, observation_of(surface)
     frames, light_shows_motion = frames_with_light(frames, cameras)
     if not finds_depth:
         return ToFit(frames, seen, {}, light_shows_motion=light_shows_motion)

@@ -15,7 +15,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.rows import GaussianRows, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.eye_gradients import LEFT, RIGHT, RIGHT_RATE, with_eye
+from gsplat_core.training.eye_gradients import LEFT, RIGHT, with_eye
 from gsplat_core.training.field_training import AutogradTraining
 from gsplat_core.training.fused_step import FusedStep
 from gsplat_core.training.observations import Observation
@@ -258,7 +258,7 @@ class TrainingStep:
 
     def _gaussian_rates(self, rate_scale: float) -> dict[str, float]:
         rates = self._rates
-        right = {} if self.gaussians.right_sh is None else {RIGHT: RIGHT_RATE * rates.sh * rate_scale}
+        right = {} if self.gaussians.right_sh is None else {RIGHT: rates.right_share * rates.sh * rate_scale}
         return {
             "means": rates.means_px * self._mm_per_px * rate_scale,
             "quats": rates.quats * rate_scale,

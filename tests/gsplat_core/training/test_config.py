@@ -9,7 +9,13 @@ from gsplat_core.deformation.basis_kind import BasisLearningRates
 from gsplat_core.deformation.hexplane_kind import HexPlaneLearningRates
 from gsplat_core.errors import InvalidSetting, UserError
 from gsplat_core.scene.frames import DepthOrigin
-from gsplat_core.training.config import MEASURED_WEIGHS, MEASURED_WEIGHS_ONLINE, LearningRates, ReconstructorConfig
+from gsplat_core.training.config import (
+    MATCHED_WEIGHS,
+    MEASURED_WEIGHS,
+    MEASURED_WEIGHS_ONLINE,
+    LearningRates,
+    ReconstructorConfig,
+)
 
 
 @pytest.mark.parametrize(
@@ -83,13 +89,16 @@ def test_offline_there_are_more_gaussians_finer_motion_and_the_error_that_psnr_m
 
 
 @pytest.mark.parametrize("origin", [None, *DepthOrigin])
-def test_measured_depth_counts_more_than_depth_that_was_found(make_frame, origin):
+def test_measured_depth_and_that_of_two_eyes_count_more_than_other_depth_that_was_found(make_frame, origin):
     config = ReconstructorConfig(depth_weight=0.2)
     frame = make_frame(depth=np.full((40, 48), 60.0, np.float32), depth_origin=origin)
-    measured = origin in (None, DepthOrigin.MEASURED)
-    for all_known, factor in ((True, MEASURED_WEIGHS), (False, MEASURED_WEIGHS_ONLINE)):
-        weight = config.starting_from(frame, all_known).depth_weight
-        assert weight == pytest.approx(0.2 * factor if measured else 0.2)
+    offline, online = {DepthOrigin.STEREO: MATCHED_WEIGHS}, {}
+    for measured in (None, DepthOrigin.MEASURED):
+        offline[measured], online[measured] = MEASURED_WEIGHS, MEASURED_WEIGHS_ONLINE
+    for all_known, factors in ((True, offline), (False, online)):
+        starts = config.starting_from(frame, all_known)
+        assert starts.depth_weight == pytest.approx(0.2 * factors.get(origin, 1.0))
+        assert starts.rates.right_share == (1.0 if all_known and origin is DepthOrigin.STEREO else 0.1)
 
 
 def test_without_depth_and_without_an_end_weights_stay_as_they_are(make_frame):

@@ -10,7 +10,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.training import parallax
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.parallax import frames_with_parallax
+from gsplat_core.training.parallax import frames_with_parallax, to_fit
 from tests.gsplat_core.geometry.moving_scope import (
     FIRST,
     HEIGHT,
@@ -79,3 +79,25 @@ def test_still_cameras_known_depth_and_other_projections_are_left_alone() -> Non
     for model in ("fisheye", "ortho"):
         others = [Camera(each.K, WIDTH, HEIGHT, each.world_to_camera, model) for each in cameras]  # type: ignore[arg-type]
         assert frames_with_parallax(frames, others) == (frames, {}, False)
+
+
+def test_matched_depth_becomes_a_surface_before_it_is_learned() -> None:
+    frames, cameras = video(2, SIDEWAYS)
+    true = depth_of_surface()
+    noise_px = 0.1 * np.random.default_rng(0).standard_normal(true.shape)
+    focal_px = float(cameras[0].K[0, 0])  # without a calibration the eyes are one unit apart
+    sure = np.full(true.shape, 0.8, np.float32)
+    depth = (focal_px / (focal_px / true + noise_px)).astype(np.float32)
+    frames = [
+        frame.with_fields(depth=depth, depth_confidence=sure, depth_origin=DepthOrigin.STEREO) for frame in frames
+    ]
+    found = to_fit(list(frames), lambda frame: Observation.of(frame, cameras[0]), finds_depth=False)
+    for frame, one in zip(found.frames, found.seen, strict=True):
+        assert frame.depth is not None and one.depth is not None
+        learned = one.depth.numpy()
+        assert np.array_equal(learned, np.where(learned > 0, frame.depth, 0)) and (learned > 0).mean() > 0.8
+        off, before = np.std(frame.depth / true - 1), np.std(depth / true - 1)
+        assert off < 0.5 * before
+    measured = [frame.with_fields(depth_origin=DepthOrigin.MEASURED) for frame in frames]
+    as_it_was = to_fit(list(measured), lambda frame: Observation.of(frame, cameras[0]), finds_depth=False)
+    assert all(frame.depth is depth for frame in as_it_was.frames)
