@@ -205,6 +205,7 @@ class _Work:
             seed=0 if run is None else run.seed,
             steps_per_frame=steps,
             scale=self.scale,
+            eyes=None if run is None else run.eyes,
         )
 
     def _geometry(self) -> Geometry:

@@ -15,6 +15,7 @@ from gsplat_core.io.sessions import SessionReader, is_session
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model
+from gsplat_core.training.config import Eyes
 from operators.applications.finishing import FirstFrames
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, SourceDescription
@@ -35,6 +36,7 @@ class EvaluatedRun:
     scale: float
     heldout: bool
     """Whether the protocol's held-out frames were kept from training."""
+    eyes: Eyes = "left"
     fps: float | None = None
     """The rate at which a live run played; None: the recording's own."""
 

@@ -79,8 +79,8 @@ class ReplaySettings:
     """Replay a recorded session like any other recording, and not with the calls that it made."""
     depth: str = "auto"
     """Where depth comes from: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
-    eyes: Eyes = "both"
-    """Which pictures of a stereo scope are trained on; `both` where the right one's camera is known."""
+    eyes: Eyes | None = None
+    """Pictures of a stereo scope that are trained on; None: frame by frame the left ones, which are shown, offline those of both eyes."""
     poses: Poses = "given"
     """Where the scope was: as the recording says, or as is estimated from the pictures, frame by frame (`operators.pose`)."""
     heldout: bool = False
@@ -95,7 +95,7 @@ class ReplaySettings:
             check_steps("steps_per_frame", self.steps_per_frame)
         check_max_frames(self.max_frames)
         check_depth(self.depth)
-        check_eyes(self.eyes)
+        check_eyes(self.eyes or "left")
         for name in self.sinks:
             SINKS.check(name)
 
@@ -107,7 +107,7 @@ class ReplaySettings:
     def reconstructor_config(self, pixels: int | None = None, *, offline: bool = False) -> ReconstructorConfig:
         """The reconstructor's settings for frames of so many pixels. offline: for `Reconstructor.fit`. Raises InvalidSetting."""
         config = ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig(field=self.field)
-        config = replace(config, eyes=self.eyes)
+        config = replace(config, eyes=self.eyes or ("both" if offline else "left"))
         if offline:
             config = replace(config, depth_from_motion=self.depth in ("auto", "parallax"))
         if pixels is not None:

@@ -99,7 +99,8 @@ PosesFromOption = Annotated[
     ),
 ]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
-EyesOption = Annotated[str, typer.Option(help="Pictures of a stereo scope that are trained on: left or both.")]
+EYES = "Pictures of a stereo scope that are trained on: left or both."
+EyesOption = Annotated[str | None, typer.Option(help=EYES, show_default="left; of reconstruct both")]
 ScaleOption = Annotated[float, typer.Option(help="Resize the frames by this factor.")]
 MaxFramesOption = Annotated[int | None, typer.Option(help="Stop after this many frames.", show_default=False)]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout, and nothing else.")]
@@ -116,7 +117,7 @@ class RunOptions:
     max_frames: MaxFramesOption = None
     scale: ScaleOption = 1.0
     depth: DepthOption = "auto"
-    eyes: EyesOption = "both"
+    eyes: EyesOption = None
 
     def settings(self) -> dict[str, Any]:
         """By name."""
@@ -181,7 +182,7 @@ class SynthesizeOptions:
 class LiveOptions(RunOptions):
     """What `live` takes besides; the names are those of `LiveSettings`."""
 
-    eyes: EyesOption = "left"
+    eyes: Annotated[str, typer.Option(help=EYES)] = "left"
     seconds: Annotated[
         float | None, typer.Option(help="End after so many seconds.", show_default="when the source ends")
     ] = None

@@ -24,7 +24,9 @@ class ReplayOptions(BaseModel):
     depth: Literal["auto", "recorded", "stereo", "none"] = Field(
         default="auto", description="Where the frames' depth comes from; `stereo`: from the two eyes."
     )
-    eyes: Literal["left", "both"] = Field(default="both", description="Pictures of a stereo scope that are trained on.")
+    eyes: Literal["left", "both"] | None = Field(
+        default=None, description="Pictures of a stereo scope that are trained on; null: the left ones."
+    )
     heldout: bool = Field(
         default=False, description="Show every eighth frame without training on it, and score it apart."
     )

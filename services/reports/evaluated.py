@@ -64,5 +64,6 @@ def _run(folder: Path, report: RunReport) -> EvaluatedRun:
         steps_per_frame=run.steps_per_frame,
         scale=run.scale,
         heldout=report.quality.heldout is not None,
+        eyes=run.eyes,
         fps=report.recording.fps if run.command == "live" else None,
     )

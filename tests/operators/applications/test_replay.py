@@ -163,3 +163,19 @@ def test_offline_a_small_frame_gets_no_more_gaussians_than_it_can_show(tiny, tmp
     small = settings.reconstructor_config(64 * 48, offline=True)
     assert (small.gaussians, small.max_gaussians) == (64 * 48 // 4, 64 * 48 // 2)
     assert settings.reconstructor_config(1280 * 1024, offline=True) == ReconstructorConfig.offline("hexplane")
+
+
+@pytest.mark.parametrize(
+    ("asked", "shown", "offline"), [(None, "left", "both"), ("left", "left", "left"), ("both", "both", "both")]
+)
+def test_frame_by_frame_the_eye_that_is_shown_is_trained_on_and_offline_both_unless_told(
+    tiny, tmp_path, asked, shown, offline
+):
+    settings = ReplaySettings(tiny, tmp_path / "out", eyes=asked)
+    assert settings.reconstructor_config().eyes == shown
+    assert settings.reconstructor_config(offline=True).eyes == offline
+
+
+def test_a_third_eye_is_refused(tiny, tmp_path):
+    with pytest.raises(InvalidSetting, match="eyes is 'right'"):
+        ReplaySettings(tiny, tmp_path / "out", eyes="right")
