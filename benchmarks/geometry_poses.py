@@ -1,11 +1,12 @@
 """Poses from pictures alone, against those that a recording came with.
 
-    python benchmarks/geometry_poses.py RECORDING... [--synthetic FRAMES] [--fps 15] [--seeds 0 1] [--rigid] [--back] [--causal] [--assume F] [--depth]
+    python benchmarks/geometry_poses.py RECORDING... [--synthetic FRAMES] [--fps 15] [--seeds 0 1] [--rigid] [--way WAY] [--causal] [--assume F] [--depth]
 
 One JSON line a recording: ATE (root mean square of the distance between both ways after the best similarity) as a share of the given way, errors in
 pixels, processor seconds, and where tissue was found to breathe the frequencies and how much of the way is said to be uncertain. `--synthetic 150` adds a
 rendered recording of so many frames, 320x256, with a moving scope before tissue that breathes and is pulled; `--rigid` the same before tissue that stands
-still. `--back` shows the rendered frames forth and then back again, with other noise, and adds how far off the last pose is. `--causal` estimates frame by frame, as live and `replay` do, on one
+still. `--way back` has the scope go sideways until it sees none of what it saw at first, and back again, `--way circle`
+round a circle as wide, and adds how far off the last pose is, which is the first one. `--causal` estimates frame by frame, as live and `replay` do, on one
 thread, and gives the processor's milliseconds a frame. `--depth` adds the error of depth maps of tissue that breathes (`moving_tissue`) with these poses, of every fifth frame, after one scale. `--assume 0.9` does without the calibration: the focal length is assumed to be 0.9 of the longer
 side, and what the pictures tell of it stands beside the true one, in the same unit.
 """
@@ -29,9 +30,13 @@ from gsplat_core.geometry.moving_tissue import MovingTissue
 from gsplat_core.geometry.odometry import Trajectory, trajectory_of
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+
+FARTHEST_MM = 110.0
+"""Of the ways that lead back: a picture shows 82 mm of the tissue."""
 
 
 def measured(
@@ -109,17 +114,6 @@ def measured_causally(name: str, frames: Sequence[Frame], camera: Camera) -> dic
     return figures
 
 
-def forth_and_back(frames: Sequence[Frame]) -> list[Frame]:
-    """The frames, and then all but the last of them again in the opposite order, with other noise."""
-    random = np.random.default_rng(0)
-    back = []
-    for frame in reversed(frames[:-1]):
-        noisy = frame.image + random.normal(0, 3, frame.image.shape)
-        back.append(frame.with_fields(image=np.clip(noisy, 0, 255).astype(np.uint8)))
-    step_ns = frames[1].pts_ns - frames[0].pts_ns
-    return [frame.with_fields(seq=number, pts_ns=number * step_ns) for number, frame in enumerate([*frames, *back])]
-
-
 def depth_of(frames: Sequence[Frame], camera: Camera, found: Trajectory) -> dict[str, Any]:
     """Errors of depth with the poses that were found, after one scale."""
     blind = [frame.with_fields(depth=None, depth_origin=None, pose=None) for frame in frames]
@@ -139,16 +133,29 @@ def depth_of(frames: Sequence[Frame], camera: Camera, found: Trajectory) -> dict
     }
 
 
-def synthetic(asked: Asked, rigid: bool) -> Any:
+def synthetic(asked: Asked, rigid: bool, way: str = "sway") -> Any:
     """A rendered recording with a moving scope."""
-    moving, still = Tissue.points, Tug((0.0, 0.0), (0.0,) * 3)
-    if not rigid:
-        return render_recording(asked)
-    Tissue.points = lambda self, u, v, time_s, tug: moving(self, u, v, 0.0, still)  # type: ignore[method-assign]
+    moving, still, swaying = Tissue.points, Tug((0.0, 0.0), (0.0,) * 3), SyntheticScene._left_at
+    if rigid:
+        Tissue.points = lambda self, u, v, time_s, tug: moving(self, u, v, 0.0, still)  # type: ignore[method-assign]
+    if way != "sway":
+        SyntheticScene._left_at = lambda self, time_s: on_way(  # type: ignore[method-assign]
+            self.camera, way, time_s * asked.fps / (asked.frames - 1)
+        )
     try:
         return render_recording(asked)
     finally:
-        Tissue.points = moving  # type: ignore[method-assign]
+        Tissue.points, SyntheticScene._left_at = moving, swaying  # type: ignore[method-assign]
+
+
+def on_way(camera: Camera, way: str, share: float) -> Camera:
+    """A camera that looks straight ahead, on its way away and back to where it began."""
+    turn = 2 * np.pi * share
+    across = 0.0 if way == "back" else FARTHEST_MM / 2 * np.sin(turn)
+    centre = np.array([FARTHEST_MM / 2 * (1 - np.cos(turn)), across, 3 * np.sin(2 * turn)])
+    pose = np.eye(4)
+    pose[:3, 3] = -centre
+    return camera.with_pose(pose)
 
 
 def main() -> None:
@@ -160,7 +167,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--depth", action="store_true")
     parser.add_argument("--rigid", action="store_true")
-    parser.add_argument("--back", action="store_true")
+    parser.add_argument("--way", choices=["sway", "back", "circle"], default="sway")
     parser.add_argument("--causal", action="store_true")
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--assume", type=float)
@@ -170,10 +177,9 @@ def main() -> None:
         show(recording.name, list(recording), recording.camera, arguments)
     for seed in arguments.seeds if arguments.synthetic else []:
         asked = Asked(arguments.synthetic, 320, 256, fps=arguments.fps, seed=seed, camera="moving")
-        rendered = synthetic(asked, arguments.rigid)
-        frames = forth_and_back(list(rendered)) if arguments.back else list(rendered)
-        name = f"synthetic {seed}{', rigid' * arguments.rigid}{', forth and back' * arguments.back}"
-        show(name, frames, rendered.camera, arguments)
+        rendered = synthetic(asked, arguments.rigid, arguments.way)
+        name = f"synthetic {seed}, {arguments.way}{', rigid' * arguments.rigid}"
+        show(name, list(rendered), rendered.camera, arguments)
 
 
 def show(name: str, frames: Sequence[Frame], camera: Camera, arguments: argparse.Namespace) -> None:

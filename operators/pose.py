@@ -26,6 +26,8 @@ class EstimatedPoses:
     """Frames that stand where the one before stood: they were withheld, or too little of them could be recognised."""
     begun: int
     """How often points were taken up in a scene of which nothing was known; 1 where the scope was never lost."""
+    returned: int
+    """How often an earlier key frame was seen again, by which poses are corrected."""
     explained: float
     """Share of the pictures' motion, as a typical square, that the poses explain."""
     measured: bool
@@ -66,7 +68,11 @@ class PoseOp(Operator):
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
         found = self._odometry
-        outcome.add(EstimatedPoses(found.frames, found.not_placed, found.begun, found.explained, found.is_measured))
+        outcome.add(
+            EstimatedPoses(
+                found.frames, found.not_placed, found.begun, found.returned, found.explained, found.is_measured
+            )
+        )
         if not found.frames:
             return
         unit = (
@@ -86,7 +92,7 @@ class PoseOp(Operator):
             outcome.note(f"{found.not_placed} frames could not be placed and stand where the one before stands")
         if found.begun > 1:
             outcome.note(
-                f"{found.begun - 1} times the scope was lost, and poses began anew: where it is then, beside where it was before, is not known"
+                f"{found.begun - 1} times the scope was lost, and poses began anew: where it is then, beside where it was before, is not known unless it came back"
             )
 
 

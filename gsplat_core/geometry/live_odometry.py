@@ -16,10 +16,11 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.camera_placement import placed
-from gsplat_core.geometry.local_map import KeyFrame, LocalMap
+from gsplat_core.geometry.local_map import KeyFrame, LocalMap, position_of, scaled
 from gsplat_core.geometry.odometry import DISTANCE
 from gsplat_core.geometry.point_flow import Points
 from gsplat_core.geometry.pose import inverse
+from gsplat_core.geometry.recall import Looks, Recognised, seen_again
 from gsplat_core.geometry.seen_depth import seen_depth
 from gsplat_core.geometry.stream_tracks import Numbers, SmallPicture, SmallPictures, StreamTracks
 from gsplat_core.scene.cameras import Camera
@@ -33,7 +34,7 @@ FITTING = 0.4
 """Share of the points that have to."""
 GIVEN_UP_PX = 8.0
 """Points that are off by more are followed no longer."""
-MOVED_PX = 5.0
+MOVED_PX = 16.0
 """How far the points have moved, as a median, where the next key frame is taken."""
 OFF_PX = 0.4
 """By how much points are off, as a median, where one is taken, too: what is known of them does not hold here."""
@@ -45,6 +46,16 @@ ADJUSTED = 2
 FIRST_KEYS = 6
 """At first every frame is one in which points have moved by `FIRST_MOVED_PX`."""
 FIRST_MOVED_PX = 0.5
+LOOKED_AT = 3
+"""Earlier key frames that are looked for where one is taken: the nearest ones, where the pose says."""
+LOOKS, LOOKS_NEAR = 2, 12
+"""By how they look, in turn, those of so many that are nearest, and those of places that were left."""
+LOST_LOOKS = 5
+"""That are looked for where a frame could not be placed."""
+MOST_LEFT = 2
+"""Places that were left, whose key frames are kept."""
+CORRECTED_PX = 1.0
+"""By how much their points have to be off, as a median, so that what was found since is moved; with less, bundle adjustment does it."""
 MOSTLY = 0.75
 """Share of the pictures' motion that poses have to explain, or the scope may well stand still."""
 MOST_NOT_PLACED = 15
@@ -64,11 +75,14 @@ class LiveOdometry:
         self._start = torch.from_numpy(camera.world_to_camera.copy())
         self._pictures, self._tracks, self.map = SmallPictures(camera), StreamTracks(), LocalMap()
         self._pose, self._motion = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
+        self._looks, self._left = Looks(), list[LocalMap]()
         self._key_pixels: Points = np.zeros((0, 2), np.float32)
         self._key_numbers: Numbers = np.zeros(0, np.int64)
         self._waiting = self._since_key = 0
         self.frames = self.not_placed = self.begun = 0
         """How many were seen, how many stand where the one before stood, and how often points were taken up anew."""
+        self.returned = 0
+        """How often an earlier key frame was seen again."""
         self.is_measured = False
         """Whether lengths have the unit of the frames' depth."""
         self._error_px = self._still_px = 0.0
@@ -82,9 +96,9 @@ class LiveOdometry:
             picture = self._pictures.of(frame)
             if not self.map.keys:
                 self._begin(picture, frame)
-            elif not self._follow(picture, frame):
+            elif not self._follow(picture, frame) and not self._find_back(picture):
                 self._stand()
-                if self._waiting > MOST_NOT_PLACED:
+                if self._waiting > MOST_NOT_PLACED or frame.new_scene is not None:
                     self._begin(picture, frame)
         return np.asarray((self._pose @ self._start).numpy())
 
@@ -108,6 +122,8 @@ class LiveOdometry:
             return
         self.begun += 1
         self._waiting = 0
+        if self.map.keys:
+            self._left = [self.map, *self._left][:MOST_LEFT]
         self.map = LocalMap()
         seen = self._seen_depth(frame, picture, self._tracks.pixels)
         self.is_measured = bool((seen > 0).sum() >= FEWEST_POINTS)
@@ -140,12 +156,66 @@ class LiveOdometry:
         tracks.keep(off < GIVEN_UP_PX)
         key = self._is_key(float(np.median(off)))
         if key:
+            self._look_back(picture)
             self._take_key(picture, frame)
         if self._since_key < ADJUSTED or len(self.map.keys) <= FIRST_KEYS:
             self.map.adjust()
         if key:
             self._pose = self.map.keys[-1].pose
         return True
+
+    def _look_back(self, picture: SmallPicture) -> None:
+        """Where the picture shows an earlier key frame again its points are followed from here on, and what was found since is corrected by them."""
+        found = self._seen_by_pose(picture)
+        if found is None:
+            others = [(key, places) for places in self._left for key in places.keys]
+            near = self.map.earlier(position_of(self._pose), LOOKS_NEAR)
+            found = self._looks.find(picture, [*((key, self.map) for key in near), *others], LOOKS)
+        if found is None:
+            return
+        self.returned += 1
+        if found.places is not self.map:
+            self._go_back(found, picture)
+            return
+        tracks, known = self._tracks, self.map.points(found.numbers)
+        before = known @ self._pose[:3, :3].T + self._pose[:3, 3]
+        off_px = np.linalg.norm(picture.pixels(before.numpy()) - found.pixels, axis=1)
+        if np.median(off_px) > CORRECTED_PX:
+            right = torch.from_numpy(found.pose)
+            depth = known @ right[2, :3] + right[2, 3]
+            seen, rays = picture.rays(tracks.pixels), picture.rays(found.pixels)
+            scale = float((depth / self.map.depth_around(self._pose, rays, tracks.numbers, seen)).median())
+            self.map.brought_back(found.key, inverse(right) @ scaled(self._pose, scale), scale)
+            self._pose = right
+        tracks.adopt(found.numbers, found.pixels)
+
+    def _seen_by_pose(self, picture: SmallPicture) -> Recognised | None:
+        for candidate in self.map.earlier(position_of(self._pose), LOOKED_AT):
+            found = seen_again(candidate, self.map, picture, self._pose.numpy(), self._tracks.numbers)
+            if found is not None:
+                return found
+        return None
+
+    def _find_back(self, picture: SmallPicture) -> bool:
+        """Whether a picture that could not be placed shows one of the key frames, of this place or of one that was left."""
+        maps = [self.map, *self._left]
+        found = self._looks.find(picture, [(key, each) for each in maps for key in each.keys[::-1]], LOST_LOOKS)
+        if found is None:
+            return False
+        self.returned += 1
+        self._go_back(found, picture)
+        return True
+
+    def _go_back(self, found: Recognised, picture: SmallPicture) -> None:
+        """Go on from where a picture was recognised, with nothing but its points."""
+        if found.places is not self.map:
+            self._left = [self.map, *(each for each in self._left if each is not found.places)][:MOST_LEFT]
+            self.map = found.places
+        self._tracks.begin(picture)
+        self._tracks.adopt(found.numbers, found.pixels)
+        self._pose, self._waiting = torch.from_numpy(found.pose), 0
+        self._motion = torch.eye(4, dtype=torch.float64)
+        self._key_numbers, self._key_pixels = found.numbers, found.pixels
 
     def _is_key(self, off_px: float) -> bool:
         """Whether the pictures have moved on since the last key frame, or the points are off."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 from gsplat_core.geometry.bundle import Bundle
 from gsplat_core.geometry.bundle import adjust as adjusted
 from gsplat_core.geometry.point_flow import Points
+from gsplat_core.geometry.pose import exp, inverse, log
 from gsplat_core.geometry.stream_tracks import Numbers, SmallPicture
 
 WINDOW = 12
@@ -39,12 +41,13 @@ class KeyFrame:
     pixels: Points
     picture: SmallPicture
     rays: NDArray[np.float64]
+    features: Any = None
+    """By which it is recognised, once they were asked for."""
 
     @property
     def position(self) -> NDArray[np.float64]:
         """Of its camera."""
-        pose = self.pose.numpy()
-        return np.asarray(-pose[:3, :3].T @ pose[:3, 3])
+        return position_of(self.pose)
 
 
 class LocalMap:
@@ -90,6 +93,27 @@ class LocalMap:
         apart = torch.cdist(torch.from_numpy(rays), torch.from_numpy(seen))
         nearest = apart.topk(min(NEIGHBOURS, len(numbers)), largest=False).indices
         return local[:, 2][nearest].median(1).values
+
+    def brought_back(self, key: KeyFrame, after: Tensor, scale: float) -> None:
+        """What came after an earlier key frame is off by what was found out when that one was seen again: the newest of it by a motion of the world `after` [4, 4]
+        about the world's origin, behind a factor, the rest by a share of that."""
+        start = next(index for index, each in enumerate(self.keys) if each is key)
+        newer = self.keys[start + 1 :]
+        moved = np.isin(self._numbers, np.concatenate([each.numbers for each in self.keys[: start + 1]]))
+        twist = log(after)
+        for number, each in enumerate(newer, start=1):
+            share = number / len(newer)
+            step, factor = exp(share * twist), scale**share
+            points = torch.from_numpy(np.isin(self._numbers, each.numbers) & ~moved)
+            moved |= points.numpy()
+            self._points[points] = factor * self._points[points] @ step[:3, :3].T + step[:3, 3]
+            each.pose = scaled(each.pose, factor) @ inverse(step)
+
+    def earlier(self, position: NDArray[np.float64], most: int) -> list[KeyFrame]:
+        """Key frames before the window, those that are nearest to a position first."""
+        before = self.keys[:-WINDOW]
+        order = np.argsort([float(np.linalg.norm(key.position - position)) for key in before], kind="stable")
+        return [before[index] for index in order[:most]]
 
     def adjust(self) -> None:
         """A few steps of bundle adjustment over the newest key frames. The earliest one stands, and how far away its points are, as a median."""
@@ -151,3 +175,15 @@ class LocalMap:
         seen = np.unique(np.concatenate([key.numbers for key in self.keys]))
         kept = np.isin(self._numbers, seen)
         self._numbers, self._points = self._numbers[kept], self._points[torch.from_numpy(kept)]
+
+
+def scaled(pose: Tensor, factor: float) -> Tensor:
+    """The pose [4, 4] of a world whose lengths are so many times larger."""
+    pose = pose.clone()
+    pose[:3, 3] *= factor
+    return pose
+
+
+def position_of(pose: Tensor) -> NDArray[np.float64]:
+    """Where a camera is [3]."""
+    return np.asarray((-pose[:3, :3].T @ pose[:3, 3]).numpy())

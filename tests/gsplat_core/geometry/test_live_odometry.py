@@ -13,6 +13,7 @@ from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.geometry import live_odometry, local_map
 from gsplat_core.geometry.live_odometry import LiveOdometry
 from gsplat_core.geometry.odometry import DISTANCE
+from gsplat_core.geometry.stream_tracks import StreamTracks
 from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.scene.cameras import Camera
@@ -129,6 +130,37 @@ def test_another_scene_is_begun_anew_after_a_while(rigid, monkeypatch):
     poses = placed(frames[:8] + other, odometry)
     assert odometry.begun == 2 and 3 <= odometry.not_placed <= 5
     assert not np.array_equal(poses[-1], poses[-2]), "poses go on in the other scene"
+
+
+def test_a_scope_that_was_lost_is_found_by_the_key_frames(rigid, found, monkeypatch):
+    frames = blind(rigid)
+    grey = [frame.with_fields(image=np.full_like(frame.image, 90)) for frame in frames[:2]]
+    odometry = LiveOdometry(rigid.camera)
+    before = placed(frames[:16] + grey, odometry)
+    assert (odometry.not_placed, odometry.begun, odometry.returned) == (2, 1, 0)
+    with monkeypatch.context() as patch:  # it has gone too far to be followed
+        patch.setattr(StreamTracks, "follow", lambda self, picture, guess: (self.numbers[:0], self.pixels[:0]))
+        first = placed(frames[2:3], odometry)
+    poses = np.concatenate([before, first, placed(frames[3:6], odometry)])
+    assert (odometry.not_placed, odometry.begun) == (2, 1) and odometry.returned >= 1
+    apart = np.linalg.norm(centres(poses[-4:]) - centres(found[2:6]), axis=1)
+    assert apart.max() < 0.5 < np.linalg.norm(centres(found[15:16]) - centres(found[2:3]))
+
+
+def test_a_place_that_was_left_is_gone_on_with_behind_another_scene(rigid, found):
+    frames = blind(rigid)
+    other = [frame.with_fields(image=np.ascontiguousarray(frame.image[::-1])) for frame in frames[8:14]]
+    other[0] = other[0].with_fields(new_scene="cut")
+    back = frames[3:8]
+    back[0] = back[0].with_fields(new_scene="cut")
+    odometry = LiveOdometry(rigid.camera)
+    poses = placed(frames[:8] + other + back, odometry)
+    assert odometry.begun == 2 and odometry.returned >= 1, "a cut is not waited for"
+    assert np.linalg.norm(centres(poses[-4:]) - centres(found[4:8]), axis=1).max() < 0.5
+
+
+def centres(poses: np.ndarray) -> np.ndarray:
+    return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
 
 
 def test_memory_is_bounded(rigid, monkeypatch):

@@ -1,0 +1,136 @@
+"""Key frames that are kept are recognised when the scope sees again what they show: by where it is, or, when that is not known, by how they look."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsplat_core.geometry.camera_placement import placed
+from gsplat_core.geometry.local_map import KeyFrame, LocalMap
+from gsplat_core.geometry.point_flow import Points
+from gsplat_core.geometry.stream_tracks import Numbers, SmallPicture, found_again
+
+FEWEST_POINTS = 20
+"""Of a key frame that have to be found where a pose says."""
+SHOWN = 0.4
+"""Share of its points that have to lie within the picture for it to be looked for."""
+FOUND = 0.3
+"""Share of these that have to be found, and ..."""
+AGREE, AGREE_PX = 0.5, 4.0
+"""... share of the found ones that have to agree on a pose, to so many pixels."""
+FEATURES = 400
+"""Of a picture, by which a key frame is looked for when nothing is known of where the scope is."""
+CLEARER = 0.8
+"""The best match of a feature is nearer than the second one by this factor."""
+FEWEST_MATCHES, MATCH_PX = 12, 8.0
+"""That have to agree on a pose by RANSAC, and how far they may be off: their depth is that of known points around."""
+TRIES = 100
+"""Of RANSAC."""
+
+Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """A key frame whose points a picture shows."""
+
+    key: KeyFrame
+    places: LocalMap
+    pose: Pose
+    """Of the picture, world to camera, by these points alone."""
+    numbers: Numbers
+    """Of the points that were found, ascending."""
+    pixels: Points
+    """Where they are."""
+
+
+def seen_again(
+    key: KeyFrame, places: LocalMap, picture: SmallPicture, pose: Pose, followed: Numbers | None = None
+) -> Recognised | None:
+    """A key frame found in a picture that was taken from about `pose`; None where it is not seen, or those of its points that are not `followed` already are too
+    few."""
+    new = places.knows(key.numbers)
+    if followed is not None:
+        new &= ~np.isin(key.numbers, followed)
+    numbers = key.numbers[new]
+    if len(numbers) < FEWEST_POINTS:
+        return None
+    points = places.points(numbers).numpy()
+    guess = picture.pixels(points @ pose[:3, :3].T + pose[:3, 3])
+    shown = picture.shows(guess)
+    if shown.sum() < max(FEWEST_POINTS, SHOWN * len(key.numbers)):
+        return None
+    numbers, points, guess = numbers[shown], points[shown], guess[shown]
+    there, trusted = found_again(key.picture, picture, key.pixels[new][shown], guess)
+    if trusted.sum() < max(FEWEST_POINTS, FOUND * len(numbers)):
+        return None
+    rays = picture.rays(there[trusted])
+    found, off = placed(pose, points[trusted], rays, float(picture.camera.K[0, 0]))
+    agree = off < AGREE_PX
+    if agree.sum() < max(FEWEST_POINTS, AGREE * len(off)):
+        return None
+    return Recognised(key, places, found, numbers[trusted][agree], there[trusted][agree])
+
+
+class Looks:
+    """Recognises key frames by features that do not depend on how the scope is turned (ORB; Rublee et al. 2011)."""
+
+    def __init__(self) -> None:
+        self._orb: Any = cv2.ORB_create(nfeatures=FEATURES, nlevels=4)  # type: ignore[attr-defined]
+        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+        self._turn = 0
+
+    def find(self, picture: SmallPicture, kept: Sequence[tuple[KeyFrame, LocalMap]], most: int) -> Recognised | None:
+        """The first of at most so many key frames that the picture shows; they take turns from call to call."""
+        candidates = [kept[(self._turn + number) % len(kept)] for number in range(min(most, len(kept)))]
+        self._turn += len(candidates)
+        if not candidates:
+            return None
+        corners, features = self._features(picture)
+        if len(corners) < FEWEST_MATCHES:
+            return None
+        for key, places in candidates:
+            pose = self._pose_by(key, places, picture, corners, features)
+            if pose is not None:
+                found = seen_again(key, places, picture, pose)
+                if found is not None:
+                    return found
+        return None
+
+    def _features(self, picture: SmallPicture) -> tuple[Points, Any]:
+        corners, features = self._orb.detectAndCompute(picture.grey, picture.usable)
+        return np.array([corner.pt for corner in corners], np.float32).reshape(-1, 2), features
+
+    def _pose_by(
+        self, key: KeyFrame, places: LocalMap, picture: SmallPicture, corners: Points, features: Any
+    ) -> Pose | None:
+        """About where the picture was taken, if it shows what the key frame shows."""
+        if key.features is None:
+            key.features = self._features(key.picture)
+        before, kept = key.features
+        if len(before) < FEWEST_MATCHES:
+            return None
+        pairs = self._matcher.knnMatch(kept, features, k=2)
+        matches = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < CLEARER * pair[1].distance]
+        if len(matches) < FEWEST_MATCHES:
+            return None
+        rays = key.picture.rays(before[[match.queryIdx for match in matches]])
+        known = places.knows(key.numbers)
+        depth = places.depth_around(key.pose, rays, key.numbers[known], key.rays[known])
+        local = torch.cat([torch.from_numpy(rays), torch.ones(len(rays), 1, dtype=torch.float64)], 1) * depth[:, None]
+        points = ((local - key.pose[:3, 3]) @ key.pose[:3, :3]).numpy()
+        there = picture.rays(corners[[match.trainIdx for match in matches]])
+        found, turn, shift, agree = cv2.solvePnPRansac(
+            points, there, np.eye(3), None, iterationsCount=TRIES, reprojectionError=MATCH_PX / float(picture.camera.K[0, 0])
+        )  # fmt: skip
+        if not found or agree is None or len(agree) < FEWEST_MATCHES:
+            return None
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+        return pose
