@@ -130,9 +130,8 @@ class DepthOp(Operator):
         self._counts.contribute(outcome, self.choice, self._finder)
 
 
-def offline_choice(choice: str, source: SourceDescription) -> str:
-    """The setting `depth` for a recording of which all frames are known: where nothing else shows how far away tissue is, `auto` is by the scope's own
-    light."""
+def choice_without_clock(choice: str, source: SourceDescription) -> str:
+    """The setting `depth` where no camera has to be kept up with: where nothing else shows how far away tissue is, `auto` is by the scope's own light."""
     fields = source.fields if source.moves else source.fields - {"pose"}
     return "light" if choice == "auto" and not fields & {"depth", "right_image", "pose"} else choice
 
@@ -140,7 +139,7 @@ def offline_choice(choice: str, source: SourceDescription) -> str:
 def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConfig) -> str | None:
     """What is to be said where frames with these fields are given no recorded depth, and there is time to find it; None where they keep it.
 
-    choice: the setting `depth`, or `offline_choice` of it.
+    choice: the setting `depth`, or `choice_without_clock` of it.
     """
     if "depth" in fields and choice in ("auto", "recorded"):
         return None

@@ -279,7 +279,7 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
             "give a smaller --scale or --max-frames",
         )
     notes.extend(description.notes)
-    if (note := lacking_depth(settings, description, config, offline=offline)) is not None:
+    if (note := lacking_depth(settings, description, config)) is not None:
         notes.append(note)
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
     return source

@@ -12,7 +12,7 @@ from gsplat_core.geometry.registry import DEPTHS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, FrameStatus
 from gsplat_core.training.config import ReconstructorConfig
-from operators.depth import DepthOp, FoundDepth, offline_choice, without_depth
+from operators.depth import DepthOp, FoundDepth, choice_without_clock, without_depth
 from operators.outcome import OutcomeBuilder
 from operators.sources.source import SourceDescription
 
@@ -157,7 +157,7 @@ def test_a_scene_that_depth_by_light_starts_is_not_said_to_start_on_a_plane_for_
 )  # fmt: skip
 def test_offline_light_is_asked_where_nothing_else_shows_how_far_away_tissue_is(choice, fields, moves, expected):
     source = SourceDescription("it", 8, 6, 30.0, Camera.from_focal(8.0, 8, 6), frozenset(fields), moves=moves)
-    assert offline_choice(choice, source) == expected
+    assert choice_without_clock(choice, source) == expected
 
 
 @pytest.mark.parametrize(("has_time", "asked"), [(True, [0, 2, 3]), (False, [])])
