@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 
-LOBES = ((1.0, 0.04), (1.5, 0.15))
+LOBES = ((1.0, 0.06), (1.5, 0.15))
 """Variances, and over how much of the direction (a sine) colours stay alike: of glints, and of the broad sheen."""
 SLOW, SLOW_S = 0.5, 0.6
 """Variance of what changes with time alone, and over how many seconds it stays alike: shadows, and points that slip."""
