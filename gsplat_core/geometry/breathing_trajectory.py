@@ -2,8 +2,8 @@
 
 Poses that take tissue to be at rest have its breathing in them. Here the frequencies of breathing and heart beat are looked for that explain better where
 points were seen (`breathing_frequencies`), and cameras, points and their motion are found together (`moving_bundle`), with what may be expected of a
-scope's trajectory (`trajectory_prior`), learned anew as the trajectory gets better. Nothing is said where no frequency explains clearly more, or less than one and a half
-breaths are seen.
+scope's trajectory (`trajectory_prior`), learned anew as the trajectory gets better. Nothing is said where no frequency explains clearly more, less than one and a half
+breaths are seen, or the scope itself swings nearly as fast (`trajectory_lines`).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from gsplat_core.geometry.bundle import adjust as adjust_still
 from gsplat_core.geometry.moving_bundle import MovingBundle, adjust, with_waves
 from gsplat_core.geometry.pose import exp, inverse, log
 from gsplat_core.geometry.surface_field import MOST_NODES, SurfaceField
+from gsplat_core.geometry.trajectory_lines import is_told
 from gsplat_core.geometry.trajectory_prior import TrajectoryPrior, learned_from
 
 EVERY_S = 0.4
@@ -106,9 +107,12 @@ def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTraje
     if not frequencies_hz or start is None:
         return None
     found, frequencies_hz, prior = refined(start[0], sightings.times_s[frames], frequencies_hz)
+    told, mistaken = is_told(start[0].poses, found.poses, sightings.times_s[frames], frequencies_hz)
+    if not told:
+        return None
     poses = _all_placed(sightings, frames, found, start[1], frequencies_hz)
     error = float(found.off().norm(dim=1).median())
-    return BreathingTrajectory(poses, found.rest, frequencies_hz, prior.uncertain, error)
+    return BreathingTrajectory(poses, found.rest, frequencies_hz, max(prior.uncertain, mistaken), error)
 
 
 def refined(

@@ -97,7 +97,7 @@ def _about_breathing(found: Trajectory, focal_px: float) -> list[str]:
     if found.error_px > OFF * focal_px:
         return [
             f"points are off by {found.error_px:.2g} px: the tissue moves by itself. What it moves as a whole is in the poses; to tell breathing from the scope's trajectory"
-            " the recording has to show one and a half breaths, better five"
+            " the recording has to show one and a half breaths, better five, and the scope must not swing nearly as fast itself"
         ]
     return []
 

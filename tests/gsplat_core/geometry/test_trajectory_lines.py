@@ -1,0 +1,66 @@
+"""Breathing is taken from a trajectory only where the scope's own way can be told from it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.geometry.breathing_frequencies import waves
+from gsplat_core.geometry.pose import exp
+from gsplat_core.geometry.trajectory_lines import is_told
+from gsplat_core.geometry.trajectory_prior import coordinates, learned_from
+
+TIMES_S = torch.arange(0, 20, 0.2, dtype=torch.float64)
+
+
+def poses(*swings: tuple[float, float, int]) -> torch.Tensor:
+    """A scope that sways along its axes with these frequencies and amplitudes, in units of the tissue's distance."""
+    twist = torch.zeros(len(TIMES_S), 6, dtype=torch.float64)
+    random = torch.from_numpy(np.random.default_rng(0).normal(0, 3e-4, twist.shape))
+    for hz, amplitude, axis in swings:
+        twist[:, axis] += amplitude * torch.sin(2 * torch.pi * hz * TIMES_S + axis)
+    return exp(twist + random)
+
+
+def refined(poses: torch.Tensor, hz: tuple[float, ...]) -> torch.Tensor:
+    """What is left of a trajectory when the prior has given to the tissue what is its at these frequencies."""
+    poses, swings = poses.clone(), waves(TIMES_S, hz)
+    for _ in range(4):
+        prior = learned_from(poses, TIMES_S, swings)
+        y, _ = coordinates(poses)
+        for axis in range(3):
+            pushed = swings.T @ prior.precision[axis]
+            y[:, axis] -= swings @ torch.linalg.solve(pushed @ swings, pushed @ y[:, axis])
+        poses[:, :3, 3] = -(poses[:, :3, :3] @ y[:, :3, None])[:, :, 0]
+    return poses
+
+
+def sways(fastest_hz: float) -> list[tuple[float, float, int]]:
+    return [(fastest_hz, 0.1, 0), (0.19, 0.06, 1), (0.15, 0.08, 2)]
+
+
+def test_breathing_that_is_faster_than_the_way_is_told():
+    way, breathing = sways(0.22), (0.33, 0.03, 0)
+    told, mistaken = is_told(both := poses(*way, breathing), refined(both, (0.33,)), TIMES_S, (0.33,))
+    assert told and mistaken < 0.01
+
+
+@pytest.mark.parametrize("gap_hz", [0.027, -0.027])
+def test_a_scope_that_sways_nearly_as_fast_is_not_told_from_breathing(gap_hz):
+    way, breathing = sways(0.25 + gap_hz), (0.25, 0.01, 0)
+    told, mistaken = is_told(both := poses(*way, breathing), refined(both, (0.25,)), TIMES_S, (0.25,))
+    assert not told and mistaken > 0.01
+
+
+def test_much_breathing_is_taken_away_even_there():
+    """Poses that keep it would be off by more."""
+    way, breathing = sways(0.22), (0.25, 0.4, 0)
+    told, mistaken = is_told(both := poses(*way, breathing), refined(both, (0.25,)), TIMES_S, (0.25,))
+    assert told and mistaken > 0.005
+
+
+def test_other_frequencies_stay_where_they_are():
+    way, lines = sways(0.22), [(0.33, 0.03, 0), (1.1, 0.02, 1)]
+    told, _ = is_told(both := poses(*way, *lines), refined(both, (0.33, 1.1)), TIMES_S, (0.33, 1.1))
+    assert told
