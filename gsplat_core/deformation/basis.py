@@ -23,7 +23,7 @@ from gsplat_core.deformation.continuation import Continuation
 from gsplat_core.deformation.displacement import displaced
 from gsplat_core.deformation.field import ops_for
 from gsplat_core.deformation.field_slots import BasisSlot
-from gsplat_core.deformation.smoothing import least_squares_weights, towards_neighbours_
+from gsplat_core.deformation.smoothing import least_squares_weights, towards_neighbours_, towards_others_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
@@ -108,6 +108,10 @@ class BasisField(BumpTensors):
                 "a field that forgets its past has no columns in the order of time; smooth one that keeps them all"
             )
         towards_neighbours_(self.weights.data[: self.count, : self.bumps], amount)
+
+    def share_motion(self, neighbours: Tensor, amount: float) -> None:
+        """See `DeformationField.share_motion`: the positions' weights of each bump."""
+        towards_others_(self.weights.data[: self.count, : self.bumps, POSITION], neighbours, amount)
 
     @property
     def parameter_count(self) -> int:

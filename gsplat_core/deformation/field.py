@@ -204,6 +204,12 @@ class DeformationField(torch.nn.Module):
         In place, outside of any optimiser; for a field of which all frames are known. Here nothing is learned for times.
         """
 
+    def share_motion(self, neighbours: Tensor, amount: float) -> None:
+        """Move the motion of each Gaussian `amount` (0..1) of the way to the mean of its `neighbours` [N, K], at all times.
+
+        In place, outside of any optimiser. Here no Gaussian has a motion of its own.
+        """
+
     def reserve(self, rows: int) -> bool:
         """Take the memory for `rows` Gaussians now, so that `append` and `close_gaps` move no tensor until there are more.
 

@@ -1,4 +1,4 @@
-"""Smoothing of what a field has learned, along its axis of time."""
+"""Smoothing of what a field has learned, along its axis of time and among its Gaussians."""
 
 from __future__ import annotations
 
@@ -25,6 +25,17 @@ def towards_neighbours_(values: Tensor, amount: float) -> None:
         return
     for rows in values.split(ROWS_AT_ONCE):
         rows[:, 1:-1].add_(rows.diff(n=2, dim=1), alpha=amount / 2)
+
+
+def towards_others_(values: Tensor, others: Tensor, amount: float) -> None:
+    """Move each of `values` [N, ...] `amount` of the way to the mean of the `others` [N, K] of its row, in place, all at once."""
+    if others.shape[1] == 0:
+        return
+    before = values.contiguous()
+    mean = torch.zeros_like(before)
+    for each in others.unbind(1):
+        mean += before[each]
+    values.lerp_(mean / others.shape[1], amount)
 
 
 def least_squares_weights(taus: Sequence[float], bumps: int) -> Tensor:

@@ -15,6 +15,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.densification import UNSEEN_PX, densify, on_tissue, shares_of
+from gsplat_core.training.nearest import nearest_others
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steadiness import steadiness
 from gsplat_core.training.step import TrainingStep
@@ -35,6 +36,9 @@ class FitSettings:
     """How far, in a pass over all frames, what the field learned for each time is moved to the mean of its neighbours in time, times the
     factor of the learning rates: a frame between two others is then shown between them, not with the noise of both. Where frames are not
     between their neighbours, because things move fast, it is less (`steadiness`). 0: not at all."""
+    rigidity: float = 1.0
+    """How far, in a pass over all frames, the motion of each Gaussian is moved to the mean of its neighbours', times the factor of the learning rates: tissue moves
+    as one piece, and what moves by itself is most often noise. Less where things move fast, by the root of `steadiness`. 0: not at all."""
     densify_rounds: int = 6
     """How often Gaussians that nobody sees are dropped and those with the largest error are split; 0: never."""
     densify_until: float = 0.7
@@ -46,8 +50,9 @@ class FitSettings:
         for name in ("final_rate", "densify_until"):
             if not 0 < getattr(self, name) <= 1:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be above 0 and at most 1")
-        if not 0 <= self.smoothing < math.inf:
-            raise InvalidSetting(f"smoothing is {self.smoothing}; it must be at least 0")
+        for name in ("smoothing", "rigidity"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 0")
         if self.densify_rounds < 0 or self.densify_frames < 1:
             raise InvalidSetting(
                 f"densify_rounds is {self.densify_rounds} and densify_frames {self.densify_frames}; they must be at least 0 and 1"
@@ -92,10 +97,14 @@ class OfflineTraining:
         self._observations = [*observations, *rights]
         """Of both eyes."""
         self._first_count, self._most = step.gaussians.count, most_gaussians
-        self._smoothing = settings.smoothing and settings.smoothing * steadiness(observations)
+        steady = steadiness(observations) if settings.smoothing or settings.rigidity else 0.0
+        # A ratio of squares; what neighbours' motions differ by goes with its root.
+        self._smoothing, self._rigidity = settings.smoothing * steady, settings.rigidity * math.sqrt(steady)
         self._random = np.random.default_rng(seed)
         self._order: list[int] = []
         self._rate = 1.0
+        self._neighbours: Tensor | None = None
+        """Of each Gaussian; None: to be looked for, as they are others now."""
 
     def __call__(self, steps: int, progress: Callable[[int, Tensor], None] | None) -> Tensor:
         """Take `steps` steps; `progress` is called after each one. Returns the last one's loss, a tensor [] on the device."""
@@ -107,7 +116,7 @@ class OfflineTraining:
                 rounds.pop(0)
             self._rate = self._settings.rate_at(number / steps)
             loss = self._step(self._next(), rate_scale=self._rate)
-            if (number + 1) % SMOOTH_EVERY == 0 and self._smoothing:
+            if (number + 1) % SMOOTH_EVERY == 0:
                 self._smooth()
             if progress is not None:
                 progress(number + 1, loss)
@@ -122,12 +131,18 @@ class OfflineTraining:
 
     def _smooth(self) -> None:
         """As much as belongs to the steps since the last time."""
-        amount = self._smoothing * self._rate * SMOOTH_EVERY / len(self._observations)
-        self._step.field.smooth_in_time(min(amount, MOST_AT_ONCE))
+        each = self._rate * SMOOTH_EVERY / len(self._observations)
+        if self._smoothing:
+            self._step.field.smooth_in_time(min(self._smoothing * each, MOST_AT_ONCE))
+        if self._rigidity and self._step.field.takes_positions:
+            if self._neighbours is None:
+                self._neighbours = nearest_others(self._step.gaussians.means)
+            self._step.field.share_motion(self._neighbours, min(self._rigidity * each, MOST_AT_ONCE))
 
     def _densify(self, share: float) -> None:
         """A round; `share` of all rounds is over with it, and their number grows from the first to the most along with that."""
         self._step.settle(self._observations[-1], rate_scale=self._rate)
+        self._neighbours = None
         order = self._random.permutation(len(self._observations)).tolist()
         chosen, others = (
             [self._observations[index] for index in part]

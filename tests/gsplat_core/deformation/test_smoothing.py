@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
-from gsplat_core.deformation.smoothing import ROWS_AT_ONCE, least_squares_weights, towards_neighbours_
+from gsplat_core.deformation.smoothing import ROWS_AT_ONCE, least_squares_weights, towards_neighbours_, towards_others_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field.plain_torch import basis_field
 
@@ -112,3 +112,32 @@ def test_fields_that_cannot_follow_say_so():
     ring.keep_last(0.5)
     for field in (ring, DeformationField((0.0, 1.0))):
         assert not field.follow(slice(0, 2), [0.5], offsets)
+
+
+@pytest.mark.parametrize("shape", [(1, 2, 3), (5, 1, 3), (6, 4, 3)])
+def test_others_are_taken_as_they_were_before(shape):
+    """All rows at once: against the same by whole matrices."""
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(shape, generator=generator)
+    others = torch.randint(0, shape[0], (shape[0], 4), generator=generator)
+    expected = values + 0.3 * (values[others].mean(dim=1) - values)
+    towards_others_(values, others, 0.3)
+    torch.testing.assert_close(values, expected)
+    alone = values.clone()
+    towards_others_(alone, others[:, :0], 0.3)
+    assert torch.equal(alone, values)
+
+
+def test_a_basis_field_shares_motion_and_nothing_else():
+    field = BasisField(3, (0.0, 1.0), bumps=5)
+    with torch.no_grad():
+        field.weights[1] = 1.0
+    address = field.weights.data_ptr()
+    field.share_motion(torch.tensor([[1, 2], [0, 2], [0, 1]]), 0.5)
+    torch.testing.assert_close(field.weights[:, 2, 0], torch.tensor([0.25, 0.5, 0.25]))
+    torch.testing.assert_close(field.weights[:, 2, 3:], torch.tensor([0.0, 1.0, 0.0])[:, None].expand(3, 10))
+    assert field.weights.data_ptr() == address  # captured graphs stay valid
+
+
+def test_a_field_without_a_motion_for_each_gaussian_is_left_alone():
+    DeformationField((0.0, 1.0)).share_motion(torch.zeros(3, 2, dtype=torch.int64), 0.5)

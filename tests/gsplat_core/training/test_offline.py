@@ -12,7 +12,9 @@ import torch
 from gsplat_core.deformation import BasisField
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.layout import POSITION
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.nearest import nearest_others
 from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY, FitSettings
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.step import TrainingStep
@@ -108,6 +110,17 @@ def test_smoothing_never_goes_beyond_the_neighbours(tissue_video, camera, monkey
     assert max(amounts) == MOST_AT_ONCE
     fitted(camera, tissue_video(2), 100, smoothing=0.0)
     assert len(amounts) == 100 // SMOOTH_EVERY
+
+
+def test_neighbours_move_more_alike_the_more_rigid_tissue_is(tissue_video, camera):
+    def unlike(rigidity):
+        learning, _ = fitted(camera, tissue_video(6), 60, densify_rounds=1, rigidity=rigidity)
+        model = learning.snapshot()
+        motion = model.field.weights[..., POSITION].flatten(1)
+        others = motion[nearest_others(model.gaussians.means)].mean(dim=1)
+        return float((motion - others).square().sum() / motion.square().sum())
+
+    assert unlike(2.0) < 0.7 * unlike(0.0)
 
 
 def test_densification_helps_where_the_first_frame_was_too_coarse(tissue_video, camera):
