@@ -114,7 +114,8 @@ __global__ void __launch_bounds__(kBlock)
 }
 
 // The same for all channels, by what is missing to `target` [N, 13].
-__global__ void __launch_bounds__(kBlock) move_to(DeviceBumps field, float* __restrict__ weights, const float* __restrict__ target) {
+__global__ void __launch_bounds__(kBlock)
+    move_to(DeviceBumps field, float* __restrict__ weights, const float* __restrict__ target) {
   const Place at;
   if (at.gaussian >= field.count) return;
   const float tau = *field.tau, now = delta_of(field, at, tau);
