@@ -194,6 +194,8 @@ def brightness(page, canvas):
 
 
 def test_the_page_shows_camera_and_reconstruction(page):
+    # Both come by streams of their own: the first picture of one may come a moment after the other's.
+    page.wait_for_function("raw.width === shown.width && raw.height === shown.height")
     assert page.evaluate("[raw.width, raw.height, shown.width, shown.height].join()") == "160,128,160,128"
     assert 30 < brightness(page, "raw") < 225 and abs(brightness(page, "raw") - brightness(page, "shown")) < 25
 
