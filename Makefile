@@ -20,9 +20,9 @@ demo: native
 	@set -e; if $(BIN)/python -m services.cli.gpu_check; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
 	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --device $$device
 
-# All tests, in two groups beside each other, which take the processor for as long: whole programs, whose tests often wait, and all the others, most of
-# which use one core. What a group says is printed when it is over.
-PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py
+# All tests, in two groups beside each other, which take equally long: whole programs, whose tests often wait, with geometry, whose tests compute; and
+# all the others, most of which use one core. What a group says is printed when it is over.
+PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py tests/gsplat_core/geometry
 test: native .venv/.development
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going test-of-programs test-of-parts
 
