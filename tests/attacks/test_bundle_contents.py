@@ -9,12 +9,10 @@ import torch
 from safetensors.torch import save
 
 from gsplat_core.io.bundle import load_bundle
-from services.registry import check
 from services.registry.bundle_file import pack
 from services.registry.errors import Conflict
 from services.registry.limits import RegistryLimits
 from services.registry.models import ModelRegistry
-from tests.services.registry.stub_check import says
 
 
 @pytest.fixture
@@ -33,33 +31,18 @@ def payload(bundle, tmp_path):
 @pytest.fixture
 def rejected(registry, bundle, tmp_path):
     """Pack the tampered bundle, upload it, and get the reason for which its check rejects it."""
-    return lambda: reason_of_rejection(registry, bundle, tmp_path)
-
-
-@pytest.fixture
-def found_wrong(bundle, tmp_path, monkeypatch, capsys):
-    """The same where the check's findings come from this process: in its own it loads torch each time."""
 
     def upload():
-        with monkeypatch.context() as unlimited:
-            unlimited.setattr(check, "_limit_resources", lambda options: None)
-            assert check.main([str(bundle.folder), "--json"]) == 0
-        program = says(f"print({capsys.readouterr().out!r})")
-        with ModelRegistry(tmp_path / "registry", check_program=program) as registry:
-            return reason_of_rejection(registry, bundle, tmp_path)
+        pack(bundle.folder, tmp_path / "upload", overwrite=True)
+        version = registry.upload("liver", tmp_path / "upload", None, "stranger").version
+        record = registry.check("liver", version)
+        assert record.state == "rejected", record
+        with pytest.raises(Conflict, match="is rejected"):
+            registry.activate("liver", version, None, "stranger")
+        assert "\n" not in record.reason and str(tmp_path) not in record.reason
+        return record.reason
 
     return upload
-
-
-def reason_of_rejection(registry, bundle, tmp_path):
-    pack(bundle.folder, tmp_path / "upload", overwrite=True)
-    version = registry.upload("liver", tmp_path / "upload", None, "stranger").version
-    record = registry.check("liver", version)
-    assert record.state == "rejected", record
-    with pytest.raises(Conflict, match="is rejected"):
-        registry.activate("liver", version, None, "stranger")
-    assert "\n" not in record.reason and str(tmp_path) not in record.reason
-    return record.reason
 
 
 class Attack:
@@ -91,41 +74,41 @@ def test_weights_that_are_not_finite_are_rejected(rejected, bundle):
     assert "field.weights holds 390 of 390 values that are NaN" in rejected()
 
 
-def test_overlapping_tensors_are_rejected(found_wrong, bundle):
+def test_overlapping_tensors_are_rejected(rejected, bundle):
     header = json.loads(bundle.header_and_data()[0])
     header["gaussians.means"]["data_offsets"] = header["gaussians.log_scales"]["data_offsets"]
     bundle.replace_header(json.dumps(header).encode())
-    assert "not a safetensors file" in found_wrong()
+    assert "not a safetensors file" in rejected()
 
 
-def test_a_giant_header_is_rejected(found_wrong, bundle):
+def test_a_giant_header_is_rejected(rejected, bundle):
     bundle.replace_tensors(struct.pack("<Q", 2**40) + bundle.tensors.read_bytes()[8:])
-    assert "states a header of 1099511627776 bytes" in found_wrong()
+    assert "states a header of 1099511627776 bytes" in rejected()
 
 
-def test_tensors_that_the_manifest_does_not_name_are_rejected(found_wrong, bundle):
+def test_tensors_that_the_manifest_does_not_name_are_rejected(rejected, bundle):
     bundle.replace_tensors(save(dict(load_bundle(bundle.folder).tensors()) | {"__reduce__": torch.zeros(0)}))
-    assert "unknown __reduce__" in found_wrong()
+    assert "unknown __reduce__" in rejected()
 
 
-def test_a_nested_manifest_is_rejected(found_wrong, bundle):
+def test_a_nested_manifest_is_rejected(rejected, bundle):
     bundle.manifest.write_bytes(b"[" * 100_000 + b"]" * 100_000)
-    assert "not valid JSON" in found_wrong()
+    assert "not valid JSON" in rejected()
 
 
-def test_a_picture_beyond_the_budget_is_rejected_unrendered(found_wrong, bundle):
+def test_a_picture_beyond_the_budget_is_rejected_unrendered(rejected, bundle):
     bundle.edit(lambda manifest: manifest["camera"].update(width_px=16384, height_px=4096))
-    assert "16384x4096" in found_wrong()
+    assert "16384x4096" in rejected()
 
 
-def test_more_gaussians_than_the_file_has_are_rejected(found_wrong, bundle):
+def test_more_gaussians_than_the_file_has_are_rejected(rejected, bundle):
     bundle.edit(lambda manifest: manifest["gaussians"].update(count=1_900_000))
-    assert "describes" in found_wrong()
+    assert "describes" in rejected()
 
 
-def test_a_model_that_shows_nothing_is_rejected(found_wrong, bundle):
+def test_a_model_that_shows_nothing_is_rejected(rejected, bundle):
     """Every value is finite, and so is the picture: the Gaussians are moved out of it."""
     tensors = dict(load_bundle(bundle.folder).tensors())
     tensors["field.weights"] = torch.full_like(tensors["field.weights"], 3e38)
     bundle.replace_tensors(save(tensors))
-    assert "show nothing" in found_wrong()
+    assert "show nothing" in rejected()
