@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.rendering.sheen import Sheen, half_directions
+from gsplat_core.scene.bilinear import at_positions
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.scene.scope_path import ScopePath
@@ -101,8 +102,8 @@ class SeenFromElsewhere:
             & (pixels <= (camera.width_px - 0.5, camera.height_px - 0.5)).all(axis=1)
         )
         pixels = np.where(inside[:, None], pixels, 0.5)
-        depth = _between_pixels(_host(picture.depth)[..., None], pixels)[:, 0]
-        colours = _between_pixels(_host(picture.image).clip(0, 1), pixels)
+        depth = at_positions(_host(picture.depth)[..., None], pixels)[:, 0]
+        colours = at_positions(_host(picture.image).clip(0, 1), pixels)
         halves = half_directions(self._tangents(points), points, eye, eye)
         return Look(halves, colours, inside & (depth > 0) & (z <= BEHIND * depth))
 
@@ -117,15 +118,3 @@ def _projected(camera: Camera, points: Array) -> tuple[Array, Array]:
     z = local[:, 2]
     pixels = local[:, :2] / np.where(z > 0, z, 1.0)[:, None] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
     return np.asarray(pixels), np.asarray(z)
-
-
-def _between_pixels(plane: Array, pixels: Array) -> Array:
-    """The values of a picture [H, W, C] at positions [N, 2] in it, linear between the pixels' centres: [N, C]."""
-    height, width = plane.shape[:2]
-    at = pixels - 0.5
-    low = np.floor(at).astype(np.int64).clip(0, (max(width - 2, 0), max(height - 2, 0)))
-    (column, row), (right, down) = low.T, (at - low).T[..., None]
-    after, under = np.minimum(column + 1, width - 1), np.minimum(row + 1, height - 1)
-    above = (1 - right) * plane[row, column] + right * plane[row, after]
-    below = (1 - right) * plane[under, column] + right * plane[under, after]
-    return np.asarray((1 - down) * above + down * below)

@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.scene.bilinear import at_positions
+
 Array = NDArray[np.float64]
 
 CELLS = 20
@@ -50,7 +52,7 @@ class Tangents:
         place = self._sums(x) / self._total
         product = self._sums((q[:, :, None] * x[:, None, :]).reshape(-1, 6)) / self._total
         shared = product.reshape(size, size, 2, 3) - self._mean[..., :, None] * place[..., None, :]
-        along = self._between_cells(self._inverse @ shared)
+        along = at_positions(self._inverse @ shared, self._at)
         return np.asarray(along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12))
 
     def _sums(self, values: Array) -> Array:
@@ -58,13 +60,3 @@ class Tangents:
         size = self._size
         sums = [np.bincount(self._cell, self._weights * each, size * size).reshape(size, size) for each in values.T]
         return np.stack([self._spread @ each @ self._spread for each in sums], axis=-1)
-
-    def _between_cells(self, of_cells: Array) -> Array:
-        """What cells [rows, columns, ...] have, at each point [N, ...], linear between their middles."""
-        at = (self._at - 0.5).clip(0, self._size - 1 - 1e-6)
-        low = np.floor(at).astype(np.int64)
-        share = (at - low)[:, :, None, None]
-        (column, row), (right, down) = low.T, share.swapaxes(0, 1)
-        above = (1 - right) * of_cells[row, column] + right * of_cells[row, column + 1]
-        below = (1 - right) * of_cells[row + 1, column] + right * of_cells[row + 1, column + 1]
-        return np.asarray((1 - down) * above + down * below)
