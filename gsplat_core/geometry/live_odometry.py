@@ -16,11 +16,11 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.camera_placement import placed
-from gsplat_core.geometry.local_map import KeyFrame, LocalMap, position_of, scaled
+from gsplat_core.geometry.local_map import KeyFrame, LocalMap, position_of, scaled, unprojected
 from gsplat_core.geometry.odometry import DISTANCE
+from gsplat_core.geometry.place_recognition import PlaceRecognition, Recognised, seen_again
 from gsplat_core.geometry.point_flow import Points
 from gsplat_core.geometry.pose import inverse
-from gsplat_core.geometry.recall import Looks, Recognised, seen_again
 from gsplat_core.geometry.seen_depth import seen_depth
 from gsplat_core.geometry.stream_tracks import Numbers, SmallPicture, SmallPictures, StreamTracks
 from gsplat_core.scene.cameras import Camera
@@ -46,12 +46,12 @@ ADJUSTED = 2
 FIRST_KEYS = 6
 """At first every frame is one in which points have moved by `FIRST_MOVED_PX`."""
 FIRST_MOVED_PX = 0.5
-LOOKED_AT = 3
-"""Earlier key frames that are looked for where one is taken: the nearest ones, where the pose says."""
-LOOKS, LOOKS_NEAR = 2, 12
-"""By how they look, in turn, those of so many that are nearest, and those of places that were left."""
-LOST_LOOKS = 5
-"""That are looked for where a frame could not be placed."""
+FOLLOWED_KEYS = 3
+"""Where a key frame is taken, so many of the nearest earlier ones are looked for by following their points to where the pose has them, and ..."""
+MATCHED_KEYS, NEAR_KEYS = 2, 12
+"""... so many by their features, in turn, of so many that are nearest and of the places that were left."""
+MATCHED_WHEN_LOST = 5
+"""That are looked for by their features where a frame could not be placed."""
 MOST_LEFT = 2
 """Places that were left, whose key frames are kept."""
 CORRECTED_PX = 1.0
@@ -75,7 +75,7 @@ class LiveOdometry:
         self._start = torch.from_numpy(camera.world_to_camera.copy())
         self._pictures, self._tracks, self.map = SmallPictures(camera), StreamTracks(), LocalMap()
         self._pose, self._motion = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
-        self._looks, self._left = Looks(), list[LocalMap]()
+        self._recognition, self._left = PlaceRecognition(), list[LocalMap]()
         self._key_pixels: Points = np.zeros((0, 2), np.float32)
         self._key_numbers: Numbers = np.zeros(0, np.int64)
         self._waiting = self._since_key = 0
@@ -129,7 +129,7 @@ class LiveOdometry:
         self.is_measured = bool((seen > 0).sum() >= FEWEST_POINTS)
         middle = float(seen[seen > 0].median()) if self.is_measured else DISTANCE
         depth = torch.where((seen > 0) & self.is_measured, seen, middle)
-        self.map.add_points(new, self._placed_at(picture.rays(self._tracks.pixels), depth))
+        self.map.add_points(new, unprojected(self._pose, picture.rays(self._tracks.pixels), depth))
         self._take_key(picture, frame)
 
     def _follow(self, picture: SmallPicture, frame: Frame) -> bool:
@@ -169,8 +169,8 @@ class LiveOdometry:
         found = self._seen_by_pose(picture)
         if found is None:
             others = [(key, places) for places in self._left for key in places.keys]
-            near = self.map.earlier(position_of(self._pose), LOOKS_NEAR)
-            found = self._looks.find(picture, [*((key, self.map) for key in near), *others], LOOKS)
+            near = self.map.earlier(position_of(self._pose), NEAR_KEYS)
+            found = self._recognition.find(picture, [*((key, self.map) for key in near), *others], MATCHED_KEYS)
         if found is None:
             return
         self.returned += 1
@@ -190,7 +190,7 @@ class LiveOdometry:
         tracks.adopt(found.numbers, found.pixels)
 
     def _seen_by_pose(self, picture: SmallPicture) -> Recognised | None:
-        for candidate in self.map.earlier(position_of(self._pose), LOOKED_AT):
+        for candidate in self.map.earlier(position_of(self._pose), FOLLOWED_KEYS):
             found = seen_again(candidate, self.map, picture, self._pose.numpy(), self._tracks.numbers)
             if found is not None:
                 return found
@@ -199,7 +199,9 @@ class LiveOdometry:
     def _find_back(self, picture: SmallPicture) -> bool:
         """Whether a picture that could not be placed shows one of the key frames, of this place or of one that was left."""
         maps = [self.map, *self._left]
-        found = self._looks.find(picture, [(key, each) for each in maps for key in each.keys[::-1]], LOST_LOOKS)
+        found = self._recognition.find(
+            picture, [(key, each) for each in maps for key in each.keys[::-1]], MATCHED_WHEN_LOST
+        )
         if found is None:
             return False
         self.returned += 1
@@ -244,12 +246,7 @@ class LiveOdometry:
             if self.is_measured:
                 measured = self._seen_depth(frame, picture, pixels)
                 depth = torch.where(measured > 0, measured, depth)
-            self.map.add_points(new, self._placed_at(rays, depth))
+            self.map.add_points(new, unprojected(self._pose, rays, depth))
         self._since_key = 0
         self._key_numbers, self._key_pixels = tracks.numbers, tracks.pixels
         self.map.add_key(KeyFrame(self._pose, tracks.numbers, tracks.pixels, picture, picture.rays(tracks.pixels)))
-
-    def _placed_at(self, rays: NDArray[np.float64], depth: Tensor) -> Tensor:
-        """Places in the world [N, 3] of points seen along `rays` from where the scope is."""
-        local = torch.cat([torch.from_numpy(rays), torch.ones(len(rays), 1, dtype=torch.float64)], 1) * depth[:, None]
-        return (local - self._pose[:3, 3]) @ self._pose[:3, :3]

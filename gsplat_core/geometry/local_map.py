@@ -177,6 +177,12 @@ class LocalMap:
         self._numbers, self._points = self._numbers[kept], self._points[torch.from_numpy(kept)]
 
 
+def unprojected(pose: Tensor, rays: NDArray[np.float64], depth: Tensor) -> Tensor:
+    """Places in the world [N, 3] of points that the camera of a pose [4, 4] sees along `rays` [N, 2] at `depth` [N]."""
+    local = torch.cat([torch.from_numpy(rays), torch.ones(len(rays), 1, dtype=torch.float64)], 1) * depth[:, None]
+    return (local - pose[:3, 3]) @ pose[:3, :3]
+
+
 def scaled(pose: Tensor, factor: float) -> Tensor:
     """The pose [4, 4] of a world whose lengths are so many times larger."""
     pose = pose.clone()

@@ -8,11 +8,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from gsplat_core.geometry.camera_placement import placed
-from gsplat_core.geometry.local_map import KeyFrame, LocalMap
+from gsplat_core.geometry.local_map import KeyFrame, LocalMap, unprojected
 from gsplat_core.geometry.point_flow import Points
 from gsplat_core.geometry.stream_tracks import Numbers, SmallPicture, found_again
 
@@ -78,7 +77,7 @@ def seen_again(
     return Recognised(key, places, found, numbers[trusted][agree], there[trusted][agree])
 
 
-class Looks:
+class PlaceRecognition:
     """Recognises key frames by features that do not depend on how the scope is turned (ORB; Rublee et al. 2011)."""
 
     def __init__(self) -> None:
@@ -123,8 +122,7 @@ class Looks:
         rays = key.picture.rays(before[[match.queryIdx for match in matches]])
         known = places.knows(key.numbers)
         depth = places.depth_around(key.pose, rays, key.numbers[known], key.rays[known])
-        local = torch.cat([torch.from_numpy(rays), torch.ones(len(rays), 1, dtype=torch.float64)], 1) * depth[:, None]
-        points = ((local - key.pose[:3, 3]) @ key.pose[:3, :3]).numpy()
+        points = unprojected(key.pose, rays, depth).numpy()
         there = picture.rays(corners[[match.trainIdx for match in matches]])
         found, turn, shift, agree = cv2.solvePnPRansac(
             points, there, np.eye(3), None, iterationsCount=TRIES, reprojectionError=MATCH_PX / float(picture.camera.K[0, 0])

@@ -9,8 +9,8 @@ import torch
 from gsplat_core.geometry import live_odometry
 from gsplat_core.geometry.live_odometry import LiveOdometry
 from gsplat_core.geometry.local_map import KeyFrame, LocalMap
+from gsplat_core.geometry.place_recognition import PlaceRecognition, seen_again
 from gsplat_core.geometry.pose import exp
-from gsplat_core.geometry.recall import Looks, seen_again
 from gsplat_core.geometry.stream_tracks import SmallPicture, SmallPictures, StreamTracks
 from gsplat_core.io.recordings.synthetic.rendered import Asked, RenderedRecording, render_recording
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
@@ -49,8 +49,8 @@ def drift(recording: RenderedRecording) -> tuple[float, LiveOdometry]:
 def test_what_is_seen_again_takes_most_of_the_drift_away(there_and_back, monkeypatch):
     with_return, odometry = drift(there_and_back)
     assert odometry.returned >= 3 and odometry.begun == 1
-    monkeypatch.setattr(live_odometry, "LOOKED_AT", 0)
-    monkeypatch.setattr(live_odometry, "LOOKS", 0)
+    monkeypatch.setattr(live_odometry, "FOLLOWED_KEYS", 0)
+    monkeypatch.setattr(live_odometry, "MATCHED_KEYS", 0)
     without, odometry = drift(there_and_back)
     assert odometry.returned == 0
     assert with_return < 0.5 * without and with_return < 0.02
@@ -91,8 +91,8 @@ def test_points_that_are_followed_already_tell_nothing_new(kept):
 
 
 @pytest.mark.parametrize("position", [(0.05, 0.0, 0.0), (0.1, 0.05, 0.0)])
-def test_a_key_frame_is_recognised_by_its_looks(kept, position):
-    found = Looks().find(small(position), [kept], 1)
+def test_a_key_frame_is_recognised_by_its_features(kept, position):
+    found = PlaceRecognition().find(small(position), [kept], 1)
     assert found is not None
     np.testing.assert_allclose(found.pose[:3, 3], [-each for each in position], atol=0.02)
 
@@ -106,17 +106,17 @@ def test_what_shows_something_else_is_not_recognised(kept, shown):
         "noise": np.random.default_rng(0).integers(0, 255, image.shape).astype(np.uint8),
     }[shown]
     picture = SmallPictures(FIRST).of(Frame(0, 0, other))
-    assert Looks().find(picture, [kept], 1) is None
+    assert PlaceRecognition().find(picture, [kept], 1) is None
     assert seen_again(*kept, picture, np.eye(4)) is None
 
 
 def test_key_frames_take_turns(kept):
-    looks, asked = Looks(), []
-    looks._pose_by = lambda key, *_: asked.append(key)
+    recognition, asked = PlaceRecognition(), []
+    recognition._pose_by = lambda key, *_: asked.append(key)
     candidates = [(number, None) for number in range(3)]
     for _ in range(2):
-        assert looks.find(small(), candidates, 2) is None
-    assert asked == [0, 1, 2, 0] and looks.find(small(), [], 2) is None
+        assert recognition.find(small(), candidates, 2) is None
+    assert asked == [0, 1, 2, 0] and recognition.find(small(), [], 2) is None
 
 
 def test_a_correction_moves_what_came_after_by_its_share_and_nothing_before():
