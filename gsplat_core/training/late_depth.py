@@ -42,7 +42,7 @@ class LateDepth:
         )
 
     @staticmethod
-    def to_move_by(frame: Frame, device: torch.device | str) -> LateDepth:
+    def for_placement(frame: Frame, device: torch.device | str) -> LateDepth:
         """That of a frame which was trained on with its depth: what the scene is moved by, alone."""
         possible = possible_depth(frame)
         return LateDepth(None, known_depth(possible, device) if possible.any() else None, None)

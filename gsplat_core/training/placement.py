@@ -77,7 +77,7 @@ class Placement:
         if self.is_placed and frame.depth_origin not in CORRECTS_ALL_TIMES + CORRECTS_ONE_TIME:
             return
         # Depth by light is in no observation: the loss does not see it.
-        late = late or LateDepth.to_move_by(frame, observation.image.device)
+        late = late or LateDepth.for_placement(frame, observation.image.device)
         possible = late.possible
         if possible is None:
             return
