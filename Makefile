@@ -3,6 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 OUT ?= out/demo
 EXAMPLES ?= 200
+MUTANTS ?= 60
 # Waiting threads sleep: tests and benchmarks share the machine.
 export OMP_WAIT_POLICY ?= PASSIVE
 MODULES := $(wildcard $(sort $(shell git ls-files --cached --others --exclude-standard 'gsplat_core/*.py' 'operators/*.py' 'services/*.py')))
@@ -12,7 +13,7 @@ CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*
 CUDA_ARCHITECTURES ?= native
 CUDA_TOOLKIT := build/cuda-toolkit
 
-.PHONY: demo test test-of-programs test-of-parts lint format fuzz bench native cuda compilers lock licences sbom clean always
+.PHONY: demo results mutants test test-of-programs test-of-parts lint format fuzz bench native cuda compilers lock licences sbom clean always
 
 # On the NVIDIA GPU where there is one that torch can use: the CUDA kernels are built for it first. A build that fails ends it.
 demo: native
@@ -53,8 +54,17 @@ format: .venv/.development
 fuzz: native .venv/.development
 	$(BIN)/python -m tests.system.api_fuzzing --examples $(EXAMPLES)
 
+# Measures this machine into benchmarks/logs/cpu; `make results` makes RESULTS.md and the figures of the README out of the logs.
 bench: native .venv/.development
-	benchmarks/run_all.sh
+	$(BIN)/python benchmarks/suite.py --device cpu
+	$(BIN)/python benchmarks/publish.py
+
+results: .venv/.development
+	$(BIN)/python benchmarks/publish.py
+
+# One-line changes of the product, each with the tests that reach it: the share that is noticed.
+mutants: native .venv/.development
+	$(BIN)/python -m tests.mutants --count $(MUTANTS)
 
 # Rebuilds the C++ core where its sources changed; a no-op otherwise.
 native: .venv/.runtime

@@ -1,0 +1,302 @@
+"""Change one line of the product at a time and count how many changes the tests notice.
+
+    python -m tests.mutants --count 60 --seed 1            # what `make mutants` runs
+    python -m tests.mutants --only operators/display.py --count 10
+    python -m tests.mutants --survivors out/mutants.jsonl   # only those that survived an earlier run
+
+A mutant is a module with one expression changed: a comparison turned round or moved by its border, an arithmetic operator or a number exchanged,
+`and` for `or`, `min` for `max`, a condition negated, a call left out. Tests are run with the mutant in the place of the module, in all processes
+that they start, and no file of the checkout is changed. First the test files that import the module are run, then those that import a module that
+imports it. A mutant survives when all of them pass. Chosen at random with a seed, in equal parts from each folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDERS = ("operators", "services", "gsplat_core/training", "gsplat_core/geometry", "gsplat_core/endoscope")
+PACKAGES = ("gsplat_core", "operators", "services")
+MOST_TEST_FILES = 24
+"""Test files beyond those that import the module itself."""
+LIMIT_S = 300.0
+"""A mutant whose tests take longer is killed: it hangs."""
+COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
+    ast.Lt: (ast.GtE, ast.LtE), ast.LtE: (ast.Gt, ast.Lt), ast.Gt: (ast.LtE, ast.GtE), ast.GtE: (ast.Lt, ast.Gt),
+    ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.In: (ast.NotIn,), ast.NotIn: (ast.In,),
+    ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,),
+}  # fmt: skip
+OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult,
+}  # fmt: skip
+EXCHANGED = {"min": "max", "max": "min", "any": "all", "all": "any", "minimum": "maximum", "maximum": "minimum"}
+UNSEEN_CALLS = {"debug", "info", "warning", "exception", "error", "log", "touch_progress"}
+"""Calls whose only effect is a log line; they are not left out."""
+
+HOOK = """
+import importlib.abc, importlib.util, os, sys
+
+class Mutant(importlib.abc.MetaPathFinder):
+    name, path, origin = os.environ["INTRASPLAT_MUTANT"].split("|")
+
+    def find_spec(self, fullname, path, target=None):
+        if fullname != self.name:
+            return None
+        locations = [os.path.dirname(self.origin)] if self.origin.endswith("__init__.py") else None
+        loader = importlib.machinery.SourceFileLoader(fullname, self.path)
+        return importlib.util.spec_from_file_location(fullname, self.path, loader=loader, submodule_search_locations=locations)
+
+sys.meta_path.insert(0, Mutant())
+"""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A changed module.
+
+    Attributes:
+        path: the module, relative to the root.
+        line: line of the changed expression.
+        change: the expression before and after.
+        source: text of the changed module.
+    """
+
+    path: str
+    line: int
+    change: str
+    source: str
+
+
+def mutants_of(path: Path) -> Iterator[Mutant]:
+    """Every mutant of a module."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for index, node in enumerate(ast.walk(tree)):
+        for number in range(len(_changes(node))):
+            changed_tree = copy.deepcopy(tree)
+            changed = next(each for place, each in enumerate(ast.walk(changed_tree)) if place == index)
+            before = ast.unparse(changed)
+            _changes(changed)[number]()
+            after = ast.unparse(changed)
+            if after != before:
+                yield Mutant(
+                    str(path.relative_to(ROOT)),
+                    getattr(node, "lineno", 0),
+                    f"{before}  =>  {after}",
+                    ast.unparse(changed_tree),
+                )
+
+
+def _changes(node: ast.AST) -> list[Callable[[], None]]:
+    """Functions that change the node in place, each in one way."""
+    if isinstance(node, ast.Compare) and len(node.ops) == 1:
+        return [lambda new=new: node.ops.__setitem__(0, new()) for new in COMPARISONS.get(type(node.ops[0]), ())]
+    if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS and not _is_text(node):
+        return [lambda: setattr(node, "op", OPERATORS[type(node.op)]())]
+    if isinstance(node, ast.BoolOp):
+        return [lambda: setattr(node, "op", ast.Or() if isinstance(node.op, ast.And) else ast.And())]
+    if isinstance(node, ast.If | ast.IfExp) and not _only_types(node.test):
+        return [lambda: setattr(node, "test", ast.UnaryOp(ast.Not(), node.test))]
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float) and node.value not in (0, 1, -1, 2):
+        return [lambda: setattr(node, "value", node.value * 100 if isinstance(node.value, float) else node.value + 1)]
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in EXCHANGED:
+        return [lambda: setattr(node.func, "id", EXCHANGED[node.func.id])]
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in EXCHANGED:
+        return [lambda: setattr(node.func, "attr", EXCHANGED[node.func.attr])]
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call) and _called(node.value) not in UNSEEN_CALLS:
+        return [lambda: setattr(node, "value", ast.Constant(None))]
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and not isinstance(node.operand, ast.Constant):
+        return [lambda: setattr(node, "op", ast.UAdd())]
+    return []
+
+
+def _called(call: ast.Call) -> str:
+    return call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+
+
+def _is_text(node: ast.BinOp) -> bool:
+    sides = (node.left, node.right)
+    return any(
+        isinstance(side, ast.JoinedStr) or (isinstance(side, ast.Constant) and isinstance(side.value, str))
+        for side in sides
+    )
+
+
+def _only_types(test: ast.expr) -> bool:
+    return isinstance(test, ast.Name) and test.id == "TYPE_CHECKING"
+
+
+def module_name(path: str) -> str:
+    """Import name of a module's path relative to the root."""
+    name = path.removesuffix(".py").replace("/", ".")
+    return name.removesuffix(".__init__")
+
+
+@cache
+def imports_of(path: Path) -> frozenset[str]:
+    """Our modules that a file imports, in functions too."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return frozenset(name for name in found if name.split(".")[0] in PACKAGES)
+
+
+@cache
+def importers() -> dict[str, frozenset[Path]]:
+    """Files of the product and of the tests that import each module."""
+    found = defaultdict(set)
+    for folder in (*PACKAGES, "tests"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for name in imports_of(path):
+                found[name].add(path)
+    return {name: frozenset(paths) for name, paths in found.items()}
+
+
+def tests_for(path: str) -> list[str]:
+    """Test files to run for a mutant of a module: nearest first.
+
+    Those that import the module or are named after it come first, then those that are reached through modules that import it, breadth first.
+    """
+    name, stem = module_name(path), Path(path).stem
+    named = [each for each in sorted((ROOT / "tests").rglob("test_*.py")) if each.stem.startswith(f"test_{stem}")]
+    direct = [each for each in sorted(importers().get(name, ())) if each.name.startswith("test_")]
+    chosen = list(dict.fromkeys([*named, *direct]))
+    seen, level = {name}, {name}
+    while level and len(chosen) < MOST_TEST_FILES:
+        above = {each for one in level for each in importers().get(one, ())}
+        further = sorted(
+            (each for each in above if each.name.startswith("test_")), key=lambda each: len(imports_of(each))
+        )
+        chosen = list(dict.fromkeys([*chosen, *further]))
+        level = {
+            module_name(str(each.relative_to(ROOT))) for each in above if each.parts[len(ROOT.parts)] in PACKAGES
+        } - seen
+        seen |= level
+    return [str(each.relative_to(ROOT)) for each in chosen[: max(MOST_TEST_FILES, len(named) + len(direct))]]
+
+
+def killed_by(mutant: Mutant, folder: Path) -> str | None:
+    """The first test that fails with the mutant in place, `time` where the tests do not end, None where all pass."""
+    files = tests_for(mutant.path)
+    if not files:
+        return None
+    (folder / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
+    source = folder / "mutant.py"
+    source.write_text(mutant.source, encoding="utf-8")
+    env = os.environ | {
+        "INTRASPLAT_MUTANT": f"{module_name(mutant.path)}|{source}|{ROOT / mutant.path}",
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")])),
+        "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+    }  # fmt: skip
+    pytest = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", "-m", "not slow"]
+    command = [*pytest, *files]
+    try:
+        done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    except subprocess.TimeoutExpired:
+        return "time"
+    if done.returncode == 0:
+        return None
+    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    if not failed:
+        sys.exit(f"pytest ended with {done.returncode} and no failed test:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+    test = failed[0].split(" - ")[0].split(" ", 1)[1]
+    if subprocess.run([*pytest, test], cwd=ROOT, capture_output=True, check=False).returncode != 0:
+        sys.exit(f"{test} fails without a mutant, too; mend it first")
+    return test
+
+
+def chosen_mutants(only: list[str] | None, count: int, seed: int) -> list[Mutant]:
+    """Random mutants, in equal parts from each folder."""
+    rng = random.Random(seed)
+    groups = [[ROOT / each for each in only]] if only else [sorted((ROOT / folder).rglob("*.py")) for folder in FOLDERS]
+    chosen: list[Mutant] = []
+    for number, files in enumerate(groups):
+        share = count * (number + 1) // len(groups) - count * number // len(groups)
+        weights = [max(1, len(file.read_text(encoding="utf-8"))) for file in files]
+        seen: set[tuple[str, str]] = set()
+        for _ in range(share * 20):
+            if share == 0:
+                break
+            possible = [
+                each for each in mutants_of(rng.choices(files, weights)[0]) if (each.path, each.change) not in seen
+            ]
+            if possible:
+                mutant = rng.choice(possible)
+                seen.add((mutant.path, mutant.change))
+                chosen.append(mutant)
+                share -= 1
+    return chosen
+
+
+def survivors_of(log: Path) -> list[Mutant]:
+    """The mutants that survived an earlier run, as far as their modules still have these expressions."""
+    lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    wanted = {(line["path"], line["change"]) for line in lines if "path" in line and line["killed_by"] is None}
+    return [
+        each
+        for path in sorted({path for path, _ in wanted})
+        for each in mutants_of(ROOT / path)
+        if (path, each.change) in wanted
+    ]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", nargs="*", help="modules to change")
+    parser.add_argument("--survivors", type=Path, help="log of an earlier run; only mutants that survived it")
+    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "mutants.jsonl")
+    parser.add_argument("--least", type=float, default=0.85, help="exit code 1 where a smaller share is killed")
+    options = parser.parse_args()
+    chosen = (
+        survivors_of(options.survivors)
+        if options.survivors
+        else chosen_mutants(options.only, options.count, options.seed)
+    )
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    killed = 0
+    with tempfile.TemporaryDirectory() as folder, options.out.open("w", encoding="utf-8") as log:
+
+        def run(numbered: tuple[int, Mutant]) -> tuple[Mutant, str | None, float]:
+            number, mutant = numbered
+            place = Path(folder) / str(number)
+            place.mkdir()
+            start = time.perf_counter()
+            return mutant, killed_by(mutant, place), time.perf_counter() - start
+
+        with ThreadPoolExecutor(options.jobs) as pool:
+            for mutant, by, seconds in pool.map(run, enumerate(chosen)):
+                killed += by is not None
+                result = {"path": mutant.path, "line": mutant.line, "change": mutant.change, "killed_by": by}
+                log.write(json.dumps(result | {"seconds": round(seconds, 1)}) + "\n")
+                log.flush()
+                print(
+                    f"{'killed  ' if by else 'SURVIVED'} {mutant.path}:{mutant.line} {mutant.change[:120]!r}",
+                    flush=True,
+                )
+    share = killed / max(1, len(chosen))
+    print(f"{killed} of {len(chosen)} mutants killed ({share:.0%}); {options.out}")
+    return 0 if share >= options.least else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
