@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # compute-sanitizer's four tools over the tests of sanitized_tests.txt, which together launch every kernel on small inputs
 # (gpu_kernels_reached.py chose them). Fails when a tool finds something in a kernel of ours, or a test fails, or a tool takes
-# longer than LIMIT seconds (240). Needs the built kernels (benchmarks/gpu_check.sh or `make cuda`), pytest and
+# longer than LIMIT seconds (240). Needs the built kernels (benchmarks/gpu_build.sh or `make cuda`), pytest and
 # compute-sanitizer; TOOLS names others than all tools, arguments go to pytest.
 set -uo pipefail
 cd "$(dirname "$0")/.."

@@ -14,7 +14,7 @@ from gsplat_core.scene.gaussians import Gaussians
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",
     {
-        "auto": "gsplat_core.deformation.basis_kind:KIND",  # the better one in benchmarks/results/replay.md
+        "auto": "gsplat_core.deformation.basis_kind:KIND",  # the better one in benchmarks/notes/replay.md
         "basis": "gsplat_core.deformation.basis_kind:KIND",
         "hexplane": "gsplat_core.deformation.hexplane_kind:KIND",
     },

@@ -77,7 +77,7 @@ class FrameRenderer:
         """`camera` gives size and camera model of every frame, and the pose of those rendered without one.
 
         With `precision` "fp16" the harmonics are kept, the field deforms and splats are blended in half precision: a near-exact picture
-        (`benchmarks/results/renderer.md` has its PSNR to the exact one) in less time.
+        (`benchmarks/notes/renderer.md` has its PSNR to the exact one) in less time.
 
         Raises InvalidInput when the Gaussians are not float32 on a CUDA device, or the precision is another one.
         """

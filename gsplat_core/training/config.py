@@ -59,7 +59,7 @@ class ReconstructorConfig:
     """What a `Reconstructor` learns and how much work it does. Raises InvalidSetting for a value out of its range."""
 
     field: str = "auto"
-    """Deformation field: a name in `gsplat_core.deformation.FIELDS`. `auto` is the better one in `benchmarks/results/replay.md`."""
+    """Deformation field: a name in `gsplat_core.deformation.FIELDS`. `auto` is the better one in `benchmarks/notes/replay.md`."""
     gaussians: int = 30_000
     """Gaussians that the first frame starts with; frames that uncover new tissue add to them."""
     max_gaussians: int = 60_000

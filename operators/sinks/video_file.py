@@ -24,7 +24,7 @@ from operators.storage import StorageReserve, storage_errors
 CODEC = "libvpx-vp9"
 """VP9, by libvpx: browsers play it in an MP4, OpenCV reads it, and the encoder is under a BSD licence."""
 _QUALITY = "24"
-"""libvpx's scale from 0 to 63, lower is better: 38 dB to the input and more (benchmarks/results/graph.md)."""
+"""libvpx's scale from 0 to 63, lower is better: 38 dB to the input and more (benchmarks/notes/graph.md)."""
 _FRAMES_WAITING = 2
 """Frames that may wait for the encoder; the next one makes the caller wait."""
 _OPTIONS = {

@@ -56,7 +56,7 @@ class EngineSpec(_Strict):
 CPU_PIXELS = 320 * 256
 """Two cores keep up with so many at 30 frames/s while nobody watches (docs/live.md). With more cores it was not measured."""
 FEW_CORES, FEW_CORES_PIXELS = 2, 200 * 160
-"""So many two cores keep up with beside 50 viewers and 200 requests/s, too (benchmarks/results/service.md)."""
+"""So many two cores keep up with beside 50 viewers and 200 requests/s, too (benchmarks/notes/service.md)."""
 SCALE_STEPS = 16
 
 

@@ -1,0 +1,65 @@
+"""Run one `intrasplat` command on one recording, as a user does, and print its figures as one JSON line.
+
+    python benchmarks/plain.py live RECORDING --device cuda --fps 30
+    python benchmarks/plain.py replay RECORDING
+    python benchmarks/plain.py reconstruct RECORDING --steps 16000
+
+Further options are the command's own. The line holds what the command's report says of quality, baselines, latency, frames and memory. A recording of
+a single frame is played as eight equal frames.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+STILL_FRAMES = 8
+KEPT = ("recording", "run", "frames", "quality", "model", "live", "frames_sha256", "notes", "operators")
+"""Parts of a report that are logged."""
+
+
+def main() -> int:
+    command, recording, *options = sys.argv[1:]
+    with tempfile.TemporaryDirectory() as folder:
+        images = Path(recording) / "images"
+        single = images.is_dir() and len(list(images.iterdir())) == 1
+        source = still(Path(recording), Path(folder)) if single else Path(recording)
+        words = [sys.executable, "-m", "services.cli", command, str(source), "--json", *options]
+        if command != "live":
+            words += ["--out", f"{folder}/out"]
+        start = time.perf_counter()
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        wall_s = time.perf_counter() - start
+        if done.returncode != 0:
+            print(done.stderr[-2000:], file=sys.stderr)
+            return done.returncode
+        print(json.dumps({"wall_s": round(wall_s, 2), **figures(json.loads(done.stdout))}), flush=True)
+    return 0
+
+
+def figures(report: dict[str, Any]) -> dict[str, Any]:
+    """The report without its per-frame series, quantiles and file names."""
+    return {name: report[name] for name in KEPT if report.get(name) is not None}
+
+
+def still(stills: Path, folder: Path) -> Path:
+    """A recording of several equal frames out of one that has a single frame; its calibration stays."""
+    made = folder / stills.name
+    for images in (each for each in stills.iterdir() if each.is_dir()):
+        (made / images.name).mkdir(parents=True)
+        (picture,) = images.iterdir()
+        for frame in range(STILL_FRAMES):
+            shutil.copyfile(picture, made / images.name / f"{frame:06d}{picture.suffix}")
+    for file in (each for each in stills.iterdir() if each.is_file()):
+        shutil.copyfile(file, made / file.name)
+    return made
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,366 @@
+"""Make RESULTS.md, and the figures in README.md, out of the logs in `benchmarks/logs`.
+
+    python benchmarks/publish.py            # writes
+    python benchmarks/publish.py --check    # exit code 1 where a written figure and its log differ
+
+Each table below names the logs that its rows are read from and the values of a result that its columns show. A figure is the median over the
+runs in the log; where there are several, the worst run and their number follow. A row without a log is not printed. Logs are written by
+`suite.py`; each line has the command, commit, machine and date.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import statistics
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+LOGS = ROOT / "benchmarks" / "logs"
+RESULTS = ROOT / "benchmarks" / "RESULTS.md"
+README = ROOT / "README.md"
+BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
+ENVELOPE = ("benchmark", "run", "commit", "date", "machine", "command", "seconds")
+"""What every log line states besides its result."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A value of each result.
+
+    Attributes:
+        title: heading of the column.
+        path: keys of the value in a result, joined by dots. Alternatives are tried in order.
+        digits: digits after the point.
+        unit: printed after the figure.
+        scale: the printed figure is the value times this.
+        better: `more` or `less`: which runs are worse; None where neither is.
+    """
+
+    title: str
+    path: str | tuple[str, ...]
+    digits: int = 1
+    unit: str = ""
+    scale: float = 1.0
+    better: str | None = None
+
+    def of(self, result: Mapping[str, Any]) -> float | None:
+        """The value in a result; None where it has none."""
+        for path in [self.path] if isinstance(self.path, str) else self.path:
+            value: Any = result
+            for key in path.split("."):
+                value = value.get(key) if isinstance(value, Mapping) else None
+            if isinstance(value, int | float):
+                return self.scale * float(value)
+        return None
+
+    def cell(self, results: Iterable[Mapping[str, Any]]) -> str:
+        """The median over the runs; with several runs also the worst and their number."""
+        values = [value for result in results if (value := self.of(result)) is not None]
+        if not values:
+            return "–"
+        text = f"{statistics.median(values):.{self.digits}f}"
+        if len(values) > 1 and self.better:
+            worst = min(values) if self.better == "more" else max(values)
+            text += f" ({worst:.{self.digits}f}; {len(values)})"
+        return text + (f" {self.unit}" if self.unit else "")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a table.
+
+    Attributes:
+        what: first cell.
+        log: `DEVICE/NAME` of the log.
+        where: values that a result must have to be this row's; needed where a log holds results of several kinds.
+        asked: what was asked for, in words; empty where nothing was.
+    """
+
+    what: str
+    log: str
+    where: Mapping[str, Any] = field(default_factory=dict)
+    asked: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of RESULTS.md."""
+
+    title: str
+    text: str
+    first: str
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    readme: tuple[str, ...] = ()
+    """Titles of the columns that the README shows; empty where the README has nothing of the table."""
+
+
+def db(title: str, *paths: str, better: str | None = "more") -> Column:
+    return Column(title, paths, 1, "dB", better=better)
+
+
+def ms(title: str, *paths: str, digits: int = 1, better: str | None = "less") -> Column:
+    return Column(title, paths, digits, "ms", better=better)
+
+
+LIVE_COLUMNS = (
+    db("displayed frame (training error)", "live.settled_psnr_tissue_db"),
+    db("worst frame", "live.worst_psnr_tissue_db"),
+    db("next frame, before it is seen", "live.next_frame_db"),
+    db("previous frame", "live.previous_frame_db", better=None),
+    ms("age p50", "live.age_p50_ms"),
+    ms("age p99", "live.age_p99_ms"),
+    Column("frames in", "frames.ingested", 0),
+    Column("shown", "live.pictures", 0, better="more"),
+    Column("width", "recording.width_px", 0),
+)
+REPLAY_COLUMNS = (
+    db("displayed frame (training error)", "quality.live.psnr_tissue_db"),
+    db("next frame, before it is seen", "quality.next_frame.psnr_tissue_db", "quality.live.next_frame_db"),
+    db("previous frame", "quality.baselines.previous_frame_db", better=None),
+    Column("whole command", "wall_s", 1, "s", better="less"),
+    Column("peak memory", "run.peak_memory_bytes", 0, "MiB", 1 / 2**20, better="less"),
+    Column("in", "frames.ingested", 0),
+    Column("shown", "frames.displayed", 0, better="more"),
+)
+OFFLINE_COLUMNS = (
+    db("held-out frames", "quality.heldout.psnr_tissue_db"),
+    db("neighbours' mean", "quality.baselines.heldout_neighbour_mean_db", better=None),
+    db("previous frame", "quality.baselines.heldout_previous_frame_db", better=None),
+    db("training frames (training error)", "quality.training.psnr_tissue_db"),
+    Column("whole command", "wall_s", 1, "s", better="less"),
+)
+KERNEL_COLUMNS = (
+    ms("ours", "ours_ms", digits=3),
+    ms("gsplat 1.5.3", "gsplat_fused_adam_ms", "gsplat_ms", digits=3),
+    ms("plain PyTorch", "plain_on_gsplat_ms", "plain_ms", digits=3),
+    Column("memory, ours", "ours_extra_mib", 0, "MiB"),
+    Column("memory, gsplat", ("gsplat_fused_adam_extra_mib", "gsplat_extra_mib"), 0, "MiB"),
+)
+CPU_COLUMNS = (
+    ms("median", "median_ms", "forward_ms", "ms", digits=1),
+    Column("plain torch / ours", "ratio_to_reference", 0, "times"),
+)
+
+
+def kernel(log: str, work: str, asked: str = "") -> Row:
+    return Row(work, f"cuda/{log}", {"work": work}, asked)
+
+
+TABLES = (
+    Table(
+        "Live, one NVIDIA H200",
+        "`intrasplat live RECORDING --device cuda`, the whole command. PSNR is over tissue pixels. The displayed frame has been trained on "
+        "before it is shown, so its PSNR is a training error. *Next frame* is what was predicted for a frame before the frame was seen, "
+        "which is comparable with the previous frame shown again. Age runs from a frame's arrival to its picture on the screen.",
+        "recording",
+        LIVE_COLUMNS,
+        (
+            Row("`cutting`, 30 frames/s", "cuda/live_cutting", asked="42.5 dB, worst 37, p99 33 ms"),
+            Row("`cutting`, 60 frames/s", "cuda/live_cutting_60", asked="40 dB, p99 25 ms"),
+            Row("`heart`, left eye, 30 frames/s", "cuda/live_heart", asked="37 dB, worst 30"),
+            Row("`sinus`, 30 frames/s", "cuda/live_sinus", asked="38 dB"),
+            Row("`resting_bowel`, 30 frames/s", "cuda/live_resting_bowel", asked="32 dB"),
+            Row("`laparoscopy`, 30 frames/s", "cuda/live_laparoscopy"),
+            Row("`laparoscopy`, 60 frames/s", "cuda/live_laparoscopy_60"),
+            Row("`stereomis_like`, 30 frames/s", "cuda/live_stereomis_like"),
+            Row("`cutting`, HexPlane field", "cuda/live_cutting_hexplane"),
+        ),
+        ("displayed frame (training error)", "next frame, before it is seen", "previous frame", "age p50", "age p99"),
+    ),
+    Table(
+        "Live, two CPU cores",
+        "`intrasplat live RECORDING`, usual priority, nothing else running. The command chooses the size of the pictures by what the machine can do.",
+        "recording",
+        LIVE_COLUMNS,
+        (
+            Row("`cutting`, 30 frames/s", "cpu/live_cutting", asked="34 dB, p99 150 ms"),
+            Row("`heart`, left eye, 30 frames/s", "cpu/live_heart"),
+            Row("`resting_bowel`, 30 frames/s", "cpu/live_resting_bowel"),
+        ),
+    ),
+    Table(
+        "Replay",
+        "`intrasplat replay RECORDING`, the whole command with its report, 10 optimiser steps a frame.",
+        "recording",
+        REPLAY_COLUMNS,
+        (
+            Row("`cutting`, H200", "cuda/replay_cutting"),
+            Row("`cutting`, H200, `--depth none`", "cuda/replay_cutting_no_depth"),
+            Row("`heart`, left eye, H200", "cuda/replay_heart"),
+            Row("`sinus`, H200", "cuda/replay_sinus"),
+            Row("`sinus`, H200, `--depth none`", "cuda/replay_sinus_no_depth"),
+            Row("`resting_bowel`, H200", "cuda/replay_resting_bowel"),
+            Row("`cutting`, two CPU cores", "cpu/replay_cutting", asked="33 dB, 150 s, 3 GB"),
+            Row("`cutting`, two CPU cores, HexPlane", "cpu/replay_cutting_hexplane"),
+            Row("`sinus`, two CPU cores", "cpu/replay_sinus"),
+        ),
+    ),
+    Table(
+        "Offline reconstruction, one NVIDIA H200",
+        "`intrasplat reconstruct RECORDING --device cuda`, default settings. Every eighth frame is held out. The neighbours' mean sees the frame after the held-out one.",
+        "recording",
+        OFFLINE_COLUMNS,
+        (
+            Row("`cutting`", "cuda/reconstruct_cutting"),
+            Row("`cutting`, `--steps 16000`", "cuda/reconstruct_cutting_16000", asked="40.0 dB in 15 s"),
+            Row("`heart`, left eye", "cuda/reconstruct_heart"),
+            Row("`sinus`", "cuda/reconstruct_sinus", asked="33 dB"),
+            Row("`organ_still`, eight equal stereo frames", "cuda/reconstruct_organ_still", asked="48 dB"),
+        ),
+        ("held-out frames", "neighbours' mean", "whole command"),
+    ),
+    Table(
+        "Kernels, one NVIDIA H200",
+        "Milliseconds of one call, beside gsplat 1.5.3 and plain PyTorch in the same process.",
+        "work",
+        KERNEL_COLUMNS,
+        (
+            kernel("render", "surgical50k_640x512 forward", "0.06 ms"),
+            kernel("render", "surgical50k_640x512 forward+backward", "0.30 ms"),
+            kernel("render", "volume1m_1080p forward", "0.40 ms"),
+            kernel("render", "volume1m_1080p forward, fp16", "0.30 ms"),
+            kernel("render", "volume1m_1080p forward+backward", "1.8 ms"),
+            kernel("render", "volume4m_4k forward", "1.5 ms"),
+            kernel("render", "volume4m_4k forward+backward", "7 ms"),
+            Row("`rasterization()`, surgical50k_640x512 forward", "cuda/rasterization", {"work": "surgical50k_640x512 forward"}, "0.35 ms"),
+            Row("`rasterization()`, surgical50k_640x512 forward+backward", "cuda/rasterization", {"work": "surgical50k_640x512 forward+backward"}, "1.2 ms"),
+            Row("`rasterization()`, volume1m_1080p forward", "cuda/rasterization", {"work": "volume1m_1080p forward"}, "0.9 ms"),
+            Row("`rasterization()`, volume1m_1080p forward+backward", "cuda/rasterization", {"work": "volume1m_1080p forward+backward"}, "2.8 ms"),
+            kernel("training", "training step, basis, 40000 Gaussians of degree 0, 640x512", "0.4 ms"),
+            kernel("training", "training step, small, 50000 Gaussians of degree 0, 640x512", "0.6 ms"),
+            kernel("deformation", "deform, hexplane 85M, fp32, 50000 Gaussians"),
+            kernel("deformation", "deform and render, hexplane 85M, fp32, 50000 Gaussians, 640x512", "0.10 ms"),
+        ),
+        ("ours", "gsplat 1.5.3"),
+    ),
+)  # fmt: skip
+
+
+def log_lines(log: str, logs: Path = LOGS) -> list[dict[str, Any]]:
+    """The lines of a log; none where there is no such file.
+
+    Raises:
+        ValueError: a line lacks a part of its envelope.
+    """
+    path = logs / f"{log}.jsonl"
+    if not path.exists():
+        return []
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+    for number, line in enumerate(lines, 1):
+        if lacking := [part for part in ENVELOPE if part not in line]:
+            raise ValueError(
+                f"{path.name} line {number} lacks {', '.join(lacking)}; write logs with benchmarks/suite.py"
+            )
+    return lines
+
+
+def results_of(row: Row, logs: Path = LOGS) -> list[dict[str, Any]]:
+    """The results of the row's log that have the values in `row.where`."""
+    found = [line["result"] for line in log_lines(row.log, logs) if "result" in line]
+    return [result for result in found if all(result.get(key) == value for key, value in row.where.items())]
+
+
+def table_text(table: Table, logs: Path = LOGS, columns: tuple[str, ...] = ()) -> str:
+    """The table in Markdown; empty where none of its rows has a log. `columns` chooses among the columns by title."""
+    rows = [(row, results) for row in table.rows if (results := results_of(row, logs))]
+    shown = [
+        column
+        for column in table.columns
+        if (not columns or column.title in columns)
+        and any(column.of(each) is not None for _, found in rows for each in found)
+    ]
+    if not rows:
+        return ""
+    asked = not columns and any(row.asked for row, _ in rows)
+    head = [table.first, *(column.title for column in shown), *(["asked"] if asked else [])]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for row, results in rows:
+        cells = [row.what, *(column.cell(results) for column in shown), *([row.asked] if asked else [])]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def provenance(table: Table, logs: Path = LOGS) -> str:
+    """A sentence for each machine and commit that the table's figures come from."""
+    lines = [line for log in dict.fromkeys(row.log for row in table.rows) for line in log_lines(log, logs)]
+    said: dict[str, set[str]] = {}
+    for line in lines:
+        about = line["machine"]
+        gpu = f"{about['gpu']}, " if "gpu" in about else ""
+        name = f"{gpu}{about['cores']} cores of {about['cpu']}, {about['instruction_set']}, torch {about['torch']}"
+        said.setdefault(f"commit {line['commit']}, {line['date']}, {name}", set()).add(line["benchmark"])
+    if len(said) == 1:
+        return f"Measured at {next(iter(said))}."
+    return " ".join(f"{', '.join(sorted(names))}: measured at {what}." for what, names in sorted(said.items()))
+
+
+def failures(logs: Path = LOGS) -> list[str]:
+    """Commands in the logs that ended with an error."""
+    found = []
+    for row in (row for table in TABLES for row in table.rows):
+        found += [
+            f"- {row.log}, run {line['run']}: exit code {line['exit_code']}"
+            for line in log_lines(row.log, logs)
+            if "exit_code" in line
+        ]
+    return sorted(set(found))
+
+
+def results_text(logs: Path = LOGS) -> str:
+    """RESULTS.md."""
+    parts = [
+        "# Results",
+        "Generated by `python benchmarks/publish.py` from the logs in [logs](logs); do not edit. `python benchmarks/suite.py --device cpu` "
+        "and `--device cuda` measure again ([suite.py](suite.py) has the commands). Figures are medians; where a figure has several runs, "
+        "the worst run and the number of runs follow in brackets. Notes on experiments of earlier commits are in [notes](notes); their "
+        "figures are not comparable with these.",
+    ]
+    for table in TABLES:
+        if text := table_text(table, logs):
+            parts += [f"## {table.title}", table.text, text, provenance(table, logs)]
+    if failed := failures(logs):
+        parts += ["## Commands that failed", "\n".join(failed)]
+    return "\n\n".join(parts) + "\n"
+
+
+def readme_block(name: str, logs: Path = LOGS) -> str:
+    """The figures of one block of the README: the tables that it shows, in short."""
+    if name != "figures":
+        raise ValueError(f"unknown block of results {name!r} in README.md; there is 'figures'")
+    parts = []
+    for table in TABLES:
+        if table.readme and (text := table_text(table, logs, table.readme)):
+            parts.append(f"**{table.title}**\n\n{text}")
+    return "\n\n".join(parts) + "\n" if parts else ""
+
+
+def with_figures(text: str, logs: Path = LOGS) -> str:
+    """A document with its blocks of figures made anew."""
+    return BLOCK.sub(lambda found: found.group(1) + readme_block(found.group(2), logs) + found.group(3), text)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 where a file would change")
+    options = parser.parse_args()
+    wanted = {RESULTS: results_text(), README: with_figures(README.read_text(encoding="utf-8"))}
+    stale = [path for path, text in wanted.items() if not path.exists() or path.read_text(encoding="utf-8") != text]
+    if options.check:
+        for path in stale:
+            print(f"{path.relative_to(ROOT)} differs from the logs; run python benchmarks/publish.py")
+        return 1 if stale else 0
+    for path in stale:
+        path.write_text(wanted[path], encoding="utf-8")
+        print(f"wrote {path.relative_to(ROOT)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
