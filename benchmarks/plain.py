@@ -39,13 +39,16 @@ def main() -> int:
         if done.returncode != 0:
             print(done.stderr[-2000:], file=sys.stderr)
             return done.returncode
-        print(json.dumps({"wall_s": round(wall_s, 2), **figures(json.loads(done.stdout))}), flush=True)
+        line = json.dumps({"wall_s": round(wall_s, 2), **figures(json.loads(done.stdout))})
+        print(line.replace(str(source.parent), "…"), flush=True)
     return 0
 
 
 def figures(report: dict[str, Any]) -> dict[str, Any]:
-    """The report without its per-frame series, quantiles and file names."""
-    return {name: report[name] for name in KEPT if report.get(name) is not None}
+    """The report without its per-frame series, its quantiles and what it says of the machine, which a log states itself."""
+    kept = {name: report[name] for name in KEPT if report.get(name) is not None}
+    kept["run"] = {name: value for name, value in kept["run"].items() if name not in ("machine", "started_at")}
+    return kept
 
 
 def still(stills: Path, folder: Path) -> Path:
