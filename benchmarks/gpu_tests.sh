@@ -3,7 +3,7 @@
 # Usage: benchmarks/gpu_tests.sh [ARGUMENTS OF pytest]; PROCESSES is 8 unless the environment says otherwise. Logs go to out/gpu_tests.
 set -uo pipefail
 cd "$(dirname "$0")/.."
-export PYTHONPATH=$PWD FAIL_WITHOUT_CUDA=1 OMP_NUM_THREADS=2
+export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH} FAIL_WITHOUT_CUDA=1 OMP_NUM_THREADS=2
 processes=${PROCESSES:-8}
 mkdir -p out/gpu_tests
 mapfile -t files < <(grep -rlE "cuda|gpu|device" tests/gsplat_core tests/operators --include='test_*.py' | sort)
