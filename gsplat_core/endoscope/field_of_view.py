@@ -41,6 +41,8 @@ class FieldOfViewSettings:
     """An ellipse is taken where so much of the outline lies on one ..."""
     ellipse_distance: float = 0.015
     """... within this, in shares of its size."""
+    lit_outside: float = 0.25
+    """At most this share of the area outside of the outline may be lit: by text and logos, and where compression smears the rim."""
     margin: float = 0.01
     """The field ends this far inside of the outline, in shares of the picture's longer side: there it is blurred or has a bright ring."""
     window_frames: int = 30
@@ -60,6 +62,7 @@ class FieldOfViewSettings:
             least_field=share,
             ellipse_share=share,
             ellipse_distance=share,
+            lit_outside=share,
             margin=NumberIn(0.0, 0.2),
             window_frames=count,
             windows_to_change=count,
@@ -94,11 +97,19 @@ class FieldOfView:
         else:
             self._brightest, self._darkest = np.maximum(self._brightest, grey), np.minimum(self._darkest, grey)
         self._frames += 1
+        if self._frames > 1 and self._shows_more(grey) and find_outline(grey, grey, self.settings) is None:
+            self._take(None)
         if self._frames == 1 or self._frames % self.settings.window_frames == 0:
             self._consider(find_outline(self._brightest, self._darkest, self.settings))
             if self._frames > 1:
                 self._brightest = self._darkest = None
         return self.mask
+
+    def _shows_more(self, grey: NDArray[np.uint8]) -> bool:
+        """Return whether a picture, reduced to levels [H, W], is lit where the field is believed to have ended."""
+        outside = grey[~self._reduced]
+        lit = outside > self.settings.darkest_level + self.settings.surround_range
+        return bool(lit.size and lit.mean() > self.settings.lit_outside)
 
     def _start(self, shape: tuple[int, ...]) -> None:
         self._shape, self._frames, self._candidates = shape, 0, []
@@ -179,7 +190,7 @@ def find_outline(
     share = float(inside.mean())
     if share < settings.least_field or share > 1 - settings.least_surround:
         return None
-    if not _ends_sharply(inside, brightest, limit, settings):
+    if float(lit[~inside].mean()) > settings.lit_outside or not _ends_sharply(inside, brightest, limit, settings):
         return None
     return (outline + 0.5) / np.array([width, height])
 

@@ -13,6 +13,7 @@ from gsplat_core.io.recordings import open_recording
 
 Image = NDArray[np.uint8]
 PLACES = {"cutting": "cutting", "heart": "heart/left.mp4", "sinus": "sinus", "colon": "colon/video.mp4"}
+PLACES |= {name: f"others/{name}" for name in ("resting_bowel", "laparoscopy", "stereomis_like")}
 FRAME_NS = 33_333_333
 
 

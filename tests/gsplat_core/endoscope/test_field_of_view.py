@@ -81,6 +81,52 @@ def test_a_dark_cave_in_a_full_picture_is_no_surround(centre):
     assert masks(images)[-1] is None
 
 
+@pytest.mark.parametrize("turned", range(4))
+@pytest.mark.parametrize("width", [60, 120, 200])
+def test_lit_tissue_beside_a_black_corner_is_never_left_out(turned, width):
+    """A black corner and one that is cut off by a curve: an ellipse through both rims would leave out half of a lit picture."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    black = x / WIDTH - y / HEIGHT > 1 - width / WIDTH
+    black |= (x - WIDTH / 2) ** 2 + (y + 900) ** 2 > 1170**2
+    black = np.rot90(black, turned)
+    images = seen_through(~black, count=31, level=2)
+    for mask in masks(images):
+        if mask is not None:
+            left_out = mask == 0
+            assert (left_out & ~black).sum() < 0.3 * left_out.sum()
+
+
+def rendered_bowel(seed):
+    """A full picture with a black corner at a curved rim, bright elsewhere, with a darker band of blobs below."""
+    rng = np.random.default_rng(seed)
+    image = next(iter(texture(seed, 1, WIDTH, HEIGHT))).copy()
+    cv2.ellipse(image, (int(rng.integers(260, 320)), -10), (90, 50), 20, 0, 360, (3, 3, 3), -1)
+    cv2.line(image, (0, 150), (120, 140), (8, 8, 8), 6)
+    cv2.line(image, (120, 140), (230, 255), (8, 8, 8), 6)
+    return image
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_dark_folds_from_edge_to_edge_cut_no_lit_tissue_off(seed):
+    mask = masks([rendered_bowel(seed)])[0]
+    assert mask is None or mask[180:, :60].all()
+
+
+def test_a_field_that_is_gone_is_gone_with_the_next_picture_that_is_lit_outside_of_it():
+    found = masks([*seen_through(disc(radius=90), count=12), *texture(4, 2, WIDTH, HEIGHT)])
+    assert found[11] is not None and found[12] is None
+
+
+def test_text_that_appears_in_the_surround_leaves_the_field_as_it_is():
+    images = seen_through(disc(), count=70)
+    for image in images[20:]:
+        image[4:60, 4:40] = 220
+        image[4:60, 280:316] = 220
+        image[200:250, 4:40] = 220
+    found = masks(images)
+    assert found[-1] is found[0] is not None
+
+
 @pytest.mark.parametrize("colour", [(10, 10, 12), (190, 195, 200)])
 def test_a_tool_at_the_rim_takes_nothing_away(colour):
     images = seen_through(disc(), count=95)
@@ -133,7 +179,7 @@ def test_in_colon_the_four_corners_are_left_out(recordings_dir):
 
 
 @pytest.mark.recordings
-@pytest.mark.parametrize("name", ["cutting", "heart"])
+@pytest.mark.parametrize("name", ["cutting", "heart", "resting_bowel", "laparoscopy", "stereomis_like"])
 def test_recordings_that_fill_the_picture_have_none(recordings_dir, name):
     assert set(map(type, masks(clip(recordings_dir, name)))) == {type(None)}
 
