@@ -66,8 +66,3 @@ def check_colours(relaxation: float, config: ReconstructorConfig, device: torch.
             f"colour_relaxation is {relaxation} with sh_degree {config.sh_degree}: on a GPU colours that depend on the view are"
             " not corrected; set sh_degree or colour_relaxation to 0"
         )
-    if device.type == "cpu" and (not config.squared_error or config.ssim_weight > 0):
-        raise InvalidSetting(
-            f"colour_relaxation is {relaxation} with squared_error {config.squared_error} and ssim_weight"
-            f" {config.ssim_weight}: colours are corrected by the squared error alone; set squared_error and ssim_weight 0"
-        )

@@ -28,8 +28,8 @@ class LiveTraining:
     """Share of the rehearsal steps that go to the newest frame; the others are spread evenly over the window."""
     colour_relaxation: float = 0.0
     """Above 0 colours are not trained with a rate but corrected by what the picture is off by, by so many times the mean over the pixels that
-    show them (`colour_correction`), where the field takes colours at one time. On a CPU with the squared error; on a GPU with harmonics of
-    degree 0, and depth is looked at by some of the rehearsal steps alone (`DEPTH_EVERY`)."""
+    show them (`colour_correction`), where the field takes colours at one time. On a GPU with harmonics of degree 0 only, and depth is looked at by
+    some of the rehearsal steps alone (`DEPTH_EVERY`)."""
 
     def __post_init__(self) -> None:
         for name in ("first_rate", "last_rate"):

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.image_loss.image_loss import STEEP_AS_L1, image_loss
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
@@ -53,12 +52,9 @@ def loss_and_gradients(
 ) -> Compared:
     """Loss against `observation`, and its gradient for the Gaussians.
 
-    The same as `render`, `image_loss` and `backward()`, without an autograd graph: this is the inner loop of training. With a
-    `colour_relaxation` above 0 the same passes say how colours change, see `colour_correction`. Raises InvalidInput when the loss is another
-    one than the squared error then.
+    Equals `render`, `image_loss` and `backward()`, without an autograd graph: this is the inner loop of training. With a `colour_relaxation`
+    above 0 the same passes also compute the change of the colours, see `colour_correction`.
     """
-    if colour_relaxation > 0 and not weights.show_residuals:
-        raise InvalidInput(f"colours are corrected by the residual, which the squared error alone shows, got {weights}")
     camera = observation.camera
     viewmat, intrinsics = (matrix[None] for matrix in camera.matrices(gaussians.device))
     scales, opacities = gaussians.scales, gaussians.opacities
@@ -73,7 +69,8 @@ def loss_and_gradients(
 
     loss, v_picture, v_alphas = _loss_of_picture(splats, observation, weights, use_depth)
     tissue = (observation.mask != 0).float() if colour_relaxation > 0 else None
-    v_means2d, v_conics, v_channels, v_opacities = _composite_backward(splats, v_picture, v_alphas, settings, tissue)
+    weighed = None if tissue is None else _to_weigh(splats, observation, weights, tissue)
+    v_means2d, v_conics, v_channels, v_opacities = _composite_backward(splats, v_picture, v_alphas, settings, weighed)
     v_depths = v_channels[:, 3].contiguous()[None, None] if use_depth else None
     v_means, _, v_quats, v_scales, _ = torch.ops.gsplat_core.project_gaussians_backward(
         gaussians.means[None], None, gaussians.quats[None], scales[None], viewmat[None], intrinsics[None],
@@ -89,7 +86,10 @@ def loss_and_gradients(
         v_means = v_means + v_directions[0]
     colour_change = None
     if tissue is not None:
-        residuals = v_channels[:, :3] * (-3 * STEEP_AS_L1 * tissue.sum())
+        if weights.show_residuals:
+            residuals = v_channels[:, :3] * (-3 * STEEP_AS_L1 * tissue.sum())
+        else:
+            residuals = v_channels[:, -4:-1].contiguous()
         colour_change = colour_correction(unclamped, residuals, v_channels[:, -1], colour_relaxation) / SH_C0
         v_sh[:, 0] = 0
     gradients = {
@@ -121,6 +121,14 @@ def _loss_of_picture(
     return result.loss, v_picture.reshape(picture.shape), v_alphas
 
 
+def _to_weigh(splats: RenderedSplats, observation: Observation, weights: LossWeights, tissue: Tensor) -> Tensor:
+    """Return the pictures [H, W, D] that `colour_correction` needs summed per splat: the residuals, unless the loss's gradient holds them, then the tissue."""
+    if weights.show_residuals:
+        return tissue[..., None]
+    residuals = (observation.image.float() / 255 - splats.image[0, ..., :3]) * tissue[..., None]
+    return torch.cat([residuals, tissue[..., None]], -1)
+
+
 def _composite(
     means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int, tile_size: int,
     isect_offsets: Tensor, flatten_ids: Tensor, **_: object,
@@ -137,13 +145,13 @@ def _composite_backward(
 ) -> tuple[Tensor, ...]:
     """Gradients of the splats' means2d [N, 2], conics [N, 3], channels [N, D] and opacities [N].
 
-    With `weighed` [H, W] the channels have one more, the last: the sum over pixels of blending weight times that.
+    With `weighed` [H, W, E] there are E more channels, at the end: the sums over pixels of blending weight times each of these pictures.
     """
     channels = splats.channels[0]
     if weighed is not None:
-        # A channel in which every splat is 0: no other gradient sees it.
-        channels = torch.nn.functional.pad(channels, (0, 1))
-        v_picture = torch.cat([v_picture, weighed[None, ..., None]], -1)
+        # Channels in which every splat is 0: no other gradient sees them.
+        channels = torch.nn.functional.pad(channels, (0, weighed.shape[-1]))
+        v_picture = torch.cat([v_picture, weighed[None]], -1)
     blended = (splats.rows.means2d[0], splats.rows.conics[0], channels, splats.opacities[0])
     lists = (splats.isect_offsets, splats.flatten_ids)
     size = (settings.width, settings.height, settings.tile_size)

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from gsplat_core import reference
-from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0
 from gsplat_core.training.colour_correction import LEAST_WEIGHT_PX, colour_correction
@@ -101,7 +100,15 @@ def test_without_tissue_or_gaussians_there_is_no_change(make_gaussians):
     assert loss_and_gradients(make_gaussians(0), observation(), SQUARED, 1.0).colour_change.shape == (0, 3)
 
 
-@pytest.mark.parametrize("weights", [LossWeights(), LossWeights(0.1, squared=True)])
-def test_another_loss_is_refused(make_gaussians, weights):
-    with pytest.raises(InvalidInput, match="the squared error alone"):
-        loss_and_gradients(make_gaussians(5), observation(), weights, 1.0)
+@pytest.mark.parametrize(
+    "weights", [LossWeights(), LossWeights(0.1), LossWeights(0.1, 0.5), LossWeights(0.1, squared=True)]
+)
+def test_every_loss_has_the_correction_of_the_squared_error_and_keeps_its_own_gradients(
+    make_gaussians, assert_near, weights
+):
+    gaussians, seen = make_gaussians(60), observation()
+    compared, plain = (loss_and_gradients(gaussians, seen, weights, relaxation) for relaxation in (1.5, 0.0))
+    assert_near(compared.colour_change, by_autograd(gaussians, seen, 1.5), of_largest=1e-4)
+    for name in ("means", "quats", "log_scales", "logit_opacities"):
+        assert_near(compared.gradients[name], plain.gradients[name], of_largest=1e-5)
+    assert plain.gradients["sh"][:, 0].any() and not compared.gradients["sh"][:, 0].any()

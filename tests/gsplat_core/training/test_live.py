@@ -150,12 +150,6 @@ def test_settings_out_of_range_are_refused(wrong):
         LiveTraining(**wrong)
 
 
-@pytest.mark.parametrize("loss", [{}, {"squared_error": True, "ssim_weight": 0.1}])
-def test_colours_are_corrected_by_the_squared_error_only(loss):
-    with pytest.raises(InvalidSetting, match="set squared_error and ssim_weight 0"):
-        LiveReconstructor(ReconstructorConfig(**loss), CAMERA, live=LiveTraining(colour_relaxation=1.0))
-
-
 def test_colours_that_depend_on_the_view_are_not_corrected_on_a_gpu():
     with pytest.raises(InvalidSetting, match="set sh_degree or colour_relaxation to 0"):
         LiveReconstructor(
