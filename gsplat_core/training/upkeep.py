@@ -103,9 +103,10 @@ class Upkeep:
     def _renew(
         self, step: TrainingStep, seen: Seen, observation: Observation, last_seen: LastSeen | None, leaving: Tensor
     ) -> None:
-        """Bring depths and rotations back, let those `leaving`, bool [N], go, and split what has too much to do."""
+        """Bring depths and rotations back where the field can follow, remove those `leaving`, bool [N], and split what has too much to do."""
         since, self._renewed_at = step.steps - self._renewed_at, step.steps
-        step.scale_about(observation.camera, self._towards_surface(step, seen, since, observation))
+        if step.field.takes_positions:
+            step.scale_about(observation.camera, self._towards_surface(step, seen, since, observation))
         step.shorten_rotations()
         if last_seen is not None:
             last_seen.join(step.gaussians.count, observation.time_s)
