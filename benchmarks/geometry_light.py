@@ -1,8 +1,8 @@
-"""How good depth by the scope's own light is, beside a plane, and what it costs: python benchmarks/geometry_light.py [--pictures DIR]
+"""Errors of depth by the scope's own light, beside those of planes, and its cost: python benchmarks/geometry_light.py [--pictures DIR]
 
-A line of JSON for each recording. `error` and `plane` are root mean squares after one factor per frame, by the median depth; `believed` is the
-share of the pixels with a confidence of at least 0.5, `doubted` that of the frames without an answer, which count as a plane. `whole` is the error where
-all frames are looked at together, as `reconstruct` does it.
+A line of JSON for each recording. `error` is the root mean square after one factor per frame, in shares of the median depth. `level` and `plane` are those of the level
+plane and of the best-fit plane (`gsplat_core.evaluation.plane`). `believed` is the share of the pixels with a confidence of at least 0.5. `doubted` is the share of the
+frames without an answer, which count as a level plane. `whole` is the error where all frames are looked at together, as `reconstruct` does it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.evaluation.depth_share import MOST_PIXELS
+from gsplat_core.evaluation.plane import flat_depths, pixels_to_compare
 from gsplat_core.geometry.depth_map import BELIEVED
 from gsplat_core.geometry.light import LightDepth
 from gsplat_core.geometry.light_of_recording import frames_with_light
@@ -63,7 +65,7 @@ def whole(frames: Sequence[Frame], camera: Camera) -> float | None:
 def measure(name: str, frames: Sequence[Frame], camera: Camera, pictures: Path | None) -> dict[str, object]:
     """All frames of a recording in order; the estimator is not shown their depth."""
     estimator = LightDepth()
-    errors, planes, believed, doubted, spent = [], [], [], [], []
+    errors, levels, planes, believed, doubted, spent = [], [], [], [], [], []
     for frame in frames:
         began = time.process_time()
         found = estimator.estimate(bare(frame), camera)
@@ -75,13 +77,18 @@ def measure(name: str, frames: Sequence[Frame], camera: Camera, pictures: Path |
         if frame.depth is not None:
             kept = known_tissue(frame)
             errors.append(error(depth, frame.depth, kept))
-            planes.append(error(np.ones_like(depth), frame.depth, kept))
+            rays, true = pixels_to_compare(camera, kept, MOST_PIXELS, frame.depth)
+            flat = flat_depths(rays, true)
+            assert flat is not None
+            for found_errors, plane in ((levels, flat.level), (planes, flat.plane)):
+                found_errors.append(float(np.sqrt(np.mean(np.square(plane - true))) / np.median(true)))
         if pictures is not None and frame.seq == 0:
             _draw(pictures / f"{name}.png", frame, depth)
     figures: dict[str, object] = {"recording": name, "frames": len(spent)}
     if errors:
-        figures |= {"error": round(float(np.mean(errors)), 4), "plane": round(float(np.mean(planes)), 4)}
-        figures["worst_beside_plane"] = round(float(np.max(np.subtract(errors, planes))), 4)
+        means = {"error": errors, "level": levels, "plane": planes}
+        figures |= {name: round(float(np.mean(each)), 4) for name, each in means.items()}
+        figures["worst_beside_level"] = round(float(np.max(np.subtract(errors, levels))), 4)
     if errors:
         figures["whole"] = whole(frames, camera)
     figures |= {"believed": round(float(np.mean(believed)), 3), "doubted": round(float(np.mean(doubted)), 3)}

@@ -2,7 +2,7 @@
 
 One line for each case:
 * depth: root mean squared error as a share of the median depth, as it is and after one scale; of each frame's median depth everywhere
-  (level), of its best tilted plane; the mean angle of normals, and of that plane's;
+  (level), of its best-fit plane; the mean angle of normals, and of those two planes;
 * third: PSNR of the third camera, which training never gets, as it is and after one scale; of the left picture as it is, and shifted;
 * points: median error of followed points of the tissue in mm, as it is, after one scale, and of no motion; in px, and of no motion;
 * which shares of the pictures' change motion, colour and size explain; the trajectory's error after similarity, as a share of the path.
@@ -175,7 +175,7 @@ def copy_of(whole: Path, given: Path, case: Case) -> None:
 
 
 HEADER = (
-    f"{'case':<9} {'depth':>7} {'scaled':>7} {'level':>7} {'plane':>7} {'normals':>8} {'plane':>6}  {'third':>6} {'scaled':>6} {'left':>6}"
+    f"{'case':<9} {'depth':>7} {'scaled':>7} {'level':>7} {'plane':>7} {'normals':>8} {'level':>6} {'plane':>6}  {'third':>6} {'scaled':>6} {'left':>6}"
     f" {'shifted':>7}  {'points':>7} {'scaled':>7} {'still':>7}   {'px':>5} {'still':>5}  {'motion':>6} {'colour':>6}"
     f" {'size':>6}  {'ATE':>6}  {'time':>5}"
 )
@@ -193,7 +193,7 @@ def line(name: str, geometry: Geometry, seconds: float) -> str:
     return (
         f"{name:<9} {depth.rmse_share:7.2%} {depth.scaled_rmse_share:7.2%} {depth.level_rmse_share:7.2%}"
         f" {depth.plane_rmse_share:7.2%}"
-        f" {normals.mean_deg:7.1f}° {normals.plane_mean_deg:5.1f}°"
+        f" {normals.mean_deg:7.1f}° {normals.level_mean_deg:5.1f}° {normals.plane_mean_deg:5.1f}°"
         f"  {third.model.psnr_tissue_db:6.2f} {scaled.model.psnr_tissue_db:6.2f} {third.left.psnr_tissue_db:6.2f}"
         f" {third.shifted.psnr_tissue_db:7.2f}"
         f"  {tracking.model.median_mm:7.2f} {tracking.scaled.median_mm:7.2f} {tracking.still.median_mm:7.2f}"

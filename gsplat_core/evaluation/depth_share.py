@@ -1,4 +1,4 @@
-"""How far a model's depth is off over a whole sequence, as a share of the typical depth, beside the best flat plane of each frame."""
+"""Errors of a model's depth over a whole sequence, as a share of the typical depth, beside the level plane and the best-fit plane of each frame."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.evaluation.plane import best_plane, plane_depth
+from gsplat_core.evaluation.plane import flat_depths, pixels_to_compare
 from gsplat_core.scene.cameras import Camera
 
 MOST_PIXELS = 8192
@@ -24,9 +24,9 @@ class DepthShare:
     scaled_rmse_share: float
     """The same after the model's depth was multiplied by `scale`: of the shape alone."""
     plane_rmse_share: float
-    """The same of each frame's best flat plane, tilted as it may be, which knows the truth."""
+    """The same of each frame's best-fit plane (`FlatDepths.plane`), which knows the truth."""
     level_rmse_share: float
-    """The same of each frame's median true depth, shown everywhere."""
+    """The same of each frame's level plane (`FlatDepths.level`)."""
     median_share: float
     """Median of the absolute error after `scale`, divided by the true depth."""
     rmse: float
@@ -51,12 +51,10 @@ class DepthShareSums:
         both = known & np.isfinite(shown) & (shown > 0)
         self._known += int(known.sum())
         self._both += int(both.sum())
-        plane = best_plane(camera, true, known)
-        if plane is None or not both.any():
-            return
-        level = np.full_like(true, np.median(true[known]))
-        values = np.stack([each[both].astype(np.float64) for each in (true, shown, plane_depth(camera, plane), level)])
-        self._kept.append(values[:, :: max(1, values.shape[1] // MOST_PIXELS)])
+        rays, *values = pixels_to_compare(camera, both, MOST_PIXELS, true, shown)
+        flat = flat_depths(rays, values[0])
+        if flat is not None:
+            self._kept.append(np.stack([*values, flat.plane, flat.level]))
 
     @property
     def errors(self) -> DepthShare | None:

@@ -1,4 +1,4 @@
-"""How far the normals of a model's surface are off, beside those of the best flat plane of each frame."""
+"""Errors of the normals of a model's surface, beside those of the level plane and of the best-fit plane of each frame."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.evaluation.plane import best_plane
+from gsplat_core.evaluation.plane import best_plane, pixels_to_compare
 from gsplat_core.evaluation.projection import points_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.metrics import ScoredMean
 
+MOST_PIXELS = 8192
+"""Pixels of a frame that its plane is fitted to, spread evenly."""
 SMOOTH_PX = 5
 """Points are averaged over so many pixels across before they are differentiated: stored depth has steps."""
 
@@ -25,7 +27,9 @@ class NormalErrors:
     mean_deg: float
     median_deg: float
     plane_mean_deg: float
-    """Of the normal of each frame's best flat plane, which knows the truth."""
+    """Of the normal of each frame's best-fit plane (`best_plane`), which knows the truth."""
+    level_mean_deg: float
+    """Of the normal of a level plane: along the optical axis, towards the camera."""
     frames: int
 
 
@@ -48,28 +52,31 @@ class NormalSums:
     """Takes frames one at a time; the normals of both depths are found in the same way."""
 
     def __init__(self) -> None:
-        self._mean, self._median, self._plane = ScoredMean(), ScoredMean(), ScoredMean()
+        self._mean, self._median, self._plane, self._level = (ScoredMean() for _ in range(4))
 
     def add(self, camera: Camera, true: NDArray[Any], shown: NDArray[Any], known: NDArray[np.bool_]) -> None:
         """Compare the surface that a model shows, depth z [H, W], 0 = nothing there, with the true one where that is known."""
-        right, both = normals_of(camera, true, known & np.isfinite(shown) & (shown > 0))
-        found, _ = normals_of(camera, shown, known & np.isfinite(shown) & (shown > 0))
-        plane = best_plane(camera, true, known)
-        if plane is None or not both.any():
+        compared = known & np.isfinite(shown) & (shown > 0)
+        right, both = normals_of(camera, true, compared)
+        found, _ = normals_of(camera, shown, compared)
+        if not both.any():
             return
-        flat = -plane / np.linalg.norm(plane)
+        plane = best_plane(*pixels_to_compare(camera, compared, MOST_PIXELS, true))
+        if plane is None:
+            return
         angles = _degrees(np.einsum("ni,ni->n", right[both], found[both]))
         self._mean.add(float(angles.mean()))
         self._median.add(float(np.median(angles)))
-        self._plane.add(float(_degrees(right[both] @ flat).mean()))
+        self._plane.add(float(_degrees(right[both] @ (-plane / np.linalg.norm(plane))).mean()))
+        self._level.add(float(_degrees(-right[both][:, 2]).mean()))
 
     @property
     def errors(self) -> NormalErrors | None:
         """The means so far; None where nothing could be compared."""
-        mean, median, plane = self._mean.mean, self._median.mean, self._plane.mean
-        if mean is None or median is None or plane is None:
+        mean, median, plane, level = (each.mean for each in (self._mean, self._median, self._plane, self._level))
+        if mean is None or median is None or plane is None or level is None:
             return None
-        return NormalErrors(mean, median, plane, self._mean.count)
+        return NormalErrors(mean, median, plane, level, self._mean.count)
 
 
 def _degrees(cosine: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ the poses; a model's may be another one, so that one factor for the whole record
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.evaluation.plane import flat_depths
 from gsplat_core.scene.cameras import Camera
 
 Array = NDArray[np.float64]
@@ -72,7 +74,9 @@ class SparseDepthErrors:
     scale: float
     """The factor that was taken out: median of true over rendered depth."""
     plane_median: float
-    """As `median`, for a plane across the axis at the best distance."""
+    """As `median`, for each frame's best-fit plane (`FlatDepths.plane`); NaN where no frame has three sightings."""
+    level_median: float
+    """As `median`, for each frame's level plane (`FlatDepths.level`)."""
     covered: float
     """Share of the sightings at which there is a depth; the others are in no error."""
     sightings: int
@@ -85,6 +89,8 @@ class SparseDepthSums:
         self._points = points
         self._rendered: list[Array] = []
         self._true: list[Array] = []
+        self._flat: list[Array] = []
+        """Of each frame the depths [2, n] of the best-fit and of the level plane."""
 
     def add(self, number: int, depth: NDArray[np.float32], camera: Camera) -> None:
         """Compare depth z [H, W], 0 = unknown, of frame `number` with its points; `camera` has the frame's pose and this size."""
@@ -92,8 +98,16 @@ class SparseDepthSums:
             raise InvalidInput(f"depth is {list(depth.shape)}, its camera {camera.width_px}x{camera.height_px}")
         pixels, true = self._points.seen_in(number, camera)
         column, row = pixels.astype(np.int64).T
-        self._rendered.append(depth[row, column].astype(np.float64))
+        shown = depth[row, column].astype(np.float64)
+        self._rendered.append(shown)
         self._true.append(true)
+        known = np.isfinite(shown) & (shown > 0)
+        rays = np.column_stack([(pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2], np.ones(len(true))])
+        flat = flat_depths(rays[known], true[known])
+        planes = np.full((2, len(true)), np.nan)
+        if flat is not None:
+            planes[:, known] = flat.plane, flat.level
+        self._flat.append(planes)
 
     def errors(self) -> SparseDepthErrors | None:
         """None where no sighting has a depth."""
@@ -104,13 +118,16 @@ class SparseDepthSums:
         found, told = rendered[known], true[known]
         scale = float(np.median(told / found))
         relative = np.abs(scale * found - told) / told
-        plane = np.abs(np.median(told) - told) / told
+        plane, level = np.abs(np.concatenate(self._flat, axis=1)[:, known] - told) / told
+        has_plane = np.isfinite(plane)
+        median = lambda errors: float(np.median(errors[has_plane])) if has_plane.any() else math.nan
         return SparseDepthErrors(
             median=float(np.median(relative)),
             percentile_90=float(np.percentile(relative, 90)),
             rank_correlation=_rank_correlation(found, told),
             scale=scale,
-            plane_median=float(np.median(plane)),
+            plane_median=median(plane),
+            level_median=median(level),
             covered=float(known.mean()),
             sightings=len(true),
         )

@@ -44,17 +44,15 @@ def scale_sentence(geometry: GeometryFacts) -> str | None:
 def _depth(geometry: GeometryFacts) -> Iterator[GeometryRow]:
     depth, normals = geometry.depth, geometry.normals
     if depth is not None:
-        baselines = f"best flat plane {_percent(depth.plane_rmse_share)}, median depth everywhere {_percent(depth.level_rmse_share)}"
+        baselines = f"level plane {_percent(depth.level_rmse_share)}, best-fit plane {_percent(depth.plane_rmse_share)}"
         unit = "root mean squared error, share of the median depth"
         yield GeometryRow(f"Depth, {unit}", _percent(depth.rmse_share), baselines)
         yield GeometryRow(f"Depth after one scale, {unit}", _percent(depth.scaled_rmse_share), baselines, True)
     if normals is not None:
-        yield GeometryRow(
-            "Normals, mean angle",
-            _degrees(normals.mean_deg),
-            f"best flat plane {_degrees(normals.plane_mean_deg)}",
-            True,
-        )
+        baselines = f"best-fit plane {_degrees(normals.plane_mean_deg)}"
+        if normals.level_mean_deg is not None:
+            baselines = f"level plane {_degrees(normals.level_mean_deg)}, {baselines}"
+        yield GeometryRow("Normals, mean angle", _degrees(normals.mean_deg), baselines, True)
 
 
 def _views(geometry: GeometryFacts) -> Iterator[GeometryRow]:

@@ -114,9 +114,9 @@ class DepthShareFacts(Part):
     scaled_rmse_share: float
     """After the model's depth was multiplied by `scale`: of its shape alone, relative."""
     plane_rmse_share: float
-    """Of each frame's best flat plane."""
+    """Of each frame's best-fit plane."""
     level_rmse_share: float
-    """Of each frame's median true depth, shown everywhere."""
+    """Of each frame's level plane, at the median true depth."""
     median_share: float
     rmse: float
     """In the unit of the recording's depth, mm where it has a scale."""
@@ -130,6 +130,8 @@ class NormalFacts(Part):
     mean_deg: float
     median_deg: float
     plane_mean_deg: float
+    level_mean_deg: float | None = None
+    """None in reports that were written before it was measured."""
     frames: Count
 
 
