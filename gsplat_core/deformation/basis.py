@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.deformation.basis_adam import BasisRates
-from gsplat_core.deformation.basis_bumps import BumpTensors
+from gsplat_core.deformation.basis_bumps import BUMPS_PER_SPACING, BumpTensors
 from gsplat_core.deformation.continuation import Continuation
 from gsplat_core.deformation.displacement import displaced
 from gsplat_core.deformation.field import ops_for
@@ -29,6 +29,10 @@ from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import BASIS_CHANNELS, POSITION, ROTATION
+
+OVERSHOOT = 0.25
+"""Bound on a course between the offsets that it follows and beyond the first and last: this share of their range outside of it. Least squares alone put a
+course far outside where offsets jump."""
 
 
 class BasisField(BumpTensors):
@@ -178,11 +182,14 @@ class BasisField(BumpTensors):
         self._ops.basis_field_move_to_(*bumps, tau, deltas)
 
     def follow(self, rows: slice, times_s: Sequence[float], offsets: Tensor) -> bool:
-        """See `DeformationField.follow`: least squares over the weights of bumps as they are laid out. False for a ring."""
+        """See `DeformationField.follow`: least squares over the weights of bumps as they are laid out, bounded by `OVERSHOOT`. False for a ring."""
         if self._columns.is_ring:
             return False
         solution = least_squares_weights([self.tau(time_s) for time_s in times_s], self.bumps)
         weights = torch.einsum("bt,ntc->nbc", solution.to(offsets), offsets)
+        low, high = offsets.amin(dim=1, keepdim=True), offsets.amax(dim=1, keepdim=True)
+        beyond = OVERSHOOT * (high - low)
+        weights = weights.clamp((low - beyond) / BUMPS_PER_SPACING, (high + beyond) / BUMPS_PER_SPACING)
         self.weights.data[rows, : self.bumps, POSITION] = weights
         return True
 

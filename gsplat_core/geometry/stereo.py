@@ -64,6 +64,8 @@ class StereoDepth:
         self._size = size
         self._rows: list[NDArray[np.float64]] = []
         self._span: tuple[float, float] | None = None
+        self._looked: tuple[float, float] | None = None
+        self._seen: tuple[float, float] | None = None
         self._look_in = 0
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
@@ -88,28 +90,46 @@ class StereoDepth:
         if span.count > MOST_DISPARITIES:
             why = f"the eyes see points at too many distances: {span.count} disparities would have to be looked through, {MOST_DISPARITIES} can be"
             return doubted(shape, DepthOrigin.STEREO, why)
+        is_first = self._seen is None
         planes = self._planes(left, right, frame, camera, span, parallel_px)
-        return self._as_depth(planes, frame, camera, parallel_px)
+        found = self._as_depth(planes, frame, camera, parallel_px)
+        widened = self._span_of(frame.width_px)
+        if is_first and found.doubt is None and span != widened and widened.count <= MOST_DISPARITIES:
+            # The first frame of a scene is matched as the ones after it are.
+            planes = self._planes(left, right, frame, camera, widened, parallel_px)
+            found = self._as_depth(planes, frame, camera, parallel_px)
+        return found
 
     def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], frame: Frame, parallel_px: float) -> str | None:
-        """Learn rows and disparities of the pair; why it cannot be used, in a sentence, or None."""
+        """Learn rows and disparities of the pair. Returns a sentence that says why it cannot be used, or None."""
         look = look_at(left, right, frame.loss_mask)
         why = look.doubt or _unlike_distances(look, parallel_px, calibrated=frame.right_camera is not None)
         if why is not None:
             return why
         self._rows = [*self._rows, look.rows][-KEPT_LOOKS:]
         low, high = (float(value) for value in np.percentile(look.disparities, (1, 99)))
-        known = self._span or (low, high)
-        self._span = min(low, known[0]), max(high, known[1])
+        known = self._seen or (low, high)
+        self._span = self._looked = min(low, known[0]), max(high, known[1])
         self._look_in = LOOK_EVERY
         return None
 
+    def _widen_to(self, seen: tuple[float, float]) -> None:
+        """Look for what was seen in the next frame, too.
+
+        Until the next look the span only widens, and by one margin at most: wrong matches lie anywhere in it, so that it would widen without an end, and
+        pictures that are alike would be matched in another span, and otherwise, from frame to frame.
+        """
+        assert self._span is not None and self._looked is not None
+        least, most = _widened(self._looked)
+        self._span = min(self._span[0], max(seen[0], least)), max(self._span[1], min(seen[1], most))
+
     def _span_of(self, width_px: int) -> Span:
-        """What is looked for in pictures that were shrunk for it."""
+        """Return the disparities to look for, in pixels of the pictures that are matched."""
         assert self._span is not None
         low, high = self._span
-        margin, shrink = MARGIN_PX + MARGIN_SHARE * (high - low), _shrink(width_px)
-        return Span.around((low - margin) / shrink, (high + margin) / shrink)
+        shrink = _shrink(width_px)
+        low, high = _widened((low, high))
+        return Span.around(low / shrink, high / shrink)
 
     def _planes(
         self,
@@ -150,9 +170,11 @@ class StereoDepth:
         step = max(1, frame.width_px // SAMPLED_PX)
         some = planes[:, ::step, ::step]
         reach = reach_of(frame, camera)
-        near, far = (float(value) for value in np.percentile(some[0][some[0] > 0], (0.5, 99.5)))
-        self._span = reach / far + parallel_px, reach / near + parallel_px
-        middle = float(np.median(some[0][some[1] >= BELIEVED]))
+        believed_depth = some[0][some[1] >= BELIEVED]
+        near, far = (float(value) for value in np.percentile(believed_depth, (0.5, 99.5)))
+        self._seen = reach / far + parallel_px, reach / near + parallel_px
+        self._widen_to(self._seen)
+        middle = float(np.median(believed_depth))
         if frame.right_camera is not None and not PLAUSIBLE_MM[0] <= middle <= PLAUSIBLE_MM[1]:
             why = f"the distances cannot be those of a scope: {middle:.3g} mm in the middle; check the distance between the eyes and its unit"
             return doubted(depth.shape, DepthOrigin.STEREO, why)
@@ -169,6 +191,12 @@ class StereoDepth:
             f"the rows of the two eyes are not the same: those of the right one were moved by {off:.1f} px; if its columns are off by as much,"
             f" depth is off by {abs(off) * middle / reach:.1%}, so check the calibration"
         )
+
+
+def _widened(span: tuple[float, float]) -> tuple[float, float]:
+    """Return a span of disparities with the margin at both ends."""
+    margin = MARGIN_PX + MARGIN_SHARE * (span[1] - span[0])
+    return span[0] - margin, span[1] + margin
 
 
 def _shrink(width_px: int) -> int:

@@ -78,7 +78,7 @@ class SurfaceTracks:
         smooth, relief = (torch.stack(each, dim=1) for each in zip(*read, strict=True))
         # What a tool hides for a while stands out from what is around it as it did before and does afterwards.
         depth = smooth * between_known(relief, torch.ones_like(relief), self._times)
-        depth = between_known(depth, depth, self._times)
+        depth = 1 / steady_course(1 / between_known(depth, depth, self._times), self._times)
         return torch.stack([_world(pixels[k], depth[:, k], one) for k, one in enumerate(self._seen)], dim=1)
 
     def _across(self, points: Tensor, number: int) -> Tensor:
@@ -184,6 +184,24 @@ def between_known(values: Tensor, otherwise: Tensor, times: Tensor) -> Tensor:
     span = times[following] - times[last]
     share = torch.where(span > 0, (times - times[last]) / span.clamp(min=1e-9), torch.zeros_like(span))
     return torch.where(known.any(dim=1, keepdim=True), a + share * (b - a), otherwise)
+
+
+def steady_course(values: Tensor, times: Tensor) -> Tensor:
+    """Return each row of `values` [N, T] with the share of its changes over `times` [T] that noise does not explain; the rest stays at the row's median.
+
+    The noise is what a value differs by from the line between its two neighbours in time, as in `steadiness`. The share is that of a Wiener filter. Two
+    values or fewer are no evidence of motion. No result lies outside of the range of its row.
+    """
+    middle = values.median(dim=1, keepdim=True).values
+    if values.shape[1] < 3:
+        return middle.expand_as(values)
+    span = times[2:] - times[:-2]
+    share = torch.where(span > 0, (times[1:-1] - times[:-2]) / span.clamp(min=1e-9), 0.5)
+    off = values[:, 1:-1] - torch.lerp(values[:, :-2], values[:, 2:], share)
+    # The variance of a value and that of the line between two others add up.
+    noise = (off.square() / (1 + share.square() + (1 - share).square())).mean(dim=1, keepdim=True)
+    found = (values - middle).square().mean(dim=1, keepdim=True)
+    return middle + (1 - noise / found.clamp(min=torch.finfo(found.dtype).tiny)).clamp(0, 1) * (values - middle)
 
 
 def _flows(frames: Sequence[Frame]) -> list[Flow]:

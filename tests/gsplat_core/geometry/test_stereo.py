@@ -216,3 +216,29 @@ def test_a_pair_with_too_many_distances_is_doubted(left, right, monkeypatch):
 
 def test_a_frame_with_one_eye_has_nothing_to_match(left, right):
     assert estimate(frame(left, right).with_fields(right_image=None, right_camera=None)) is None
+
+
+def surrounded(grey, rng):
+    """A picture whose sides show nothing but noise, as beyond a scope's circle: wrong matches lie anywhere there."""
+    x = np.linspace(-1, 1, grey.shape[1])
+    return np.where(np.abs(x) < 0.45, grey, 20 + rng.normal(0, 3, grey.shape)).astype(np.float32)
+
+
+def test_a_still_pair_has_the_same_depth_in_every_frame(left, right, rng):
+    """What is matched wrongly must not widen the span of the next frame, and thereby change what is matched in it."""
+    eyes = surrounded(left, rng), surrounded(right, rng)
+    estimator = StereoDepth()
+    found = [estimator.estimate(frame(*eyes, seq=seq), camera()) for seq in range(5)]
+    for each in found[1:]:
+        np.testing.assert_array_equal(each.depth, found[0].depth)
+        np.testing.assert_array_equal(each.confidence, found[0].confidence)
+    assert off_by(found[0], bowl())[1] > 0.2
+
+
+def test_tissue_that_comes_nearer_is_followed_between_two_looks(left):
+    estimator = StereoDepth()
+    for seq, nearer in enumerate(np.linspace(1.0, 1.5, 20)):
+        disparity = bowl() * np.float32(nearer)
+        found = estimator.estimate(frame(left, right_of(left, disparity), seq=seq), camera())
+        error, believed = off_by(found, disparity)
+        assert error < 0.01 and believed > 0.7, f"frame {seq}"
