@@ -16,7 +16,6 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.config import ReconstructorConfig
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
-from operators.sources.source import SourceDescription
 
 
 @dataclass(frozen=True)
@@ -130,16 +129,10 @@ class DepthOp(Operator):
         self._counts.contribute(outcome, self.choice, self._finder)
 
 
-def choice_without_clock(choice: str, source: SourceDescription) -> str:
-    """The setting `depth` where no camera has to be kept up with: where nothing else shows how far away tissue is, `auto` is by the scope's own light."""
-    fields = source.fields if source.moves else source.fields - {"pose"}
-    return "light" if choice == "auto" and not fields & {"depth", "right_image", "pose"} else choice
-
-
 def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConfig) -> str | None:
-    """What is to be said where frames with these fields are given no recorded depth, and there is time to find it; None where they keep it.
+    """Return a note for frames with these fields that are given no recorded depth, where there is time to find it; None where they keep it.
 
-    choice: the setting `depth`, or `choice_without_clock` of it.
+    choice: the setting `depth`.
     """
     if "depth" in fields and choice in ("auto", "recorded"):
         return None

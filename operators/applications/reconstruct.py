@@ -26,7 +26,6 @@ from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplayApplication, ReplaySettings, new_reconstructor, prepare
 from operators.applications.result import RunOutcome
 from operators.applications.session import Session, Start
-from operators.depth import choice_without_clock
 from operators.sources.source import FrameSource
 
 
@@ -70,7 +69,6 @@ def reconstruct(
                 f"poses is {inside.poses!r}; reconstruct sees all frames at once, so write their poses with `intrasplat poses` first"
             )
         source = prepare(inside, notes, offline=True)
-        inside = replace(inside, depth=choice_without_clock(inside.depth, source.description))
         start = Start.now()
         model, eyes, done = _fit(source, inside, steps, progress, stop_requested, notes)
         if done < steps:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from operators.depth import DepthOp, choice_without_clock, without_depth
+from operators.depth import DepthOp, without_depth
 from operators.graph import Operator
 from operators.pose import pose_operators
 from operators.sources.source import SourceDescription
@@ -28,22 +28,15 @@ def replay_analysis(
     settings = graph.settings
     # What shows a finished model learns nothing from depth.
     learns = graph.stage == "replay"
-    choice = chosen_depth(settings, graph.frame_source.description) if learns else settings.depth
     depth = DepthOp(
-        graph, name="depth", choice="recorded" if follows else choice, camera=camera, held_out=held_out,
+        graph, name="depth", choice="recorded" if follows else settings.depth, camera=camera, held_out=held_out,
         has_time=learns, device=settings.device,
     )  # fmt: skip
     poses = "given" if follows else settings.poses
     return RecordedToolMaskOp(graph, name="tool_mask"), *pose_operators(graph, poses, camera, settings.depth), depth
 
 
-def chosen_depth(settings: ReplaySettings, source: SourceDescription) -> str:
-    """Where depth comes from: the setting, with what `auto` is for this source."""
-    estimated = settings.poses == "estimated"
-    return settings.depth if estimated else choice_without_clock(settings.depth, source)
-
-
 def lacking_depth(settings: ReplaySettings, source: SourceDescription, config: ReconstructorConfig) -> str | None:
-    """What is to be said where frames come without depth that is learned from; None where they have it."""
+    """Return a note for a source whose frames have no depth to learn from; None where they have it."""
     poses = {"pose"} if settings.poses == "estimated" else set()
-    return without_depth(chosen_depth(settings, source), source.fields | poses, config)
+    return without_depth(settings.depth, source.fields | poses, config)

@@ -5,17 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cached_property
 
-import numpy as np
-
 from gsplat_core.io.recordings import Recording, open_recording
 from gsplat_core.scene.frames import Frame
 from operators.sources.options import SourceOptions
 from operators.sources.realtime import play
 from operators.sources.source import FrameSource, SourceDescription
 from operators.sources.threaded import ThreadedSource
-
-LOOKED_AT = 100
-"""Frames whose poses are compared, at least, or all of them."""
 
 
 class RecordingSource(ThreadedSource):
@@ -42,19 +37,11 @@ class RecordingSource(ThreadedSource):
             frame_count=recording.frame_count,
             digest=recording.digest,
             notes=recording.notes,
-            moves=_moves(recording),
         )
 
     def frames(self) -> Iterator[Frame]:
         """The recording's frames, in order."""
         return iter(self.recording)
-
-
-def _moves(recording: Recording) -> bool:
-    """Whether the camera is not at rest, as some frames spread over the recording tell."""
-    step = max(1, recording.frame_count // LOOKED_AT)
-    seen = (recording.camera_at(index).world_to_camera for index in range(0, recording.frame_count, step))
-    return any(not np.array_equal(pose, recording.camera.world_to_camera) for pose in seen)
 
 
 def recording_source(address: str, options: SourceOptions) -> FrameSource:

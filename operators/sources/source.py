@@ -43,8 +43,6 @@ class SourceDescription:
     """SHA-256 of what is read, where the same can be read again."""
     notes: tuple[str, ...] = ()
     """Fallbacks that were taken, in sentences."""
-    moves: bool = True
-    """Whether the poses of frames that have one may differ."""
 
     @property
     def is_stereo(self) -> bool:

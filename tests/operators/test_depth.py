@@ -12,9 +12,8 @@ from gsplat_core.geometry.registry import DEPTHS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, FrameStatus
 from gsplat_core.training.config import ReconstructorConfig
-from operators.depth import DepthOp, FoundDepth, choice_without_clock, without_depth
+from operators.depth import DepthOp, FoundDepth, without_depth
 from operators.outcome import OutcomeBuilder
-from operators.sources.source import SourceDescription
 
 CAMERA = Camera.from_focal(20.0, 24, 16)
 PLANE = np.full((16, 24), 50, np.float32)
@@ -148,16 +147,18 @@ def test_a_scene_that_depth_by_light_starts_is_not_said_to_start_on_a_plane_for_
     assert "unless answers of the depth network show how far away it is" in said
 
 
-@pytest.mark.parametrize(
-    ("choice", "fields", "moves", "expected"),
-    [
-        ("auto", {"mask"}, True, "light"), ("auto", {"pose"}, False, "light"), ("auto", {"pose"}, True, "auto"), ("auto", {"depth"}, False, "auto"),
-        ("auto", {"right_image"}, False, "auto"), ("none", set(), False, "none"), ("stereo", set(), False, "stereo"),
-    ],
-)  # fmt: skip
-def test_offline_light_is_asked_where_nothing_else_shows_how_far_away_tissue_is(choice, fields, moves, expected):
-    source = SourceDescription("it", 8, 6, 30.0, Camera.from_focal(8.0, 8, 6), frozenset(fields), moves=moves)
-    assert choice_without_clock(choice, source) == expected
+@pytest.mark.parametrize("has_time", [True, False])
+@pytest.mark.parametrize("fields", [{}, {"pose": np.eye(4)}], ids=["fixed", "with poses"])
+def test_no_default_finds_depth_by_light(frame, compute, monkeypatch, has_time, fields):
+    by_light = Fixed(None)
+    monkeypatch.setattr(registry, "DEPTHS", {**{name: DEPTHS[name] for name in DEPTHS}, "light": lambda: by_light})
+    operator = DepthOp(None, choice="auto", camera=CAMERA, has_time=has_time)
+    operator.start()
+    for seq in range(3):
+        compute(operator, frame=frame(seq, **fields))
+    assert by_light.asked == []
+    said = without_depth("auto", frozenset({"pose"} if fields else ()), ReconstructorConfig.offline())
+    assert "light" not in said
 
 
 @pytest.mark.parametrize(("has_time", "asked"), [(True, [0, 2, 3]), (False, [])])
