@@ -2,9 +2,11 @@
 truth, without a model in between.
 
     python benchmarks/geometry_moving.py [--frames 150] [--fps 30] [--width 320] [--height 256] [--seeds 0 1 2 3]
+        [--breathing-ratio 2] [--rate-wander 0.15] [--scope-path seeded]
 
 One JSON line a seed: the frequencies that were found (of each window), doubts, relative errors (root mean square over all tissue of all frames, the
-same where depth is believed, the share that is believed, the median of the absolute value, after one scale for all frames), and processor seconds.
+same where depth is believed, the share that is believed, the median of the absolute value, after one scale for all frames), the root mean square relative errors of the
+level plane and of the best-fit plane of each frame (`gsplat_core.evaluation.plane`), and processor seconds. The last three options are those of `intrasplat synthesize`.
 """
 
 from __future__ import annotations
@@ -15,9 +17,13 @@ import time
 from typing import Any
 
 import numpy as np
+from run_facts import run_facts
 
+from gsplat_core.evaluation.depth_share import MOST_PIXELS
+from gsplat_core.evaluation.plane import flat_depths, pixels_to_compare
 from gsplat_core.geometry.depth_map import BELIEVED
 from gsplat_core.geometry.moving_tissue import MovingTissue
+from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
 from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
 
 
@@ -28,7 +34,7 @@ def measured(asked: Asked) -> dict[str, Any]:
     began = time.process_time()
     tissue = MovingTissue(frames, [recording.camera_at(frame.seq) for frame in frames])
     found_s = time.process_time() - began
-    relative, believed = [], []
+    relative, believed, flat = [], [], []
     for number, frame in enumerate(recording):
         found = tissue.depth_of(number)
         assert frame.depth is not None
@@ -36,10 +42,15 @@ def measured(asked: Asked) -> dict[str, Any]:
         if found.doubt is None:
             relative.append((found.depth / frame.depth)[frame.mask != 0])
             believed.append(found.confidence[frame.mask != 0] >= BELIEVED)
+            rays, true = pixels_to_compare(recording.camera, frame.mask != 0, MOST_PIXELS, frame.depth)
+            planes = flat_depths(rays, true)
+            assert planes is not None
+            flat.append(np.stack([planes.level, planes.plane]) / true - 1)
     figures: dict[str, Any] = {
         "seed": asked.seed,
         "frames": asked.frames,
         "fps": asked.fps,
+        **breathing_facts(asked.extras),
         "frequencies_hz": [[round(hz, 3) for hz in each] for each in tissue.frequencies_hz],
         "doubts": tissue.doubts,
         "finding_s": round(found_s, 1),
@@ -53,10 +64,33 @@ def measured(asked: Asked) -> dict[str, Any]:
             "median_percent": percent(np.median(np.abs(ratio - 1))),
             "scaled_rms_percent": percent(np.sqrt(np.mean((ratio / np.median(ratio) - 1) ** 2))),
             "believed_percent": percent(sure.mean()),
+            **{
+                f"{name}_percent": percent(np.sqrt(np.mean(np.square(off))))
+                for name, off in zip(("level", "plane"), np.concatenate(flat, axis=1), strict=True)
+            },
         }
         if sure.any():
             figures["believed_rms_percent"] = percent(np.sqrt(np.mean((ratio[sure] - 1) ** 2)))
     return figures
+
+
+def add_breathing_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a rendered recording's breathing and scope path; defaults as those of `intrasplat synthesize`."""
+    parser.add_argument("--breathing-ratio", type=float, default=CLEAR.breathing_ratio)
+    parser.add_argument("--rate-wander", type=float, default=CLEAR.rate_wander)
+    parser.add_argument("--scope-path", choices=["usual", "seeded"], default=CLEAR.scope_path)
+
+
+def asked_breathing(arguments: argparse.Namespace) -> Extras:
+    """Return what `add_breathing_options` was given."""
+    return Extras(
+        breathing_ratio=arguments.breathing_ratio, rate_wander=arguments.rate_wander, scope_path=arguments.scope_path
+    )
+
+
+def breathing_facts(extras: Extras) -> dict[str, Any]:
+    """Return the figures' conditions for a line of the log."""
+    return {name: getattr(extras, name) for name in ("breathing_ratio", "rate_wander", "scope_path")}
 
 
 def percent(share: float) -> float:
@@ -70,10 +104,14 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=320)
     parser.add_argument("--height", type=int, default=256)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3])
+    add_breathing_options(parser)
     asked = parser.parse_args()
     for seed in asked.seeds:
-        wanted = Asked(asked.frames, asked.width, asked.height, fps=asked.fps, seed=seed, camera="moving")
-        print(json.dumps(measured(wanted)), flush=True)
+        wanted = Asked(
+            asked.frames, asked.width, asked.height, fps=asked.fps, seed=seed, camera="moving",
+            extras=asked_breathing(asked),
+        )  # fmt: skip
+        print(json.dumps(measured(wanted) | run_facts()), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Poses from pictures alone, against those that a recording came with.
 
     python benchmarks/geometry_poses.py RECORDING... [--synthetic FRAMES] [--fps 15] [--seeds 0 1] [--rigid] [--way WAY] [--causal] [--assume F] [--depth]
+        [--breathing-ratio 2] [--rate-wander 0.15] [--scope-path seeded]
 
 One JSON line a recording: ATE (root mean square of the distance between both ways after the best similarity) as a share of the given way, errors in
 pixels, processor seconds, and where tissue was found to breathe the frequencies and how much of the way is said to be uncertain. `--synthetic 150` adds a
@@ -16,12 +17,15 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from geometry_moving import add_breathing_options, asked_breathing, breathing_facts
+from run_facts import run_facts
 
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.geometry.focal_length import trajectory_without_calibration, with_focal_length
@@ -171,25 +175,34 @@ def main() -> None:
     parser.add_argument("--causal", action="store_true")
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--assume", type=float)
+    add_breathing_options(parser)
     arguments = parser.parse_args()
     for path in arguments.recordings:
         recording = open_recording(path, scale=arguments.scale)
         show(recording.name, list(recording), recording.camera, arguments)
     for seed in arguments.seeds if arguments.synthetic else []:
-        asked = Asked(arguments.synthetic, 320, 256, fps=arguments.fps, seed=seed, camera="moving")
+        extras = asked_breathing(arguments)
+        asked = Asked(arguments.synthetic, 320, 256, fps=arguments.fps, seed=seed, camera="moving", extras=extras)
         rendered = synthetic(asked, arguments.rigid, arguments.way)
         name = f"synthetic {seed}, {arguments.way}{', rigid' * arguments.rigid}"
-        show(name, list(rendered), rendered.camera, arguments)
+        show(name, list(rendered), rendered.camera, arguments, breathing_facts(extras))
 
 
-def show(name: str, frames: Sequence[Frame], camera: Camera, arguments: argparse.Namespace) -> None:
+def show(
+    name: str,
+    frames: Sequence[Frame],
+    camera: Camera,
+    arguments: argparse.Namespace,
+    conditions: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
+    """Print a recording's figures; conditions: of how it was rendered."""
     if arguments.causal:
-        print(json.dumps(measured_causally(name, frames, camera)), flush=True)
+        print(json.dumps(measured_causally(name, frames, camera) | conditions | run_facts()), flush=True)
         return
     figures, found = measured(name, frames, camera, arguments.assume)
     if arguments.depth:
         figures |= depth_of(frames, camera, found)
-    print(json.dumps(figures), flush=True)
+    print(json.dumps(figures | conditions | run_facts()), flush=True)
 
 
 if __name__ == "__main__":

@@ -176,6 +176,15 @@ class SynthesizeOptions:
     exposure_changes: Annotated[bool, typer.Option("--exposure-changes", help="Let the exposure go up and down.")] = (
         False
     )
+    breathing_ratio: Annotated[
+        float, typer.Option(help="Duration of expiration over that of inspiration; 2 is usual at rest.")
+    ] = 1.0
+    rate_wander: Annotated[
+        float, typer.Option(help="Largest deviation of the breathing rate, as a share of it: 0.15 is ±15 %.")
+    ] = 0.0
+    scope_path: Annotated[
+        str, typer.Option(help="Way of a moving scope: usual (of every seed) or seeded (another one for each seed).")
+    ] = "usual"
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,9 @@ def synthesize_command(out: Path, options: SynthesizeOptions, *, as_json: bool) 
         smoke=options.smoke,
         depth_noise_mm=options.depth_noise,
         exposure_changes=options.exposure_changes,
+        breathing_ratio=options.breathing_ratio,
+        rate_wander=options.rate_wander,
+        scope_path=options.scope_path,
     )
     with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as show:
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +56,7 @@ def describe(files: FrameFiles, frames: int) -> None:
         "ground_truth": meaning,
     }
     if extras != CLEAR:
-        description["made_with"] = asdict(extras)
+        description["made_with"] = extras.described()
     if extras.exposure_changes and scene.air is not None:
         description["exposure"] = [scene.air.exposure_at(index / files.fps) for index in range(frames)]
     _write(files.folder / "recording.json", description)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from gsplat_core.errors import InvalidSetting
 
 MOST_SMOKE = 5.0
 MOST_NOISE_MM = 20.0
+MOST_RATIO = 5.0
+MOST_WANDER = 0.5
 
 
 @dataclass(frozen=True)
@@ -29,12 +31,34 @@ class Extras:
     exposure_changes: bool = False
     """Let the exposure go up and down."""
 
+    breathing_ratio: float = 1.0
+    """Duration of expiration over that of inspiration."""
+    rate_wander: float = 0.0
+    """Largest deviation of the breathing rate, as a share of it."""
+    scope_path: str = "usual"
+    """Way of a moving scope: `usual`, the same for every seed, or `seeded`, another one for each."""
+
     def __post_init__(self) -> None:
         if self.scene not in ("open", "colon"):
             raise InvalidSetting(f"scene must be 'open' or 'colon', got {self.scene!r}")
         for name, most in (("smoke", MOST_SMOKE), ("depth_noise_mm", MOST_NOISE_MM)):
             if not 0 <= getattr(self, name) <= most:
                 raise InvalidSetting(f"{name} must be from 0 to {most:g}, got {getattr(self, name)}")
+        if not 1 / MOST_RATIO <= self.breathing_ratio <= MOST_RATIO:
+            raise InvalidSetting(
+                f"breathing_ratio must be from {1 / MOST_RATIO:g} to {MOST_RATIO:g}, got {self.breathing_ratio}"
+            )
+        if not 0 <= self.rate_wander <= MOST_WANDER:
+            raise InvalidSetting(f"rate_wander must be from 0 to {MOST_WANDER:g}, got {self.rate_wander}")
+        if self.scope_path not in ("usual", "seeded"):
+            raise InvalidSetting(f"scope_path must be 'usual' or 'seeded', got {self.scope_path!r}")
+
+    def described(self) -> dict[str, object]:
+        """Return the fields for `recording.json`. Those that later versions added are left out at their defaults, so that recordings keep their bytes."""
+        added = ("breathing_ratio", "rate_wander", "scope_path")
+        return {
+            name: value for name, value in asdict(self).items() if name not in added or value != getattr(CLEAR, name)
+        }
 
     @property
     def changes_pictures(self) -> bool:

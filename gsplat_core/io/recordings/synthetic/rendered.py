@@ -6,12 +6,13 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
 
 from gsplat_core.io.recordings.calibration import DEFAULT_FOCAL_FACTOR
+from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
 from gsplat_core.io.recordings.synthetic.scene import BASELINE_MM, SyntheticScene
 from gsplat_core.io.recordings.synthetic.synthesize import check_arguments, threads_that_fit
 from gsplat_core.scene.cameras import Camera
@@ -29,6 +30,8 @@ class Asked:
     seed: int = 0
     camera: Literal["fixed", "moving"] = "fixed"
     stereo: bool = False
+    extras: Extras = CLEAR
+    """Of these the breathing and the scope's path count."""
 
 
 class RenderedRecording:
@@ -45,7 +48,9 @@ class RenderedRecording:
         right = self.camera.right_eye(BASELINE_MM) if asked.stereo else None
         self._frames = [frame.with_fields(depth_origin=DepthOrigin.MEASURED, right_camera=right) for frame in frames]
         self.frame_count, self.fps = len(frames), asked.fps
-        self.digest = hashlib.sha256(json.dumps(astuple(asked)).encode()).hexdigest()
+        extras = [] if asked.extras == CLEAR else [asked.extras.described()]
+        stated = [*(getattr(asked, each.name) for each in fields(asked) if each.name != "extras"), *extras]
+        self.digest = hashlib.sha256(json.dumps(stated).encode()).hexdigest()
         self.fields = frozenset({"mask", "depth", "pose", *(["right_image"] if asked.stereo else [])})
         self.stereo_baseline_mm = BASELINE_MM if asked.stereo else None
 
@@ -66,7 +71,7 @@ def render_recording(asked: Asked, progress: Callable[[int, int], None] | None =
     check_arguments(frames, asked.width_px, asked.height_px, fps, asked.seed, asked.camera)
     threads = threads_that_fit(asked.width_px, asked.height_px)
     scene = SyntheticScene.from_seed(
-        asked.seed, asked.width_px, asked.height_px, frames / fps, asked.camera == "moving"
+        asked.seed, asked.width_px, asked.height_px, frames / fps, asked.camera == "moving", asked.extras
     )
 
     def rendered(index: int) -> Frame:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -25,6 +25,40 @@ SCENES: dict[str, type[Tissue]] = {"open": Tissue, "colon": Colon}
 
 
 @dataclass(frozen=True)
+class Sway:
+    """The way of a moving scope: a sine along each axis and one about its own, at 0 at time 0."""
+
+    periods_s: tuple[float, float, float, float] = (4.1, 5.3, 6.7, 4.7)
+    """Along x, y and z, and of the roll."""
+    reaches: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    """Factors of the usual amplitudes."""
+    phases: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+    @classmethod
+    def seeded(cls, rng: np.random.Generator) -> Sway:
+        """Another way: periods of 0.7 to 1.5 times the usual ones, 0.6 to 1.3 times as far, at other phases."""
+        periods = np.array(cls.periods_s) * rng.uniform(0.7, 1.5, 4)
+        return cls(
+            *(tuple(each.tolist()) for each in (periods, rng.uniform(0.6, 1.3, 4), rng.uniform(0, 2 * np.pi, 4)))
+        )
+
+    def at(self, time_s: float, sway_mm: tuple[float, float, float]) -> tuple[NDArray[np.float64], float]:
+        """Return the centre [3] in mm and the roll in radians, for the usual amplitudes along x, y and z."""
+        turn = 2 * np.pi * time_s
+        ways = [
+            most * reach * (np.sin(turn / period + phase) - np.sin(phase))
+            for most, reach, period, phase in zip(
+                (*sway_mm, USUAL_ROLL), self.reaches, self.periods_s, self.phases, strict=True
+            )
+        ]
+        return np.array(ways[:3]), float(ways[3])
+
+
+USUAL_ROLL = 0.05
+USUAL_SWAY = Sway()
+
+
+@dataclass(frozen=True)
 class SyntheticScene:
     """Tissue, tool and cameras as functions of time."""
 
@@ -33,6 +67,8 @@ class SyntheticScene:
     camera: Camera
     moving: bool
     air: Air | None = None
+    sway: Sway = field(default_factory=lambda: USUAL_SWAY)
+    """How a moving scope sways."""
 
     @classmethod
     def from_seed(
@@ -45,7 +81,13 @@ class SyntheticScene:
         shape, tool = (np.random.default_rng(child) for child in seeds[:2])
         tissue = kind(shape, texel_mm=min(0.6 * TISSUE_DISTANCE_MM / float(camera.K[0, 0]), 0.3))
         air = Air.from_seed(seeds[2], extras.smoke, extras.exposure_changes) if extras.changes_pictures else None
-        return cls(tissue, ToolMotion(tool, cycles=int(duration_s // CYCLE_S) + 1), camera, moving, air)
+        breath, path = (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(5)[3:])
+        first, second = breath.uniform(0, 2 * np.pi, 2)
+        tissue.breathing = replace(
+            tissue.breathing, ratio=extras.breathing_ratio, wander=extras.rate_wander, wander_phases=(first, second)
+        )
+        sway = Sway.seeded(path) if extras.scope_path == "seeded" else USUAL_SWAY
+        return cls(tissue, ToolMotion(tool, cycles=int(duration_s // CYCLE_S) + 1), camera, moving, air, sway)
 
     def camera_at(self, time_s: float, view: View = "left") -> Camera:
         """A camera's intrinsics and where it is; the left one at time 0 is at the world's origin."""
@@ -56,10 +98,8 @@ class SyntheticScene:
         """At rest, or swaying around a point on the tissue."""
         if not self.moving:
             return self.camera
-        sway = 2 * np.pi * time_s
-        x, y, z = self.tissue.sway_mm
-        centre = np.array([x * np.sin(sway / 4.1), y * np.sin(sway / 5.3), z * np.sin(sway / 6.7)])
-        rotation = _looking(np.array([0, 0, self.tissue.looked_at_mm]) - centre, 0.05 * np.sin(sway / 4.7))
+        centre, roll = self.sway.at(time_s, self.tissue.sway_mm)
+        rotation = _looking(np.array([0, 0, self.tissue.looked_at_mm]) - centre, roll)
         return self.camera.with_pose(_pose(rotation, centre))
 
     def left_to(self, view: View) -> NDArray[np.float64]:

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.io.recordings.calibration import DEFAULT_FOCAL_FACTOR
+from gsplat_core.io.recordings.synthetic.breathing import Breathing
 from gsplat_core.io.recordings.synthetic.lamp import REFERENCE_MM
 from gsplat_core.io.recordings.synthetic.texture import TissueTexture
 
 Array = NDArray[np.floating]
 
 TISSUE_DISTANCE_MM = 74.0
-BREATH_PERIOD_S = 3.4
 PULSE_PERIOD_S = 0.9
 TUG_RADIUS_MM = 12.0
 
@@ -68,7 +68,8 @@ class Tissue:
             for k, angle, phase, slope in zip(wave_numbers, angles, rng.uniform(0, 2 * np.pi, 6), slopes, strict=True)
         ]
         self._tilt = rng.uniform(-0.10, 0.10, 2)
-        self._breath_phase = float(rng.uniform(0, 2 * np.pi))
+        self.breathing = Breathing(float(rng.uniform(0, 2 * np.pi)))
+        """Replaced where a recording asks for another one."""
         self._breath_angle = float(rng.uniform(0, 2 * np.pi))
         self.texture = TissueTexture(rng, texel_mm)
 
@@ -98,7 +99,7 @@ class Tissue:
         (x, y, z), (x_u, y_u, z_u), (x_v, y_v, z_v) = rest.position, rest.along_u, rest.along_v
 
         # Breathing: a long wave that lifts and shears; pulse: a short one that runs across.
-        breath = 2 * np.pi * time_s / BREATH_PERIOD_S + self._breath_phase
+        breath = self.breathing.phase(time_s)
         pulse = 2 * np.pi * time_s / PULSE_PERIOD_S
         direction = (np.cos(self._breath_angle), np.sin(self._breath_angle))
         for wavelength_mm, phase, lift_mm, shear_mm in ((130.0, breath, 2.4, 1.6), (55.0, -pulse, 0.35, 0.25)):
