@@ -118,6 +118,15 @@ class RenderedFrame:
                 raise InvalidInput(f"frame {self.frame.seq}: {name} is {list(plane.shape)}, the image {list(size[:2])}")
 
 
+@dataclass(frozen=True)
+class Prediction:
+    """A frame with the picture that the model gave of it before it was trained on it."""
+
+    frame: Frame
+    image: NDArray[np.uint8] | None
+    """RGB uint8 [H, W, 3], rendered at the frame's time and pose; None where no prediction was made."""
+
+
 class PictureState(Enum):
     """How a shown picture stands to the present."""
 

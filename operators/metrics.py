@@ -1,4 +1,4 @@
-"""How good each displayed frame is, and which bytes were displayed."""
+"""Scores of displayed frames, trivial baselines beside them, and the digest of the displayed bytes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from gsplat_core.scene.frames import Frame, FrameStatus
-from gsplat_core.training.metrics import FrameQuality, QualityTracker, psnr_tissue_db
+from gsplat_core.training.metrics import FrameQuality, QualityTracker, ScoredMean, psnr_tissue_db
 from operators.frame_log import Entry, FrameLog
 from operators.graph import Operator, OperatorSpec
-from operators.messages import RenderedFrame
+from operators.messages import Prediction, RenderedFrame
 from operators.outcome import OutcomeBuilder
 
 
@@ -24,8 +24,11 @@ class ScoredFrame:
 
     rendered: RenderedFrame
     quality: FrameQuality
+    """Where the frame was trained on before it was shown, this is the training error of its picture."""
     previous_frame_db: float
-    """Tissue PSNR of showing the raw frame before it instead: what doing nothing scores. NaN for the first frame."""
+    """Tissue PSNR of the previous raw frame, shown instead: the trivial baseline. NaN for the first frame."""
+    next_frame_db: float = math.nan
+    """Tissue PSNR of the picture that the model gave of this frame before it was trained on it; NaN where there is none."""
 
     def as_json(self) -> Entry:
         """One entry of the report's series; null where a measure does not exist."""
@@ -35,6 +38,7 @@ class ScoredFrame:
             "psnr_frame_db": self.quality.psnr_frame_db,
             "ssim": self.quality.ssim,
             "previous_frame_db": self.previous_frame_db,
+            "next_frame_db": self.next_frame_db,
         }
         return {
             "seq": frame.seq,
@@ -46,11 +50,48 @@ class ScoredFrame:
 
 
 @dataclass(frozen=True)
+class NextFrameResult:
+    """How well the model predicts a frame before it is trained on it: the figure of a run that is no training error."""
+
+    psnr_tissue_db: float | None
+    """Mean tissue PSNR of the predictions."""
+    previous_frame_db: float | None
+    """Mean tissue PSNR of the previous raw frame over the same frames: the trivial prediction."""
+    frames: int
+    """Frames that have both figures."""
+
+
+class NextFrameScores:
+    """Means of predicted frames and of their trivial baseline, over the frames that have both."""
+
+    def __init__(self) -> None:
+        self._predicted, self._previous = ScoredMean(), ScoredMean()
+
+    def add(self, predicted_db: float, previous_db: float) -> None:
+        """Take one frame's two figures; without effect where either is not finite."""
+        if math.isfinite(predicted_db) and math.isfinite(previous_db):
+            self._predicted.add(predicted_db)
+            self._previous.add(previous_db)
+
+    @property
+    def result(self) -> NextFrameResult:
+        """The means so far."""
+        return NextFrameResult(self._predicted.mean, self._previous.mean, self._predicted.count)
+
+
+def prediction_db(prediction: Prediction | None) -> float:
+    """Return the tissue PSNR of a prediction against its frame; NaN where none was made."""
+    if prediction is None or prediction.image is None:
+        return math.nan
+    return psnr_tissue_db(prediction.image, prediction.frame.image, prediction.frame.mask)
+
+
+@dataclass(frozen=True)
 class QualityResult:
-    """How good a run's frames were."""
+    """Scores of a run's displayed frames."""
 
     trained: QualityTracker
-    """Frames that were trained on before they were shown."""
+    """Frames that were trained on before they were shown: training errors."""
     held_out: QualityTracker
     """Frames that were shown and never trained on."""
     series: tuple[Entry, ...]
@@ -70,6 +111,7 @@ class MetricsOp(Operator):
 
     Inputs:
         rendered: `RenderedFrame`.
+        predicted: the `Prediction` of the same frame; may stay unconnected.
 
     Outputs:
         scored: `ScoredFrame`.
@@ -86,6 +128,7 @@ class MetricsOp(Operator):
         """Frames that were shown and never trained on."""
         self.frames = 0
         """How many frames arrived so far."""
+        self.next_frame = NextFrameScores()
         self._digest = hashlib.sha256()
         self._hashing = ThreadPoolExecutor(1, thread_name_prefix="hash frames")
         self._previous: Frame | None = None
@@ -93,10 +136,12 @@ class MetricsOp(Operator):
 
     def setup(self, spec: OperatorSpec) -> None:
         spec.input("rendered", type=RenderedFrame)
+        spec.input("predicted", type=Prediction, optional=True)
         spec.output("scored", type=ScoredFrame)
 
     def start(self) -> None:
         self.live, self.held_out, self.frames = QualityTracker(), QualityTracker(), 0
+        self.next_frame = NextFrameScores()
         self._digest = hashlib.sha256()
         self._hashing = ThreadPoolExecutor(1, thread_name_prefix="hash frames")
         self._previous = None
@@ -122,8 +167,10 @@ class MetricsOp(Operator):
             quality = tracker.observe(frame.seq, rendered.image, frame.image, frame.mask)
             if previous is not None and previous.image.shape == frame.image.shape:
                 before_db = psnr_tissue_db(previous.image, frame.image, frame.mask)
+        next_db = prediction_db(op_input.receive("predicted"))
+        self.next_frame.add(next_db, before_db)
         hashed.result()
-        scored = ScoredFrame(rendered, quality, before_db)
+        scored = ScoredFrame(rendered, quality, before_db, next_db)
         if self.log is not None:
             self.log.write(scored.as_json())
         self._previous = frame
@@ -135,6 +182,7 @@ class MetricsOp(Operator):
         if self.log is not None and self.frames:
             outcome.output("frames", self.log.path)
         outcome.add(QualityResult(self.live, self.held_out, entries, per_entry, self.frames_sha256, self.frames))
+        outcome.add(self.next_frame.result)
 
     @property
     def frames_sha256(self) -> str:

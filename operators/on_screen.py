@@ -1,11 +1,11 @@
-"""How good a live stream's pictures were: what was on the screen when the next frame arrived, against the frame before it."""
+"""Scores of a live stream: the picture on the screen when the next frame arrived, against the frame before it."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 import time
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -17,13 +17,15 @@ from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.training.metrics import FrameQuality, QualityTracker, ScoredMean, psnr_tissue_db
 from operators.frame_log import FrameLog, Value
 from operators.graph import ConditionType, MessageOrTimeoutCondition, Operator, OperatorSpec
-from operators.messages import ShownPicture
-from operators.metrics import QualityResult, ScoredFrame
+from operators.messages import Prediction, ShownPicture
+from operators.metrics import NextFrameScores, QualityResult, ScoredFrame, prediction_db
 from operators.outcome import OutcomeBuilder
 
 LOOK_NS = 500_000_000
 WAITING = 8
 """Frames and pictures that may wait to be scored; beyond them the oldest go unscored and are counted."""
+PREDICTIONS_KEPT = 64
+"""Frames whose figures are kept until their prediction arrives, or whose prediction is kept until they are scored."""
 TRIM_EVERY_S = 30.0
 """How often memory that is free is given back to the system."""
 SIMILARITY_EVERY = 8
@@ -37,14 +39,15 @@ class OnScreenResult:
     """Figures of a live stream, besides the means of `QualityResult`."""
 
     settled_db: float | None
-    """Mean tissue PSNR after the first second."""
+    """Mean tissue PSNR after the first second: the training error of what was shown, at the age that it had."""
     worst_db: float | None
     """Lowest tissue PSNR of a frame after the first second."""
     worst_seq: int | None
+    """Number of that frame."""
     previous_frame_db: float | None
-    """Mean tissue PSNR of the raw frame before, shown instead, after the first second ..."""
+    """Mean tissue PSNR of the previous raw frame, shown instead, after the first second."""
     previous_frame_throughout_db: float | None
-    """... and over all frames that were scored."""
+    """The same mean over all frames that were scored."""
     frames: int
     """Frames that were scored."""
     not_on_screen: int
@@ -57,27 +60,35 @@ class OnScreenMetricsOp(Operator):
     """Scores each frame by what was on the screen when the next frame arrived: the picture of this frame, or, where that came too late, the
     older one that was still there. State and age are drawn into what is shown, and not into what is scored.
 
+    The model has been trained on most of these frames before their picture was shown, so these figures are training errors. Predictions
+    are scored beside them (`NextFrameResult`), after the first second.
+
     Inputs:
         frame: `Frame`, each one as it goes into reconstruction.
         shown: `ShownPicture`.
+        predicted: `Prediction` of some of the frames; may stay unconnected.
 
     Outputs:
         scored: `ScoredFrame`.
 
     Params:
         log: where each frame's figures are written; without one there is no series.
+        report: also measure SSIM and the digest of all pictures, which only a report shows, and contribute `QualityResult`.
     """
 
-    def __init__(self, fragment: Any, *args: Any, log: FrameLog | None = None, **kwargs: Any) -> None:
-        self.log = log
+    def __init__(
+        self, fragment: Any, *args: Any, log: FrameLog | None = None, report: bool = True, **kwargs: Any
+    ) -> None:
+        self.log, self.report = log, report
         self._reset()
         super().__init__(fragment, MessageOrTimeoutCondition(fragment, LOOK_NS), *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:
-        for name, kind in (("frame", Frame), ("shown", ShownPicture)):
-            port = spec.input(name, policy="drop_oldest", type=kind).condition(ConditionType.NONE)
+        for name, kind in (("frame", Frame), ("shown", ShownPicture), ("predicted", Prediction)):
+            optional = name == "predicted"
+            port = spec.input(name, policy="drop_oldest", type=kind, optional=optional).condition(ConditionType.NONE)
             port.connector(port.ConnectorType.DEFAULT, capacity=WAITING)
-        spec.output("scored", type=ScoredFrame).condition(ConditionType.NONE)
+        spec.output("scored", type=ScoredFrame, optional=True).condition(ConditionType.NONE)
 
     def start(self) -> None:
         self._reset()
@@ -91,6 +102,7 @@ class OnScreenMetricsOp(Operator):
             self._score_waiting(waiting=0)
         self._frames.clear()
         self._shown.clear()
+        self._predicted.clear()
         if self.log is not None:
             self.log.close()
 
@@ -99,10 +111,15 @@ class OnScreenMetricsOp(Operator):
         """Every frame that was scored."""
         self.settled, self.before, self.before_throughout = ScoredMean(), ScoredMean(), ScoredMean()
         self.worst: tuple[float, int] | None = None
+        self.next_frame = NextFrameScores()
         self.frames = self.not_on_screen = self.unscored = 0
         self._digest = hashlib.sha256()
         self._frames: deque[Frame | None] = deque()
         self._shown: deque[ShownPicture] = deque()
+        self._predicted: OrderedDict[int, float] = OrderedDict()
+        """Tissue PSNR of predictions whose frame is not scored yet, by number."""
+        self._waiting_db: OrderedDict[int, float] = OrderedDict()
+        """Tissue PSNR of the previous raw frame, of frames whose prediction has not arrived."""
         self._on_screen: ShownPicture | None = None
         self._previous: Frame | None = None
         self._first_s: float | None = None
@@ -118,6 +135,9 @@ class OnScreenMetricsOp(Operator):
         frame: Frame | None
         while (frame := op_input.receive("frame")) is not None:
             self._frames.append(frame)
+        prediction: Prediction | None
+        while (prediction := op_input.receive("predicted")) is not None:
+            self._take(prediction)
         # Pictures come by another way than frames: a frame is scored when the one after the next is there.
         for scored in self._score_waiting(waiting=2):
             op_output.emit(scored, "scored")
@@ -139,8 +159,21 @@ class OnScreenMetricsOp(Operator):
                 scores.append(scored)
         return scores
 
+    def _take(self, prediction: Prediction) -> None:
+        """Score a prediction, which on a slow machine arrives after its frame was scored."""
+        value, seq = prediction_db(prediction), prediction.frame.seq
+        if not math.isfinite(value):
+            return
+        before_db = self._waiting_db.pop(seq, None)
+        if before_db is not None:
+            self.next_frame.add(value, before_db)
+        else:
+            _keep(self._predicted, seq, value)
+
     def _show(self, picture: ShownPicture) -> None:
         self._on_screen = picture
+        if not self.report:
+            return
         frame = picture.rendered.frame
         self._digest.update(f"{frame.seq} {frame.width_px} {frame.height_px}\n".encode())
         self._digest.update(np.ascontiguousarray(picture.rendered.image).data)
@@ -162,14 +195,14 @@ class OnScreenMetricsOp(Operator):
         if scorable:
             quality = self.quality.observe(
                 frame.seq, on_screen.rendered.image, frame.image, frame.mask,
-                similarity=self.frames % SIMILARITY_EVERY == 1,
+                similarity=self.report and self.frames % SIMILARITY_EVERY == 1,
             )  # fmt: skip
             if previous is not None and previous.image.shape == frame.image.shape:
                 before_db = psnr_tissue_db(previous.image, frame.image, frame.mask)
         else:
             quality = FrameQuality(frame.seq, math.nan, math.nan, math.nan)
         self._count(frame, on_screen, quality, before_db)
-        scored = ScoredFrame(on_screen.rendered, quality, before_db)
+        scored = ScoredFrame(on_screen.rendered, quality, before_db, self._next_frame_db(frame, before_db))
         if self.log is not None and self._log_works:
             # What ended the run, a full disk say, is said once: `stop` writes no more into a log that has failed.
             self._log_works = False
@@ -183,7 +216,7 @@ class OnScreenMetricsOp(Operator):
         if self._first_s is None:
             self._first_s = frame.time_s
         self.before_throughout.add(before_db)
-        if frame.time_s - self._first_s < SETTLING_S:
+        if not self._is_settled(frame):
             return
         value = quality.psnr_tissue_db
         self.settled.add(value)
@@ -191,13 +224,28 @@ class OnScreenMetricsOp(Operator):
         if math.isfinite(value) and (self.worst is None or value < self.worst[0]):
             self.worst = value, frame.seq
 
+    def _is_settled(self, frame: Frame) -> bool:
+        return self._first_s is not None and frame.time_s - self._first_s >= SETTLING_S
+
+    def _next_frame_db(self, frame: Frame, before_db: float) -> float:
+        """Return what the prediction of a frame scores, where it has arrived; count it, or remember its baseline for when it comes."""
+        value = self._predicted.pop(frame.seq, math.nan)
+        if self._is_settled(frame) and math.isfinite(before_db):
+            if math.isfinite(value):
+                self.next_frame.add(value, before_db)
+            else:
+                _keep(self._waiting_db, frame.seq, before_db)
+        return value
+
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
-        entries, per_entry = self.log.series(self.frames) if self.log is not None else ((), 1)
-        if self.log is not None and self.frames:
-            outcome.output("frames", self.log.path)
-        sha256 = self._digest.hexdigest()
-        outcome.add(QualityResult(self.quality, QualityTracker(), entries, per_entry, sha256, self.frames))
+        if self.report:
+            entries, per_entry = self.log.series(self.frames) if self.log is not None else ((), 1)
+            if self.log is not None and self.frames:
+                outcome.output("frames", self.log.path)
+            sha256 = self._digest.hexdigest()
+            outcome.add(QualityResult(self.quality, QualityTracker(), entries, per_entry, sha256, self.frames))
+        outcome.add(self.next_frame.result)
         worst_db, worst_seq = self.worst or (None, None)
         outcome.add(
             OnScreenResult(
@@ -205,6 +253,12 @@ class OnScreenMetricsOp(Operator):
                 self.not_on_screen, self.unscored,
             )
         )  # fmt: skip
+
+
+def _keep(values: OrderedDict[int, float], seq: int, value: float) -> None:
+    values[seq] = value
+    while len(values) > PREDICTIONS_KEPT:
+        values.popitem(last=False)
 
 
 def _entry(scored: ScoredFrame, frame: Frame, on_screen: ShownPicture, until_ns: float) -> Mapping[str, Value]:

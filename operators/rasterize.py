@@ -1,21 +1,25 @@
-"""From a model at a moment to a picture at the frame's camera."""
+"""Render the deformed model from the camera of its frame, and predict frames that the model has not been trained on."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.registry import RENDERERS, new_renderer
-from gsplat_core.rendering.renderer import Renderer
+from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer
+from gsplat_core.scene.frames import FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import Snapshot
 from gsplat_core.transfers import HostCopy
 from operators.graph import Operator, OperatorSpec
-from operators.messages import DeformedScene, RenderedFrame
+from operators.messages import DeformedScene, Prediction, RenderedFrame
 
 
 def displayed(image: torch.Tensor) -> NDArray[np.uint8]:
@@ -43,16 +47,10 @@ class Rasterizer:
         self._stream: torch.cuda.Stream | None = None
 
     def draw(self, scene: DeformedScene) -> RenderedFrame:
-        """The picture of a scene, complete."""
+        """Render a scene; returns when picture, depth and opacity are on the host."""
         with torch.inference_mode(), self._own_stream(scene.model):
-            renderer = self._renderer_for(scene)
-            reads_snapshots = RENDERERS[self.renderer].capabilities.reads_snapshots
-            renderer.prepare(scene.model if reads_snapshots else scene.model.as_model())
-            output = renderer.render(scene.camera, scene.time_s).result()
+            picture, output = self._render(scene, STANDARD_OUTPUTS)
             # All three are queued before the first is waited for.
-            picture = output.image
-            if scene.frame.exposure != (1.0, 1.0, 1.0):
-                picture = picture * picture.new_tensor(scene.frame.exposure)
             image, depth, alpha = _displayed(picture), HostCopy(output.depth), HostCopy(output.alpha)
             made_from = scene.reconstruction
             return RenderedFrame(
@@ -67,6 +65,21 @@ class Rasterizer:
                 taken_ns=None if made_from is None else made_from.taken_ns,
                 published_ns=None if made_from is None else made_from.published_ns,
             )
+
+    def picture(self, scene: DeformedScene) -> NDArray[np.uint8]:
+        """Render the picture of a scene alone, RGB uint8 [H, W, 3]."""
+        with torch.inference_mode(), self._own_stream(scene.model):
+            return _displayed(self._render(scene, ("image",))[0]).numpy()
+
+    def _render(self, scene: DeformedScene, outputs: Iterable[str]) -> tuple[torch.Tensor, RenderOutput]:
+        """Return the picture at the frame's exposure, and what was rendered."""
+        renderer = self._renderer_for(scene)
+        reads_snapshots = RENDERERS[self.renderer].capabilities.reads_snapshots
+        renderer.prepare(scene.model if reads_snapshots else scene.model.as_model())
+        output = renderer.render(scene.camera, scene.time_s, outputs).result()
+        if scene.frame.exposure == (1.0, 1.0, 1.0):
+            return output.image, output
+        return output.image * output.image.new_tensor(scene.frame.exposure), output
 
     def _renderer_for(self, scene: DeformedScene) -> Renderer:
         camera = scene.camera
@@ -92,33 +105,68 @@ class RasterizeOp(Operator):
 
     On a GPU this operator's thread waits for the picture (see `Rasterizer`); the other threads go on meanwhile.
 
+    With `predict_every` it also renders predictions: the model of the scene before, at the time and pose of this scene's frame, which that model
+    has not been trained on. Each picture is emitted before its prediction is rendered.
+
     Inputs:
         scene: `DeformedScene`.
 
     Outputs:
         rendered: `RenderedFrame`, complete.
+        predicted: with `predict_every`, one `Prediction` for each frame.
 
     Params:
         renderer: a name in `gsplat_core.rendering.registry.RENDERERS`.
+        predict_every: every so many frames one is predicted; 0: none.
         rasterizer: one that was used already; this operator is its only user from now on. None: it makes one.
     """
 
     renderer: str
+    predict_every: int
 
     def __init__(self, fragment: Any, *args: Any, rasterizer: Rasterizer | None = None, **kwargs: Any) -> None:
         self._rasterizer = rasterizer
+        self._before: DeformedScene | None = None
+        self._drawn = 0
         super().__init__(fragment, *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:
         spec.input("scene", type=DeformedScene)
         spec.output("rendered", type=RenderedFrame)
+        spec.output("predicted", type=Prediction, optional=True)
         spec.param("renderer", "alpha")
+        spec.param("predict_every", 0)
+
+    def start(self) -> None:
+        self._before, self._drawn = None, 0
 
     def stop(self) -> None:
-        # It holds the last model and, on a GPU, memory.
-        self._rasterizer = None
+        # Both hold a model and, on a GPU, memory.
+        self._rasterizer = self._before = None
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         if self._rasterizer is None:
             self._rasterizer = Rasterizer(self.renderer)
-        op_output.emit(self._rasterizer.draw(op_input.receive("scene")), "rendered")
+        scene: DeformedScene = op_input.receive("scene")
+        op_output.emit(self._rasterizer.draw(scene), "rendered")
+        if self.predict_every:
+            op_output.emit(self._prediction(scene, self._rasterizer), "predicted")
+
+    def _prediction(self, scene: DeformedScene, rasterizer: Rasterizer) -> Prediction:
+        before, self._before = self._before, scene
+        self._drawn += 1
+        if before is None or self._drawn % self.predict_every or not _is_predictable(before, scene):
+            return Prediction(scene.frame, None)
+        # The exposure is found in the picture, which a prediction does not know.
+        frame = scene.frame.with_fields(exposure=before.frame.exposure)
+        return Prediction(
+            scene.frame, rasterizer.picture(replace(scene, frame=frame, model=before.model, reconstruction=None))
+        )
+
+
+def _is_predictable(before: DeformedScene, scene: DeformedScene) -> bool:
+    """Return True where `scene` continues the scene `before` with a frame that can be scored."""
+    frame, earlier = scene.frame, before.frame
+    usable = frame.status is not FrameStatus.DAMAGED and frame.withheld is None
+    continues = frame.new_scene is None and frame.scene == earlier.scene and frame.image.shape == earlier.image.shape
+    return usable and continues

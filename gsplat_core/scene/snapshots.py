@@ -28,7 +28,7 @@ from gsplat_core.scene.rows import inert_gaussians
 ROW_STEP = 1024
 """The capacity for Gaussians is a multiple of this."""
 ROW_HEADROOM = 1.25
-MOST_SLOTS = 8
+MOST_SLOTS = 9
 """Snapshots of one publisher that may be held at a time. A replay needs three, seldom four."""
 
 

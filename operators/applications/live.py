@@ -20,7 +20,7 @@ from operators.applications.device import check_device
 from operators.applications.finishing import saves_model
 from operators.applications.limits import check_picture
 from operators.applications.live_analysis import analysis_operator
-from operators.applications.live_settings import LiveSettings
+from operators.applications.live_settings import LIVE_PREDICT_EVERY, LiveSettings
 from operators.applications.live_start import LiveParts, low_latency, new_parts, warm_up
 from operators.applications.recording import RunRecording
 from operators.applications.replay import REPORT_RESERVE_BYTES
@@ -93,7 +93,13 @@ class LiveApplication(Application):
             depth=beside,
         )
         deform = DeformOp(self, name="deform")
-        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer, rasterizer=self._parts.rasterizer)
+        rasterize = RasterizeOp(
+            self,
+            name="rasterize",
+            renderer=settings.renderer,
+            predict_every=LIVE_PREDICT_EVERY[settings.device],
+            rasterizer=self._parts.rasterizer,
+        )
         self.display = DisplayOp(
             self,
             name="display",
@@ -101,8 +107,8 @@ class LiveApplication(Application):
             source_state=lambda: self.frame_source.state,
             settings=settings.display,
         )
-        log = FrameLog(out / FRAMES_FILE, reserve) if settings.frame_log else None
-        self.metrics = OnScreenMetricsOp(self, name="on_screen", log=log)
+        log = FrameLog(out / FRAMES_FILE, reserve) if settings.report else None
+        self.metrics = OnScreenMetricsOp(self, name="on_screen", log=log, report=settings.report)
         self.add_flow(analysis, self.reconstruct, {("frame", "frame")})
         self.add_flow(
             self.reconstruct, deform, {("reconstruction", "reconstruction")}, policy="drop_oldest", capacity=2
@@ -112,11 +118,13 @@ class LiveApplication(Application):
         recording.pictures_of(self.display)
         self.add_flow(analysis, self.metrics, {("frame", "frame")})
         self.add_flow(self.display, self.metrics, {("shown", "shown")})
+        self.add_flow(rasterize, self.metrics, {("predicted", "predicted")})
         if self._on_shown is not None:
             shown = CallbackSinkOp(self, name="viewer", callback=self._on_shown)
             self.add_flow(self.display, shown, {("shown", "message")}, policy="drop_oldest")
-        keyframes = KeyframesOp(self, name="keyframes")
-        self.add_flow(self.metrics, keyframes, {("scored", "scored")}, policy="drop_oldest", capacity=4)
+        if settings.report:
+            keyframes = KeyframesOp(self, name="keyframes")
+            self.add_flow(self.metrics, keyframes, {("scored", "scored")}, policy="drop_oldest", capacity=4)
         if self._on_scored is not None:
             report = self._on_scored
             progress = CallbackSinkOp(self, name="progress", callback=lambda scored: report(self, scored))

@@ -48,6 +48,8 @@ LIVE_SHOW_AFTER = {"cpu": (0.85, 28.3), "cuda": (0.6, 17.0)}
 sooner, as long as it is shown before the next frame comes."""
 LIVE_FIRST_STEPS = {"cpu": 4, "cuda": 5}
 """Steps of a scene's first frame: its picture, and the frames behind it, wait for them."""
+LIVE_PREDICT_EVERY = {"cpu": 8, "cuda": 4}
+"""Every so many pictures the next frame's prediction is rendered and scored. It costs as much as a picture and its score."""
 LIVE_CATCH_UP_INTERVALS = {"cpu": 2.0, "cuda": 4.0}
 """How long a frame may wait before it is passed over. A GPU catches up within a few frames; two cores would show each of them late."""
 LIVE_STARTS_FROM_MOTION = {"cpu": True, "cuda": False}
@@ -82,8 +84,9 @@ class LiveSettings:
     """Record the session into this folder, which is not there yet; None: it is not recorded."""
     recording: WriterOptions = dataclasses.field(default_factory=WriterOptions)
     """How it is recorded."""
-    frame_log: bool = True
-    """Write a line of figures for each frame; a run without an end leaves it out, since the file grows."""
+    report: bool = True
+    """Gather what a report shows: a line of figures for each frame, key frames, SSIM and the digest of the pictures. A run without an end
+    has no report, and its log would grow."""
     tool_mask: str = "builtin"
     """How tools are found in frames that come without a mask (`operators.tool_mask.TOOL_MASKS`)."""
     depth: str = "auto"

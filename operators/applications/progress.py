@@ -16,7 +16,11 @@ class Progress:
     total: int
     unit: str = "frames"
     psnr_tissue_db: float | None = None
-    """Quality of the newest displayed frame."""
+    """Tissue PSNR of the newest displayed frame; its training error where `trained`."""
+    previous_frame_db: float | None = None
+    """Tissue PSNR of the raw frame before it, shown instead."""
+    trained: bool = True
+    """The newest displayed frame was trained on before it was shown."""
 
 
 ProgressCallback = Callable[[Progress], None]

@@ -80,6 +80,7 @@ def reconstruct(
             stop_requested=stop_requested,
             make_reconstructor=lambda: FittedModel(model, eyes),
             stage="evaluate",
+            predicts=False,
         )
         graph.announce()
         return Session(

@@ -13,6 +13,7 @@ any number of threads (`scheduler_for`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -147,12 +148,14 @@ class ReplayApplication(Application):
         make_reconstructor: Callable[[], Any] | None = None,
         followed: FollowedSession | None = None,
         stage: str = "replay",
+        predicts: bool = True,
     ) -> None:
+        """predicts: score each frame's prediction by the model that has not seen it; False for a model that has seen all frames."""
         super().__init__(name="replay", track=True)
         self.scheduler(scheduler_for(settings.device, self))
         self.frame_source = source
         self.settings = settings
-        self.stage = stage
+        self.stage, self._predicts = stage, predicts
         self._progress = progress
         self._stop_requested = stop_requested
         self._make_reconstructor = make_reconstructor or (lambda: new_reconstructor(settings, source))
@@ -169,7 +172,7 @@ class ReplayApplication(Application):
         )
         self.reconstruct = self._reconstruct_op()
         deform = DeformOp(self, name="deform")
-        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer)
+        rasterize = RasterizeOp(self, name="rasterize", renderer=settings.renderer, predict_every=int(self._predicts))
         self.metrics = MetricsOp(self, name="metrics", log=FrameLog(out / FRAMES_FILE, reserve))
         for before, after in pairwise((source, *looks, self.reconstruct)):
             self.add_flow(before, after, {("frame", "frame")})
@@ -183,6 +186,8 @@ class ReplayApplication(Application):
             if kind is RenderedFrame:
                 self.add_flow(rasterize, sink, {("rendered", port)})
         self.add_flow(rasterize, self.metrics, {("rendered", "rendered")})
+        if self._predicts:
+            self.add_flow(rasterize, self.metrics, {("predicted", "predicted")})
         for sink in sinks:
             port, kind = input_of(sink)
             if kind is ScoredFrame:
@@ -212,12 +217,26 @@ class ReplayApplication(Application):
         self._show(0, None)
 
     def _report(self, scored: ScoredFrame) -> None:
-        self._show(self.metrics.frames, scored.quality.psnr_tissue_db)
+        self._show(self.metrics.frames, scored)
 
-    def _show(self, done: int, psnr_tissue_db: float | None) -> None:
-        total = self.frame_source.description.frame_count
-        if self._progress is not None:
-            self._progress(Progress(self.stage, done, total or done, psnr_tissue_db=psnr_tissue_db))
+    def _show(self, done: int, scored: ScoredFrame | None) -> None:
+        total = self.frame_source.description.frame_count or done
+        if self._progress is None:
+            return
+        if scored is None:
+            self._progress(Progress(self.stage, done, total))
+            return
+        measured, previous_db = scored.quality.psnr_tissue_db, scored.previous_frame_db
+        self._progress(
+            Progress(
+                self.stage,
+                done,
+                total,
+                psnr_tissue_db=measured,
+                previous_frame_db=previous_db if math.isfinite(previous_db) else None,
+                trained=scored.rendered.trained,
+            )
+        )
 
 
 def replay(

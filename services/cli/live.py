@@ -25,6 +25,7 @@ from operators.frame_clock import ClockSettings
 from operators.metrics import ScoredFrame
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.interrupt import InterruptRequest
+from services.cli.runs import next_frame_line, quality_line
 from services.cli.streams import printable
 from services.reports.build import write_reports
 from services.reports.schema import LiveFacts, RunReport
@@ -70,7 +71,8 @@ class LiveStatus:
         state = "" if graph.display.state is None else graph.display.state.value
         line = (
             f"{state:<11} {rate:5.1f} pictures/s  age {graph.display.age_p50_ms:5.1f} ms"
-            f"  {scored.quality.psnr_tissue_db:5.2f} dB  {graph.reconstruct.newest_gaussians} Gaussians"
+            f"  training error {scored.quality.psnr_tissue_db:5.2f} dB (previous frame {scored.previous_frame_db:5.2f} dB)"
+            f"  {graph.reconstruct.newest_gaussians} Gaussians"
         )
         print(f"\r{line}" if self._terminal else line, end="" if self._terminal else "\n", file=sys.stderr, flush=True)  # noqa: T201
         self._written = True
@@ -170,16 +172,11 @@ def _summary(report: RunReport, facts: LiveFacts) -> str:
         f" {sum(facts.dropped.values())} passed over; ended: {printable(report.run.stop_reason)}",
         f"age of what was shown: p50 {facts.age_p50_ms:.1f} ms, p99 {facts.age_p99_ms:.1f} ms, most {facts.age_max_ms:.1f} ms",
     ]
-    if facts.settled_psnr_tissue_db is not None:
-        beside = (
-            ""
-            if facts.previous_frame_db is None
-            else f" (previous frame shown instead: {facts.previous_frame_db:.2f} dB)"
-        )
-        lines.append(
-            f"live tissue PSNR after the first second {facts.settled_psnr_tissue_db:.2f} dB,"
-            f" worst {facts.worst_psnr_tissue_db:.2f} dB{beside}"
-        )
+    # The first second, in which the model begins, is in none of these figures.
+    name = "displayed frame (training error)"
+    lines += quality_line(name, facts.settled_psnr_tissue_db, facts.previous_frame_db)
+    lines += quality_line(f"worst {name}", facts.worst_psnr_tissue_db, None)
+    lines += next_frame_line(report)
     for name, counts in (("not trained on", facts.withheld), ("new scenes", facts.scenes), ("states", facts.states)):
         if counts:
             lines.append(f"{name}: " + ", ".join(f"{count} x {reason}" for reason, count in counts.items()))

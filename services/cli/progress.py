@@ -75,7 +75,7 @@ class ProgressPrinter:
         rate = 0.0
         if self._measured_from and now_s > self._measured_from[0]:
             rate = (progress.done - self._measured_from[1]) / (now_s - self._measured_from[0])
-        quality = "" if progress.psnr_tissue_db is None else f"{progress.psnr_tissue_db:.2f} dB"
+        quality = _quality(progress)
         rate_text = f"{rate:.1f} {progress.unit}/s" if rate else ""
         if self._bar is not None:
             if first:
@@ -95,3 +95,12 @@ class ProgressPrinter:
         if quality:
             parts.append(quality)
         print("  ".join(parts), file=sys.stderr, flush=True)  # noqa: T201
+
+
+def _quality(progress: Progress) -> str:
+    """Return the PSNR of the newest frame, what kind of error it is, and the trivial baseline."""
+    if progress.psnr_tissue_db is None:
+        return ""
+    kind = "training error" if progress.trained else "held out"
+    beside = "" if progress.previous_frame_db is None else f", previous frame {progress.previous_frame_db:.2f} dB"
+    return f"{progress.psnr_tissue_db:.2f} dB ({kind}{beside})"

@@ -50,12 +50,29 @@ def print_report(report: RunReport, out: Path, *, as_json: bool) -> None:
         f"{frames.displayed} of {frames.ingested} frames displayed, {frames.dropped} dropped, in {run.wall_s:.1f} s"
     ]
     for name, part, baseline in (
-        ("live", quality.live, quality.baselines.previous_frame_db),
-        ("held-out", quality.heldout, quality.baselines.heldout_previous_frame_db),
-        ("training", quality.training, None),
+        ("displayed frame (training error)", quality.live, quality.baselines.previous_frame_db),
+        ("held-out frames", quality.heldout, quality.baselines.heldout_previous_frame_db),
+        ("training frames (training error)", quality.training, quality.baselines.previous_frame_db),
     ):
-        if part is not None and part.psnr_tissue_db is not None:
-            beside = "" if baseline is None else f" (previous frame shown instead: {baseline:.2f} dB)"
-            lines.append(f"{name} tissue PSNR {part.psnr_tissue_db:.2f} dB{beside}")
+        if part is not None:
+            lines += quality_line(name, part.psnr_tissue_db, baseline)
+    lines += next_frame_line(report)
     typer.echo("\n".join(lines))
     typer.echo(str(out / "report.html"))
+
+
+def quality_line(name: str, psnr_db: float | None, previous_db: float | None) -> list[str]:
+    """Return one line with a mean tissue PSNR and the trivial baseline over the same frames; none without the PSNR."""
+    if psnr_db is None:
+        return []
+    beside = "" if previous_db is None else f" (previous frame shown instead: {previous_db:.2f} dB)"
+    return [f"tissue PSNR, {name}: {psnr_db:.2f} dB{beside}"]
+
+
+def next_frame_line(report: RunReport) -> list[str]:
+    """Return the line of the figure that is no training error; none where it was not measured."""
+    measured = report.quality.next_frame
+    if measured is None:
+        return []
+    name = "next frame, predicted before training on it"
+    return quality_line(name, measured.psnr_tissue_db, measured.previous_frame_db)

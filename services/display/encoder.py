@@ -25,7 +25,8 @@ class EncodedPicture:
     """A picture for viewers; all of them share it."""
 
     header: dict[str, object]
-    """JSON: `seq`, `pts_ns`, `arrived_ns`, `age_ms`, `state`, and of reconstructions `model_version`, `steps`, `psnr_db` (docs/processes.md)."""
+    """JSON: `seq`, `pts_ns`, `arrived_ns`, `age_ms`, `state`, and of reconstructions `model_version`, `steps`, `psnr_db`, `previous_frame_db` and
+    `next_frame_db` (docs/processes.md)."""
     jpeg: bytes
 
     @cached_property

@@ -14,7 +14,7 @@ from operators.display import LiveDisplayResult
 from operators.frame_log import Entry
 from operators.ingest import SourceResult
 from operators.live_reconstruct import TrainingCounts
-from operators.metrics import QualityResult
+from operators.metrics import NextFrameResult, QualityResult
 from operators.on_screen import OnScreenResult
 from operators.reconstruct import ModelResult, TrainedEyes
 from operators.sinks.keyframes import KeyframesResult
@@ -31,6 +31,7 @@ from services.reports.schema import (
     FrameEntry,
     Latency,
     ModelFacts,
+    NextFrameQuality,
     OperatorTimes,
     Quality,
     QualityReport,
@@ -134,6 +135,7 @@ def _qualities(outcome: RunOutcome, quality: QualityResult) -> QualityReport:
     previous_db = screen.previous_frame_throughout_db if screen else None
     return QualityReport(
         live=None if offline else _quality(quality.trained),
+        next_frame=_next_frame(outcome.find(NextFrameResult)),
         training=_quality(quality.trained) if offline else None,
         heldout=_quality(quality.held_out) if outcome.settings.heldout else None,
         baselines=BaselineQuality(
@@ -142,6 +144,14 @@ def _qualities(outcome: RunOutcome, quality: QualityResult) -> QualityReport:
             heldout_previous_frame_db=baselines.heldout_previous_frame_db if baselines else None,
             heldout_neighbour_mean_db=baselines.heldout_neighbour_mean_db if baselines else None,
         ),
+    )
+
+
+def _next_frame(result: NextFrameResult | None) -> NextFrameQuality | None:
+    if result is None or not result.frames:
+        return None
+    return NextFrameQuality(
+        psnr_tissue_db=result.psnr_tissue_db, previous_frame_db=result.previous_frame_db, frames=result.frames
     )
 
 

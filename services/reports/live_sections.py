@@ -9,6 +9,7 @@ from statistics import fmean
 
 from services.reports.charts import NARROW, Chart, Line
 from services.reports.schema import FrameEntry, LiveFacts, RunReport
+from services.reports.sections import against
 
 AGE_GROUPS = 12
 """Points of the curve of quality over age: groups of equally many frames."""
@@ -28,14 +29,16 @@ def live_section(report: RunReport) -> str:
 
 
 def _tiles(live: LiveFacts) -> str:
-    versus = ""
-    if live.settled_psnr_tissue_db is not None and live.previous_frame_db is not None:
-        gain = live.settled_psnr_tissue_db - live.previous_frame_db
-        versus = f'<span class="{"good" if gain >= 0 else "bad"}">{gain:+.2f} dB</span> against the previous frame'
+    versus = against(live.settled_psnr_tissue_db, live.previous_frame_db)
     first = "–" if live.first_picture_ms is None else f"{live.first_picture_ms:,.0f}"
     tiles = (
-        ("After the first second", _decibels(live.settled_psnr_tissue_db), "dB", versus),
-        ("Worst frame since then", _decibels(live.worst_psnr_tissue_db), "dB", ""),
+        (
+            "Displayed frame, after the first second",
+            _decibels(live.settled_psnr_tissue_db),
+            "dB",
+            f"training error; {versus}",
+        ),
+        ("Worst frame since then", _decibels(live.worst_psnr_tissue_db), "dB", "training error"),
         (
             "Age of what is shown",
             f"{live.age_p50_ms:,.1f}",
@@ -81,7 +84,10 @@ def _quality_over_age(report: RunReport) -> Chart | None:
     ages = [fmean(entry.age_ms or 0.0 for entry in group) for group in groups]
     lines = (
         Line(
-            "On the screen when the next frame came", ages, [_mean(group, "psnr_tissue_db") for group in groups], "main"
+            "On the screen when the next frame came (training error)",
+            ages,
+            [_mean(group, "psnr_tissue_db") for group in groups],
+            "main",
         ),
         Line("Previous frame shown instead", ages, [_mean(group, "previous_frame_db") for group in groups], "base"),
     )

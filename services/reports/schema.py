@@ -99,6 +99,16 @@ class Quality(Part):
     frames: Count
 
 
+class NextFrameQuality(Part):
+    """Each frame predicted by the model that had not been trained on it: rendered at the frame's time and pose, and scored before training."""
+
+    psnr_tissue_db: float | None
+    """Mean tissue PSNR of the predictions. Of a live run: after the first second, of every fourth (GPU) or eighth (CPU) picture."""
+    previous_frame_db: float | None
+    """Mean tissue PSNR of the previous raw frame over the same frames: the trivial prediction."""
+    frames: Count
+
+
 class BaselineQuality(Part):
     """Tissue PSNR of doing nothing, on the same recording."""
 
@@ -113,12 +123,14 @@ class BaselineQuality(Part):
 
 class QualityReport(Part):
     live: Quality | None
-    """Each displayed frame right after its own training steps; null for an offline reconstruction."""
+    """Training error: each displayed frame right after the model was trained on it. Null for an offline reconstruction."""
+    next_frame: NextFrameQuality | None = None
+    """The figure that is no training error. Null for an offline reconstruction, and in reports of earlier versions."""
     heldout: Quality | None
     """Frames that were never trained on; null without `--heldout`."""
     baselines: BaselineQuality
     training: Quality | None = None
-    """Training frames after all of the training; null for a replay."""
+    """Training error of an offline reconstruction: training frames after all of the training. Null for a replay."""
 
 
 class ModelFacts(Part):
@@ -132,7 +144,7 @@ class LiveFacts(Part):
     """What a live run kept up with, and how old its pictures were."""
 
     settled_psnr_tissue_db: float | None
-    """Mean after the first second, of what was on the screen when the next frame arrived."""
+    """Training error: mean after the first second, of what was on the screen when the next frame arrived."""
     worst_psnr_tissue_db: float | None
     """The lowest of these."""
     previous_frame_db: float | None
@@ -173,9 +185,13 @@ class FrameEntry(Part):
     trained: bool
     model_version: Count
     psnr_tissue_db: float | None
+    """Of the displayed picture; a training error where the frame was `trained` on."""
     psnr_frame_db: float | None
     ssim: float | None
     previous_frame_db: float | None
+    """Of the previous raw frame, shown instead."""
+    next_frame_db: float | None = None
+    """Of the picture that the model gave of this frame before it was trained on it; null where there is none."""
     age_ms: float | None = None
     """Live: age of what was on the screen, when it came there."""
     steps: Count | None = None

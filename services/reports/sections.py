@@ -7,7 +7,7 @@ from html import escape
 
 from services.reports.charts import NARROW, Chart, Line
 from services.reports.pictures import KeyframePictures
-from services.reports.schema import Quality, RunReport
+from services.reports.schema import RunReport
 
 
 def _decibels(value: float | None) -> str:
@@ -18,27 +18,39 @@ def _tile(name: str, value: str, unit: str, more: str) -> str:
     return f'<li><span class="name">{name}</span><b>{value}<span>{unit}</span></b><span class="more">{more}</span></li>'
 
 
-def _headline(report: RunReport) -> tuple[str, Quality | None, float | None]:
-    """The quality that this run is about, and the baseline that belongs to it."""
-    quality = report.quality
-    if quality.live is not None:
-        return "Live quality, tissue", quality.live, quality.baselines.previous_frame_db
-    return "Held-out quality, tissue", quality.heldout, quality.baselines.heldout_previous_frame_db
+def against(psnr_db: float | None, baseline_db: float | None) -> str:
+    """Return HTML that states the gain over the previous frame, and what that frame scores."""
+    if psnr_db is None or baseline_db is None:
+        return "no baseline"
+    gain = psnr_db - baseline_db
+    kind = "good" if gain >= 0 else "bad"
+    return f'<span class="{kind}">{gain:+.2f} dB</span> against the previous frame ({baseline_db:.2f} dB)'
+
+
+def _quality_tiles(report: RunReport) -> list[str]:
+    """Return the tiles of the quality that this run is about. A training error never stands alone."""
+    quality, baselines = report.quality, report.quality.baselines
+    tiles = []
+    if (next_frame := quality.next_frame) is not None:
+        value, previous_db = next_frame.psnr_tissue_db, next_frame.previous_frame_db
+        more = f"{against(value, previous_db)}; before training on the frame"
+        tiles.append(_tile("Next frame, predicted", _decibels(value), "dB", more))
+    if (heldout := quality.heldout) is not None:
+        more = against(heldout.psnr_tissue_db, baselines.heldout_previous_frame_db)
+        tiles.append(_tile("Held-out frames", _decibels(heldout.psnr_tissue_db), "dB", more))
+    if (live := quality.live) is not None and report.live is None:  # a live run has a tile without the first second
+        more = f"training error; {against(live.psnr_tissue_db, baselines.previous_frame_db)}"
+        tiles.append(_tile("Displayed frame", _decibels(live.psnr_tissue_db), "dB", more))
+    return tiles
 
 
 def tiles_section(report: RunReport) -> str:
-    """The figures that come first."""
-    name, quality, baseline = _headline(report)
-    psnr = quality.psnr_tissue_db if quality else None
-    versus = "no baseline"
-    if psnr is not None and baseline is not None:
-        gain = psnr - baseline
-        versus = f'<span class="{"good" if gain >= 0 else "bad"}">{gain:+.2f} dB</span> against the previous frame'
+    """Return the figures that come first."""
     frames, wall = report.frames, report.run.wall_s
     rate = frames.displayed / wall if wall else 0.0
     damaged = f", {frames.damaged:,} damaged" if frames.damaged else ""
     tiles = [
-        _tile(name, _decibels(psnr), "dB", versus),
+        *_quality_tiles(report),
         _tile(
             "Frames displayed",
             f"{frames.displayed:,}",
@@ -92,7 +104,8 @@ def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | Non
         depth = f"depth {near_far[0]:.1f} to {near_far[1]:.1f}{unit}" if near_far else "no depth"
         cells.append(
             f'<div class="row"><b>Frame {seq}</b><span>{rendered.frame.time_s:.2f} s</span><span>model {rendered.model_version}</span>'
-            f"<span>{_finite(quality.psnr_tissue_db)} dB tissue</span><span>SSIM {_finite(quality.ssim, 4)}</span><span>{depth}</span>{tags}</div>"
+            f"<span>{_finite(quality.psnr_tissue_db)} dB tissue{_kind(rendered.trained)}</span>"
+            f"<span>previous frame {_finite(pictures.scored.previous_frame_db)} dB</span><span>SSIM {_finite(quality.ssim, 4)}</span><span>{depth}</span>{tags}</div>"
         )
         for name, uri in (
             ("raw", pictures.raw),
@@ -111,6 +124,10 @@ def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | Non
     )
 
 
+def _kind(trained: bool) -> str:
+    return " (training error)" if trained else ""
+
+
 def _finite(value: float, digits: int = 2) -> str:
     return f"{value:.{digits}f}" if value == value else "–"
 
@@ -123,8 +140,21 @@ def quality_over_time_section(report: RunReport) -> str:
         return ""
     lines = []
     if trained:
-        name = "Reconstruction, training frames" if report.quality.live is None else "Reconstruction, live"
+        shown = "training frames" if report.quality.live is None else "displayed frame"
+        name = f"Reconstruction, {shown} (training error)"
         lines.append(Line(name, [e.time_s for e in trained], [e.psnr_tissue_db for e in trained], "main"))
+    predicted = [entry for entry in report.series if entry.next_frame_db is not None]
+    if predicted:
+        name = "Next frame, predicted before training on it"
+        lines.append(
+            Line(
+                name,
+                [e.time_s for e in predicted],
+                [e.next_frame_db for e in predicted],
+                "third",
+                marks=_is_sampled(report),
+            )
+        )
     lines.append(
         Line(
             "Previous frame shown instead",
@@ -161,18 +191,37 @@ def quality_over_time_section(report: RunReport) -> str:
     return f"<section><h2>Quality over time</h2>{chart.figure()}</section>"
 
 
+def _is_sampled(report: RunReport) -> bool:
+    """Return True where only some of the frames are predicted: points are drawn for them, and no line between."""
+    return report.live is not None
+
+
 def baselines_section(report: RunReport) -> str:
     """The reconstruction beside what doing nothing scores."""
     quality, baselines = report.quality, report.quality.baselines
     rows: list[tuple[str, float | None, bool]] = []
     if quality.live is not None:
         rows += [
-            (f"IntraSplat, live, {quality.live.frames} frames", quality.live.psnr_tissue_db, True),
+            (
+                f"IntraSplat, displayed frame (training error), {quality.live.frames} frames",
+                quality.live.psnr_tissue_db,
+                True,
+            ),
             ("Previous frame shown instead", baselines.previous_frame_db, False),
+        ]
+    if (next_frame := quality.next_frame) is not None:
+        name = f"IntraSplat, next frame predicted before training on it, {next_frame.frames} frames"
+        rows += [
+            (name, next_frame.psnr_tissue_db, True),
+            ("Those frames: previous frame shown instead", next_frame.previous_frame_db, False),
         ]
     if quality.training is not None:
         rows.append(
-            (f"IntraSplat, training frames, {quality.training.frames} frames", quality.training.psnr_tissue_db, True)
+            (
+                f"IntraSplat, training frames (training error), {quality.training.frames} frames",
+                quality.training.psnr_tissue_db,
+                True,
+            )
         )
     if quality.heldout is not None:
         rows.append((f"IntraSplat, held out, {quality.heldout.frames} frames", quality.heldout.psnr_tissue_db, True))
@@ -193,7 +242,11 @@ def baselines_section(report: RunReport) -> str:
             f'<td class="track"><span class="rail"><span class="dot" style="left:{share:.1f}%"></span></span></td></tr>'
         )
     extra = ""
-    for name, part in (("Live", quality.live), ("Held out", quality.heldout), ("Training", quality.training)):
+    for name, part in (
+        ("Displayed frame (training error)", quality.live),
+        ("Held out", quality.heldout),
+        ("Training frames (training error)", quality.training),
+    ):
         if part is not None:
             ssim = "–" if part.ssim is None else f"{part.ssim:.4f}"
             extra += f"{name}: whole-frame PSNR {_decibels(part.psnr_frame_db)} dB, SSIM {ssim}. "

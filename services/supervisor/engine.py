@@ -57,7 +57,7 @@ def live_settings(spec: EngineSpec, out: Path, source: str) -> LiveSettings:
         poses=spec.poses,
         out_of_body=spec.out_of_body,
         clock=ClockSettings(budget_ms=spec.budget_ms),
-        frame_log=False,
+        report=False,
     )
 
 

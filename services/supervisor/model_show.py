@@ -20,7 +20,7 @@ from services.bus.runtime import read_json, write_json
 from services.supervisor.captured_source import CapturedSource
 from services.supervisor.finished_model import FinishedModel, NotFinite
 from services.supervisor.layers import Layers
-from services.supervisor.screen import Screen
+from services.supervisor.screen import SCORES, Screen
 from services.supervisor.specs import EngineSpec
 from services.supervisor.worker import Worker
 
@@ -177,7 +177,7 @@ class ModelShow:
             "model": showing.model.name,
             "model_version": showing.model.version,
             "steps": 0,
-            "psnr_db": None,
+            **dict.fromkeys(SCORES),
         }
         shown = self._screen.publish("model", header, image)
         if shown and self._layers is not None:

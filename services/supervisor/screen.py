@@ -17,6 +17,9 @@ from services.bus.durations import Durations
 from services.bus.pictures import PicturePublisher
 
 Shows = Literal["live", "model"]
+SCORES = ("psnr_db", "previous_frame_db", "next_frame_db")
+"""Tissue PSNR of the frame that was scored last: of the displayed picture (a training error), of the previous raw frame shown instead, and
+of the newest predicted frame, before the model was trained on it."""
 
 
 class Screen:
@@ -38,7 +41,7 @@ class Screen:
         self.ages = Durations()
         """Of new pictures, when they were shown."""
         self._last: dict[str, Any] = {}
-        self._psnr_db: float | None = None
+        self._scores: dict[str, float | None] = dict.fromkeys(SCORES)
 
     @property
     def wanted(self) -> Shows:
@@ -52,12 +55,20 @@ class Screen:
 
     def show(self, shown: ShownPicture) -> bool:
         """A picture of the live reconstruction; False when it is not shown."""
-        return self.publish("live", {**header_of(shown), "psnr_db": self._psnr_db}, shown.image)
+        return self.publish("live", {**header_of(shown), **self._scores}, shown.image)
 
     def scored(self, scored: ScoredFrame) -> None:
-        """What the newest scored picture's tissue PSNR was: the next ones tell it."""
-        value = scored.quality.psnr_tissue_db
-        self._psnr_db = round(value, 3) if math.isfinite(value) else None
+        """Take the scores of the newest scored frame, which the headers of the following pictures state."""
+        found = {
+            "psnr_db": scored.quality.psnr_tissue_db,
+            "previous_frame_db": scored.previous_frame_db,
+            "next_frame_db": scored.next_frame_db,
+        }
+        known = {name: round(value, 3) if math.isfinite(value) else None for name, value in found.items()}
+        # Only some frames are predicted: the last prediction's score stays until the next one.
+        if known["next_frame_db"] is None:
+            known["next_frame_db"] = self._scores["next_frame_db"]
+        self._scores = known
 
     def publish(self, shows: Shows, header: Mapping[str, Any], image: NDArray[np.uint8]) -> bool:
         """Publish a picture; False, without effect, when the other one is shown by now."""

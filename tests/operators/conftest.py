@@ -25,7 +25,7 @@ class FakeInput:
     messages: dict[str, Any]
 
     def receive(self, name: str) -> Any:
-        return self.messages.pop(name)
+        return self.messages.pop(name, None)
 
     def queued(self, name: str) -> int:
         return int(name in self.messages)

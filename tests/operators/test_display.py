@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from operators.display import DisplayOp, DisplaySettings, LiveDisplayResult, draw_label
+from operators.display import DisplayOp, DisplaySettings, LiveDisplayResult, _age_text, draw_label
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.messages import PictureState
 from operators.outcome import OutcomeBuilder
@@ -177,3 +177,67 @@ def test_the_outcome_counts_states_and_ages(screen, rendered, frame, fake_time, 
 def test_thresholds_out_of_range_are_refused(wrong):
     with pytest.raises(InvalidSetting):
         DisplaySettings(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("interval_ms", "stale_ms", "frozen_ms"),
+    [(33.3, 150.0, 1000.0), (100.0, 300.0, 1000.0), (200.0, 600.0, 1200.0), (1000.0, 3000.0, 6000.0)],
+)
+def test_the_thresholds_follow_the_camera_and_a_picture_that_old_has_not_passed_them(interval_ms, stale_ms, frozen_ms):
+    state = lambda age_ms: DisplaySettings().state(age_ms * 1e6, interval_ms * 1e6, SourceState.LIVE)
+    assert state(0) is state(stale_ms) is PictureState.LIVE
+    assert state(stale_ms + 0.1) is state(frozen_ms) is PictureState.STALE
+    assert state(frozen_ms + 0.1) is PictureState.FROZEN
+
+
+def test_thresholds_that_are_asked_for_are_the_ones():
+    settings = DisplaySettings(stale_after_ms=50, stale_after_intervals=1, frozen_after_ms=400)
+    ages = {40: PictureState.LIVE, 60: PictureState.STALE, 390: PictureState.STALE, 410: PictureState.FROZEN}
+    for age_ms, state in ages.items():
+        assert settings.state(age_ms * 1e6, 20e6, SourceState.LIVE) is state
+
+
+@pytest.mark.parametrize("source", [each for each in SourceState if each is not SourceState.LIVE])
+def test_a_source_that_is_not_live_is_lost_however_young_the_picture_is(source):
+    assert DisplaySettings().state(0.0, 33e6, source) is PictureState.SOURCE_LOST
+
+
+def test_a_picture_that_is_not_live_is_sent_again_five_times_a_second(
+    screen, rendered, frame, fake_time, compute_queued
+):
+    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, age_ms=0)])
+    sent_ms = []
+    for now_ms in range(10, 1001, 10):
+        fake_time.pass_ms(10)
+        again = compute_queued(screen.operator)
+        assert all(shown.age_ns == now_ms * 1_000_000 and not shown.new for shown in again)
+        sent_ms += [now_ms for _ in again]
+    assert sent_ms == [160, 360, 560, 760, 960]
+
+
+def test_a_picture_of_the_future_has_no_age(screen, rendered, frame, fake_time, compute_queued):
+    """Clocks of two processes may differ by a little."""
+    (shown,) = compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, age_ms=-5)])
+    assert (shown.age_ns, shown.state) == (0, PictureState.LIVE)
+    assert screen.operator.age_p50_ms == 0
+
+
+def test_the_clock_learns_how_long_showing_takes(screen, rendered, frame, fake_time, compute_queued):
+    usual_ns = screen.operator.clock.display_ns
+    picture = rendered(0, frame=frame(0, arrived_ns=fake_time.ns), published_ns=fake_time.ns - 6_000_000)
+    compute_queued(screen.operator, rendered=[picture])
+    assert usual_ns < screen.operator.clock.display_ns < 6_000_000
+
+
+def test_each_change_of_state_is_counted_once(screen, rendered, frame, fake_time, compute_queued):
+    for seq in range(2):
+        compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, seq=seq)])
+        for _ in range(40):
+            fake_time.pass_ms(50)
+            compute_queued(screen.operator)
+    assert screen.operator.states == {"live": 2, "stale": 2, "frozen": 2}
+
+
+@pytest.mark.parametrize(("age_ns", "said"), [(4_400_000, "4 ms"), (999_000_000, "999 ms"), (1_250_000_000, "1.2 s")])
+def test_ages_are_written_in_ms_or_s(age_ns, said):
+    assert _age_text(age_ns) == said

@@ -9,7 +9,8 @@ import pytest
 
 from gsplat_core.scene.frames import FrameStatus
 from operators.frame_log import FrameLog
-from operators.metrics import MetricsOp, QualityResult
+from operators.messages import Prediction
+from operators.metrics import MetricsOp, NextFrameResult, QualityResult
 from operators.outcome import OutcomeBuilder
 
 
@@ -100,3 +101,73 @@ def test_the_digest_depends_on_every_byte_and_on_the_order(rendered, compute):
     same = digest(rendered(0), rendered(1))
     assert same == digest(rendered(0), rendered(1))
     assert len({same, digest(rendered(0), changed), digest(rendered(1), rendered(0)), digest(rendered(0))}) == 4
+
+
+def _decibels(grey_levels):
+    return 20 * math.log10(255 / grey_levels)
+
+
+def test_predictions_are_compared_with_the_previous_frame_over_the_frames_that_have_both(
+    frame, rendered, compute, tmp_path
+):
+    grey = [frame(k, image=np.full((16, 24, 3), 100 + level, np.uint8)) for k, level in enumerate((0, 4, 24, 25))]
+    offsets = (9, 2, None, 8)
+    operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    operator.start()
+    for source, offset in zip(grey, offsets, strict=True):
+        image = None if offset is None else source.image + np.uint8(offset)
+        compute(operator, rendered=rendered(frame=source), predicted=Prediction(source, image))
+    operator.stop()
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    found = outcome.find(NextFrameResult)
+    # The first frame has no previous one, and the third was not predicted.
+    assert found.frames == 2
+    assert found.psnr_tissue_db == pytest.approx((_decibels(2) + _decibels(8)) / 2)
+    assert found.previous_frame_db == pytest.approx((_decibels(4) + _decibels(1)) / 2)
+    logged = [entry["next_frame_db"] for entry in outcome.find(QualityResult).series]
+    assert logged == [pytest.approx(_decibels(9)), pytest.approx(_decibels(2)), None, pytest.approx(_decibels(8))]
+
+
+def test_a_prediction_counts_over_tissue_only(frame, rendered, compute):
+    mask = np.ones((16, 24), np.uint8)
+    mask[:, 12:] = 0
+    source = frame(1, mask=mask)
+    image = source.image + np.uint8(5)
+    image[:, 12:] = 0
+    operator = MetricsOp(None)
+    operator.start()
+    compute(operator, rendered=rendered(0))
+    (scored,) = compute(operator, rendered=rendered(frame=source), predicted=Prediction(source, image))
+    assert scored.next_frame_db == pytest.approx(_decibels(5))
+
+
+def test_without_predictions_there_is_no_figure(rendered, compute):
+    operator = MetricsOp(None)
+    (_, scored) = score(operator, compute, [rendered(0), rendered(1)])
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    assert outcome.find(NextFrameResult) == NextFrameResult(None, None, 0)
+    assert math.isnan(scored.next_frame_db) and scored.as_json()["next_frame_db"] is None
+
+
+def test_the_baseline_of_a_frame_is_the_one_that_came_before_it_however_that_was_shown(frame, rendered, compute):
+    """Kills a baseline from the displayed picture, from an older frame or over another mask."""
+    levels = [frame(k, image=np.full((16, 24, 3), 100 + level, np.uint8)) for k, level in enumerate((0, 3, 10))]
+    scored = score(MetricsOp(None), compute, [rendered(frame=each, offset=50) for each in levels])
+    assert [each.previous_frame_db for each in scored[1:]] == [pytest.approx(_decibels(3)), pytest.approx(_decibels(7))]
+
+
+def test_a_frame_of_another_size_has_no_baseline(frame, rendered, compute):
+    other = frame(1, image=np.zeros((8, 12, 3), np.uint8))
+    scored = score(MetricsOp(None), compute, [rendered(0), rendered(frame=other, offset=2), rendered(frame=other)])
+    assert [math.isnan(each.previous_frame_db) for each in scored] == [True, True, False]
+
+
+def test_each_run_begins_anew(rendered, compute):
+    operator = MetricsOp(None)
+    score(operator, compute, [rendered(0), rendered(1)])
+    first = operator.frames_sha256
+    (scored,) = score(operator, compute, [rendered(0)])
+    assert operator.frames == operator.live.count == 1 and operator.frames_sha256 != first
+    assert math.isnan(scored.previous_frame_db)

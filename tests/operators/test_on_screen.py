@@ -7,11 +7,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from gsplat_core.scene.frames import FrameStatus
 from gsplat_core.training.metrics import psnr_tissue_db
 from operators.frame_log import FrameLog, read_frames
-from operators.messages import PictureState, ShownPicture
-from operators.metrics import QualityResult
-from operators.on_screen import OnScreenMetricsOp, OnScreenResult
+from operators.messages import PictureState, Prediction, ShownPicture
+from operators.metrics import NextFrameResult, QualityResult
+from operators.on_screen import PREDICTIONS_KEPT, OnScreenMetricsOp, OnScreenResult
 from operators.outcome import OutcomeBuilder
 
 MS = 1_000_000
@@ -117,3 +118,165 @@ def test_memory_does_not_grow_when_pictures_come_without_frames(stream, compute_
         compute_queued(operator, shown=[shown(pictures[0], k)])
     assert len(operator._shown) <= 64
     operator.stop()
+
+
+def decibels(grey_levels):
+    return 20 * np.log10(255 / grey_levels)
+
+
+def in_time(pictures):
+    return [shown(picture, k * PERIOD + MS) for k, picture in enumerate(pictures)]
+
+
+@pytest.mark.parametrize("worst_at", [25, 30, 39])
+def test_the_worst_frame_is_the_lowest_after_the_first_second(frame, rendered, compute_queued, worst_at):
+    """The first second is worse still, and one frame is better than all the others."""
+    offsets = {k: 60 for k in range(25)} | {worst_at: 30, 27: 1}
+    frames = [frame(k, arrived_ns=k * PERIOD) for k in range(40)]
+    pictures = [rendered(k, frame=frames[k], offset=offsets.get(k, 5)) for k in range(40)]
+    _, result, _ = score(OnScreenMetricsOp(None), compute_queued, frames, in_time(pictures))
+    assert result.worst_seq == worst_at
+    assert result.worst_db == pytest.approx(decibels(30), abs=0.05)
+
+
+def test_the_first_frame_that_counts_is_that_of_a_whole_second(frame, rendered, compute_queued):
+    frames = [frame(k, arrived_ns=k * PERIOD) for k in range(26)]
+    pictures = [rendered(k, frame=frames[k], offset=9 if k < 25 else 3) for k in range(26)]
+    _, result, _ = score(OnScreenMetricsOp(None), compute_queued, frames, in_time(pictures))
+    assert result.settled_db == pytest.approx(decibels(3), abs=0.05), "frame 25 was taken at 1.00 s"
+
+
+def test_a_stream_that_ends_within_the_first_second_has_no_settled_figures(stream, compute_queued):
+    frames, pictures = stream(6)
+    _, result, _ = score(OnScreenMetricsOp(None), compute_queued, frames, in_time(pictures))
+    assert (result.settled_db, result.worst_db, result.worst_seq, result.previous_frame_db) == (None,) * 4
+
+
+def test_frames_without_figures_are_neither_the_worst_nor_in_the_means(frame, rendered, compute_queued):
+    frames = [frame(k, arrived_ns=k * PERIOD) for k in range(40)]
+    frames[30] = frames[30].with_fields(status=FrameStatus.DAMAGED)
+    frames[31] = frames[31].with_fields(withheld="black")
+    frames[32] = frames[32].with_fields(mask=np.zeros((16, 24), np.uint8))
+    bad = {30: 90, 31: 80, 32: 70, 35: 20}
+    pictures = [rendered(k, frame=frames[k], offset=bad.get(k, 2)) for k in range(40)]
+    _, result, quality = score(OnScreenMetricsOp(None), compute_queued, frames, in_time(pictures))
+    assert (result.worst_seq, result.frames) == (35, 40)
+    assert quality.trained.count == 38, "the frame without tissue was observed and has no figure"
+    assert result.not_on_screen == 0
+
+
+def test_what_is_on_the_screen_when_the_next_frame_arrives_counts_and_what_comes_after_does_not(stream, compute_queued):
+    frames, pictures = stream(3)
+    exactly = [shown(pictures[0], MS), shown(pictures[1], 2 * PERIOD), shown(pictures[2], 3 * PERIOD)]
+    assert score(OnScreenMetricsOp(None), compute_queued, frames, exactly)[1].not_on_screen == 0
+    later = [exactly[0], shown(pictures[1], 2 * PERIOD + 1), exactly[2]]
+    assert score(OnScreenMetricsOp(None), compute_queued, frames, later)[1].not_on_screen == 1
+
+
+def test_a_picture_of_another_size_scores_nothing(stream, frame, rendered, compute_queued):
+    frames, pictures = stream(2)
+    small = frame(2, image=np.zeros((8, 12, 3), np.uint8), arrived_ns=2 * PERIOD)
+    _, result, _ = score(OnScreenMetricsOp(None), compute_queued, [*frames, small], in_time(pictures))
+    assert result.frames == 2
+
+
+def test_similarity_is_measured_on_every_eighth_frame_from_the_first(stream, compute_queued, tmp_path):
+    frames, pictures = stream(20)
+    operator = OnScreenMetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    score(operator, compute_queued, frames, in_time(pictures))
+    assert [row["seq"] for row in read_frames(operator.log.path) if row["ssim"] is not None] == [0, 8, 16]
+
+
+def test_the_log_says_what_was_on_the_screen_and_when(stream, rendered, compute_queued, tmp_path):
+    frames, _ = stream(2)
+    picture = rendered(
+        0, frame=frames[0], content=frames[0], steps=7, taken_ns=3 * MS, published_ns=9 * MS, model_version=5
+    )
+    operator = OnScreenMetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    score(
+        operator,
+        compute_queued,
+        frames,
+        [ShownPicture(picture, picture.image, PictureState.STALE, 15 * MS, 15 * MS, True)],
+    )
+    first, second = read_frames(operator.log.path)
+    told = {
+        "seq": 0,
+        "shown_seq": 0,
+        "shown_ns": 15 * MS,
+        "age_ms": 15.0,
+        "state": "stale",
+        "taken_ms": 3.0,
+        "published_ms": 9.0,
+    }
+    assert first.items() >= (told | {"steps": 7, "model_version": 5, "withheld": None}).items()
+    assert (second["seq"], second["shown_seq"]) == (1, 0)
+
+
+def predicted(frames, offsets):
+    return [Prediction(frames[k], frames[k].image + np.uint8(offset)) for k, offset in offsets.items()]
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_predictions_are_scored_whenever_they_come_and_compared_over_the_same_frames(
+    frame, rendered, compute_queued, tmp_path, late
+):
+    levels = [100 + (k % 2) * 6 for k in range(40)]
+    levels[33] = 130
+    frames = [
+        frame(k, image=np.full((16, 24, 3), level, np.uint8), arrived_ns=k * PERIOD) for k, level in enumerate(levels)
+    ]
+    pictures = [rendered(k, frame=frames[k]) for k in range(40)]
+    operator = OnScreenMetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
+    predictions = [*predicted(frames, {10: 90, 26: 3, 33: 5}), Prediction(frames[35], None)]
+    operator.start()
+    compute_queued(operator, frame=frames, shown=in_time(pictures), predicted=[] if late else predictions)
+    compute_queued(operator, predicted=predictions if late else [])
+    operator.stop()
+    outcome = OutcomeBuilder()
+    operator.contribute(outcome)
+    found = outcome.find(NextFrameResult)
+    assert found.frames == 2, "frame 10 is of the first second, and frame 35 was not predicted"
+    assert found.psnr_tissue_db == pytest.approx((decibels(3) + decibels(5)) / 2)
+    assert found.previous_frame_db == pytest.approx((decibels(6) + decibels(30)) / 2)
+    logged = {row["seq"]: row["next_frame_db"] for row in read_frames(operator.log.path)}
+    known = {seq: value for seq, value in logged.items() if value is not None}
+    assert known == ({} if late else pytest.approx({10: decibels(90), 26: decibels(3), 33: decibels(5)}))
+
+
+def test_predictions_of_frames_that_never_come_take_no_memory(stream, compute_queued):
+    frames, _ = stream(1)
+    operator = OnScreenMetricsOp(None)
+    operator.start()
+    for k in range(10 * PREDICTIONS_KEPT):
+        compute_queued(operator, predicted=[Prediction(frames[0].with_fields(seq=k), frames[0].image)])
+    assert len(operator._predicted) <= PREDICTIONS_KEPT
+    operator.stop()
+
+
+def test_frames_that_are_never_predicted_take_no_memory(frame, rendered, compute_queued):
+    frames = [frame(k, arrived_ns=k * PERIOD) for k in range(30 + 2 * PREDICTIONS_KEPT)]
+    pictures = [rendered(k, frame=frames[k]) for k in range(len(frames))]
+    operator = OnScreenMetricsOp(None)
+    score(operator, compute_queued, frames, in_time(pictures))
+    assert 0 < len(operator._waiting_db) <= PREDICTIONS_KEPT
+
+
+def test_a_run_without_a_report_measures_nothing_that_only_a_report_shows(stream, compute_queued, monkeypatch):
+    frames, pictures = stream(10)
+    operator = OnScreenMetricsOp(None, report=False)
+    scored, result, quality = score(operator, compute_queued, frames, in_time(pictures))
+    assert quality is None and result.frames == 10
+    assert all(np.isnan(each.quality.ssim) and each.quality.psnr_tissue_db > 40 for each in scored)
+    assert operator._digest.hexdigest() == OnScreenMetricsOp(None)._digest.hexdigest(), "no picture was hashed"
+
+
+def test_the_digest_is_over_every_new_picture_and_all_of_its_bytes(stream, rendered, compute_queued):
+    frames, pictures = stream(3)
+    digest = lambda shown_ones: score(OnScreenMetricsOp(None), compute_queued, frames, shown_ones)[2].frames_sha256
+    changed = rendered(1, frame=frames[1], image=pictures[1].image.copy())
+    changed.image[-1, -1, -1] ^= 1
+    all_of_them = in_time(pictures)
+    other = [all_of_them[0], shown(changed, PERIOD + MS), all_of_them[2]]
+    assert len({digest(all_of_them), digest(other), digest(all_of_them[:2])}) == 3
+    assert digest(all_of_them) == digest(in_time(pictures))

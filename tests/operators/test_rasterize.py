@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
+import pytest
 import torch
 
 from gsplat_core.rendering.registry import RENDERERS
 from gsplat_core.rendering.renderer import Capabilities, FinishedFrame
+from gsplat_core.scene.frames import FrameStatus
 from gsplat_core.scene.model import Model
 from gsplat_core.scene.snapshots import SnapshotSlots
 from operators.messages import DeformedScene
@@ -69,3 +74,85 @@ def test_a_renderer_that_reads_no_snapshots_is_given_models(frame, model, camera
         RENDERERS.remove("grey")
     assert [type(given) for given in prepared] == [Model]
     assert (shown.image == 128).all() and not shown.depth.any() and not shown.alpha.any()
+
+
+def _run(operator, compute, scenes):
+    """Each scene's outputs, by the kind of message."""
+    operator.start()
+    return [compute(operator, scene=scene) for scene in scenes]
+
+
+def test_a_frame_is_predicted_by_the_model_that_has_not_seen_it_at_the_frames_own_time(frame, camera, model, compute):
+    asked = []
+
+    class Moving(Model):
+        """Says at which time it is looked at."""
+
+        def at(self, time_s):
+            asked.append((self.version, time_s))
+            return super().at(time_s)
+
+    def moving(version):
+        made = model(version, index=version)
+        return Moving(version, made.gaussians, None, camera, (0.0, 1.0))
+
+    scenes = [DeformedScene(frame(k), moving(k + 1), camera, True) for k in range(3)]
+    outputs = _run(RasterizeOp(None, predict_every=1), compute, scenes)
+    assert [[type(message).__name__ for message in each] for each in outputs] == [["RenderedFrame", "Prediction"]] * 3
+    first, second, third = (each[1] for each in outputs)
+    assert first.image is None, "nothing was learned before the first frame"
+    assert (second.frame.seq, third.frame.seq) == (1, 2)
+    assert asked == [(1, 0.0), (2, 0.04), (1, 0.04), (3, 0.08), (2, 0.08)]
+    # The model of a resting scene shows the same at any time.
+    np.testing.assert_array_equal(third.image, outputs[1][0].image)
+    assert (third.image != outputs[2][0].image).any()
+
+
+def test_a_prediction_is_taken_from_the_pose_of_its_frame_at_the_exposure_of_the_frame_before(
+    frame, model, camera, compute
+):
+    pose = np.eye(4)
+    pose[0, 3] = 8.0
+    shown = [model(1), model(2)]
+    still = DeformedScene(frame(0, exposure=(0.5, 0.5, 0.5)), shown[0], camera, True)
+    moved = DeformedScene(frame(1, pose=pose, exposure=(1.5, 1.5, 1.5)), shown[1], camera.with_pose(pose), True)
+    (_, (_, predicted)) = _run(RasterizeOp(None, predict_every=1), compute, [still, moved])
+    unseen = DeformedScene(frame(1, pose=pose, exposure=(0.5, 0.5, 0.5)), shown[0], camera.with_pose(pose), True)
+    np.testing.assert_array_equal(predicted.image, compute(RasterizeOp(None), scene=unseen)[0].image)
+
+
+@pytest.mark.parametrize(
+    "unlike", [{"status": FrameStatus.DAMAGED}, {"withheld": "blur"}, {"scene": 1}, {"new_scene": "cut"}]
+)
+def test_a_frame_that_cannot_be_scored_or_begins_a_scene_is_not_predicted(frame, model, camera, compute, unlike):
+    scenes = [
+        DeformedScene(frame(0), model(1), camera, True),
+        DeformedScene(frame(1, **unlike), model(2), camera, True),
+    ]
+    (_, (_, predicted)) = _run(RasterizeOp(None, predict_every=1), compute, scenes)
+    assert predicted.image is None
+
+
+def test_a_frame_of_another_size_is_not_predicted(frame, model, camera, compute):
+    small, half = frame(0), camera.scaled(0.5)
+    other = frame(1, image=np.ascontiguousarray(frame(1).image[::2, ::2]))
+    scenes = [DeformedScene(small, model(1), camera, True), DeformedScene(other, model(2), half, True)]
+    (_, (_, predicted)) = _run(RasterizeOp(None, predict_every=1), compute, scenes)
+    assert predicted.image is None
+
+
+def test_every_third_frame_is_predicted_and_the_model_is_kept_no_longer_than_the_run(frame, model, camera, compute):
+    operator = RasterizeOp(None, predict_every=3)
+    scenes = [DeformedScene(frame(k), model(k + 1), camera, True) for k in range(7)]
+    predicted = [each[1].image is not None for each in _run(operator, compute, scenes)]
+    assert predicted == [False, False, True, False, False, True, False]
+    operator.stop()
+    held = weakref.ref(scenes[-1].model)
+    del scenes
+    gc.collect()
+    assert held() is None
+
+
+def test_without_being_asked_nothing_is_predicted(frame, model, camera, compute):
+    scenes = [DeformedScene(frame(k), model(k + 1), camera, True) for k in range(2)]
+    assert [len(each) for each in _run(RasterizeOp(None), compute, scenes)] == [1, 1]

@@ -70,7 +70,9 @@ class ReplayView(BaseModel):
     attempts: int = Field(examples=[1], description="How often it was begun: again where its process died.")
     frames_done: int = Field(examples=[300])
     frames: int | None = Field(None, examples=[900])
-    psnr_db: float | None = Field(None, examples=[36.5], description="Over tissue, of the newest frame.")
+    psnr_db: float | None = Field(
+        None, examples=[36.5], description="Over tissue, of the newest displayed frame: its training error."
+    )
     created_by: str
     created_at: str
     started_at: str | None = None

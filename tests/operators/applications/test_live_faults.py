@@ -270,7 +270,7 @@ def test_faults_one_upon_the_other(watched, seed):
 def test_a_run_without_a_log_scores_its_pictures_all_the_same(watched):
     script = Script()
     script.good(15)
-    watch = watched(script, frame_log=False)
+    watch = watched(script, report=False)
     assert watch.outcome is not None
     assert "frames" not in watch.outcome.outputs
     assert watch.part(OnScreenResult).frames > 5

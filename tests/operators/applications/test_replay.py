@@ -17,7 +17,7 @@ from operators.applications.result import RunOutcome
 from operators.errors import DeviceMissing, OutputError, RunFailed, StorageFull
 from operators.graph import MultiThreadScheduler
 from operators.ingest import SourceResult
-from operators.metrics import QualityResult
+from operators.metrics import NextFrameResult, QualityResult
 from operators.reconstruct import ModelResult
 from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult
@@ -179,3 +179,36 @@ def test_frame_by_frame_the_eye_that_is_shown_is_trained_on_and_offline_both_unl
 def test_a_third_eye_is_refused(tiny, tmp_path):
     with pytest.raises(InvalidSetting, match="eyes is 'right'"):
         ReplaySettings(tiny, tmp_path / "out", eyes="right")
+
+
+def test_the_next_frame_is_predicted_as_the_causal_protocol_does(settings):
+    """The same learner, evaluated by a protocol of its own that renders by another way."""
+    from gsplat_core.evaluation.causal import evaluate_causal
+    from gsplat_core.evaluation.pictures import PictureMaker
+    from gsplat_core.io.recordings import open_recording
+    from operators.applications.device import seeded
+
+    settings = replace(settings, steps_per_frame=3)
+    outcome = replay(settings)
+    source = replay_module.prepare(settings, [])
+    with seeded(settings.seed, "cpu"):
+        expected = evaluate_causal(
+            open_recording(settings.recording),
+            replay_module.new_reconstructor(settings, source),
+            PictureMaker(source.description.camera, "cpu", "alpha"),
+        )
+    found = outcome.find(NextFrameResult)
+    assert found.frames == expected.frames == 3
+    assert found.psnr_tissue_db == pytest.approx(expected.psnr_tissue_db, abs=0.05)
+    assert found.previous_frame_db == pytest.approx(outcome.find(Baselines).previous_frame_db)
+    trained_db = [entry["psnr_tissue_db"] for entry in series(outcome)][1:]
+    predicted_db = [entry["next_frame_db"] for entry in series(outcome)]
+    assert predicted_db[0] is None
+    assert sum(trained_db) > sum(predicted_db[1:]), "three steps on a frame make its picture better than its prediction"
+
+
+def test_progress_has_the_previous_frame_beside_the_training_error(settings):
+    events = []
+    replay(settings, events.append)
+    assert [event.previous_frame_db is None for event in events] == [True, True, False, False, False]
+    assert all(event.trained for event in events)

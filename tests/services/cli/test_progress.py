@@ -13,14 +13,14 @@ def test_plain_lines_have_counts_rates_and_an_estimate(capsys, monkeypatch):
         printer(Progress("replay", 0, 10))
         printer(Progress("replay", 1, 10))
         printer(Progress("replay", 2, 10))
-        printer(Progress("replay", 7, 10, psnr_tissue_db=38.126))
+        printer(Progress("replay", 7, 10, psnr_tissue_db=38.126, previous_frame_db=37.3))
         printer(Progress("replay", 10, 10))
         printer(Progress("evaluate", 1, 5))
     captured = capsys.readouterr()
     assert captured.err.splitlines() == [
         "replay 0/10",
         "replay 1/10",
-        "replay 7/10  1.0 frames/s  eta 3 s  38.13 dB",
+        "replay 7/10  1.0 frames/s  eta 3 s  38.13 dB (training error, previous frame 37.30 dB)",
         "replay 10/10  1.0 frames/s",
         "evaluate 1/5",
     ]
@@ -31,3 +31,13 @@ def test_quiet_is_quiet(capsys):
     with ProgressPrinter(quiet=True) as printer:
         printer(Progress("replay", 10, 10))
     assert capsys.readouterr() == ("", "")
+
+
+def test_the_error_of_a_held_out_frame_is_called_that(capsys):
+    with ProgressPrinter() as printer:
+        printer(Progress("replay", 1, 1, psnr_tissue_db=33.0, previous_frame_db=36.0, trained=False))
+        printer(Progress("evaluate", 1, 1, psnr_tissue_db=33.0))
+    assert capsys.readouterr().err.splitlines() == [
+        "replay 1/1  33.00 dB (held out, previous frame 36.00 dB)",
+        "evaluate 1/1  33.00 dB (training error)",
+    ]
