@@ -41,12 +41,12 @@ def measured(report: EvaluationReport) -> list[Measured]:
         found.append(Measured(key, name, what, score, baselines))
 
     if (live := report.live) is not None:
-        shown = "what was on the screen when the next frame came"
+        shown = "what was on the screen when the next frame came (training error)"
         add("live", "Live", shown, live.score, named("live", "previous_frame"))
         add(
             "settled",
             "Live, settled",
-            "the same without the first second",
+            "the same without the first second (training error)",
             live.settled,
             named("settled", "previous_frame"),
         )
@@ -62,7 +62,7 @@ def measured(report: EvaluationReport) -> list[Measured]:
         add("second_eye", "Right eye", shown, report.second_eye.score, against)
     if report.retention is not None:
         start_s, end_s = report.retention.last_range_s
-        shown = f"the last {end_s - start_s:.3g} s again, by the final model"
+        shown = f"the last {end_s - start_s:.3g} s again, by the final model (training error)"
         add("retention", "Retention", shown, report.retention.last, named("last", "last_frame"))
     return found
 
