@@ -12,6 +12,7 @@ Each operator has a thread of its own, and so has depth, which nothing waits for
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from gsplat_core.rendering.registry import check_renderer
@@ -27,6 +28,12 @@ from operators.applications.replay import REPORT_RESERVE_BYTES
 from operators.applications.result import RunOutcome
 from operators.applications.session import Session
 from operators.applications.trial_run import trial_run
+from operators.applications.working_size import (
+    SHARE_OF_INTERVAL,
+    PacedTissue,
+    choose_working_size,
+    measured_frame_s,
+)
 from operators.deform import DeformOp
 from operators.depth_beside import DepthBeside, DepthBesideOp
 from operators.display import DisplayOp
@@ -41,7 +48,9 @@ from operators.pose import check_poses, pose_operators
 from operators.rasterize import RasterizeOp
 from operators.sinks.callback import CallbackSinkOp
 from operators.sinks.keyframes import KeyframesOp
-from operators.sources.registry import SourceOptions, open_source
+from operators.sources.options import SourceOptions
+from operators.sources.registry import open_source
+from operators.sources.scaled import ScaledSource, scaled_description
 from operators.sources.source import FrameSource
 from operators.storage import StorageReserve
 
@@ -151,7 +160,7 @@ def live(
     def run(inside: LiveSettings, notes: list[str]) -> RunOutcome:
         source = prepare(inside, notes)
         with low_latency():
-            trial_run(inside, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
+            inside, source = on_trial(inside, source, notes)
             graph = LiveApplication(
                 source,
                 inside,
@@ -172,6 +181,32 @@ def live(
     return delivered(settings, "live", run, report)
 
 
+def on_trial(
+    settings: LiveSettings, source: FrameSource, notes: list[str], share: float = SHARE_OF_INTERVAL
+) -> tuple[LiveSettings, FrameSource]:
+    """Run the graph on trial; returns the settings and the source at the size that the run works at.
+
+    Where no scale was given, a run on a CPU chooses it by what this machine measures, and says so in `notes`. share: of the time between two
+    frames that a frame may take.
+    """
+    if settings.device != "cpu" or settings.scale is not None:
+        trial_run(settings, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
+        return settings, source
+    about = source.description
+
+    def paced(tissue: PacedTissue, tried: LiveSettings) -> LiveApplication:
+        return LiveApplication(tissue, tried, new_parts(tried, tissue), on_shown=tissue.shown)
+
+    chosen = choose_working_size(
+        about,
+        lambda scale: measured_frame_s(replace(settings, scale=scale), scaled_description(about, scale), paced),
+        share,
+    )
+    notes.append(chosen.sentence)
+    settings = replace(settings, scale=chosen.scale)
+    return settings, source if chosen.scale == 1 else ScaledSource(source, chosen.scale)
+
+
 def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
     """Check everything that can be checked before the first frame; returns the source, and adds what is to be said about it to `notes`.
 
@@ -182,10 +217,15 @@ def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
     source = open_source(
         settings.source,
         SourceOptions(
-            settings.scale, settings.max_frames, realtime=True, loop=settings.loop, fps=settings.fps, process=True
+            settings.given_scale,
+            settings.max_frames,
+            realtime=True,
+            loop=settings.loop,
+            fps=settings.fps,
+            process=True,
         ),
     )
-    check_picture(source.description.camera, settings.scale)
+    check_picture(source.description.camera, settings.given_scale)
     check_poses(settings.poses, source.description.camera)
     notes.extend(source.description.notes)
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()

@@ -72,7 +72,8 @@ class LiveSettings:
     eyes: Eyes = "left"
     """Which pictures of a stereo scope are trained on; `both` where the right one's camera is known. Depth is found from both in either case, and what is
     shown is the left one's: the right one takes steps from it."""
-    scale: float = 1.0
+    scale: float | None = None
+    """Resize the stream's pictures by this factor. None: as much as this machine needs on a CPU (`working_size`), not at all on a GPU."""
     max_frames: int | None = None
     seconds: float | None = None
     """End after so long; None: when the source ends or the run is interrupted."""
@@ -103,7 +104,7 @@ class LiveSettings:
     def __post_init__(self) -> None:
         check_seed(self.seed)
         check_eyes(self.eyes)
-        check_scale(self.scale)
+        check_scale(self.given_scale)
         check_max_frames(self.max_frames)
         if self.seconds is not None and not 0 < self.seconds < 1e9:
             raise InvalidSetting(f"seconds is {self.seconds:g}; it must be positive")
@@ -114,6 +115,11 @@ class LiveSettings:
             raise InvalidSetting(f"out-of-body is {self.out_of_body!r}; choose {' or '.join(get_args(Policy))}")
         check_tool_mask(self.tool_mask)
         check_depth(self.depth)
+
+    @property
+    def given_scale(self) -> float:
+        """The factor that was asked for; 1 where none was."""
+        return 1.0 if self.scale is None else self.scale
 
     @property
     def chosen_clock(self) -> ClockSettings:
@@ -174,7 +180,7 @@ class LiveSettings:
             field=ReconstructorConfig(field=self.field).chosen_field,
             renderer=self.renderer,
             seed=self.seed,
-            scale=self.scale,
+            scale=self.given_scale,
             steps_per_frame=None,
             heldout=False,
         )

@@ -48,7 +48,7 @@ def new_recorder(
         fps=source.fps,
         camera=camera_record(source.camera),
         fields=tuple(sorted(source.fields & {"mask", "depth", "right_image", "pose"})),  # type: ignore[arg-type]
-        settings={"device": settings.device, "scale": settings.scale, "seed": settings.seed},
+        settings={"device": settings.device, "scale": settings.given_scale, "seed": settings.seed},
         keeps_bytes=settings.recording.keep_bytes,
         keeps_s=settings.recording.keep_s,
     )

@@ -59,11 +59,16 @@ def made_up_tissue(height_px: int, width_px: int) -> NDArray[np.uint8]:
 def trial_run(
     settings: LiveSettings, source: FrameSource, new_graph: Callable[[FrameSource, LiveSettings], Application]
 ) -> None:
-    """Run the graph that `new_graph` makes on made-up pictures. Nothing of it is recorded or stays on the disk.
+    """Run the graph that `new_graph` makes on made-up pictures.
 
     Raises as a run does, OperatorFailed for instance: what fails here would fail on the stream.
     """
+    run_on_trial(settings, lambda inside: new_graph(MadeUpTissue(source.description), inside))
+
+
+def run_on_trial(settings: LiveSettings, new_graph: Callable[[LiveSettings], Application]) -> None:
+    """Run a live graph of which nothing is recorded and nothing stays on the disk. Raises as a run does."""
     with TemporaryDirectory(prefix="intrasplat-trial-") as folder:
         inside = replace(settings, out=Path(folder), record=None, out_of_body="off", seconds=None, max_frames=None)
         with seeded(settings.seed, settings.device):
-            run(new_graph(MadeUpTissue(source.description), inside), "embedded")
+            run(new_graph(inside), "embedded")

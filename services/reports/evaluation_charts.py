@@ -84,7 +84,9 @@ def hold_section(report: EvaluationReport) -> str:
     live = report.live
     if live is not None and live.age_when_shown is not None and live.score.psnr_tissue_db is not None:
         age = live.age_when_shown.p50_ms * report.recording.fps / 1000
-        lines.append(Line("Live, at the median age (training error)", [age], [live.score.psnr_tissue_db], "second", marks=True))
+        lines.append(
+            Line("Live, at the median age (training error)", [age], [live.score.psnr_tissue_db], "second", marks=True)
+        )
     chart = Chart(
         title="Frame-hold curve",
         description="Tissue PSNR of a raw frame that is shown late, against the frame that is seen by then.",

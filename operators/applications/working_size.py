@@ -1,0 +1,177 @@
+"""Working size of a live run on a CPU: the largest at which this machine shows each frame before the next one comes.
+
+Nothing about the machine is assumed. The live graph is run on made-up pictures, one at a time, with the fewest steps that a frame gets, and the
+time from a frame's arrival to its picture is measured. That run is also the trial run (`trial_run`) of the size that is chosen.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsplat_core.scene.frames import Frame, FrameStatus
+from operators.applications.live_settings import LiveSettings
+from operators.applications.trial_run import made_up_tissue, run_on_trial
+from operators.graph import Application
+from operators.messages import ShownPicture
+from operators.sources.scaled import scaled_description
+from operators.sources.source import SourceDescription
+from operators.sources.threaded import ThreadedSource
+
+SCALE_STEPS = 16
+"""Sizes are multiples of this fraction of the stream's width and height."""
+MIN_SIDE_PX = 64
+"""No smaller size is chosen."""
+FIRST_PIXELS = 320 * 256
+"""Size that is measured first, where the pictures are larger."""
+SHARE_OF_INTERVAL = 0.9
+"""Largest share of the time between two frames that a frame may take."""
+MOST_MEASUREMENTS = 4
+STARTING_FRAMES, TIMED_FRAMES = 3, 9
+"""Frames of one measurement: those that start the model, which are not counted, and those that are."""
+GIVEN_UP_S = 2.0
+"""A frame that takes longer than this ends the measurement; it counts as this long."""
+
+
+@dataclass(frozen=True)
+class WorkingSize:
+    """A size that was chosen, and what it was chosen by."""
+
+    scale: float
+    width_px: int
+    height_px: int
+    frame_s: float
+    """Measured time from a frame's arrival to its picture, at this size."""
+    interval_s: float
+    """Time between two frames of the stream."""
+    full_size: tuple[int, int]
+    """Width and height of the stream's pictures."""
+
+    @property
+    def sentence(self) -> str:
+        """The choice and its reason, for the report."""
+        size, full = f"{self.width_px}x{self.height_px}", "{}x{}".format(*self.full_size)
+        of = f"all {size} pixels" if self.scale == 1 else f"{size} of {full} pixels"
+        took, between = f"{1e3 * self.frame_s:.0f} ms", f"{1e3 * self.interval_s:.0f} ms"
+        if self.frame_s <= self.interval_s:
+            why = f"a frame takes {took} at this size on this machine, and frames come {between} apart"
+        else:
+            why = f"even at this size a frame takes {took} on this machine, and frames come {between} apart, so some of them are passed over"
+        return f"the run reconstructs {of}: {why}; --scale sets another size"
+
+
+def choose_working_size(
+    about: SourceDescription, measure: Callable[[float], float], share: float = SHARE_OF_INTERVAL
+) -> WorkingSize:
+    """Choose the largest size whose frames take at most `share` of the time between two frames.
+
+    Args:
+        about: the stream at its full size.
+        measure: returns the seconds that a frame takes at a scale; called for at most `MOST_MEASUREMENTS` of them.
+        share: of the time between two frames.
+    """
+    interval_s = 1 / about.fps
+    smallest = min(SCALE_STEPS, math.ceil(SCALE_STEPS * MIN_SIDE_PX / min(about.width_px, about.height_px)))
+    guess = math.floor(SCALE_STEPS * math.sqrt(FIRST_PIXELS / (about.width_px * about.height_px)))
+    step = min(SCALE_STEPS, max(smallest, guess))
+    measured: dict[int, float] = {}
+    while step not in measured and len(measured) < MOST_MEASUREMENTS:
+        measured[step] = measure(step / SCALE_STEPS)
+        step = min(SCALE_STEPS, max(smallest, _largest_that_fits(measured, share * interval_s)))
+    fitting = [step for step, took_s in measured.items() if took_s <= share * interval_s]
+    chosen = max(fitting) if fitting else min(measured)
+    scaled = scaled_description(about, chosen / SCALE_STEPS)
+    return WorkingSize(
+        scale=chosen / SCALE_STEPS,
+        width_px=scaled.width_px,
+        height_px=scaled.height_px,
+        frame_s=measured[chosen],
+        interval_s=interval_s,
+        full_size=(about.width_px, about.height_px),
+    )
+
+
+def _largest_that_fits(measured: dict[int, float], allowed_s: float) -> int:
+    """Estimate the largest step whose frames take `allowed_s`: a frame takes a fixed time and a time for each of its pixels.
+
+    Between two measured sizes the estimate lies between them, so that a choice that was measured too long is not measured again.
+    """
+    fits = max((step for step, took_s in measured.items() if took_s <= allowed_s), default=None)
+    too_large = min((step for step, took_s in measured.items() if took_s > allowed_s), default=None)
+    near = sorted(measured, key=lambda step: abs(measured[step] - allowed_s))[:2]
+    if len(near) == 1:
+        squared = near[0] ** 2 * allowed_s / measured[near[0]]
+        if fits is not None:
+            # Where most of the time is fixed, this is far too small; a second size a quarter larger shows what a pixel costs.
+            squared = max(squared, (fits + max(1, fits // 4)) ** 2)
+    else:
+        (a, b), (s, t) = near, (measured[near[0]], measured[near[1]])
+        per_pixel = (t - s) / (b**2 - a**2)
+        # Without a slope, as beside other load, the time is taken to be proportional.
+        squared = a**2 + (allowed_s - s) / per_pixel if per_pixel > 0 else a**2 * allowed_s / s
+    step = math.floor(math.sqrt(max(0.0, squared)))
+    if too_large is not None:
+        step = min(step, too_large - 1)
+    if fits is not None:
+        step = max(step, fits)
+    return step
+
+
+class PacedTissue(ThreadedSource):
+    """Made-up pictures, each given when the one before it has been shown; measures how long that took."""
+
+    def __init__(self, like: SourceDescription) -> None:
+        super().__init__(ahead=1)
+        self.description = replace(like, name="trial run", frame_count=None, digest=None, notes=())
+        self.took_s: dict[int, float] = {}
+        """Seconds from each frame's arrival to its picture, by the frame's number."""
+        self._shown = threading.Event()
+        self._given: tuple[int, int] | None = None
+        """Number and time of arrival of the newest frame."""
+
+    def frames(self) -> Iterator[Frame]:
+        """The pictures, at the stream's times."""
+        camera, fps = self.description.camera, self.description.fps
+        picture = made_up_tissue(camera.height_px, camera.width_px)
+        for seq in range(STARTING_FRAMES + TIMED_FRAMES):
+            self._shown.clear()
+            self._given = seq, time.monotonic_ns()
+            moved = np.roll(picture, 2 * seq, axis=1)
+            yield Frame(seq, round(seq / fps * 1e9), moved, status=FrameStatus.LIVE, arrived_ns=self._given[1])
+            if not self._shown.wait(GIVEN_UP_S):
+                self.took_s[seq] = GIVEN_UP_S
+                if seq >= STARTING_FRAMES:
+                    return
+
+    def shown(self, picture: ShownPicture) -> None:
+        """Take a picture that is on the screen."""
+        if picture.new and self._given is not None and picture.rendered.frame.seq == self._given[0]:
+            self.took_s[self._given[0]] = (picture.shown_ns - self._given[1]) * 1e-9
+            self._shown.set()
+
+    @property
+    def frame_s(self) -> float:
+        """Median time of a frame, without those that start the model; `GIVEN_UP_S` where none was shown."""
+        timed = [took_s for seq, took_s in self.took_s.items() if seq >= STARTING_FRAMES]
+        return statistics.median(timed or [GIVEN_UP_S])
+
+
+def measured_frame_s(
+    settings: LiveSettings, about: SourceDescription, new_graph: Callable[[PacedTissue, LiveSettings], Application]
+) -> float:
+    """Run the graph that `new_graph` makes on paced pictures of the size of `about`; returns the median time of a frame in seconds.
+
+    Raises as a run does.
+    """
+    clock = settings.chosen_clock
+    fewest = clock.at_least_steps or 1
+    tissue = PacedTissue(about)
+    paced = replace(settings, clock=replace(clock, at_most_steps=fewest, rehearse_at_most=0))
+    run_on_trial(paced, lambda tried: new_graph(tissue, tried))
+    return tissue.frame_s
