@@ -17,9 +17,9 @@ CUDA_TOOLKIT := build/cuda-toolkit
 
 # On the NVIDIA GPU where there is one that torch can use: the CUDA kernels are built for it first. A build that fails ends it.
 demo: native
-	$(BIN)/intrasplat synthesize --out out/recording
+	$(BIN)/intrasplat synthesize --out out/recording --frames 90 --behind
 	@set -e; if $(BIN)/python -m services.cli.gpu_check; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
-	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --device $$device
+	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --depth stereo --device $$device
 
 # All tests, in two groups beside each other, which take equally long: whole programs, whose tests often wait, with geometry, whose tests compute; and
 # all the others, most of which use one core. What a group says is printed when it is over.

@@ -23,6 +23,7 @@ from typing import Any, get_args
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.registry import check_depth
 from gsplat_core.io.recordings import is_heldout
+from gsplat_core.io.recordings.truth import open_behind
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import Eyes, ReconstructorConfig, check_eyes
@@ -51,6 +52,7 @@ from operators.sinks.registry import SINKS, SinkOptions, input_of
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource
 from operators.storage import StorageReserve
+from operators.truth import TruthOp
 
 REPORT_RESERVE_BYTES = 8 * 2**20
 """Room on the disk that stays free for the video's index and the report."""
@@ -194,8 +196,19 @@ class ReplayApplication(Application):
                 self.add_flow(self.metrics, sink, {("scored", port)})
         if self._followed is not None:
             self.add_flow(rasterize, self._followed.compare_op(self, "compare"), {("rendered", "rendered")})
+        self._compare_with_truth(rasterize)
         progress = CallbackSinkOp(self, name="progress", callback=self._report)
         self.add_flow(self.metrics, progress, {("scored", "message")})
+
+    def _compare_with_truth(self, rasterize: RasterizeOp) -> None:
+        """Score what no camera shows, where the recording knows the tissue behind its tools."""
+        folder, about = Path(self.settings.recording), self.frame_source.description
+        if about.frame_count is None or not folder.is_dir():
+            return
+        behind = open_behind(folder, about.frame_count)
+        if behind is not None:
+            truth = TruthOp(self, name="truth", behind=behind, camera=about.camera, frame_count=about.frame_count)
+            self.add_flow(rasterize, truth, {("rendered", "rendered")})
 
     def _reconstruct_op(self) -> ReconstructOp:
         if self._followed is not None:

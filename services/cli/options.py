@@ -169,6 +169,7 @@ class SynthesizeOptions:
     ] = False
     flow: Annotated[bool, typer.Option("--flow", help="Optical flow and scene flow to the next frame.")] = False
     tracks: Annotated[bool, typer.Option("--tracks", help="Which of the followed points each frame sees.")] = False
+    behind: Annotated[bool, typer.Option("--behind", help="Pictures and depth of the tissue behind the tool.")] = False
     smoke: Annotated[float, typer.Option(help="Smoke that comes and goes: 0 none, 1 dense.")] = 0.0
     depth_noise: Annotated[
         float, typer.Option(metavar="MM", help="Noise of the depth at 74 mm; the true one is kept in true_depth.")

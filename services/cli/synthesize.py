@@ -25,6 +25,7 @@ def synthesize_command(out: Path, options: SynthesizeOptions, *, as_json: bool) 
         third=options.third,
         flow=options.flow,
         tracks=options.tracks,
+        behind=options.behind,
         smoke=options.smoke,
         depth_noise_mm=options.depth_noise,
         exposure_changes=options.exposure_changes,

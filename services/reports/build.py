@@ -8,6 +8,7 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.baselines import Baselines
+from gsplat_core.evaluation.depth_share import DepthShare
 from gsplat_core.training.metrics import QualityTracker
 from operators.applications.result import RunOutcome
 from operators.display import LiveDisplayResult
@@ -20,13 +21,15 @@ from operators.reconstruct import ModelResult, TrainedEyes
 from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult
 from operators.sources.source import SourceDescription
+from operators.truth import TruthResult
 from services.reports.html import write_html
 from services.reports.live import live_facts
 from services.reports.machine import machine_facts
-from services.reports.pictures import keyframe_pictures
+from services.reports.pictures import hidden_pictures, keyframe_pictures
 from services.reports.schema import (
     BaselineQuality,
     BinEntry,
+    DepthErrors,
     FrameCounts,
     FrameEntry,
     Latency,
@@ -38,6 +41,7 @@ from services.reports.schema import (
     RecordingFacts,
     RunFacts,
     RunReport,
+    TruthFacts,
 )
 from services.version import product_version
 
@@ -136,6 +140,7 @@ def _qualities(outcome: RunOutcome, quality: QualityResult) -> QualityReport:
     return QualityReport(
         live=None if offline else _quality(quality.trained),
         next_frame=_next_frame(outcome.find(NextFrameResult)),
+        truth=_truth(outcome.find(TruthResult)),
         training=_quality(quality.trained) if offline else None,
         heldout=_quality(quality.held_out) if outcome.settings.heldout else None,
         baselines=BaselineQuality(
@@ -155,13 +160,41 @@ def _next_frame(result: NextFrameResult | None) -> NextFrameQuality | None:
     )
 
 
+def _truth(result: TruthResult | None) -> TruthFacts | None:
+    if result is None or (result.behind_tools is None and result.depth is None):
+        return None
+    behind = result.behind_tools
+    return TruthFacts(
+        behind_tools_psnr_db=None if behind is None else behind.psnr_db,
+        last_seen_psnr_db=None if behind is None else behind.last_seen_db,
+        inpainted_psnr_db=None if behind is None else behind.inpainted_db,
+        frames=0 if behind is None else behind.frames,
+        depth=_depth(result.depth),
+        depth_behind_tools=_depth(result.depth_behind_tools),
+    )
+
+
+def _depth(share: DepthShare | None) -> DepthErrors | None:
+    if share is None:
+        return None
+    return DepthErrors(
+        reconstruction=share.rmse_share,
+        level_plane=share.level_rmse_share,
+        best_plane=share.plane_rmse_share,
+        frames=share.frames,
+    )
+
+
 def write_reports(outcome: RunOutcome, folder: Path) -> RunReport:
     """Write `report.json` and `report.html`; each is whole or not there. Raises StorageFull."""
     report = build_report(outcome)
     report = report.model_copy(update={"outputs": {**report.outputs, "report": "report.json", "page": "report.html"}})
     report.write(folder / "report.json")
     kept = outcome.find(KeyframesResult) or KeyframesResult((), None)
-    write_html(report, [keyframe_pictures(frame) for frame in kept.keyframes], folder / "report.html", kept.worst_seq)
+    pictures = [keyframe_pictures(frame) for frame in kept.keyframes]
+    model = outcome.find(ModelResult)
+    hidden = hidden_pictures(kept.keyframes[-1], model.model) if kept.keyframes and model is not None else None
+    write_html(report, pictures, folder / "report.html", kept.worst_seq, hidden)
     return report
 
 

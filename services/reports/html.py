@@ -9,8 +9,9 @@ from importlib.resources import files
 from pathlib import Path
 
 from operators.storage import write_whole
+from services.reports.hidden_sections import hidden_section
 from services.reports.live_sections import live_section
-from services.reports.pictures import KeyframePictures
+from services.reports.pictures import HiddenPictures, KeyframePictures
 from services.reports.schema import RunReport
 from services.reports.sections import (
     baselines_section,
@@ -29,18 +30,28 @@ POLICY = "default-src 'none'; img-src data:; media-src 'self'; style-src 'unsafe
 
 
 def write_html(
-    report: RunReport, keyframes: Sequence[KeyframePictures], path: Path, worst_seq: int | None = None
+    report: RunReport,
+    keyframes: Sequence[KeyframePictures],
+    path: Path,
+    worst_seq: int | None = None,
+    hidden: HiddenPictures | None = None,
 ) -> None:
     """Write the page; the file is whole or not there."""
-    write_whole(path, render_html(report, keyframes, worst_seq).encode())
+    write_whole(path, render_html(report, keyframes, worst_seq, hidden).encode())
 
 
-def render_html(report: RunReport, keyframes: Sequence[KeyframePictures], worst_seq: int | None = None) -> str:
+def render_html(
+    report: RunReport,
+    keyframes: Sequence[KeyframePictures],
+    worst_seq: int | None = None,
+    hidden: HiddenPictures | None = None,
+) -> str:
     """The page as text: inline style, inline SVG, pictures as `data:`, no script, no foreign origin."""
     recording, run = report.recording, report.run
     sections = [
         tiles_section(report),
         live_section(report),
+        hidden_section(report, hidden),
         video_section(report),
         pictures_section(keyframes, worst_seq, report),
         quality_over_time_section(report),

@@ -9,13 +9,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.orbit import Orbit
 from operators.metrics import ScoredFrame
+from operators.rasterize import displayed
 from operators.remembered import marked
 from operators.sinks.pictures import depth_map, depth_range, error_map
 
 WIDTH_PX = 420
 """Pictures are shrunk to this width, never enlarged by more than whole factors."""
 _JPEG_QUALITY = 88
+ASIDE = Orbit(16.0, 8.0)
+"""From where the model is shown besides, in degrees about what the camera looks at."""
+COVERED = 0.5
+"""Opacity from which on a pixel shows something of the model."""
+NOTHING_THERE = (70, 74, 80)
 
 
 @dataclass(frozen=True)
@@ -43,6 +51,51 @@ def keyframe_pictures(scored: ScoredFrame) -> KeyframePictures:
         depth=data_uri(depth_map(rendered)),
         depth_range=depth_range(rendered),
     )
+
+
+@dataclass(frozen=True)
+class HiddenPictures:
+    """What a reconstruction shows and the camera does not, of the last frame; `data:` URIs."""
+
+    seq: int
+    time_s: float
+    raw: str
+    behind: str
+    """The reconstruction in its own colours, tissue behind tools within a light line."""
+    depth: str
+    aside: str
+    """The model as it is seen from the side; grey where it has nothing."""
+
+
+def hidden_pictures(scored: ScoredFrame, model: Model) -> HiddenPictures | None:
+    """Return the pictures of a frame with the model of its time; None where the model shows nothing in front of the camera."""
+    rendered = scored.rendered
+    frame = rendered.frame
+    known = rendered.depth[(rendered.alpha > COVERED) & (rendered.depth > 0)]
+    if not known.size or (model.camera.width_px, model.camera.height_px) != (frame.width_px, frame.height_px):
+        return None
+    camera = model.camera if frame.pose is None else model.camera.with_pose(frame.pose)
+    output = model.render(frame.time_s, ASIDE.camera(camera, float(np.median(known))))
+    aside = displayed(output.image)
+    aside[output.alpha.detach().cpu().numpy() < COVERED] = NOTHING_THERE
+    return HiddenPictures(
+        frame.seq,
+        frame.time_s,
+        raw=data_uri(frame.image),
+        behind=data_uri(_outlined(rendered.image, frame.mask)),
+        depth=data_uri(depth_map(rendered)),
+        aside=data_uri(aside),
+    )
+
+
+def _outlined(picture: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+    """The picture with a light line around what is hidden by tools."""
+    if mask is None:
+        return picture
+    drawn = np.ascontiguousarray(picture.copy())
+    outlines, _ = cv2.findContours((mask == 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(drawn, outlines, -1, (235, 235, 235), max(1, round(picture.shape[0] / 300)))
+    return drawn
 
 
 def data_uri(image: NDArray[np.uint8]) -> str:

@@ -121,6 +121,34 @@ class BaselineQuality(Part):
     """Mean of the frames before and after; it sees the future."""
 
 
+class DepthErrors(Part):
+    """Root mean squared error of depth over the median true depth, of all compared pixels."""
+
+    reconstruction: float
+    level_plane: float
+    """Each frame's median true depth, shown everywhere: a trivial baseline that knows the truth."""
+    best_plane: float
+    """Each frame's best tilted plane: a trivial baseline that knows the truth."""
+    frames: Count
+
+
+class TruthFacts(Part):
+    """What the camera does not show, against the truth of a synthetic recording."""
+
+    behind_tools_psnr_db: float | None
+    """Over pixels behind a tool whose place was seen before, against the picture through the tool."""
+    last_seen_psnr_db: float | None
+    """Trivial baseline: each of these pixels as it was seen last."""
+    inpainted_psnr_db: float | None
+    """Trivial baseline: the frame's own picture, filled in from around the tool."""
+    frames: Count
+    """Frames that were scored behind their tools."""
+    depth: DepthErrors | None
+    """Of tissue that the camera shows."""
+    depth_behind_tools: DepthErrors | None
+    """Of tissue behind tools that was seen before."""
+
+
 class QualityReport(Part):
     live: Quality | None
     """Training error: each displayed frame right after the model was trained on it. Null for an offline reconstruction."""
@@ -129,6 +157,8 @@ class QualityReport(Part):
     heldout: Quality | None
     """Frames that were never trained on; null without `--heldout`."""
     baselines: BaselineQuality
+    truth: TruthFacts | None = None
+    """Null where the recording does not know what is behind its tools."""
     training: Quality | None = None
     """Training error of an offline reconstruction: training frames after all of the training. Null for a replay."""
 

@@ -5,6 +5,7 @@
     true_depth/         as depth/, where that one is not the truth
     flow/, scene_flow/  where what each pixel shows goes until the next frame (`true_motion`)
     views.json, views/  further cameras (`views`)
+    behind/images, behind/depth  the left eye's picture and depth through its tools
 
 Nothing here is read by training, nor is it part of a recording's digest.
 """
@@ -22,8 +23,8 @@ from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings.arrays import ArrayHeader, read_array
 from gsplat_core.io.recordings.calibration import number, read_json
 from gsplat_core.io.recordings.findings import Findings
-from gsplat_core.io.recordings.frame_files import DepthFiles, check_sizes, resize_nearest
-from gsplat_core.io.recordings.image_files import list_images
+from gsplat_core.io.recordings.frame_files import DepthFiles, check_sizes, resize_area, resize_nearest
+from gsplat_core.io.recordings.image_files import decode_picture, list_images
 from gsplat_core.io.recordings.plain_files import UnreadableFile, all_stay_inside, stays_inside
 from gsplat_core.io.recordings.true_motion import MotionFiles, open_motion
 from gsplat_core.io.recordings.views import RecordedView, open_views
@@ -44,6 +45,30 @@ class Tracks:
 
 
 @dataclass(frozen=True)
+class TissueBehindTools:
+    """Pictures and depth of a recording as they are behind its tools."""
+
+    images: tuple[Path, ...]
+    depth: DepthFiles
+
+    def of(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32]] | None:
+        """Return picture [H, W, 3] and depth z [H, W] in mm of a frame of the recording, at the frame's size; None after the last one.
+
+        Raises RecordingInvalid for a file that cannot be read.
+        """
+        if frame.seq >= len(self.images):
+            return None
+        try:
+            image = decode_picture(self.images[frame.seq]).image
+        except UnreadableFile as error:
+            raise RecordingInvalid(f"{self.images[frame.seq]}: {error}. Write it again, or remove behind/") from error
+        depth = self.depth.read(frame.seq, Findings(strict=True))
+        assert depth is not None
+        size = frame.width_px, frame.height_px
+        return resize_area(image, *size), resize_nearest(depth, *size)
+
+
+@dataclass(frozen=True)
 class GroundTruth:
     """What a recording knows beyond what a camera gives; the parts that it has not are None or empty."""
 
@@ -51,6 +76,7 @@ class GroundTruth:
     tracks: Tracks | None = None
     true_depth: DepthFiles | None = None
     motion: MotionFiles | None = None
+    behind: TissueBehindTools | None = None
 
     def depth_of(self, frame: Frame) -> NDArray[np.float32] | None:
         """The true depth of a frame of the recording, at the frame's size; the frame's own where there is no other."""
@@ -69,8 +95,24 @@ def open_truth(folder: Path, frame_count: int, scale: float = 1.0) -> GroundTrut
     if not folder.is_dir():
         return GroundTruth()
     views = open_views(folder, frame_count, scale)
-    tracks, depth = _tracks(folder, frame_count), _true_depth(folder, frame_count)
-    return GroundTruth(views, tracks, depth, open_motion(folder, frame_count))
+    tracks = _tracks(folder, frame_count)
+    depth = _depth_files(folder, "true_depth", frame_count)
+    return GroundTruth(views, tracks, depth, open_motion(folder, frame_count), open_behind(folder, frame_count))
+
+
+def open_behind(folder: Path, frame_count: int) -> TissueBehindTools | None:
+    """Return the tissue behind the tools of a recording's first `frame_count` frames; None where the recording does not know it.
+
+    Raises RecordingInvalid for what is there and cannot be read.
+    """
+    depth = _depth_files(folder, "behind/depth", frame_count)
+    if depth is None:
+        return None
+    inside = folder / "behind/images"
+    files = list_images(inside) if inside.is_dir() else []
+    if len(files) < frame_count or not all_stay_inside(folder, files, Findings(strict=True)):
+        raise RecordingInvalid(f"{inside}: {len(files)} pictures for {frame_count} frames. Give one for each frame")
+    return TissueBehindTools(tuple(files), depth)
 
 
 def _tracks(folder: Path, frame_count: int) -> Tracks | None:
@@ -102,8 +144,8 @@ def _array(path: Path, frame_count: int, dimensions: int) -> NDArray[Any] | None
         raise RecordingInvalid(f"{path}: {error}. Write it again, one row for each frame, or remove it") from error
 
 
-def _true_depth(folder: Path, frame_count: int) -> DepthFiles | None:
-    inside = folder / "true_depth"
+def _depth_files(folder: Path, name: str, frame_count: int) -> DepthFiles | None:
+    inside = folder / name
     if not inside.is_dir():
         return None
     files = list_images(inside) or list_images(inside, frozenset({".npy"}))

@@ -34,11 +34,22 @@ _NOISY = {
 }
 
 
+_BEHIND = {
+    "behind/images": "the left eye's picture through the tool: tissue that it hides, in its shadow",
+    "behind/depth": "z of that tissue",
+}
+
+
 def describe(files: FrameFiles, frames: int) -> None:
     """Write `recording.json`, and `views.json` where there is a third camera."""
     extras, scene = files.extras, files.scene
     meaning = dict(_ALWAYS)
-    for wanted, more in ((extras.third, _THIRD), (extras.flow, _FLOW), (extras.tracks, _SEEN)):
+    for wanted, more in (
+        (extras.third, _THIRD),
+        (extras.flow, _FLOW),
+        (extras.tracks, _SEEN),
+        (extras.behind, _BEHIND),
+    ):
         meaning |= more if wanted else {}
     meaning |= _NOISY if extras.depth_noise_mm else {}
     description: dict[str, Any] = {

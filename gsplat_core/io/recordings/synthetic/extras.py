@@ -24,6 +24,8 @@ class Extras:
     """Optical flow and scene flow from each frame to the next."""
     tracks: bool = False
     """Which of the points in `tracks.npy` each frame sees."""
+    behind: bool = False
+    """Pictures and depth of the tissue as they are behind the tool, in its shadow, in `behind/`, for evaluation alone."""
     smoke: float = 0.0
     """Strength; 1 is dense."""
     depth_noise_mm: float = 0.0

@@ -44,6 +44,7 @@ class FrameFiles:
         names = ["images", "masks", "depth"]
         names += ["images_right"] if self.stereo else []
         names += [f"views/third/{name}" for name in ("images", "masks", "depth")] if self.extras.third else []
+        names += ["behind/images", "behind/depth"] if self.extras.behind else []
         names += ["flow", "scene_flow"] if self.extras.flow else []
         names += ["true_depth"] if self.extras.depth_noise_mm else []
         for name in names:
@@ -57,6 +58,10 @@ class FrameFiles:
         if extras.depth_noise_mm:
             save_depth(self.folder / "true_depth" / _name(index, "depth"), left.depth)
             save_depth(self.folder / "depth" / _name(index, "depth"), self._noisy(left.depth, index))
+        if extras.behind:
+            bare = scene.render(time_s, transparent=True)
+            save_image(self.folder / "behind/images" / _name(index, "color"), bare.image)
+            save_depth(self.folder / "behind/depth" / _name(index, "depth"), bare.depth)
         if self.stereo:
             save_image(self.folder / "images_right" / _name(index, "color"), scene.render(time_s, "right").image)
         if extras.third:

@@ -40,12 +40,20 @@ class Eye:
 
 
 def render_eye(
-    tissue: Tissue, tug: Tug, parts: list[Part], camera: Camera, time_s: float, lamp: Lamp, air: Air | None = None
+    tissue: Tissue,
+    tug: Tug,
+    parts: list[Part],
+    camera: Camera,
+    time_s: float,
+    lamp: Lamp,
+    air: Air | None = None,
+    *,
+    transparent: bool = False,
 ) -> Eye:
-    """One camera's view of the scene at a time.
+    """Render one camera's view of the scene at a time.
 
     lamp: in the camera's coordinates; all cameras see by the same light. air: what is between the scope and the tissue, and how the picture
-    is exposed; None: clear, and exposed as usual.
+    is exposed; None: clear, and exposed as usual. transparent: tools are looked through; they shade the tissue all the same.
     """
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     ray_x, ray_y = pixel_rays(camera)
@@ -57,7 +65,13 @@ def render_eye(
     length = np.sqrt(ray_x * ray_x + ray_y * ray_y + 1)
     rays = np.stack([ray_x / length, ray_y / length, 1 / length], axis=-1)
     world_rays = (rays @ rotation.astype(np.float32)).reshape(-1, 3)
-    hits = trace(parts, camera.position, world_rays, (tissue_depth * length).ravel(), 1 / float(camera.K[0, 0]))
+    hits = trace(
+        [] if transparent else parts,
+        camera.position,
+        world_rays,
+        (tissue_depth * length).ravel(),
+        1 / float(camera.K[0, 0]),
+    )
     shape = tissue_depth.shape
     tool_depth = hits.distance_mm.reshape(shape) / length
     cover = hits.cover.reshape(shape)

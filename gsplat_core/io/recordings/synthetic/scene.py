@@ -111,15 +111,16 @@ class SyntheticScene:
         centre = np.array(THIRD_MM)
         return _pose(_looking(np.array([0, 0, self.tissue.looked_at_mm]) - centre, 0.0), centre)
 
-    def render(self, time_s: float, view: View = "left") -> Eye:
-        """What a camera sees at a time."""
+    def render(self, time_s: float, view: View = "left", transparent: bool = False) -> Eye:
+        """Render what a camera sees at a time; with `transparent` tools, the tissue behind them in the light that falls on it."""
         reference_mm = self.tissue.exposed_mm
         if view == "third":
             lamp = Lamp.of_eye(BASELINE_MM / 2, reference_mm).seen_from(self.left_to(view))
         else:
             lamp = Lamp.of_eye(BASELINE_MM / 2 if view == "left" else -BASELINE_MM / 2, reference_mm)
         camera = self.camera_at(time_s, view)
-        return render_eye(self.tissue, self.tug(time_s), self.parts(time_s), camera, time_s, lamp, self.air)
+        tug, parts = self.tug(time_s), self.parts(time_s)
+        return render_eye(self.tissue, tug, parts, camera, time_s, lamp, self.air, transparent=transparent)
 
     def tug(self, time_s: float) -> Tug:
         """How a tool pulls at a time."""

@@ -13,6 +13,7 @@ and with `Extras`:
 views.json, views/third/             a camera that training never gets: images, masks and depth
 flow/000000.npy, scene_flow/         float32 [H, W, 2] in pixels and [H, W, 3] in mm, to the next frame
 tracks_seen.npy                      uint8 [frames, points]: whether the left eye sees the point
+behind/images, behind/depth          the left eye's picture and depth through the tool
 true_depth/                          where depth/ has noise
 """
 
