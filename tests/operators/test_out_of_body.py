@@ -102,10 +102,11 @@ def test_off_lets_everything_pass_and_says_so(frame, compute):
     assert outcome.notes == ("no picture was examined for showing the outside of the body: the gate was off",)
 
 
-def test_by_default_it_withholds_until_there_is_evidence(frame, compute):
-    grey = np.full((120, 160, 3), 120, np.uint8)
-    passed, _ = run(None, [frame(k, image=grey) for k in range(3)], compute)
-    assert [one.withheld for one in passed] == [WITHHELD] * 3
+def test_by_default_it_withholds_what_holds_evidence_and_nothing_else(frame, compute):
+    grey, pale = np.full((120, 160, 3), 120, np.uint8), np.full((120, 160, 3), (210, 180, 150), np.uint8)
+    passed, outcome = run(None, [frame(0, image=pale), *(frame(k, image=grey) for k in range(1, 4))], compute)
+    assert [one.withheld for one in passed] == [None] + [WITHHELD] * 3
+    assert outcome.find(OutOfBodyFrames).withheld == {"even light, little red": 3}
 
 
 def test_a_start_forgets_the_stream_before(frame, compute):
@@ -115,7 +116,8 @@ def test_a_start_forgets_the_stream_before(frame, compute):
     for expected in (None, None):
         operator.start()
         assert compute(operator, frame=frame(0, image=red))[0].withheld is expected
-        assert compute(operator, frame=frame(1, image=red // 20))[0].withheld == WITHHELD
+        grey = np.full_like(red, 120)
+        assert compute(operator, frame=frame(1, image=grey))[0].withheld == WITHHELD
         assert compute(operator, frame=frame(2, image=red))[0].withheld == WITHHELD
 
 
