@@ -1,12 +1,17 @@
-"""Blur and smoke: frames much less sharp, or much paler, than the stream usually is.
+"""Blur and smoke: frames that are suddenly less sharp than the stream's recent frames, or much paler than its clear ones.
 
-Sharpness is the mean difference between neighbouring pixels over that between pixels eight apart, along rows and along columns, whichever is
-lower beside what is usual: it depends neither on the scene's contrast nor on the exposure, and motion takes it along one direction only.
+Sharpness is the mean difference between neighbouring pixels over that between pixels eight apart, along rows and along columns. The lower of
+the two, relative to its usual value, counts: it depends neither on the scene's contrast nor on the exposure, and motion takes it along one
+direction only. The usual value is that of the last second or so, blurred frames included. A stream that is soft throughout, or that becomes
+soft, therefore passes: the display never waits for sharp frames that do not come.
+
 Smoke takes contrast (the spread of the logarithm of brightness) and saturation, and makes brighter what is dark; a tool does not do the last.
+Smoke gathers slowly, so that the usual values are those of frames without it, until it has lasted as long.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import cv2
@@ -23,6 +28,8 @@ SIDE_PX = 320
 APART_PX = 8
 WIDTH_PX, HEIGHT_PX = 40, 32
 """Of the picture in which colours are measured."""
+LONGEST_RECENT = 600
+"""Most frames whose sharpness is kept, whatever the frame rate."""
 DARK = 28
 """Darker pixels do not count: noise, or outside of the field of view."""
 
@@ -43,12 +50,12 @@ class SharpnessSettings:
     """... and the haze higher by so many levels."""
     clear_above: float = 0.87
     """After smoke a frame is clear again with contrast or saturation above this."""
-    usual_frames: int = 300
-    """Usual is the median of so many frames that were good."""
-    first_frames: int = 5
-    """So many frames pass before there is a usual."""
-    longest_frames: int = 300
-    """After so many withheld frames in a row that is how the stream looks now."""
+    recent_s: float = 1.5
+    """Usual sharpness is the median over this time, so that blur is withheld for half of it at most. After smoke for as long it is usual."""
+    recent_frames: int = 5
+    """The median is taken over at least so many frames, for streams of few frames a second; before there are as many, every frame passes."""
+    clear_frames: int = 300
+    """Usual contrast, saturation and haze are the medians of so many frames that were good."""
 
     def __post_init__(self) -> None:
         share, count = NumberIn(0.01, 1.0), IntegerIn(1, 100_000)
@@ -60,9 +67,9 @@ class SharpnessSettings:
             smoke_saturation=share,
             smoke_haze=NumberIn(0.0, 255.0),
             clear_above=share,
-            usual_frames=count,
-            first_frames=count,
-            longest_frames=count,
+            recent_s=NumberIn(0.01, 60.0),
+            recent_frames=count,
+            clear_frames=count,
         )
 
 
@@ -83,55 +90,85 @@ class Appearance:
 
 
 class SharpnessGate:
-    """Compares each frame of a stream with what is usual in it; keeps five numbers for each of a fixed number of frames."""
+    """Compares each frame of a stream with what is usual in it; keeps a few numbers for each of a bounded number of frames."""
 
     def __init__(self, settings: SharpnessSettings | None = None) -> None:
         self.settings = settings or SharpnessSettings()
-        self._good: NDArray[np.float64] = np.empty((self.settings.usual_frames, 5))
-        """Values of good frames, in a ring."""
-        self._count = 0
-        self._fault: str | None = None
-        self._withheld = 0
+        self._clear: NDArray[np.float64] = np.empty((self.settings.clear_frames, 3))
+        """Contrast, saturation and haze of good frames, in a ring."""
+        self.start_scene()
 
     def start_scene(self) -> None:
-        """Another scene begins, with a usual of its own."""
-        self._count = 0
-        self._fault, self._withheld = None, 0
+        """Forget what is usual: another scene begins."""
+        self._recent: deque[tuple[float, float, float]] = deque(maxlen=LONGEST_RECENT)
+        """Seconds since the frame before, and sharpness along rows and columns, of recent frames."""
+        self._last_ns: int | None = None
+        self._clear_count = 0
+        self._fault: str | None = None
+        self._smoke_s = self._unseen_s = 0.0
+        """How long smoke has lasted, and how long frames could not be measured, which keep the fault of the one before."""
 
-    def fault(self, image: NDArray[np.uint8], kept: NDArray[np.generic] | None = None) -> str | None:
-        """ "blur", "smoke", or None for a good frame, RGB uint8 [H, W, 3]; `kept` [H, W] is 0 where it is not tissue."""
+    def fault(self, image: NDArray[np.uint8], pts_ns: int, kept: NDArray[np.generic] | None = None) -> str | None:
+        """Judge the stream's next frame: "blur", "smoke", or None for a good one.
+
+        image: RGB uint8 [H, W, 3]. pts_ns: its time. kept: [H, W], 0 where it shows no tissue.
+        """
+        elapsed_s = 0.0 if self._last_ns is None else (pts_ns - self._last_ns) * 1e-9
+        self._last_ns = pts_ns
+        # A gap says nothing about the frame after it, and a clock that stands still must not stop the window.
+        elapsed_s = min(max(elapsed_s, 1e-3), self.settings.recent_s / self.settings.recent_frames)
         seen = appearance(image, kept)
+        self._unseen_s = 0.0 if seen is not None else self._unseen_s + elapsed_s
         if seen is None:
+            if self._unseen_s > self.settings.recent_s:
+                self._fault = None
             return self._fault
-        values = np.array([seen.rows, seen.columns, seen.contrast, seen.saturation, seen.haze])
-        known = min(self._count, len(self._good))
-        if known < min(self.settings.first_frames, len(self._good)):
-            self._keep(values)
-            return None
-        usual = np.maximum(np.partition(self._good[:known], known // 2, axis=0)[known // 2], 1e-6)
-        rows, columns, contrast, saturation = (values / usual)[:4]
-        self._fault = self._judged(min(rows, columns), contrast, saturation, seen.haze - usual[4])
-        if self._fault is None:
-            self._withheld = 0
-            self._keep(values)
-            return None
-        self._withheld += 1
-        if self._withheld > self.settings.longest_frames:
-            self.start_scene()
-            self._keep(values)
+        clear = np.array([seen.contrast, seen.saturation, seen.haze])
+        if len(self._recent) >= self.settings.recent_frames:
+            rows, columns = self._usual_sharpness()
+            self._fault = self._judged(min(seen.rows / rows, seen.columns / columns), clear)
+        self._remember(elapsed_s, seen)
+        if self._fault == "smoke":
+            self._smoke_s += elapsed_s
+            if self._smoke_s > self.settings.recent_s:
+                self._clear_count = 0
+        else:
+            self._smoke_s = 0.0
+        if self._fault is None or self._clear_count == 0:
+            self._clear[self._clear_count % len(self._clear)] = clear
+            self._clear_count += 1
         return self._fault
 
-    def _keep(self, values: NDArray[np.float64]) -> None:
-        self._good[self._count % len(self._good)] = values
-        self._count += 1
+    def _remember(self, elapsed_s: float, seen: Appearance) -> None:
+        """Append the frame's sharpness, and drop frames that are no longer recent."""
+        self._recent.append((elapsed_s, seen.rows, seen.columns))
+        together_s = sum(each[0] for each in self._recent)
+        while (
+            len(self._recent) > self.settings.recent_frames and together_s - self._recent[0][0] > self.settings.recent_s
+        ):
+            together_s -= self._recent.popleft()[0]
 
-    def _judged(self, sharpness: float, contrast: float, saturation: float, haze: float) -> str | None:
+    def _usual_sharpness(self) -> tuple[float, float]:
+        """Median sharpness of the recent frames along rows and columns, each frame weighed by the time that it stands for."""
+        elapsed_s, *values = np.array(self._recent).T
+        usual = []
+        for sharpness in values:
+            order = np.argsort(sharpness)
+            until_s = np.cumsum(elapsed_s[order])
+            usual.append(max(1e-6, float(sharpness[order[np.searchsorted(until_s, 0.5 * until_s[-1])]])))
+        return usual[0], usual[1]
+
+    def _judged(self, sharpness: float, clear: NDArray[np.float64]) -> str | None:
+        """Judge a frame by its sharpness relative to the usual one, and its contrast, saturation and haze."""
         settings = self.settings
+        known = min(self._clear_count, len(self._clear))
+        usual = np.maximum(np.partition(self._clear[:known], known // 2, axis=0)[known // 2], 1e-6)
+        contrast, saturation = (float(share) for share in (clear / usual)[:2])
         if self._fault == "smoke":
             smoke = max(contrast, saturation) < settings.clear_above
         else:
             pale = contrast < settings.smoke_contrast and saturation < settings.smoke_saturation
-            smoke = pale and haze >= settings.smoke_haze
+            smoke = pale and float(clear[2] - usual[2]) >= settings.smoke_haze
         if smoke:
             return "smoke"
         limit = settings.sharp_above if self._fault == "blur" else settings.blurred_below
@@ -139,7 +176,7 @@ class SharpnessGate:
 
 
 def appearance(image: NDArray[np.uint8], kept: NDArray[np.generic] | None = None) -> Appearance | None:
-    """Of RGB uint8 [H, W, 3] where `kept` [H, W] is not 0; None where there is too little to tell."""
+    """Measure RGB uint8 [H, W, 3] where `kept` [H, W] is not 0; None where there is too little to tell."""
     step = max(1, round(max(image.shape[:2]) / SIDE_PX))
     grey = luma(sampled(image, step))
     if min(grey.shape) <= 2 * APART_PX:

@@ -11,7 +11,7 @@ from operators.endoscope.stage import Stage, StageCounts, tissue_of
 
 @dataclass(frozen=True)
 class SharpnessCounts(StageCounts):
-    """Frames that were withheld for blur and for smoke."""
+    """Count of the frames withheld for blur and for smoke."""
 
 
 class SharpnessStage(Stage):
@@ -34,5 +34,5 @@ class SharpnessStage(Stage):
             return frame
         if frame.new_scene is not None:
             self._gate.start_scene()
-        fault = self._gate.fault(frame.image, tissue_of(frame))
+        fault = self._gate.fault(frame.image, frame.pts_ns, tissue_of(frame))
         return frame if fault is None else self.withhold(frame, fault)
