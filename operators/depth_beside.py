@@ -9,11 +9,12 @@ from typing import Any
 from gsplat_core.geometry.registry import DepthFinder, check_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.threads import use_one_thread
 from gsplat_core.training.late_depth import LateDepth
 from operators.depth import DepthCounts
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
-from operators.side_thread import step_back, usable_cores, use_one_core
+from operators.side_thread import step_back, usable_cores
 
 FEW_CORES = 4
 """With so many cores or fewer training needs all of them ..."""
@@ -57,7 +58,7 @@ class DepthBeside:
         self._begun.clear()
         self._thread = threading.Thread(target=self._run, args=(self.finder,), name="depth", daemon=True)
         self._thread.start()
-        self._begun.wait()  # before others compute: see `use_one_core`
+        self._begun.wait()  # before others compute: see `use_one_thread`
 
     def stop(self) -> None:
         """Wait until the frame under work is done, and look for nothing more. Raises what went wrong in the thread."""
@@ -88,7 +89,7 @@ class DepthBeside:
         """The life of the thread."""
         step_back()
         if self._share < 1:
-            use_one_core()
+            use_one_thread()
         self._begun.set()
         scene, placed = 0, -1
         try:

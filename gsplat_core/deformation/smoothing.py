@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.basis_field.plain_torch import basis_field
+from gsplat_core.threads import one_thread
 
 ROWS_AT_ONCE = 1 << 14
 """Bounds the memory for differences."""
@@ -38,6 +39,7 @@ def towards_others_(values: Tensor, others: Tensor, amount: float) -> None:
     values.lerp_(mean / others.shape[1], amount)
 
 
+@one_thread()
 def least_squares_weights(taus: Sequence[float], bumps: int) -> Tensor:
     """The matrix [B, T], float64, that makes weights of bumps in a row, of width 1 at 0, 1, ..., of values at `taus`: the nearest course that does not bend
     too much."""

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsplat_core.geometry.moving_bundle import MovingBundle, adjust, with_waves
 from gsplat_core.geometry.trajectory_prior import TrajectoryPrior
+from gsplat_core.threads import one_thread
 
 BREATHING_HZ, HEART_HZ = (0.1, 0.8), (0.8, 3.0)
 LEAST_CYCLES, FEWEST_TRIED = 1.5, 0.5
@@ -42,6 +43,7 @@ def waves(times_s: Tensor, frequencies_hz: Sequence[float]) -> Tensor:
     return torch.stack([angles.cos(), angles.sin()], 2).flatten(1)
 
 
+@one_thread()
 def frequencies_of(start: MovingBundle, times_s: Tensor, fastest_hz: float = HEART_HZ[1]) -> tuple[float, ...]:
     """Of breathing, or of breathing and the heart, those that explain best where points were seen; none where they explain little more than tissue
     at rest does.

@@ -22,6 +22,7 @@ from gsplat_core.geometry.pose import exp, inverse, log
 from gsplat_core.geometry.surface_field import MOST_NODES, SurfaceField
 from gsplat_core.geometry.trajectory_lines import is_told
 from gsplat_core.geometry.trajectory_prior import TrajectoryPrior, learned_from
+from gsplat_core.threads import one_thread
 
 EVERY_S = 0.4
 """Between the frames that are looked at, on average."""
@@ -87,6 +88,7 @@ class BreathingTrajectory:
     """Median of how far rays are off."""
 
 
+@one_thread()
 def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTrajectory | None:
     """The trajectory before breathing tissue, or None where there is none to be told.
 
@@ -115,6 +117,7 @@ def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTraje
     return BreathingTrajectory(poses, found.rest, frequencies_hz, max(prior.uncertain, mistaken), error)
 
 
+@one_thread()
 def refined(
     start: MovingBundle, times_s: Tensor, frequencies_hz: tuple[float, ...]
 ) -> tuple[MovingBundle, tuple[float, ...], TrajectoryPrior]:

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsplat_core.geometry.levenberg_marquardt import descend, diagonal_of, products, ray_derivatives, summed
+from gsplat_core.geometry.levenberg_marquardt import descend, diagonal_of, ray_derivatives, summed
 from gsplat_core.geometry.pose import exp
+from gsplat_core.threads import one_thread
 
 NEAREST = 1e-3
 """Of the median depth: what is nearer, or behind the camera, is taken to be there."""
@@ -42,6 +43,7 @@ def errors_px(bundle: Bundle) -> Tensor:
     return residual.norm(dim=1)
 
 
+@one_thread()
 def adjust(
     bundle: Bundle, *, fixed: Tensor, rounds: int = 15, spread_px: float = 1.0, points_move: bool = True
 ) -> Bundle:
@@ -99,7 +101,7 @@ def _step(bundle: Bundle, fixed: Tensor, spread_px: float, damping: float, point
     count = int(free.sum())
     eliminated = torch.einsum("cpij,pjk->cpik", W, inverse)
     rows = W.permute(0, 2, 1, 3).reshape(count * 6, points * 3)
-    S = torch.block_diag(*H[free]) - products(eliminated.permute(0, 2, 1, 3).reshape(count * 6, points * 3), rows)
+    S = torch.block_diag(*H[free]) - eliminated.permute(0, 2, 1, 3).reshape(count * 6, points * 3) @ rows.T
     right = g[free] - torch.einsum("cpij,pj->ci", eliminated, h)
     twist = -torch.linalg.solve(S, right.reshape(-1, 1)).view(count, 6)
     shift = -(inverse @ (h + torch.einsum("cpij,ci->pj", W, twist))[:, :, None])[:, :, 0]

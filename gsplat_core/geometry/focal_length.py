@@ -22,6 +22,7 @@ from gsplat_core.geometry.pose import exp, log
 from gsplat_core.geometry.tracks import FeatureTracks, Observations
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.threads import one_thread
 
 SHORTEST, LONGEST = 0.6, 1.6
 """Bounds of the search, in units of the picture's longer side: 80° to 35° across."""
@@ -69,8 +70,9 @@ def focal_length_of(frames: Iterable[Frame], camera: Camera, found: Trajectory) 
     tracks = FeatureTracks()
     for frame in frames:
         tracks.follow(frame.image, followed_part(frame))
-    start = _start(tracks.observations(LEAST_SEEN), camera, found)
-    return None if start is None else _search(start, float(max(camera.width_px, camera.height_px)))
+    with one_thread():
+        start = _start(tracks.observations(LEAST_SEEN), camera, found)
+        return None if start is None else _search(start, float(max(camera.width_px, camera.height_px)))
 
 
 def trajectory_without_calibration(

@@ -10,15 +10,12 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 State = TypeVar("State")
 
 DONE = 1e-6
 """Of the cost: when a step gains less than this share of it, the last one was made."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e4
-SUMMED = 96
-"""Length of the parts in which long sums are taken."""
 EASIER, HARDER = 5, 8
 """The damping is divided by the first after a step that lessened the cost, and multiplied by the second after one that did not."""
 
@@ -59,14 +56,6 @@ def ray_derivatives(local: Tensor) -> tuple[Tensor, Tensor]:
 def summed(parts: Tensor, index: Tensor, count: int) -> Tensor:
     """Sums [count, …] of the parts [M, …] with the same index [M]."""
     return torch.zeros(count, *parts.shape[1:], dtype=parts.dtype).index_add_(0, index, parts)
-
-
-def products(first: Tensor, second: Tensor) -> Tensor:
-    """`first @ second.T` of matrices [N, K] and [M, K]. The sums are of parts of fixed length, so that the number of threads makes no difference, as it
-    does where libraries share out long sums."""
-    missing = -first.shape[1] % SUMMED
-    parts = [pad(each, (0, missing)).view(len(each), -1, SUMMED) for each in (first, second)]
-    return (parts[0].transpose(0, 1) @ parts[1].permute(1, 2, 0)).sum(0)
 
 
 def diagonal_of(blocks: Tensor) -> Tensor:

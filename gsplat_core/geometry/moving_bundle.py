@@ -16,6 +16,7 @@ from gsplat_core.geometry.levenberg_marquardt import descend, diagonal_of, ray_d
 from gsplat_core.geometry.pose import exp
 from gsplat_core.geometry.surface_field import SurfaceField
 from gsplat_core.geometry.trajectory_prior import TrajectoryPrior
+from gsplat_core.threads import one_thread
 
 SIGMA = 0.002
 """Standard deviation of a ray (x / z): 0.6 pixels of a picture that is 320 wide, as neighbours in time err alike."""
@@ -67,6 +68,7 @@ def with_waves(bundle: MovingBundle, waves: Tensor) -> MovingBundle:
     return replace(bundle, waves=waves, amplitudes=amplitudes)
 
 
+@one_thread()
 def adjust(
     bundle: MovingBundle, spread: float, rounds: int, prior: TrajectoryPrior | None = None
 ) -> tuple[MovingBundle, float]:

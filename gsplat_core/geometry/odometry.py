@@ -27,6 +27,7 @@ from gsplat_core.geometry.bundle import Bundle, adjust, errors_px
 from gsplat_core.geometry.tracks import FeatureTracks, Observations
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.threads import one_thread
 
 LEAST_SEEN = 4
 """Frames in which a point has to be seen."""
@@ -137,6 +138,7 @@ class _Odometry:
         self._is_key[-1] = True
         self._lost: list[int] = []
 
+    @one_thread()
     def run(self) -> Trajectory:
         """Frame after frame, then all of them once more with the final points."""
         self._take_up(0)

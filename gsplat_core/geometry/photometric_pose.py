@@ -19,6 +19,7 @@ from gsplat_core.geometry.pose import exp
 from gsplat_core.rendering.rasterization import rasterization
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.threads import one_thread
 
 SOFT = 0.05
 """Of the Charbonnier loss, as a share of full brightness: residuals well below it count by their square, those well above it by their size."""
@@ -119,11 +120,13 @@ def _compare(gaussians: Gaussians, camera: Camera, viewmat: Tensor, target: Tens
             )
         residual = (picture - target)[compared]
         size = (residual.square() + SOFT**2).sqrt()
-        error = (size - SOFT).mean()
+        with one_thread():
+            error = (size - SOFT).mean()
         (gradient,) = torch.autograd.grad(error, twist)
     weight = 1 / (size.detach() * size.numel())
     by_twist = _by_twist(picture.detach(), colors[0, ..., 3].detach(), intrinsics)[compared]
-    hessian = torch.einsum("nci,nc,ncj->ij", by_twist, weight, by_twist)
+    with one_thread():
+        hessian = torch.einsum("nci,nc,ncj->ij", by_twist, weight, by_twist)
     return _Comparison(float(error.detach()), gradient, hessian)
 
 

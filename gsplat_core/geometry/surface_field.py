@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsplat_core.threads import one_thread
+
 LINEAR = 0.2
 """How far the linear part may be expected to move tissue (standard deviation)."""
 LOCAL = 0.03
@@ -36,12 +38,14 @@ class SurfaceField:
     """[M, M]: half of v' stiffness v is how unlikely values v at the nodes are beforehand."""
 
     @classmethod
+    @one_thread()
     def over(cls, points: Tensor, most: int = MOST_NODES) -> SurfaceField:
         """Nodes spread over points [P, 3]."""
         middle = points.median(0).values
         nodes = _spread(points, middle, most)
         return cls(nodes, middle, torch.linalg.inv(_settled(_covariance(nodes, nodes, middle))))
 
+    @one_thread()
     def influence(self, points: Tensor) -> Tensor:
         """How much each point has of each node's vector [P, M]."""
         return _covariance(points, self.nodes, self.middle) @ self.stiffness

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsplat_core.geometry.breathing_frequencies import waves
 from gsplat_core.geometry.trajectory_prior import PLACES, TrajectoryPrior, coordinates, learned_from
+from gsplat_core.threads import one_thread
 
 BESIDE_CYCLES = 0.5
 """From the breathing's frequency to those beside it, in cycles over the recording."""
@@ -20,6 +21,7 @@ CLEARLY = 2.0
 """What is given to the tissue has to be so many times what would be given to it beside its frequency, or poses may get worse by it."""
 
 
+@one_thread()
 def is_told(before: Tensor, poses: Tensor, times_s: Tensor, hz: Sequence[float]) -> tuple[bool, float]:
     """Whether `poses` [C, 4, 4], from which breathing was taken, are to be believed more than those `before`; and how much of them may be the tissue's (root mean square)."""
     length_s = float(times_s[-1] - times_s[0])

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.geometry.pose import hat, log
+from gsplat_core.threads import one_thread
 
 LENGTHS_S = (0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6, 6.0, 8.0, 12.0)
 """Of the kernel."""
@@ -32,11 +33,13 @@ class TrajectoryPrior:
     uncertain: float
     """How far off the trajectory may be (root mean square) as far as it is along the given frequencies."""
 
+    @one_thread()
     def cost(self, poses: Tensor) -> float:
         """How unlikely poses [C, 4, 4] are."""
         y, _ = coordinates(poses)
         return 0.5 * float(torch.einsum("tj,jts,sj->", y, self.precision, y))
 
+    @one_thread()
     def terms(self, poses: Tensor) -> tuple[Tensor, Tensor]:
         """The cost's matrix [6 C, 6 C] and slope [6 C] by twists of the cameras."""
         y, by_twist = coordinates(poses)
@@ -60,6 +63,7 @@ def coordinates(poses: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([place, vector], 1), by_twist
 
 
+@one_thread()
 def learned_from(poses: Tensor, times_s: Tensor, waves: Tensor) -> TrajectoryPrior:
     """The prior of trajectories like that of `poses` [C, 4, 4], at `times_s` [C], as far as that is not along the `waves` [C, B]."""
     y, _ = coordinates(poses)

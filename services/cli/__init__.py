@@ -14,6 +14,9 @@ def main() -> None:
     # Threads of the C++ core that wait must sleep, not spin: on a busy machine spinning can make a render many times slower. Read once,
     # when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # numpy's BLAS rounds differently with another number of threads. With one, results do not depend on the machine's cores or on this
+    # variable's value. Read once, when numpy is imported.
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     from services.cli.app import run
 
     sys.exit(streams.code(run(sys.argv[1:])))

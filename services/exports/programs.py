@@ -19,7 +19,9 @@ from services.exports.formats import arguments_of
 PROGRAM = (sys.executable, "-P", "-m", "services.exports.make")
 REFUSED = 2
 MOST_S = 300.0
-PASSED_ON = ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TMPDIR", "HOME", "OMP_NUM_THREADS")
+PASSED_ON = (
+    "PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TMPDIR", "HOME", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS",
+)  # fmt: skip
 """What the program gets of the environment: no credentials are among it."""
 
 

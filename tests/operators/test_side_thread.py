@@ -7,9 +7,8 @@ import sys
 import threading
 
 import pytest
-import torch
 
-from operators.side_thread import NICENESS, step_back, usable_cores, use_one_core
+from operators.side_thread import NICENESS, step_back, usable_cores
 
 
 def in_a_thread(work):
@@ -19,22 +18,6 @@ def in_a_thread(work):
     thread.start()
     thread.join()
     return answers[0]
-
-
-def test_one_core_is_for_the_thread_that_asks_and_for_no_other():
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    try:
-
-        def alone():
-            use_one_core()
-            torch.ones(1_000_000).exp_()
-            return torch.get_num_threads()
-
-        assert in_a_thread(alone) == 1
-        assert torch.get_num_threads() == 3 and in_a_thread(torch.get_num_threads) == 3
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="priorities of threads are those of Linux")

@@ -1,0 +1,23 @@
+"""Weights of bumps that follow given offsets have the same bytes with any number of threads."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsplat_core.deformation.smoothing import least_squares_weights
+
+
+@pytest.mark.parametrize("bumps", [5, 11, 40, 130])
+@pytest.mark.parametrize("times", [17, 200])
+def test_the_number_of_threads_makes_no_difference(bumps, times):
+    taus = torch.linspace(0, bumps - 1, times).tolist()
+    before = torch.get_num_threads()
+    found = []
+    try:
+        for threads in (1, 2, 3, 5):
+            torch.set_num_threads(threads)
+            found.append(least_squares_weights(taus, bumps))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(found[0], each) for each in found[1:])

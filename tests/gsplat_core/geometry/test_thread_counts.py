@@ -1,0 +1,117 @@
+"""Geometry has the same bytes with any number of threads, at sizes where BLAS, LAPACK and torch's reductions share their work among threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.geometry import bundle, moving_bundle
+from gsplat_core.geometry.breathing_frequencies import waves
+from gsplat_core.geometry.breathing_trajectory import _bundle, refined
+from gsplat_core.geometry.photometric_pose import refine_pose
+from gsplat_core.geometry.surface_field import SurfaceField
+from gsplat_core.geometry.trajectory_lines import is_told
+from gsplat_core.geometry.trajectory_prior import learned_from
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import Gaussians
+from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ
+from tests.gsplat_core.geometry.breathing_sightings import bundle_of, seen_for
+from tests.gsplat_core.geometry.test_bundle import disturbed, first_only, known_scene
+
+THREADS = (1, 2, 3)
+
+
+def bytes_with(threads, work):
+    """The bytes of the tensors that `work` returns, with a number of threads that other tests do not see."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        return [np.asarray(each).tobytes() for each in work()]
+    finally:
+        torch.set_num_threads(before)
+
+
+def check(work):
+    first, *others = (bytes_with(threads, work) for threads in THREADS)
+    for threads, other in zip(THREADS[1:], others, strict=True):
+        differing = [number for number, (a, b) in enumerate(zip(first, other, strict=True)) if a != b]
+        assert not differing, f"results {differing} differ between 1 and {threads} threads"
+
+
+@pytest.fixture(scope="module")
+def breathing():
+    sightings, _ = seen_for(10.0, rate_hz=5.0)
+    return bundle_of(sightings, waves(sightings.times_s, (BREATHING_HZ, HEART_HZ))), sightings
+
+
+# 6 unknowns a camera: LAPACK shares a system of more than about 128 unknowns among threads, and BLAS even short products.
+@pytest.mark.parametrize(("cameras", "points"), [(3, 400), (8, 60), (26, 200), (40, 400)])
+@pytest.mark.parametrize("points_move", [True, False])
+def test_bundle_adjustment(cameras, points, points_move):
+    start = disturbed(known_scene(cameras, points))
+
+    def adjusted():
+        found = bundle.adjust(start, fixed=first_only(start), rounds=3, points_move=points_move)
+        return found.poses, found.points
+
+    check(adjusted)
+
+
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_bundle_adjustment_of_moving_tissue(breathing, with_prior):
+    start, sightings = breathing
+
+    def adjusted():
+        prior = learned_from(start.poses, sightings.times_s, start.waves) if with_prior else None
+        found, cost = moving_bundle.adjust(start, 0.004, 2, prior)
+        return found.poses, found.rest, found.amplitudes, cost
+
+    check(adjusted)
+
+
+def test_priors_and_fields(breathing):
+    start, sightings = breathing
+
+    def learned():
+        prior = learned_from(start.poses, sightings.times_s, start.waves)
+        field = SurfaceField.over(start.rest)
+        told = is_told(start.poses, start.poses, sightings.times_s, (BREATHING_HZ,))
+        return (
+            prior.precision, prior.uncertain, prior.cost(start.poses), *prior.terms(start.poses), field.nodes,
+            field.stiffness, field.influence(start.rest), told[1],
+        )  # fmt: skip
+
+    check(learned)
+
+
+def test_the_trajectory_before_breathing_tissue(breathing, monkeypatch):
+    monkeypatch.setattr("gsplat_core.geometry.breathing_trajectory.STAGES", ((0.007, 2, 0.06),))
+    _, sightings = breathing
+
+    def found():
+        start, numbers = _bundle(sightings, torch.arange(len(sightings.times_s)), 300, 30)
+        end, hz, prior = refined(start, sightings.times_s, (BREATHING_HZ, HEART_HZ))
+        return end.poses, end.rest, end.amplitudes, numbers, np.array(hz), prior.precision
+
+    check(found)
+
+
+def test_a_pose_that_is_refined_by_a_picture():
+    camera = Camera.from_focal(180.0, 256, 192)
+    random = torch.Generator().manual_seed(2)
+    count = 150
+    means = torch.rand(count, 3, generator=random) * torch.tensor([80.0, 60.0, 6.0]) + torch.tensor([-40.0, -30, 57])
+    scene = Gaussians(
+        means, torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.full((count, 3), 1.3),
+        torch.full((count,), 3.0), torch.randn(count, 1, 3, generator=random),
+    )  # fmt: skip
+    picture = (render(scene, camera).image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    moved = camera.with_pose(np.array([[1, 0, 0, 0.4], [0, 1, 0, -0.3], [0, 0, 1, 0.2], [0, 0, 0, 1.0]]))
+
+    def refined_pose():
+        found = refine_pose(scene, moved, picture, rounds=2)
+        return found.camera.world_to_camera, found.before, found.after
+
+    check(refined_pose)

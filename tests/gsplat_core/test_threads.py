@@ -1,0 +1,84 @@
+"""The number of threads that one thread computes with."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+
+from gsplat_core.threads import one_thread, use_one_thread
+
+
+@pytest.fixture(autouse=True)
+def three_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+def in_a_thread(work: Callable[[], int]) -> int:
+    """Result of `work` in a new thread."""
+    answers: list[int] = []
+    thread = threading.Thread(target=lambda: answers.append(work()))
+    thread.start()
+    thread.join()
+    return answers[0]
+
+
+def test_one_thread_is_for_the_thread_that_asks_and_for_no_other():
+    def alone():
+        use_one_thread()
+        torch.ones(1_000_000).exp_()
+        return torch.get_num_threads()
+
+    assert in_a_thread(alone) == 1
+    assert torch.get_num_threads() == 3 and in_a_thread(torch.get_num_threads) == 3
+
+
+def test_inside_the_block_there_is_one_and_afterwards_there_are_as_many_as_before():
+    with one_thread():
+        assert torch.get_num_threads() == 1 and in_a_thread(torch.get_num_threads) == 3
+        with one_thread():
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 3 and in_a_thread(torch.get_num_threads) == 3
+
+
+def test_an_error_gives_the_threads_back():
+    @one_thread()
+    def fail():
+        assert torch.get_num_threads() == 1
+        raise ValueError
+
+    for _ in range(2):
+        with pytest.raises(ValueError):
+            fail()
+        assert torch.get_num_threads() == 3
+
+
+def test_another_thread_computes_with_its_own_number_meanwhile():
+    """Its LAPACK, too: the last bits of a large system tell how many threads solved it."""
+    matrix = torch.randn(400, 400, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    solved = lambda: torch.linalg.inv(matrix).sum(1)
+    expected = solved()
+    inside, leave = threading.Event(), threading.Event()
+
+    def alone():
+        with one_thread():
+            inside.set()
+            leave.wait()
+        return torch.get_num_threads()
+
+    answers: list[int] = []
+    other = threading.Thread(target=lambda: answers.append(alone()))
+    other.start()
+    inside.wait()
+    try:
+        assert torch.equal(solved(), expected)
+    finally:
+        leave.set()
+        other.join()
+    assert answers == [3]
