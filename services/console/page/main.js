@@ -112,10 +112,19 @@ function chooseAmong(streams) {
 }
 
 const replays = replaysPage(report);
+
+/** Open the page of replays with a recording chosen, before its list has come. */
+function replay(name) {
+  replays.choose(name);
+  const opened = open("replays");
+  at("replay-recording").focus();
+  return opened;
+}
+
 const pages = {
   live: async () => {},
   models: modelsPage(report),
-  recordings: recordingsPage(report, async (name) => { await open("replays"); replays.choose(name); }),
+  recordings: recordingsPage(report, replay),
   replays: replays.renew,
   streams: streamsPage(report, chooseAmong),
   audit: auditPage(report),

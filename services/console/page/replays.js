@@ -10,11 +10,13 @@ const MOST_WATCHED = 8;
 /** Returns `renew`, which renews the page, and `choose(name)`, which chooses a recording in its form. */
 export function replaysPage(report) {
   let shown = [];
+  let asked = 0, current = 0; // how many lists were asked for, and the first one that knows the chosen recording
   const watched = new Map();
 
   async function renew() {
+    const number = ++asked;
     const [recordings, replays] = await Promise.all([call("GET", "/v1/recordings"), call("GET", "/v1/replays?count=50")]);
-    offer(recordings.filter((each) => each.state === "ready").map((each) => each.name));
+    if (number >= current) offer(recordings.filter((each) => each.state === "ready").map((each) => each.name));
     shown = replays;
     draw();
     const open = shown.filter((each) => OPEN.includes(each.state)).slice(-MOST_WATCHED);
@@ -107,7 +109,15 @@ export function replaysPage(report) {
     });
   });
 
-  return { renew, choose: (name) => { at("replay-recording").value = name; at("replay-recording").focus(); } };
+  /** Choose a recording in the form at once. Lists that were asked for earlier may not have it and do not change the form. */
+  function choose(name) {
+    const choice = at("replay-recording");
+    if (![...choice.options].some((option) => option.value === name)) choice.add(new Option(name, name));
+    choice.value = name;
+    current = asked + 1;
+  }
+
+  return { renew, choose };
 }
 
 /** The options of the form that were filled in. */
