@@ -159,12 +159,12 @@ def _packed(path: Path) -> Iterator[Path]:
 
 def _assigned(text: str) -> tuple[str, Any]:
     """A name and its value, as YAML reads it: a number, true, a word."""
-    import yaml
+    from services.settings.yaml_file import yaml_value
 
     name, equals, value = text.partition("=")
     if not equals or not name:
         raise InvalidSetting(f"--option {text!r:.80} has no value; write --option name=value")
     try:
-        return name.replace("-", "_"), yaml.safe_load(value)
-    except yaml.YAMLError as error:
+        return name.replace("-", "_"), yaml_value(value)
+    except ValueError as error:
         raise InvalidSetting(f"--option {text!r:.80} is not YAML; quote its value") from error

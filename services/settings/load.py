@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_settings import (
     BaseSettings,
@@ -20,7 +19,7 @@ from pydantic_settings import (
 
 from services.settings.errors import SettingsInvalid
 from services.settings.service import ServiceSettings
-from services.settings.yaml_file import YamlFile
+from services.settings.yaml_file import YamlFile, yaml_value
 
 ENVIRONMENT_PREFIX = "INTRASPLAT_"
 Location = tuple[int | str, ...]
@@ -50,6 +49,8 @@ def load_settings(file: Path | None = None, flags: Mapping[str, str] | None = No
         return ServiceSettings.model_construct(**dict(Settings()))
     except SettingsError as error:
         raise SettingsInvalid(f"the environment: {error}; give lists and tables as JSON") from error
+    except RecursionError as error:
+        raise SettingsInvalid("the environment: a value nests lists or tables too deep") from error
     except ValidationError as error:
         said = [_sentence(one["loc"], one, document, flags or {}) for one in error.errors(include_input=False)]
         raise SettingsInvalid("\n".join(said)) from None
@@ -66,9 +67,9 @@ def _nested(flags: Mapping[str, str]) -> dict[str, Any]:
             if not isinstance(place, dict):
                 raise SettingsInvalid(f"--set {name}: {section} is given as a value, too; give one of them")
         try:
-            place[key] = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise SettingsInvalid(f"--set {name}={text!r:.80} is not YAML; quote it") from error
+            place[key] = yaml_value(text)
+        except ValueError as error:
+            raise SettingsInvalid(f"--set {name}={text!r:.80} is not YAML ({error!s:.120}); quote it") from error
     return values
 
 

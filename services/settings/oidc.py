@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
+
+from services.settings.section import Section
 
 
 def _url(text: str) -> str:
@@ -29,10 +31,8 @@ def _is_loopback(host: str) -> bool:
 Url = Annotated[str, AfterValidator(_url), Field(examples=["https://login.example/realms/hospital"])]
 
 
-class OidcSettings(BaseModel):
+class OidcSettings(Section):
     """Persons of an OpenID Connect issuer, beside API keys; needs the extra oidc."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 
     issuer: Url = Field(description="As the issuer calls itself, to the letter.")
     audience: str = Field(

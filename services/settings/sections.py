@@ -7,9 +7,10 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, SecretStr, model_validator
+from pydantic import AfterValidator, Field, SecretStr, model_validator
 
 from services.settings.oidc import OidcSettings
+from services.settings.section import Section
 
 NAME_PATTERN = r"^[a-z0-9][a-z0-9-]{0,39}$"
 ResourceName = Annotated[str, Field(pattern=NAME_PATTERN, examples=["theatre-1"])]
@@ -35,12 +36,6 @@ def _host_pattern(text: str) -> str:
 
 
 HostPattern = Annotated[str, AfterValidator(_host_pattern), Field(examples=["room-1.example"])]
-
-
-class Section(BaseModel):
-    """Values that do not change, without keys that are not known, and with errors that do not repeat a secret."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 
 
 class ServerSettings(Section):

@@ -8,9 +8,13 @@ from typing import Any
 
 import yaml
 
+from gsplat_core.io.regular_files import read_regular
 from services.settings.errors import SettingsInvalid
 
 MOST_BYTES = 2**20
+MOST_NESTING = 16
+MOST_VALUES = 100_000
+_NAME_TAGS = ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge")
 
 
 @dataclass(frozen=True)
@@ -26,23 +30,21 @@ class YamlFile:
     def read(cls, path: Path) -> YamlFile:
         """Read a file; raises SettingsInvalid for one that is not there, not YAML, or names a key twice."""
         try:
-            with path.open("rb") as file:
-                data = file.read(MOST_BYTES + 1)
+            data = read_regular(path, MOST_BYTES)
         except OSError as error:
             raise SettingsInvalid(f"{path}: {error.strerror}; give the settings file's path") from error
-        if len(data) > MOST_BYTES:
-            raise SettingsInvalid(f"{path} is longer than {MOST_BYTES} bytes; is it a settings file?")
-        lines: dict[tuple[str, ...], int] = {}
         try:
             text = data.decode()
-            root = yaml.compose(text, yaml.SafeLoader)
-            if root is not None:
-                _collect(root, (), lines, path.name)
-            values = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise SettingsInvalid(f"{path} is not YAML: {' '.join(str(error).split())}") from error
-        except (UnicodeDecodeError, RecursionError) as error:
+        except UnicodeDecodeError as error:
             raise SettingsInvalid(f"{path} is not readable text: {error}") from error
+        try:
+            values = yaml_value(text)
+            root = yaml.compose(text, yaml.SafeLoader)
+        except ValueError as error:
+            raise SettingsInvalid(f"{path} is not YAML that settings may have: {error}") from error
+        lines: dict[tuple[str, ...], int] = {}
+        if root is not None:
+            _collect(root, (), lines)
         if not isinstance(values or {}, dict):
             raise SettingsInvalid(f"{path} holds a {type(values).__name__}; write `section:` and below it `key: value`")
         return cls(values or {}, lines, path.name)
@@ -56,13 +58,72 @@ class YamlFile:
         return None
 
 
-def _collect(node: yaml.Node, place: tuple[str, ...], lines: dict[tuple[str, ...], int], name: str) -> None:
+def yaml_value(text: str) -> Any:
+    """Return the value that a YAML text states. Raises ValueError, in one line, for what is not YAML or is beyond these bounds.
+
+    Lists and sections are at most MOST_NESTING deep and have at most MOST_VALUES values, those that aliases repeat counted each time. Names in
+    sections are text.
+    """
+    try:
+        _check_nesting(text)
+        root = yaml.compose(text, yaml.SafeLoader)
+        if root is not None:
+            _count(root, {})
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, OverflowError, ValueError) as error:  # ValueError: also days and numbers that are none
+        raise ValueError(" ".join(str(error).split())) from error
+
+
+def _check_nesting(text: str) -> None:
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MOST_NESTING:
+            line = event.start_mark.line + 1
+            raise ValueError(f"line {line}: lists and sections are more than {MOST_NESTING} deep inside each other")
+
+
+def _count(node: yaml.Node, counted: dict[int, int]) -> int:
+    """Return how many values a node has. Raises ValueError for more than MOST_VALUES, and for names and texts that settings cannot have."""
+    line = node.start_mark.line + 1
+    if isinstance(node, yaml.ScalarNode):
+        if "\0" in node.value:
+            raise ValueError(f"line {line}: {node.value!r:.60} holds a zero byte")
+        return 1
+    if id(node) in counted:
+        if counted[id(node)] < 0:
+            raise ValueError(f"line {line}: a value contains itself")
+        return counted[id(node)]
+    counted[id(node)] = -1
+    total = 1
+    pairs = node.value if isinstance(node, yaml.MappingNode) else [(None, each) for each in node.value]
+    seen: dict[str, int] = {}
+    for key, value in pairs:
+        if key is not None:
+            _check_name(key, seen)
+        total += _count(value, counted)
+        if total > MOST_VALUES:
+            raise ValueError(f"line {line}: it has more than {MOST_VALUES} values")
+    counted[id(node)] = total
+    return total
+
+
+def _check_name(key: yaml.Node, seen: dict[str, int]) -> None:
+    line = key.start_mark.line + 1
+    if not isinstance(key, yaml.ScalarNode) or key.tag not in _NAME_TAGS:
+        shown = repr(key.value)[:60] if isinstance(key, yaml.ScalarNode) else "a list or a section"
+        raise ValueError(f"line {line}: {shown} is not text; names in sections are text, put it in quotes")
+    if "\0" in key.value:
+        raise ValueError(f"line {line}: {key.value!r:.60} holds a zero byte")
+    if key.value in seen:
+        raise ValueError(f"line {line}: {key.value[:60]!r} is there twice, first in line {seen[key.value]}")
+    seen[key.value] = line
+
+
+def _collect(node: yaml.Node, place: tuple[str, ...], lines: dict[tuple[str, ...], int]) -> None:
     if not isinstance(node, yaml.MappingNode):
         return
     for key, value in node.value:
         here = (*place, str(key.value))
-        line = key.start_mark.line + 1
-        if here in lines:
-            raise SettingsInvalid(f"{name}, line {line}: {'.'.join(here)} is there twice, first in line {lines[here]}")
-        lines[here] = line
-        _collect(value, here, lines, name)
+        lines[here] = key.start_mark.line + 1
+        _collect(value, here, lines)
