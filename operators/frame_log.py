@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.io.regular_files import open_regular
 from operators.storage import StorageReserve, storage_errors
 
 FRAMES_FILE = "frames.jsonl"
@@ -63,7 +64,7 @@ class FrameLog:
 def read_frames(path: Path) -> Iterator[Entry]:
     """The entries of a log, one at a time. A last line that was cut off is left out. A file that is not there has none."""
     try:
-        lines = path.open("rb")
+        lines = open_regular(path)
     except FileNotFoundError:
         return
     with lines:

@@ -24,12 +24,14 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from gsplat_core.io.atomic_files import replace_durably, sync_folder, unfinished
+from gsplat_core.io.regular_files import read_regular
 from operators.errors import OutputFolderInUse
 from operators.folder_lock import LOCK, FolderLock
 from operators.output_paths import MARKER, check_folder_path
 from operators.storage import STAGING_PREFIX, storage_errors, write_whole
 
 _FORMAT = "intrasplat-output"
+MOST_MARKER_BYTES = 1 << 26
 _COMPLETE, _OLD = ".complete-", ".old-"
 RECORDINGS = "recordings"
 """Holds what runs have recorded, one folder each. It is written as the run goes on, and no later run replaces it."""
@@ -151,11 +153,9 @@ def _passing(name: str) -> bool:
 
 
 def _read_marker(folder: Path) -> dict[str, object] | None:
-    if not (folder / MARKER).is_file():  # a pipe of that name would be waited for
-        return None
     try:
-        marker = json.loads((folder / MARKER).read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
+        marker = json.loads(read_regular(folder / MARKER, MOST_MARKER_BYTES))
+    except (OSError, ValueError, RecursionError):
         return None
     return marker if isinstance(marker, dict) and marker.get("format") == _FORMAT else None
 

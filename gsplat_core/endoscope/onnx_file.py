@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.regular_files import read_regular
 
 MOST_BYTES = 512 * 2**20
 MOST_NESTING = 64
@@ -35,12 +36,9 @@ def read_model(path: Path, what: str) -> bytes:
     Raises InvalidSetting for what is no such file, is too large or has data in other files.
     """
     try:
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
+        data = read_regular(path, MOST_BYTES)
     except OSError as error:
         raise InvalidSetting(f"{what} {path} cannot be read ({error.strerror or error}); give an ONNX file") from error
-    if len(data) > MOST_BYTES:
-        raise InvalidSetting(f"{what} {path} is larger than {MOST_BYTES >> 20} MiB; give a smaller one")
     try:
         external = has_external_data(data)
     except ValueError as error:

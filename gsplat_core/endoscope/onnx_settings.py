@@ -9,6 +9,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.regular_files import read_regular
 
 METADATA_KEY = "intrasplat"
 """Of the model's metadata: its value is a JSON object with the fields of the settings."""
@@ -63,8 +64,7 @@ def read_settings(path: Path, metadata: Mapping[str, str], kind: type[Settings])
     beside = path.with_name(path.name + ".json")
     if beside.exists():
         try:
-            with beside.open("rb") as file:
-                text = file.read(MOST_BYTES + 1)
+            text = read_regular(beside, MOST_BYTES)
         except OSError as error:
             raise InvalidSetting(f"{beside} cannot be read ({error.strerror or error})") from error
         where = str(beside)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting
 from gsplat_core.io.json_object import JsonObject
+from gsplat_core.io.regular_files import read_regular
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.value_ranges import NumberIn
 
@@ -83,12 +84,9 @@ class CameraPath:
 def read_camera_path(path: Path) -> CameraPath:
     """The path that a file describes. Raises InvalidSetting, which names the file, what is wrong and where."""
     try:
-        with path.open("rb") as file:
-            text = file.read(MOST_BYTES + 1)
+        text = read_regular(path, MOST_BYTES)
     except OSError as error:
         raise InvalidSetting(f"cannot read the camera path {path}: {error.strerror or error}") from error
-    if len(text) > MOST_BYTES:
-        raise InvalidSetting(f"{path} is larger than {MOST_BYTES} bytes; it is no camera path")
     try:
         listed = JsonObject.parse(text, path.name).values.get("cameras")
         if not isinstance(listed, list) or not 1 <= len(listed) <= MOST_CAMERAS:

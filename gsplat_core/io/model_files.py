@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import stat
 from pathlib import Path
 from typing import BinaryIO
 
 from gsplat_core.errors import BundleError
+from gsplat_core.io.regular_files import open_regular
 from gsplat_core.memory import available_bytes, in_gib
 
 
@@ -23,18 +23,12 @@ def open_model_file(path: Path, folder: Path | None = None) -> BinaryIO:
         real = os.path.realpath(path, strict=True)
         if folder is not None and not Path(real).is_relative_to(os.path.realpath(folder)):
             raise BundleError(f"{path} is a link that leads out of its folder; copy the file in place of linking it")
-        # Opening a pipe without O_NONBLOCK waits until someone writes to it; for a plain file it means nothing.
-        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
-        descriptor = os.open(real, flags)
+        return open_regular(real, follow_links=False)
     except FileNotFoundError as error:
         raise BundleError(f"{path} is missing; check the name, or copy the model again") from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise BundleError(f"{path} cannot be read: {reason}; it must be a plain file") from error
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise BundleError(f"{path} is not a plain file; copy the model again")
-    return os.fdopen(descriptor, "rb")
+        raise BundleError(f"{path} cannot be read: {reason}; copy the model again") from error
 
 
 def check_memory(path: Path, needed: int) -> None:

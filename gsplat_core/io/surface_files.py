@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.ply import SCALAR_TYPES
+from gsplat_core.io.regular_files import read_regular
 
 MOST_BYTES = 1 << 30
 MOST_HEADER_BYTES = 1 << 16
@@ -36,12 +37,9 @@ def read_surface(path: Path) -> TriangleMesh:
     if reader is None:
         raise InvalidSetting(f"{path.name!r:.80} ends in none of {', '.join(readers)}; give such a mesh")
     try:
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
+        data = read_regular(path, MOST_BYTES)
     except OSError as error:
         raise InvalidSetting(f"cannot read {path}: {error.strerror or error}") from error
-    if len(data) > MOST_BYTES:
-        raise InvalidSetting(f"{path} is larger than {MOST_BYTES} bytes; give a mesh with fewer triangles")
     try:
         vertices, triangles = reader(data)
     except (ValueError, IndexError, KeyError, OverflowError, TypeError) as error:

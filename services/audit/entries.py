@@ -53,10 +53,16 @@ class Entry:
 
 def parse_line(line: bytes) -> tuple[Entry, str]:
     """An entry and the digest that its line states; raises ValueError for anything but a line that `Entry.line` wrote."""
-    values = json.loads(line)
+    try:
+        values = json.loads(line)
+    except RecursionError as error:
+        raise ValueError("it nests values too deep") from error
     if not isinstance(values, dict) or not _DIGEST.fullmatch(str(values.get("digest"))):
         raise ValueError("it has no digest")
     digest = values.pop("digest")
+    seq, detail = values.get("seq"), values.get("detail")
+    if not isinstance(seq, int) or isinstance(seq, bool) or not 0 <= seq < 1 << 63 or not isinstance(detail, dict):
+        raise ValueError("its number or its detail is not that of an entry")
     try:
         entry = Entry(**values)
     except TypeError as error:

@@ -3,12 +3,16 @@ anchor is the newest of those that were removed because they were old, which the
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from gsplat_core.io.regular_files import read_regular
 from services.audit.entries import FIRST
+
+MOST_BYTES = 4096
 
 
 @dataclass(frozen=True)
@@ -51,12 +55,21 @@ def write_anchor(log: Path, anchor: Head) -> None:
 
 def _read(path: Path) -> Head | None:
     try:
-        values = json.loads(path.read_bytes())
+        values = json.loads(read_regular(path, MOST_BYTES))
     except FileNotFoundError:
         return None
+    except RecursionError as error:
+        raise ValueError("it nests values too deep") from error
+    except OSError as error:
+        if error.errno != errno.EFBIG:
+            raise
+        raise ValueError(error.strerror) from error
     if not isinstance(values, dict) or set(values) != {"seq", "digest"}:
         raise ValueError("it does not hold a number and a digest")
-    return Head(int(values["seq"]), str(values["digest"]))
+    seq, digest = values["seq"], values["digest"]
+    if not isinstance(seq, int) or isinstance(seq, bool) or not -1 <= seq < 1 << 63 or not isinstance(digest, str):
+        raise ValueError("it does not hold a number and a digest")
+    return Head(seq, digest)
 
 
 def _write(path: Path, head: Head) -> None:

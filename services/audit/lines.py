@@ -6,12 +6,14 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from gsplat_core.io.regular_files import open_regular
+
 BLOCK_BYTES = 1 << 16
 
 
 def whole_lines_bytes(path: Path, size: int) -> int:
     """Bytes up to the end of the last whole line."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         end = size
         while end:
             start = max(0, end - BLOCK_BYTES)
@@ -25,7 +27,7 @@ def whole_lines_bytes(path: Path, size: int) -> int:
 
 def lines_backwards(path: Path, size: int | None = None) -> Iterator[bytes]:
     """The whole lines of a file, the last one first."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         end = whole_lines_bytes(path, os.fstat(file.fileno()).st_size) if size is None else size
         rest = b""
         while end:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gsplat_core.io.regular_files import open_regular
 from services.audit.entries import MOST_LINE_BYTES, Entry, digest_of_entry, parse_line
 from services.audit.head import Head, read_anchor, read_head
 from services.audit.segments import closed_segments
@@ -149,7 +149,6 @@ def _misfits_at_the_end(
 
 
 def _lines(path: Path) -> Iterator[bytes]:
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    with os.fdopen(descriptor, "rb") as file:
+    with open_regular(path, follow_links=False) as file:
         while line := file.readline(MOST_LINE_BYTES + 1):
             yield line

@@ -19,8 +19,10 @@ def audit_verify_command(file: Path | None, config: Path | None, head: str | Non
     path = file or load_settings(config).data_dir / AUDIT_FILE
     try:
         verdict = verify(path, head)
-    except OSError as error:
-        raise SettingsInvalid(f"{path}: {error.strerror}; give the audit log's path") from error
+    except (OSError, ValueError) as error:
+        raise SettingsInvalid(
+            f"{path}: {getattr(error, 'strerror', None) or error}; give the audit log's path"
+        ) from error
     if as_json:
         typer.echo(json.dumps({"intact": verdict.intact, **asdict(verdict)}, indent=2))
         return OK if verdict.intact else BAD_INPUT

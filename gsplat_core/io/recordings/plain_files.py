@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.regular_files import open_regular
 
 
 class UnreadableFile(Exception):
@@ -15,20 +16,15 @@ class UnreadableFile(Exception):
 
 
 def open_plain(path: Path) -> BinaryIO:
-    """A file opened for reading. Raises UnreadableFile for what is not there or is no plain file, without ever waiting for it."""
+    """Open a plain file for reading. Raises UnreadableFile for a missing file and for everything that is no plain file."""
     try:
-        # O_NONBLOCK: opening a pipe without it waits until someone writes. It means nothing to a plain file.
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        return open_regular(path)
     except FileNotFoundError as error:
         what = "the link leads to nothing" if os.path.islink(path) else "the file is not there"
         raise UnreadableFile(what) from error
-    except (OSError, ValueError) as error:
+    except OSError as error:
         check_plain(path)
-        raise UnreadableFile(f"the file cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise UnreadableFile("it is not a plain file")
-    return os.fdopen(descriptor, "rb")
+        raise UnreadableFile(f"the file cannot be read: {error.strerror or error}") from error
 
 
 def check_plain(path: Path) -> None:

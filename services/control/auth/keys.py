@@ -7,6 +7,7 @@ import hashlib
 import hmac
 import json
 import os
+import re
 import secrets
 import threading
 from collections.abc import Callable, Iterator
@@ -15,6 +16,8 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from gsplat_core.errors import UserError
+from gsplat_core.io.regular_files import read_regular
 from services.control.auth.roles import Role
 
 PREFIX = "intrasplat"
@@ -22,10 +25,18 @@ MOST_LIVE = 2
 """Of one name: the old key and the new one, while callers change over."""
 MOST_KEYS = 1000
 _NOBODY = 64 * "0"
+_SHA256 = re.compile("[0-9a-f]{64}")
+MOST_BYTES = 1 << 24
+MOST_TOKEN_BYTES = 4096
+_MEND = "put back a copy of it from a backup, or move it away to begin without keys"
 
 
-class KeyConflict(Exception):
+class KeyConflict(UserError):
     """Keys cannot be changed in this way now; says why."""
+
+
+class KeysUnreadable(UserError, ValueError):
+    """The file of the keys is damaged, or cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +117,7 @@ class KeyStore:
         with self._lock:
             before, stamp = self._keys, self._stamp()
             if stamp != self._read:
-                self._keys = _parse(self._path) if stamp is not None else {}
+                self._keys = _read_keys(self._path) if stamp is not None else {}
                 self._read = stamp
             keys = self._keys
         if self._on_change is not None and keys is not before:
@@ -142,8 +153,19 @@ def first_admin_key(store: KeyStore, file: Path) -> bool:
     """At the first start, when there is no key: take the administrator's from `file`, or make one and put it there. Whether one was made."""
     if store.all():
         return False
-    if file.exists():
-        store.add("admin", Role.ADMIN, file.read_text(encoding="ascii").strip())
+    if os.path.lexists(file):
+        try:
+            token = read_regular(file, MOST_TOKEN_BYTES).decode("ascii").strip()
+        except OSError as error:
+            raise KeysUnreadable(
+                f"{file} cannot be read: {error.strerror or error}; give another auth.admin_key_file"
+            ) from error
+        except UnicodeDecodeError as error:
+            raise KeysUnreadable(f"{file} holds no API key: it has bytes that are not ASCII; make it anew") from error
+        try:
+            store.add("admin", Role.ADMIN, token)
+        except KeyConflict as error:
+            raise KeyConflict(f"{file} holds no API key: {error}") from error
         return False
     token = f"{PREFIX}_{secrets.token_hex(4)}_{secrets.token_urlsafe(32)}"
     file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -159,8 +181,27 @@ def _digest(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
+def _read_keys(path: Path) -> dict[str, ApiKey]:
+    """Return the keys in a file. Raises KeysUnreadable for a file that this program has not written like that."""
+    try:
+        keys = _parse(path)
+        for key_id, key in keys.items():
+            texts = [value for name, value in asdict(key).items() if name != "streams" and value is not None]
+            if not all(isinstance(value, str) for value in texts) or not _SHA256.fullmatch(key.sha256):
+                raise ValueError(f"the key {key_id!r:.40} has a value that is no text, or no SHA-256")
+        return keys
+    except OSError as error:
+        raise KeysUnreadable(f"{path} cannot be read: {error.strerror or error}; {_MEND}") from error
+    except KeyError as error:
+        raise KeysUnreadable(f"{path} is damaged: {error} is missing; {_MEND}") from error
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise KeysUnreadable(f"{path} is damaged: {error!s:.200}; {_MEND}") from error
+
+
 def _parse(path: Path) -> dict[str, ApiKey]:
-    keys = [ApiKey(**{**each, "role": Role(each["role"])}) for each in json.loads(path.read_bytes())["keys"]]
+    keys = [
+        ApiKey(**{**each, "role": Role(each["role"])}) for each in json.loads(read_regular(path, MOST_BYTES))["keys"]
+    ]
     return {key.id: key for key in keys}
 
 
@@ -174,4 +215,4 @@ def _write(path: Path, keys: dict[str, ApiKey]) -> None:
 
 
 def _private(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)

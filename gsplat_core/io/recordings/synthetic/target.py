@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.regular_files import read_regular
 
 GENERATOR = "intrasplat synthesize"
 _FRAME = r"frame-\d{6}\."
@@ -65,9 +66,8 @@ def _foreign(target: Path) -> Iterator[str]:
 
 
 def _made_here(description: Path) -> bool:
-    with description.open("rb") as file:
-        try:
-            content = json.loads(file.read(1 << 20))
-        except (ValueError, RecursionError):
-            return False
+    try:
+        content = json.loads(read_regular(description, 1 << 20))
+    except (OSError, ValueError, RecursionError):
+        return False
     return isinstance(content, dict) and content.get("generator") == GENERATOR
