@@ -7,24 +7,28 @@ A run collects its results in a folder of its own inside, `.run-…`, and they t
     the new results          → their names
     .old-… is removed
 
-Whoever stops this in between leaves no mixture of two runs: before the first step the earlier results are untouched, and after it the next
+A run that is killed in between leaves no mixture of two runs: before the first step the earlier results are untouched, and after it the next
 run in this folder first does the steps that are left.
+
+The marker lists each file that a run wrote, with a fingerprint. Only these are replaced and removed. A run refuses a folder in which a listed
+file was changed, or in which another file lies among the results. Files that appear while a run works are kept under `kept-…`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 from gsplat_core.io.atomic_files import replace_durably, sync_folder, unfinished
-from gsplat_core.io.regular_files import read_regular
+from gsplat_core.io.regular_files import open_regular, read_regular
 from operators.errors import OutputFolderInUse
 from operators.folder_lock import LOCK, FolderLock
 from operators.output_paths import MARKER, check_folder_path
@@ -32,13 +36,19 @@ from operators.storage import STAGING_PREFIX, storage_errors, write_whole
 
 _FORMAT = "intrasplat-output"
 MOST_MARKER_BYTES = 1 << 26
-_COMPLETE, _OLD = ".complete-", ".old-"
+_COMPLETE, _OLD, _KEPT = ".complete-", ".old-", "kept-"
+_PASSING = re.compile(r"\.(run|complete|old)-[0-9a-f]{8}")
+"""Folders of a run that is under way, or was killed."""
+_CONTENTS = ".contents.json"
+_FINGERPRINT_BYTES = 1 << 16
 RECORDINGS = "recordings"
 """Holds what runs have recorded, one folder each. It is written as the run goes on, and no later run replaces it."""
 _RESULT = re.compile(
     r"reconstruction\.mp4|model|frames\.jsonl|report\.json|report\.html|\d{6,}\.png|evaluation\.(?:json|html)|evaluation-\w+\.jsonl"
 )
 """The names of results. In a folder of an earlier version, whose marker lists no files, all of them are ours."""
+_KNOWN = re.compile(rf"(?:{_RESULT.pattern})|model/(?:model(?:\.next)?\.safetensors|manifest(?:\.next)?\.json)")
+"""Files of results, for markers without fingerprints."""
 
 
 class OutputFolder:
@@ -86,6 +96,7 @@ class OutputFolder:
             if not any(self.path.iterdir()):
                 return
             complete = self.folder / f"{_COMPLETE}{self._token}"
+            _write_contents(self.path)
             sync_folder(self.path)
             replace_durably(self.path, complete)
             try:
@@ -124,8 +135,8 @@ def check_output_folder(folder: Path) -> bool:
     if not folder.is_dir():
         kind = "a link that leads nowhere" if folder.is_symlink() else "a file"
         raise OutputFolderInUse(f"{folder} is {kind}; give a folder that does not exist yet or is empty")
-    if _read_marker(folder) is not None:
-        _check_results(folder)
+    if (marker := _read_marker(folder)) is not None:
+        _check_results(folder, marker)
         return True
     others = sorted(entry.name for entry in folder.iterdir() if not _passing(entry.name))
     if others:
@@ -137,19 +148,25 @@ def check_output_folder(folder: Path) -> bool:
     return False
 
 
-def _check_results(folder: Path) -> None:
-    """Raises OutputFolderInUse when something that no run of ours wrote has the name of a result: it would be replaced."""
+def _check_results(folder: Path, marker: dict[str, object]) -> None:
+    """Raise OutputFolderInUse when a file that no run of ours wrote would be replaced: one among the results, or one with a result's name."""
     ours = _results(folder)
     foreign = [entry.name for entry in folder.iterdir() if _RESULT.fullmatch(entry.name) and entry.name not in ours]
+    if (
+        marker.get("arriving") is None
+    ):  # else a run was killed while its results were moved; the next one ends that first
+        foreign += [
+            path.relative_to(folder).as_posix() for path in _foreign_files(folder, ours, _contents(marker, "contents"))
+        ]
     if foreign:
         raise OutputFolderInUse(
-            f"{folder} holds {', '.join(sorted(foreign)[:4])}, which no run of intrasplat wrote; move it away or choose another --out"
+            f"{folder} holds {', '.join(sorted(foreign)[:4])}, which no run of intrasplat wrote like that; move it away or choose another --out"
         )
 
 
 def _passing(name: str) -> bool:
     """Whether only a run that is under way, or was killed, leaves such a name."""
-    return name == LOCK or name.startswith((STAGING_PREFIX, _COMPLETE, _OLD))
+    return name == LOCK or _PASSING.fullmatch(name) is not None
 
 
 def _read_marker(folder: Path) -> dict[str, object] | None:
@@ -160,12 +177,60 @@ def _read_marker(folder: Path) -> dict[str, object] | None:
     return marker if isinstance(marker, dict) and marker.get("format") == _FORMAT else None
 
 
-def _write_marker(folder: Path, made_by: str, files: Iterable[str], arriving: str | None = None) -> None:
-    """files: the results that are, or are about to be, in the folder. arriving: from where they are being moved."""
-    marker = {"format": _FORMAT, "version": 1, "made_by": made_by, "files": sorted(files)}
-    write_whole(
-        folder / MARKER, (json.dumps(marker if arriving is None else marker | {"arriving": arriving}) + "\n").encode()
-    )
+def _write_marker(folder: Path, made_by: str, files: Iterable[str], **more: object) -> None:
+    """files: the results that are, or are about to be, in the folder. more: `contents`, fingerprints by path; while results arrive also `arriving`,
+    the folder from which they are moved, and `earlier`, the contents that they replace."""
+    marker = {"format": _FORMAT, "version": 1, "made_by": made_by, "files": sorted(files), **more}
+    write_whole(folder / MARKER, (json.dumps(marker) + "\n").encode())
+
+
+def _write_contents(results: Path) -> None:
+    """Note the fingerprint of every file of a run that is complete, beside its results."""
+    found = {path.relative_to(results).as_posix(): _fingerprint(path) for path in _files_in(results)}
+    write_whole(results / _CONTENTS, json.dumps(found).encode())
+
+
+def _files_in(folder: Path) -> Iterator[Path]:
+    """Yield every file below a folder. Links are files."""
+    for parent, folders, names in os.walk(folder):
+        for name in [*names, *(each for each in folders if os.path.islink(os.path.join(parent, each)))]:
+            yield Path(parent) / name
+
+
+def _fingerprint(path: Path) -> str:
+    """Return a digest of a file's length, beginning and end: enough to notice that somebody put another file in its place."""
+    with open_regular(path, follow_links=False) as file:
+        size = os.fstat(file.fileno()).st_size
+        digest = hashlib.sha256(f"{size}\n".encode())
+        digest.update(file.read(_FINGERPRINT_BYTES))
+        file.seek(max(0, size - _FINGERPRINT_BYTES))
+        digest.update(file.read(_FINGERPRINT_BYTES))
+    return digest.hexdigest()
+
+
+def _contents(marker: dict[str, object], name: str) -> dict[str, str] | None:
+    """Return fingerprints by path; None of a marker that an earlier version wrote, which lists none."""
+    found = marker.get(name)
+    return {str(key): str(value) for key, value in found.items()} if isinstance(found, dict) else None
+
+
+def _foreign_files(folder: Path, results: Iterable[str], contents: dict[str, str] | None) -> list[Path]:
+    """Return the files among the results in `folder` that the run which wrote `contents` did not write, or that were changed since."""
+    found = []
+    for name in results:
+        top = folder / name
+        for path in _files_in(top) if top.is_dir() and not top.is_symlink() else [top]:
+            relative = path.relative_to(folder).as_posix()
+            try:
+                if contents is None:
+                    ours = not path.is_symlink() and path.is_file() and _KNOWN.fullmatch(relative) is not None
+                else:
+                    ours = contents.get(relative) == _fingerprint(path)
+            except OSError:
+                ours = False
+            if not ours:
+                found.append(path)
+    return found
 
 
 def _results(folder: Path) -> list[str]:
@@ -182,17 +247,44 @@ def _switch_to(folder: Path, complete: Path, made_by: str) -> None:
     """Put the results in `complete` in the place of the earlier ones; may be called again after it was stopped at any point."""
     old = folder / (_OLD + complete.name.removeprefix(_COMPLETE))
     marker = _read_marker(folder) or {}
+    arriving = [entry.name for entry in complete.iterdir() if entry.name != _CONTENTS]
     if marker.get("arriving") != complete.name:
         old.mkdir(exist_ok=True)
-        for name in _results(folder):
+        for name in {*_results(folder), *(name for name in arriving if os.path.lexists(folder / name))}:
             os.replace(folder / name, old / name)
-        _write_marker(folder, made_by, (entry.name for entry in complete.iterdir()), arriving=complete.name)
-    for entry in list(complete.iterdir()):
-        os.replace(entry, folder / entry.name)
+        contents, earlier = _read_contents(complete), _contents(marker, "contents")
+        _write_marker(folder, made_by, arriving, contents=contents, earlier=earlier, arriving=complete.name)
+    for name in arriving:
+        os.replace(complete / name, folder / name)
     sync_folder(folder)
-    listed = (_read_marker(folder) or {}).get("files")
-    _write_marker(folder, made_by, listed if isinstance(listed, list) else ())
+    marker = _read_marker(folder) or {}
+    _remove_own(folder, old, _contents(marker, "earlier"))
+    listed = marker.get("files")
+    (complete / _CONTENTS).unlink(missing_ok=True)
     complete.rmdir()
+    _write_marker(
+        folder, made_by, listed if isinstance(listed, list) else (), contents=_contents(marker, "contents") or {}
+    )
+
+
+def _read_contents(complete: Path) -> dict[str, str]:
+    try:
+        found = json.loads(read_regular(complete / _CONTENTS, MOST_MARKER_BYTES))
+    except FileNotFoundError:  # an earlier version was killed here
+        return {path.relative_to(complete).as_posix(): _fingerprint(path) for path in _files_in(complete)}
+    return dict(found)
+
+
+def _remove_own(folder: Path, old: Path, contents: dict[str, str] | None) -> None:
+    """Remove the replaced results of an earlier run. Files that the run did not write stay, in a folder `kept-…`."""
+    if not old.is_dir():
+        return
+    foreign = _foreign_files(old, [entry.name for entry in old.iterdir()], contents)
+    kept = folder / f"{_KEPT}{old.name.removeprefix(_OLD)}"
+    for path in foreign:
+        target = kept / path.relative_to(old)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(path, target)
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -200,8 +292,10 @@ def _finish_what_was_begun(folder: Path) -> None:
     """After a run that was killed: put its results in place if they were complete, and remove what is left of it."""
     marker = _read_marker(folder) or {}
     for entry in sorted(folder.iterdir()):
-        if entry.is_dir() and not entry.is_symlink():
+        if _PASSING.fullmatch(entry.name) and entry.is_dir() and not entry.is_symlink():
             if entry.name.startswith(_COMPLETE):
                 _switch_to(folder, entry, str(marker.get("made_by", "")))
-            elif entry.name.startswith((STAGING_PREFIX, _OLD)):
+            elif entry.name.startswith(STAGING_PREFIX):
                 shutil.rmtree(entry, ignore_errors=True)
+            else:
+                _remove_own(folder, entry, _contents(marker, "earlier") or _contents(marker, "contents"))

@@ -7,10 +7,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from operators.errors import OutputError
+from operators.own_files import is_own_file
 
-SIDECARS = frozenset({"images", "images_right", "masks", "depth"})
+_UNSPECIFIC = frozenset({"images", "flow", "views"})
+SIDECARS = _UNSPECIFIC | {"images_right", "masks", "depth", "true_depth", "scene_flow"}
 """Folders inside a recording whose every file belongs to it."""
-DESCRIPTIONS = ("recording.json", "cameras.json", "poses_bounds.npy")
+DESCRIPTIONS = ("recording.json", "cameras.json", "poses_bounds.npy", "valid_mask.png", "session.json")
 """Files that only a recording's folder has."""
 MAX_PATH_BYTES = 4096
 MARKER = ".intrasplat.json"
@@ -34,28 +36,89 @@ def check_folder_path(out: Path, inputs: Sequence[Path] = ()) -> None:
     check_beside_recordings(real, out, inputs)
 
 
-def check_file_path(out: Path, inputs: Sequence[Path] = ()) -> None:
-    """Raises OutputError where a run with these inputs must not write the file `out`."""
+def check_file_path(
+    out: Path,
+    inputs: Sequence[Path] = (),
+    *,
+    overwrite: bool = False,
+    into_recording: bool = False,
+    option: str = "--out",
+) -> None:
+    """Raise OutputError where a command with these inputs must not write the file `out`.
+
+    A file replaces nothing but an earlier output of this program, with `overwrite`. It never replaces an input, a part of one, or a file that another
+    name of an input leads to, and is never put among a recording's pictures.
+
+    Args:
+        out: The file.
+        inputs: Files and folders that the command reads.
+        overwrite: Replace an earlier output.
+        into_recording: `out` is made to lie in a recording's folder, beside its description.
+        option: Name by which the user gave `out`, for the messages.
+    """
+    if "\0" in str(out) or len(os.fsencode(out)) >= MAX_PATH_BYTES:
+        raise OutputError(f"{option} {str(out)[:80]!r} is no name that a file can have; give another one")
+    try:
+        _check_file_path(out, inputs, overwrite, into_recording, option)
+    except OSError as error:
+        raise OutputError(f"{option} {out} cannot be used: {error.strerror or error}; choose another one") from error
+
+
+def _check_file_path(out: Path, inputs: Sequence[Path], overwrite: bool, into_recording: bool, option: str) -> None:
     real = Path(os.path.realpath(out))
+    if out.is_dir():
+        raise OutputError(f"{out} is a folder; give the name of a file")
     if any(_same(source, real) for source in inputs):
-        raise OutputError(f"{out} is what the run reads; choose another --out")
-    folder = real.parent
+        raise OutputError(f"{out} is what the command reads; choose another {option}")
+    if into_recording:
+        inputs = [source for source in inputs if not _same(source, real.parent)]
+    else:
+        _check_no_recording(real.parent, option)
+    check_beside_recordings(real, out, inputs, option)
+    if not out.parent.is_dir():
+        raise OutputError(f"there is no folder {out.parent} to write {out.name} into; make it first")
+    if not os.path.lexists(out):
+        return
+    if not overwrite:
+        raise OutputError(f"{out} is there already; give another {option}, or --overwrite to replace it")
+    if out.is_symlink() or not out.is_file():
+        raise OutputError(f"{out} is not a plain file, so that it is not replaced; give another {option}")
+    if (part := _part_of(inputs, out)) is not None:
+        raise OutputError(f"{out} is {part} by another name, which the command reads; choose another {option}")
+    if not is_own_file(out):
+        raise OutputError(f"{out} was not written by intrasplat, so that it is not replaced; give another {option}")
+
+
+def _check_no_recording(folder: Path, option: str) -> None:
     found = [name for name in DESCRIPTIONS if os.path.lexists(folder / name)]
     found += [name for name in sorted(SIDECARS) if _holds_pictures(folder / name)]
     if found:
-        raise OutputError(f"{folder} is a recording's folder (it holds {', '.join(found)}); choose another --out")
-    check_beside_recordings(real, out, inputs)
+        raise OutputError(f"{folder} is a recording's folder (it holds {', '.join(found)}); choose another {option}")
 
 
-def check_beside_recordings(real: Path, out: Path, inputs: Sequence[Path]) -> None:
-    """Raises OutputError when `real`, which the user called `out`, is inside an input or among a recording's images, masks or depth."""
+def _part_of(inputs: Sequence[Path], out: Path) -> Path | None:
+    """Return the file of an input that `out` is a hard link of."""
+    status = out.stat()
+    if status.st_nlink < 2:
+        return None
+    for source in inputs:
+        for parent, _, names in os.walk(source):
+            for name in names:
+                found = Path(parent) / name
+                if found != out and _same(found, out):
+                    return found
+    return None
+
+
+def check_beside_recordings(real: Path, out: Path, inputs: Sequence[Path], option: str = "--out") -> None:
+    """Raise OutputError when `real`, which the user called `out`, is inside an input or among a recording's images, masks or depth."""
     for source in inputs:
         if any(_same(parent, source) for parent in _with_parents(real)):
-            raise OutputError(f"--out {out} lies inside {source}, which the run reads; choose another --out")
+            raise OutputError(f"{option} {out} lies inside {source}, which the run reads; choose another {option}")
     for part in _with_parents(real):
         if part.name.lower() in SIDECARS and _has_sidecar(part.parent, part.name.lower()):
             raise OutputError(
-                f"--out {out} lies in {part}, which belongs to the recording {part.parent}; choose another --out"
+                f"{option} {out} lies in {part}, which belongs to the recording {part.parent}; choose another {option}"
             )
 
 
@@ -65,8 +128,8 @@ def _has_sidecar(folder: Path, name: str) -> bool:
         return False
     if any((folder / description).exists() for description in DESCRIPTIONS):
         return True
-    # Beside a video or pictures a folder called images means nothing; the other three are read along with them.
-    return name != "images" and (_holds_pictures(folder / "images") or _holds_pictures(folder))
+    # Beside a video or pictures, a folder of an unspecific name means nothing. The others are read along with them.
+    return name not in _UNSPECIFIC and (_holds_pictures(folder / "images") or _holds_pictures(folder))
 
 
 def _holds_pictures(folder: Path) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -101,6 +102,12 @@ def check_depth(choice: str) -> None:
         raise InvalidSetting(f"depth is {choice!r}; choose auto, {', '.join(names)}")
     if name in WITH_ADDRESS:
         new_estimator(choice)
+
+
+def depth_inputs(choice: str) -> tuple[Path, ...]:
+    """Return the files that a depth source reads: those of a name in `WITH_ADDRESS`."""
+    name, _, address = choice.partition(":")
+    return (Path(address),) if name in WITH_ADDRESS and address else ()
 
 
 def new_estimator(choice: str) -> Estimator:

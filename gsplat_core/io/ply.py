@@ -21,6 +21,8 @@ from gsplat_core.io.model_files import check_memory, open_model_file
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 
 MAX_HEADER_BYTES = 1 << 16
+MARK_LINE = "comment written by IntraSplat"
+"""Line of the header by which a file of this program is recognised."""
 SCALAR_TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -54,7 +56,7 @@ def ply_pieces(gaussians: Gaussians) -> list[bytes]:
     ]  # fmt: skip
     names = [*POSITION, "nx", "ny", "nz", *COLOUR, *(f"f_rest_{i}" for i in range(rest.shape[1]))]
     names += ["opacity", *SCALE, *ROTATION]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {gaussians.count}"]
+    header = ["ply", "format binary_little_endian 1.0", MARK_LINE, f"element vertex {gaussians.count}"]
     header += [*(f"property float {name}" for name in names), "end_header", ""]
     body = np.concatenate(columns, axis=1).astype("<f4")
     return ["\n".join(header).encode(), body.tobytes()]

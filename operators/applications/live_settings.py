@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import get_args
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.registry import check_depth
+from gsplat_core.geometry.registry import check_depth, depth_inputs
 from gsplat_core.io.sessions import WriterOptions
 from gsplat_core.training.config import Eyes, ReconstructorConfig, check_eyes
 from gsplat_core.training.image_motion import Detail
@@ -147,7 +147,7 @@ class LiveSettings:
     def inputs(self) -> tuple[Path, ...]:
         """What the run reads from the disk."""
         path = Path(self.source)
-        return (path,) if path.exists() else ()
+        return (*((path,) if path.exists() else ()), *depth_inputs(self.depth))
 
     def reconstructor_config(self, pixels: int) -> ReconstructorConfig:
         """The reconstructor's settings for frames of so many pixels. Raises InvalidSetting."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -61,9 +61,10 @@ def render_model(
     """
     check_scale(scale)
     frames_to_render((0, 0), fps)
+    inputs = [bundle, *view.inputs]
     to_video = out.suffix.lower() == VIDEO_SUFFIX
     if to_video:
-        _check_video_path(bundle, out, overwrite)
+        _check_video_path(inputs, out, overwrite)
     check_device(device)
     check_renderer(renderer, device)
     model = load_bundle(bundle).to(device)
@@ -78,7 +79,7 @@ def render_model(
     pictures = _Pictures(model, shown, lambda: new_renderer(renderer, camera, device))
     images = _images(pictures, frames, fps, progress, stop_requested)
     if not to_video:
-        return _write_images(images, bundle, out)
+        return _write_images(images, inputs, out)
     if overwrite:
         _check_not_trained_on(model, out)
     return _write_video(images, out, (shown.across * camera.width_px, camera.height_px), fps, overwrite)
@@ -156,10 +157,10 @@ def _write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int],
     return video.frames
 
 
-def _write_images(images: Iterator[NDArray], bundle: Path, out: Path) -> int:
+def _write_images(images: Iterator[NDArray], inputs: Sequence[Path], out: Path) -> int:
     """Write numbered PNG files. A run that ends early delivers its images where none were before."""
     written = 0
-    with OutputFolder(out, "render", [bundle]) as output:
+    with OutputFolder(out, "render", inputs) as output:
         reserve = StorageReserve(output.path, lambda: RESERVE_BYTES)
         try:
             for image in images:
@@ -173,17 +174,11 @@ def _write_images(images: Iterator[NDArray], bundle: Path, out: Path) -> int:
     return written
 
 
-def _check_video_path(bundle: Path, out: Path, overwrite: bool) -> None:
+def _check_video_path(inputs: Sequence[Path], out: Path, overwrite: bool) -> None:
     with storage_errors(out.parent):
         if out.is_dir():
             raise OutputError(f"{out} is a folder; give the name of a video file that ends in {VIDEO_SUFFIX}")
-        if not out.parent.is_dir():
-            raise OutputError(f"there is no folder {out.parent} to write {out.name} into; make it first")
-        check_file_path(out, [bundle])
-        if os.path.lexists(out) and not overwrite:
-            raise OutputError(f"{out} is there already; give another --out, or --overwrite to replace it")
-        if os.path.lexists(out) and not out.is_file():
-            raise OutputError(f"{out} is not a plain file, so that it is not replaced; give another --out")
+        check_file_path(out, inputs, overwrite=overwrite)
 
 
 def _check_not_trained_on(model: Model, out: Path) -> None:

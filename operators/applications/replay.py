@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.registry import check_depth
+from gsplat_core.geometry.registry import check_depth, depth_inputs
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.io.recordings.truth import open_behind
 from gsplat_core.rendering.registry import check_renderer
@@ -105,7 +105,7 @@ class ReplaySettings:
     @property
     def inputs(self) -> tuple[Path, ...]:
         """What the run reads from the disk."""
-        return (Path(self.recording),)
+        return (Path(self.recording), *depth_inputs(self.depth))
 
     def reconstructor_config(self, pixels: int | None = None, *, offline: bool = False) -> ReconstructorConfig:
         """The reconstructor's settings for frames of so many pixels. offline: for `Reconstructor.fit`. Raises InvalidSetting."""

@@ -42,6 +42,11 @@ class ViewWish:
                 f"baseline is {self.baseline:g} and the view {self.name!r:.80}; a positive one goes with --view stereo"
             )
 
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """Files that the view is read from."""
+        return () if self.name in VIEWS else (Path(self.name),)
+
 
 RECORDED = ViewWish()
 

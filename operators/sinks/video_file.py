@@ -40,6 +40,8 @@ _TICKS_PER_S = 90_000
 _KEYFRAME_S = 2
 """A player can jump to every key frame."""
 MAX_THREADS = 8
+MARK = "written by IntraSplat"
+"""Comment in the file, by which a video of this program is recognised."""
 
 
 class VideoFile:
@@ -66,6 +68,7 @@ class VideoFile:
             self._partial: PartialFile | None = PartialFile(path)
         try:
             self._container = av.open(self._partial.file, mode="w", format="mp4")
+            self._container.metadata["comment"] = MARK
             self._stream = self._add_stream()
         except (OSError, ValueError, av.FFmpegError) as error:
             self._partial.discard()

@@ -68,6 +68,7 @@ def evaluate_command(path: Path, settings: EvaluationSettings, out: Path | None,
             report = measure(Path(folder)).model_copy(update={"outputs": {}})
     else:
         inputs = [path if run is None else run.folder, Path(settings.recording)]
+        inputs += [] if settings.poses is None else [Path(settings.poses)]
         with OutputFolder(out, "evaluate", inputs) as output:
             report = write_evaluation(measure(output.path), output.path)
             output.publish()

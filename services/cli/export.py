@@ -11,6 +11,7 @@ from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.exports.export import export_model
 from gsplat_core.io.exports.formats import ExportWish, format_named, format_of
 from operators.errors import OutputError
+from operators.output_paths import check_file_path
 from services.cli.exit_codes import OK
 
 
@@ -23,10 +24,11 @@ def export_command(
     Raises BundleError where the model cannot be used, InvalidSetting and ExportError where it cannot be exported so, OutputError where the file cannot be written.
     """
     wish = ExportWish(format_of(file) if format_name is None else format_named(format_name), time_s, times)
-    if not file.parent.is_dir():
-        raise OutputError(f"there is no folder {file.parent} to write {file.name} into; make it first")
-    if file.exists() and not (overwrite and file.is_file()):
-        raise OutputError(f"{file} is there already; give another name, or --overwrite to replace it")
+    if file.suffix.lower() != wish.format.suffix:
+        raise OutputError(
+            f"{file} does not end in {wish.format.suffix}, as a file of the format {wish.format.name} does; give such a name"
+        )
+    check_file_path(file, [model], overwrite=overwrite, option="FILE")
     loaded = load_bundle(model)
     try:
         size = export_model(loaded, file, wish, overwrite=overwrite)

@@ -12,6 +12,7 @@ from gsplat_core.errors import BundleError
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.manifest import parse_manifest
 from operators.errors import OutputError
+from operators.output_paths import check_file_path
 from services.cli.exit_codes import OK
 from services.registry.bundle_file import MANIFEST, PIECE_BYTES, SUFFIX, TENSORS, pack
 
@@ -21,7 +22,7 @@ def pack_command(model: Path, file: Path, *, overwrite: bool, as_json: bool) -> 
 
     Raises BundleError where the model cannot be used, OutputError where the file cannot be written.
     """
-    _check_target(file, overwrite)
+    _check_target(model, file, overwrite)
     load_bundle(model)
     _check_saved_whole(model)
     try:
@@ -37,13 +38,10 @@ def pack_command(model: Path, file: Path, *, overwrite: bool, as_json: bool) -> 
     return OK
 
 
-def _check_target(file: Path, overwrite: bool) -> None:
+def _check_target(model: Path, file: Path, overwrite: bool) -> None:
     if file.suffix != SUFFIX:
         raise OutputError(f"{file} does not end in {SUFFIX}; give the packed file a name that does")
-    if not file.parent.is_dir():
-        raise OutputError(f"there is no folder {file.parent} to write {file.name} into; make it first")
-    if file.exists() and not (overwrite and file.is_file()):
-        raise OutputError(f"{file} is there already; give another name, or --overwrite to replace it")
+    check_file_path(file, [model], overwrite=overwrite, option="FILE")
 
 
 def _check_saved_whole(model: Path) -> None:

@@ -12,12 +12,13 @@ from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.geometry.focal_length import FocalLength, trajectory_without_calibration, with_focal_length
 from gsplat_core.geometry.odometry import DISTANCE, Trajectory, trajectory_of
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.io.recordings.poses_file import write_poses
+from gsplat_core.io.recordings.poses_file import POSES_FILE, write_poses
 from gsplat_core.io.recordings.recording import FileRecording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from operators.applications.progress import Progress
 from operators.errors import OutputError
+from operators.output_paths import check_file_path
 from operators.storage import storage_errors
 from services.cli.exit_codes import OK
 from services.cli.interrupt import InterruptRequest
@@ -32,10 +33,9 @@ OFF = 0.002
 
 def poses_command(recording: Path, out: Path, max_frames: int | None, *, overwrite: bool, as_json: bool) -> int:
     """Estimate the poses of a recording, write them, and say how far they are to be believed."""
-    if not out.parent.is_dir():
-        raise OutputError(f"there is no folder {out.parent} to write {out.name} into; make it first")
-    if out.exists() and not (overwrite and out.is_file()):
-        raise OutputError(f"{out} is there already; give another name, or --overwrite to replace it")
+    if out.suffix != ".npy":
+        raise OutputError(f"{out} does not end in .npy; give a name that does, such as {POSES_FILE}")
+    check_file_path(out, [recording], overwrite=overwrite, into_recording=out.name == POSES_FILE)
     opened = open_recording(recording, max_frames=max_frames)
     with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as show:
 

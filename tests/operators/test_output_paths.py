@@ -77,7 +77,7 @@ def test_a_film_is_not_written_over_its_model_or_into_a_recording(take, tmp_path
     os.link(tmp_path / "model.mp4", tmp_path / "same.mp4")
     with pytest.raises(OutputError, match="which the run reads"):
         check_file_path(tmp_path / "model" / "film.mp4", [tmp_path / "model"])
-    with pytest.raises(OutputError, match="is what the run reads"):
+    with pytest.raises(OutputError, match="is what the command reads"):
         check_file_path(tmp_path / "same.mp4", [tmp_path / "model.mp4"])
     with pytest.raises(OutputError, match="is a recording's folder"):
         check_file_path(take / "film.mp4")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.geometry.mesh import Mesh
 from gsplat_core.io.exports.glb import ARRAY_BUFFER, FLOAT, METRES_PER_UNIT, TURN_X, linear, packed
+from gsplat_core.io.ply import MARK_LINE
 
 UNLIT = "KHR_materials_unlit"
 ELEMENT_ARRAY_BUFFER = 34963
@@ -29,7 +30,8 @@ def mesh_ply_pieces(mesh: Mesh, unit: str, *, with_triangles: bool) -> Iterator[
         *(f"float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
         *(f"uchar {c}" for c in ("red", "green", "blue")),
     ]
-    header = ["ply", "format binary_little_endian 1.0", f"comment unit {unit}", f"element vertex {len(mesh.vertices)}"]
+    header = ["ply", "format binary_little_endian 1.0", MARK_LINE, f"comment unit {unit}"]
+    header += [f"element vertex {len(mesh.vertices)}"]
     header += [f"property {name}" for name in names]
     if with_triangles:
         header += [f"element face {len(mesh.triangles)}", "property list uchar int vertex_indices"]

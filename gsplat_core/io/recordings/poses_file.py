@@ -14,6 +14,8 @@ from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.plain_files import UnreadableFile
 
 POSES_FILE = "poses.npy"
+TRAILER = b"\nposes estimated by IntraSplat\n"
+"""Bytes behind the array, by which a file of this program is recognised. NumPy ignores them."""
 _ADVICE = "Save [N, 4, 4] numbers: for each frame the pose from camera to world, OpenCV axes"
 
 
@@ -45,3 +47,4 @@ def write_poses(path: Path, world_to_camera: NDArray[np.float64], *, overwrite: 
     camera_to_world[:, 3] = [0, 0, 0, 1]
     with PartialFile(path, overwrite=overwrite) as partial:
         np.save(partial.file, camera_to_world)
+        partial.file.write(TRAILER)

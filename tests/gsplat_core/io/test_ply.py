@@ -9,7 +9,7 @@ from gsplat_core.errors import BundleCorrupt
 from gsplat_core.io.ply import load_ply, save_ply
 from gsplat_core.scene.gaussians import Gaussians
 
-HEADER_START = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
+HEADER_START = b"ply\nformat binary_little_endian 1.0\ncomment written by IntraSplat\nelement vertex 2\n"
 DEGREE_1 = (
     ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     + [f"f_rest_{i}" for i in range(9)]

@@ -27,6 +27,11 @@ def test_a_file_that_is_there_is_replaced_only_on_request(tmp_path, capsys):
     file.write_bytes(b"mine")
     assert run(["pack", str(model), str(file)]) == BAD_INPUT
     assert "is there already" in capsys.readouterr().err and file.read_bytes() == b"mine"
+    assert run(["pack", str(model), str(file), "--overwrite"]) == BAD_INPUT
+    assert "was not written by intrasplat" in capsys.readouterr().err and file.read_bytes() == b"mine"
+    file.unlink()
+    assert run(["pack", str(model), str(file)]) == 0
+    capsys.readouterr()
     assert run(["pack", str(model), str(file), "--overwrite"]) == 0
     assert capsys.readouterr().out == f"{file}\n" and file.stat().st_size > 1000
 

@@ -146,13 +146,17 @@ def test_a_file_that_is_there_is_replaced_only_on_request(clip, capsys):
     file.write_bytes(b"mine")
     assert run(["poses", str(folder), "--out", str(file)]) == BAD_INPUT
     assert "is there already" in capsys.readouterr().err and file.read_bytes() == b"mine"
+    assert run(["poses", str(folder), "--out", str(file), "--overwrite"]) == BAD_INPUT
+    assert "was not written by intrasplat" in capsys.readouterr().err and file.read_bytes() == b"mine"
+    file.unlink()
+    assert run(["poses", str(folder), "--out", str(file)]) == OK
     assert run(["poses", str(folder), "--out", str(file), "--overwrite"]) == OK
     assert np.load(file).shape == (COUNT, 4, 4)
 
 
 def test_a_folder_is_never_replaced(clip, capsys, tmp_path):
     assert run(["poses", str(clip()), "--out", str(tmp_path), "--overwrite"]) == BAD_INPUT
-    assert "is there already" in capsys.readouterr().err
+    assert "does not end in .npy" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
