@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.regular_files import read_regular
 from services.cli.exit_codes import OK
 from services.cli.streams import printable
 
@@ -26,14 +27,22 @@ KeyFileOption = Annotated[
 CaOption = Annotated[
     Path | None, typer.Option(help="Certificate of the authority that signed the server's.", show_default=False)
 ]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace a file that this program has written.")]
+MOST_KEY_BYTES = 4096
 DEFAULT_URL = "http://127.0.0.1:8000"
 
 
 def with_client(url: str, key_file: Path | None, ca: Path | None, act: Callable[[Any], Any]) -> Any:
+    from pydantic import ValidationError
+
     from services.client import Client
+    from services.client.requests import not_from_us
 
     with Client(url, _key(key_file), verify=str(ca) if ca else True) as client:
-        return act(client)
+        try:
+            return act(client)
+        except (ValidationError, KeyError) as error:  # JSON, and not what the API answers
+            raise not_from_us(url, "is not what this command asked for") from error
 
 
 def _key(file: Path | None) -> str:
@@ -42,9 +51,12 @@ def _key(file: Path | None) -> str:
             raise InvalidSetting(f"there is no API key; give --key-file, or set {KEY}")
         return os.environ[KEY]
     try:
-        return file.read_text(encoding="utf-8")
+        return read_regular(file, MOST_KEY_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InvalidSetting(f"{file} cannot be read as a key: {error}") from error
+        said = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise InvalidSetting(
+            f"{file} cannot be read as a key: {said}; give the file with the one line of a key"
+        ) from error
 
 
 def print_found(found: Sequence[BaseModel], names: Sequence[str], as_json: bool) -> int:
@@ -56,3 +68,10 @@ def print_found(found: Sequence[BaseModel], names: Sequence[str], as_json: bool)
             "  ".join(printable(str(value)) for name in names if (value := getattr(one, name)) not in (None, ""))
         )
     return OK
+
+
+def check_download(file: Path, overwrite: bool) -> None:
+    """Raise OutputError where a download must not be written: see `operators.output_paths.check_file_path`."""
+    from operators.output_paths import check_file_path
+
+    check_file_path(file, overwrite=overwrite)

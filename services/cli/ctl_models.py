@@ -10,7 +10,16 @@ import typer
 from gsplat_core.io.exports.formats import format_of
 from services.cli.ctl import VERSION, ModelName, StreamName
 from services.cli.ctl import ctl as ctl
-from services.cli.ctl_client import DEFAULT_URL, CaOption, KeyFileOption, UrlOption, print_found, with_client
+from services.cli.ctl_client import (
+    DEFAULT_URL,
+    CaOption,
+    KeyFileOption,
+    OverwriteOption,
+    UrlOption,
+    check_download,
+    print_found,
+    with_client,
+)
 from services.cli.exit_codes import OK
 from services.cli.options import ExportedFileArgument, JsonOption
 
@@ -75,12 +84,14 @@ def export(
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
+    overwrite: OverwriteOption = False,
 ) -> int:
     """Fetch a version of a model as a file for other programs."""
     wanted = _format(file, format)
+    check_download(file, overwrite)
 
     def act(client: Any) -> int:
-        return client.export_version(name, version, wanted, file, time_s=time, times=times)
+        return client.export_version(name, version, wanted, file, overwrite=overwrite, time_s=time, times=times)
 
     with_client(url, key_file, ca, act)
     typer.echo(str(file))
@@ -98,12 +109,14 @@ def fetch(
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
+    overwrite: OverwriteOption = False,
 ) -> int:
     """Fetch a snapshot as a file: .isplat, or one for other programs."""
     wanted = _format(file, format)
+    check_download(file, overwrite)
 
     def act(client: Any) -> int:
-        return client.export_snapshot(stream, snapshot_id, wanted, file, time_s=time, times=times)
+        return client.export_snapshot(stream, snapshot_id, wanted, file, overwrite=overwrite, time_s=time, times=times)
 
     with_client(url, key_file, ca, act)
     typer.echo(str(file))

@@ -12,7 +12,16 @@ from typing import Annotated, Any
 import typer
 
 from gsplat_core.errors import InvalidSetting
-from services.cli.ctl_client import DEFAULT_URL, CaOption, KeyFileOption, UrlOption, print_found, with_client
+from services.cli.ctl_client import (
+    DEFAULT_URL,
+    CaOption,
+    KeyFileOption,
+    OverwriteOption,
+    UrlOption,
+    check_download,
+    print_found,
+    with_client,
+)
 from services.cli.exit_codes import OK
 from services.cli.options import JsonOption
 
@@ -123,10 +132,12 @@ def result(
     url: UrlOption = DEFAULT_URL,
     key_file: KeyFileOption = None,
     ca: CaOption = None,
+    overwrite: OverwriteOption = False,
 ) -> int:
     """Download what a replay has made: report.html, report.json, frames.jsonl, reconstruction.mp4, model.isplat."""
     target = out or Path(Path(name).name)
-    with_client(url, key_file, ca, lambda client: client.result(job_id, name, target))
+    check_download(target, overwrite)
+    with_client(url, key_file, ca, lambda client: client.result(job_id, name, target, overwrite=overwrite))
     typer.echo(str(target))
     return OK
 
@@ -151,9 +162,18 @@ def _packed(path: Path) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory() as folder:
         archive = Path(folder) / "recording.zip"
-        with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as opened:
+        with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED, strict_timestamps=False) as opened:
             for file in sorted(each for each in path.rglob("*") if each.is_file()):
-                opened.write(file, file.relative_to(path))
+                if not file.resolve().is_relative_to(path.resolve()):
+                    raise InvalidSetting(
+                        f"{file} is a link that leads out of {path}; copy the file in place of linking it"
+                    )
+                try:
+                    opened.write(file, file.relative_to(path))
+                except UnicodeEncodeError as error:
+                    raise InvalidSetting(f"the name of {str(file)!r} is no text; rename it") from error
+                except OSError as error:
+                    raise InvalidSetting(f"{file} cannot be read: {error.strerror or error}; check it") from error
         yield archive
 
 
@@ -165,6 +185,11 @@ def _assigned(text: str) -> tuple[str, Any]:
     if not equals or not name:
         raise InvalidSetting(f"--option {text!r:.80} has no value; write --option name=value")
     try:
-        return name.replace("-", "_"), yaml_value(value)
+        read = yaml_value(value)
+        if not isinstance(read, str | int | float | None):
+            raise ValueError("it is neither a number nor a word")
+        return name.replace("-", "_"), read
     except ValueError as error:
-        raise InvalidSetting(f"--option {text!r:.80} is not YAML; quote its value") from error
+        raise InvalidSetting(
+            f"--option {text!r:.80} cannot be read ({error!s:.100}); write a number, true, false or a word"
+        ) from error

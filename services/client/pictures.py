@@ -13,8 +13,10 @@ from urllib.parse import urlencode, urlsplit
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import connect
 
-from services.client.errors import Unreachable
+from gsplat_core.io.regular_files import read_regular
+from services.client.errors import ClientError, Unreachable
 
+MOST_CERTIFICATE_BYTES = 1 << 20
 MOST_BYTES = 64 << 20
 
 
@@ -55,7 +57,18 @@ def picture_of(message: bytes) -> Picture:
 
 def tls_context(verify: bool | str) -> ssl.SSLContext:
     """How a server's certificate is checked: as the system does, against the authority in a file, or not at all (False)."""
-    context = ssl.create_default_context(cafile=verify if isinstance(verify, str) else None)
+    authority = None
+    if isinstance(verify, str):
+        try:
+            authority = read_regular(verify, MOST_CERTIFICATE_BYTES).decode("ascii")
+        except OSError as error:
+            raise ClientError(f"the certificate {verify} cannot be read: {error.strerror or error}") from error
+        except UnicodeDecodeError as error:
+            raise ClientError(f"{verify} is no certificate: it must be PEM, which is ASCII text") from error
+    try:
+        context = ssl.create_default_context(cadata=authority)
+    except (ssl.SSLError, ValueError) as error:
+        raise ClientError(f"{verify} is no certificate: {error}; give one in PEM") from error
     if verify is False:
         context.check_hostname = False
         context.verify_mode = ssl.CERT_NONE

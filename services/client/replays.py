@@ -85,9 +85,9 @@ class ReplayMethods(Requests):
         """Delete a replay that has ended, with its results."""
         self._ask("DELETE", f"/v1/replays/{job_id}")
 
-    def result(self, job_id: str, name: str, file: Path) -> None:
-        """Download a file that a replay has made, such as `report.html`."""
-        self._get_file(f"/v1/replays/{job_id}/results/{name}", file)
+    def result(self, job_id: str, name: str, file: Path, *, overwrite: bool = False) -> None:
+        """Download a file that a replay has made, such as `report.html`. A file that is there is replaced with `overwrite` alone."""
+        self._get_file(f"/v1/replays/{job_id}/results/{name}", file, overwrite=overwrite)
 
     def keep_model(self, job_id: str, model: str) -> VersionView:
         """Keep a replay's model in the registry as the next version of `model`."""

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
+from urllib.parse import urlsplit
 
 import httpx2
 
 from gsplat_core.io.atomic_files import PartialFile
+from gsplat_core.io.regular_files import open_regular
 from services.client.errors import ClientError, Refused, Unreachable
 from services.client.pictures import tls_context
 
 CHUNK_BYTES = 1 << 20
+MOST_ANSWER_BYTES = 64 << 20
+MOST_PROBLEM_BYTES = 1 << 16
+MOST_KEY_CHARACTERS = 4096
+SLOWEST = 10
+"""An answer that has not ended after so many times the timeout of one read is given up."""
 Found = TypeVar("Found")
 
 
@@ -23,62 +31,161 @@ class Requests:
     """What all methods of a client go through."""
 
     def __init__(self, url: str, key: str, timeout_s: float, verify: bool | str) -> None:
-        self.url = url.rstrip("/")
-        self._key = key.strip()
+        """Raises ClientError for an address, a key or a certificate that cannot be used."""
+        self.url = checked_url(url)
+        self._key = checked_key(key)
         self._verify = verify
+        self._timeout_s = timeout_s
         self._http = httpx2.Client(
             base_url=self.url,
             headers={"Authorization": f"Bearer {self._key}"},
             timeout=timeout_s,
-            verify=tls_context(verify),
+            # Reading the system's authorities takes longer than a request without TLS, which does not need them.
+            verify=tls_context(verify) if self.url.startswith("https:") or isinstance(verify, str) else False,
         )
 
     def _ask(self, method: str, path: str, **options: Any) -> Any:
-        """The JSON of the answer, None where it has none. Raises Unreachable, Refused."""
+        """The JSON of the answer, None where it has none. Raises Unreachable, Refused, ClientError for an answer that is no JSON."""
         answer = self._answer(method, path, **options)
-        return answer.json() if answer.content else None
+        try:
+            return answer.json() if answer.content else None
+        except (ValueError, RecursionError) as error:
+            raise not_from_us(self.url, "is no JSON") from error
 
     def _answer(self, method: str, path: str, **options: Any) -> httpx2.Response:
-        """An answer that is a success. Raises Unreachable, Refused."""
+        """An answer that is a success. Raises Unreachable, Refused, ClientError."""
         try:
-            answer = self._http.request(method, path, **options)
+            with self._http.stream(method, path, **options) as answer:
+                content = bytearray()
+                until_s = time.monotonic() + SLOWEST * self._timeout_s
+                for piece in answer.iter_bytes(CHUNK_BYTES):
+                    content += piece
+                    if len(content) > MOST_ANSWER_BYTES:
+                        raise not_from_us(self.url, f"has more than {MOST_ANSWER_BYTES >> 20} MiB")
+                    if time.monotonic() > until_s:
+                        raise not_from_us(self.url, "does not end")
         except httpx2.HTTPError as error:
             raise self._unreachable(error) from error
-        if answer.is_success:
-            return answer
-        raise refused_by(answer, self.url)
+        except (httpx2.InvalidURL, ValueError) as error:
+            raise ClientError(f"the request cannot be sent: {error}; check the names and values in it") from error
+        whole = _with_body(answer, content)
+        if whole.is_success:
+            return whole
+        raise refused_by(whole, self.url)
 
     def _put_file(self, path: str, file: Path) -> Any:
         """Send a file as the body, with its digest. Raises ClientError for one that cannot be read."""
         try:
-            digest, size = _digest_of(file)
-            with file.open("rb") as content:
+            with open_regular(file) as content:
+                digest, size = _digest_of(content)
+                content.seek(0)
                 headers = {
                     "Content-Type": "application/octet-stream",
                     "Content-Length": str(size),
                     "Content-Digest": f"sha-256=:{digest}:",
                 }
-                return self._ask("PUT", path, content=iter(lambda: content.read(CHUNK_BYTES), b""), headers=headers)
+                return self._ask("PUT", path, content=_pieces(content, size, file), headers=headers)
         except OSError as error:
             raise ClientError(f"{file} cannot be read: {error.strerror or error}") from error
 
-    def _get_file(self, path: str, file: Path) -> None:
-        """Write the body of an answer into a file, which is whole or not there. Raises ClientError where it cannot be written."""
+    def _get_file(self, path: str, file: Path, *, overwrite: bool = False, **options: Any) -> int:
+        """Write the body of an answer into a file, which is whole or not there, and return its size.
+
+        The body must be as long as the answer says, and have the digest that the answer states. Raises ClientError where it does not, and where the
+        file cannot be written: a file that is there is replaced with `overwrite` alone.
+        """
+        if os.path.lexists(file) and not overwrite:
+            raise ClientError(f"{file} is there already; give another name, or --overwrite to replace it")
         try:
-            with PartialFile(file) as partial, self._http.stream("GET", path) as answer:
+            with PartialFile(file, overwrite=overwrite) as partial, self._http.stream("GET", path, **options) as answer:
                 if not answer.is_success:
-                    answer.read()
-                    raise refused_by(answer, self.url)
-                for chunk in answer.iter_bytes(CHUNK_BYTES):
-                    partial.file.write(chunk)
+                    raise refused_by(_with_body(answer, _read_some(answer)), self.url)
+                sha256 = hashlib.sha256()
+                for piece in answer.iter_bytes(CHUNK_BYTES):
+                    partial.file.write(piece)
+                    sha256.update(piece)
+                _check_whole(answer, sha256.digest(), partial.file.tell(), file.name)
+                return partial.file.tell()
         except httpx2.HTTPError as error:
             raise self._unreachable(error) from error
+        except FileExistsError as error:
+            raise ClientError(f"{file} is there already; give another name, or --overwrite to replace it") from error
         except OSError as error:
             raise ClientError(f"{file} cannot be written: {error.strerror or error}") from error
+        except (httpx2.InvalidURL, ValueError) as error:
+            raise ClientError(f"the request cannot be sent: {error}; check the names and values in it") from error
 
     def _unreachable(self, error: Exception) -> Unreachable:
         said = error or type(error).__name__
         return Unreachable(f"{self.url} does not answer: {said}; check the address, and that the server runs")
+
+
+def checked_url(url: str) -> str:
+    """Return the address of a server without a slash at its end. Raises ClientError for anything else."""
+    try:
+        parts = urlsplit(url)
+        usable = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0 and url.isprintable()
+        if usable and not parts.query and not parts.fragment and " " not in url:
+            httpx2.URL(url)
+            return url.rstrip("/")
+    except (ValueError, httpx2.InvalidURL) as error:
+        raise ClientError(
+            f"{url!r:.200} is no address of a server ({error}); give one such as https://room-1.example:8000"
+        ) from error
+    raise ClientError(f"{url!r:.200} is no address of a server; give one such as https://room-1.example:8000")
+
+
+def checked_key(key: str) -> str:
+    """Return a key without spaces around it. Raises ClientError for a text that cannot be one."""
+    key = key.strip()
+    if not key:
+        raise ClientError("the API key is empty; give the one that `intrasplat keys add` printed")
+    if not key.isascii() or not key.isprintable() or " " in key or len(key) > MOST_KEY_CHARACTERS:
+        raise ClientError(
+            "the API key has characters that no key has; give the one line that `intrasplat keys add` printed"
+        )
+    return key
+
+
+def not_from_us(url: str, what: str) -> ClientError:
+    """The error for an answer that no IntraSplat server gives."""
+    return ClientError(f"the answer of {url} {what}; is it an IntraSplat server?")
+
+
+def _with_body(answer: httpx2.Response, content: bytes | bytearray) -> httpx2.Response:
+    """Return an answer whose decoded body was read."""
+    return httpx2.Response(answer.status_code, content=bytes(content))
+
+
+def _read_some(answer: httpx2.Response) -> bytes:
+    """Read the body of a refusal, as much of it as a problem document may have."""
+    content = bytearray()
+    for piece in answer.iter_bytes(1 << 16):
+        content += piece
+        if len(content) > MOST_PROBLEM_BYTES:
+            break
+    return bytes(content[:MOST_PROBLEM_BYTES])
+
+
+def _check_whole(answer: httpx2.Response, digest: bytes, size: int, name: str) -> None:
+    stated = answer.headers.get("content-digest")
+    if stated is not None and stated != f"sha-256=:{base64.b64encode(digest).decode()}:":
+        raise ClientError(f"{name} is not what the server's digest says; fetch it again")
+    length = answer.headers.get("content-length")
+    if length is None and stated is None:
+        raise ClientError(f"the server says neither the length nor the digest of {name}; is it an IntraSplat server?")
+    if length is not None and "content-encoding" not in answer.headers and length != str(size):
+        raise ClientError(f"{name} has {size} bytes, and the server announced {length}; fetch it again")
+
+
+def _pieces(content: BinaryIO, size: int, file: Path) -> Iterator[bytes]:
+    """The bytes of a file, as many as were announced. Raises ClientError for one that changes meanwhile."""
+    left = size
+    while piece := content.read(min(CHUNK_BYTES, left)):
+        left -= len(piece)
+        yield piece
+    if left or content.read(1):
+        raise ClientError(f"{file} changed while it was sent; try again")
 
 
 def waited_for(ask: Callable[[], Found], is_over: Callable[[Found], bool], within_s: float, what: str) -> Found:
@@ -99,13 +206,12 @@ def refused_by(answer: httpx2.Response, url: str) -> Refused:
     try:
         said = answer.json()
         sentence = str(said.get("detail") or said.get("title"))
-    except (ValueError, AttributeError):
+    except (ValueError, AttributeError, RecursionError):
         sentence = f"an answer that is no problem document; is {url} an IntraSplat server?"
     return Refused(answer.status_code, sentence)
 
 
-def _digest_of(file: Path) -> tuple[str, int]:
+def _digest_of(content: BinaryIO) -> tuple[str, int]:
     """SHA-256 in base64, and the size."""
-    with file.open("rb") as content:
-        digest = hashlib.file_digest(content, "sha256").digest()
-        return base64.b64encode(digest).decode(), content.tell()
+    digest = hashlib.file_digest(content, "sha256").digest()
+    return base64.b64encode(digest).decode(), content.tell()

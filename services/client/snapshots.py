@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 from pathlib import Path
 from typing import Any
 
-import httpx2
 from pydantic import TypeAdapter
 
-from gsplat_core.io.atomic_files import PartialFile
-from services.client.errors import ClientError, Unreachable
-from services.client.requests import Requests, refused_by
+from services.client.requests import Requests
 from services.control.routes.snapshots import SnapshotView
 
 EXPORT_S = 330.0
@@ -39,30 +34,19 @@ class SnapshotMethods(Requests):
         """Delete a snapshot."""
         self._ask("DELETE", f"/v1/streams/{stream}/snapshots/{number}")
 
-    def export_version(self, name: str, number: int, format_name: str, file: Path, **wish: Any) -> int:
+    def export_version(
+        self, name: str, number: int, format_name: str, file: Path, overwrite: bool = False, **wish: Any
+    ) -> int:
         """Write a version of a model into a file for other programs; returns its size. wish: `time_s`, or `times` of a sequence."""
-        return self._download(f"/v1/models/{name}/versions/{number}/exports/{format_name}", file, wish)
+        return self._download(f"/v1/models/{name}/versions/{number}/exports/{format_name}", file, wish, overwrite)
 
-    def export_snapshot(self, stream: str, number: str, format_name: str, file: Path, **wish: Any) -> int:
+    def export_snapshot(
+        self, stream: str, number: str, format_name: str, file: Path, overwrite: bool = False, **wish: Any
+    ) -> int:
         """Write a snapshot into a file for other programs; returns its size."""
-        return self._download(f"/v1/streams/{stream}/snapshots/{number}/exports/{format_name}", file, wish)
+        return self._download(f"/v1/streams/{stream}/snapshots/{number}/exports/{format_name}", file, wish, overwrite)
 
-    def _download(self, path: str, file: Path, wish: dict[str, Any]) -> int:
-        """The body of an answer as a file, which is whole or not there. Raises ClientError where it cannot be written, or is not what its digest says."""
+    def _download(self, path: str, file: Path, wish: dict[str, Any], overwrite: bool) -> int:
+        """Write the body of an answer into a file, as `Requests._get_file`. A server may take EXPORT_S to make it."""
         given = {name: value for name, value in wish.items() if value is not None}
-        try:
-            with PartialFile(file) as partial, self._http.stream("GET", path, params=given, timeout=EXPORT_S) as answer:
-                if not answer.is_success:
-                    answer.read()
-                    raise refused_by(answer, self.url)
-                sha256 = hashlib.sha256()
-                for piece in answer.iter_bytes():
-                    partial.file.write(piece)
-                    sha256.update(piece)
-                if f"sha-256=:{base64.b64encode(sha256.digest()).decode()}:" != answer.headers.get("content-digest"):
-                    raise ClientError(f"{file.name} is not what the server's digest says; fetch it again")
-                return partial.file.tell()
-        except httpx2.HTTPError as error:
-            raise Unreachable(f"{self.url} broke off: {error or type(error).__name__}; try again") from error
-        except OSError as error:
-            raise ClientError(f"{file} cannot be written: {error.strerror or error}") from error
+        return self._get_file(path, file, overwrite=overwrite, params=given, timeout=EXPORT_S)

@@ -1,0 +1,251 @@
+"""`intrasplat ctl` with a server that is none of ours, and with addresses, keys and certificates that cannot be used: sentences, no tracebacks."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import threading
+import zlib
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from services.cli.app import run
+from services.cli.exit_codes import BAD_INPUT, OK
+from services.client import requests
+
+KEY = "intrasplat_00000000_" + 43 * "a"
+
+
+class Strange(BaseHTTPRequestHandler):
+    """Answers as the server's `answer` says: status, headers, body."""
+
+    def do_GET(self):
+        length = int(self.headers.get("Content-Length", 0))
+        self.rfile.read(length)
+        status, headers, body = self.server.answer
+        self.wfile.write(f"HTTP/1.1 {status} X\r\n".encode())
+        for name, value in headers.items():
+            self.wfile.write(f"{name}: {value}\r\n".encode("latin-1"))
+        self.wfile.write(b"Connection: close\r\n\r\n" + body)
+        self.close_connection = True
+
+    do_POST = do_PUT = do_DELETE = do_GET
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def server():
+    with ThreadingHTTPServer(("127.0.0.1", 0), Strange) as found:
+        thread = threading.Thread(target=found.serve_forever, args=(0.01,))
+        thread.start()
+        yield found
+        found.shutdown()
+        thread.join()
+
+
+@pytest.fixture(autouse=True)
+def key(monkeypatch):
+    monkeypatch.setenv("INTRASPLAT_KEY", KEY)
+
+
+def ctl(server, *arguments):
+    return run(["ctl", *arguments, "--url", f"http://127.0.0.1:{server.server_address[1]}"])
+
+
+def sized(body: bytes, **headers: str):
+    return {"Content-Length": str(len(body)), **{name.replace("_", "-"): value for name, value in headers.items()}}
+
+
+BOMB = zlib.compress(bytes(80 << 20), 9)
+BODIES = [
+    b"", b"<html>hello</html>", b"{", b'{"a": ', b"null", b"[1]", b"[null]", b"{}", b"[[]]", b'"x"', b"1e999", b"\xff\xfe\x00", b"[" * 200_000,
+    b'[{"name": 1}]', b'[{"name": []}]', b'{"detail": []}', b"9" * 5000, b'["\\ud800"]',
+]  # fmt: skip
+COMMANDS = [
+    ["streams"], ["models"], ["models", "liver"], ["recordings"], ["replays"], ["start", "s"], ["create", "s", "synthetic:"],
+    ["activate", "liver", "1"], ["rollback", "liver"], ["snapshot", "s"], ["snapshots", "s"], ["replay", "r"], ["cancel", "0" * 16],
+    ["keep", "0" * 16, "liver"],
+]  # fmt: skip
+
+
+def _is_one_sentence(capsys) -> bool:
+    said = capsys.readouterr().err
+    return said.startswith("error: ") and "Traceback" not in said and len(said) < 1000
+
+
+@pytest.mark.parametrize("body", BODIES, ids=lambda body: repr(body[:20]))
+@pytest.mark.parametrize("status", [200, 302, 404])
+@pytest.mark.parametrize("command", COMMANDS[:1], ids=" ".join)
+def test_an_answer_that_is_none_is_one_sentence(server, capsys, command, status, body):
+    server.answer = status, sized(body, Content_Type="application/json", Location="http://127.0.0.1:1/"), body
+    code = ctl(server, *command)
+    assert code == OK if (status < 300 and body == b"[]") else code == BAD_INPUT
+    assert _is_one_sentence(capsys)
+
+
+@pytest.mark.parametrize("body", [b"<html></html>", b"[1]", b"null", b"{}"], ids=repr)
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_every_command_reads_answers_like_that(server, capsys, command, body):
+    server.answer = 200, sized(body), body
+    assert ctl(server, *command) == BAD_INPUT
+    assert _is_one_sentence(capsys)
+
+
+@pytest.mark.parametrize(
+    ("headers", "body"),
+    [
+        ({"Content-Length": "100"}, b"[]"),
+        ({"Content-Length": "-1"}, b"[]"),
+        ({"Content-Length": "x"}, b"[]"),
+        ({"Transfer-Encoding": "chunked"}, b"zz\r\n[]"),
+        ({"Transfer-Encoding": "chunked"}, b"5\r\n[]"),
+        ({"Content-Encoding": "gzip"}, b"no gzip"),
+        ({"Content-Encoding": "gzip"}, gzip.compress(b"[")[:-3]),
+        ({"Content-Encoding": "deflate"}, BOMB),
+        ({"Content-Type": "application/json; charset=nowhere"}, b"[1"),
+        ({"X": "y" * 200_000}, b"[]"),
+        ({"Bad\x00Name": "y"}, b"[]"),
+    ],
+    ids=lambda value: repr(value)[:40],
+)
+def test_broken_http_is_one_sentence(server, capsys, headers, body):
+    server.answer = 200, headers, body
+    assert ctl(server, "streams") == BAD_INPUT
+    assert _is_one_sentence(capsys)
+
+
+def test_an_answer_without_end_is_given_up(server, capsys, monkeypatch):
+    monkeypatch.setattr(requests, "MOST_ANSWER_BYTES", 1000)
+    server.answer = 200, {}, bytes(100_000)
+    assert ctl(server, "streams") == BAD_INPUT
+    assert "is it an IntraSplat server" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "", "http://[::1", "http://", "http:///x", "ftp://a", "localhost:8000", "http://a:99999", "http://a:x", "http://a:0", "http://a b",
+        "http://a\nb", "http://a\x00", "http://\ud800", "http://a?x=1", "http://a#b", "file:///etc/passwd", "//a", "http://[v1.x]", "http://a:-1",
+        "http://" + "a" * 300, "http://xn--zzzzzzzzzzzz-.example",
+    ],
+)  # fmt: skip
+def test_an_address_that_is_none_is_one_sentence(capsys, url):
+    assert run(["ctl", "streams", "--url", url]) == BAD_INPUT
+    assert _is_one_sentence(capsys)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"\n", b"a b", "ключ".encode(), b"\xff\xfe", b"a\x00b", b"a\nb", b"a\rb", b"a\x1bb", b"a" * 5000, "a\u2028b".encode()],
+    ids=lambda value: repr(value)[:20],
+)  # fmt: skip
+@pytest.mark.parametrize("how", ["file", "variable"])
+def test_a_key_that_is_none_is_one_sentence(tmp_path, capsys, monkeypatch, content, how):
+    more = []
+    if how == "file":
+        (tmp_path / "key").write_bytes(content)
+        more = ["--key-file", str(tmp_path / "key")]
+    elif b"\0" in content:
+        return
+    else:
+        monkeypatch.setenv("INTRASPLAT_KEY", os.fsdecode(content))
+    assert run(["ctl", "streams", "--url", "http://127.0.0.1:9", *more]) == BAD_INPUT
+    assert _is_one_sentence(capsys)
+
+
+@pytest.mark.parametrize("option", ["--ca", "--key-file"])
+@pytest.mark.parametrize(
+    "kind", ["missing", "junk", "empty", "pipe", "device", "folder", "half a certificate", "binary"]
+)
+def test_a_certificate_that_is_none_is_one_sentence(tmp_path, capsys, kind, option):
+    path = tmp_path / "ca.pem"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "folder":
+        path.mkdir()
+    elif kind != "missing":
+        half = b"-----BEGIN CERTIFICATE-----\nMIIB\n"
+        path.write_bytes(
+            {"junk": b"hello\n\n\x07", "empty": b"", "half a certificate": half, "binary": bytes(range(256))}[kind]
+        )
+    assert run(["ctl", "streams", "--url", "http://127.0.0.1:9", option, str(path)]) == BAD_INPUT
+    assert _is_one_sentence(capsys)
+
+
+@pytest.mark.parametrize("name", ["a\x00b", "a\nb", "\ud800", "a" * 100_000])
+@pytest.mark.parametrize("command", [["start"], ["models"], ["cancel"], ["remove-recording"], ["snapshots"]])
+def test_names_that_cannot_be_sent_are_one_sentence(server, capsys, command, name):
+    server.answer = 404, sized(b"{}"), b"{}"
+    assert ctl(server, *command, name) == BAD_INPUT
+    assert _is_one_sentence(capsys)
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["a=" + "[" * 50_000, "a=2001-01-01", "a=.nan", "a={b: 1}", "a=\x00", "a", "=1", "a=!!python/name:os.system"],
+)
+def test_options_that_cannot_be_sent_are_one_sentence(server, capsys, option):
+    server.answer = 404, sized(b"{}"), b"{}"
+    assert ctl(server, "replay", "r", "--option", option) == BAD_INPUT
+    assert _is_one_sentence(capsys)
+
+
+@pytest.mark.parametrize("path", ["/dev/zero", "/dev/stdin", "/nowhere", "fifo", "folder with a link"])
+def test_an_upload_of_what_is_no_file_is_one_sentence(server, capsys, tmp_path, path):
+    server.answer = 404, sized(b"{}"), b"{}"
+    if path == "fifo":
+        os.mkfifo(tmp_path / "fifo")
+        path = str(tmp_path / "fifo")
+    elif path == "folder with a link":
+        (tmp_path / "x").symlink_to("/etc/passwd")
+        path = str(tmp_path)
+    assert ctl(server, "add-recording", "r1", path) == BAD_INPUT
+    assert _is_one_sentence(capsys)
+
+
+DOWNLOADS = {
+    "result": lambda file: ["result", "0" * 16, "report.html", "--out", file],
+    "export": lambda file: ["export", "liver", "1", file, "--format", "ply"],
+    "fetch": lambda file: ["fetch", "s", "1", file, "--format", "ply"],
+}
+
+
+@pytest.mark.parametrize("command", DOWNLOADS)
+@pytest.mark.parametrize("overwrite", [[], ["--overwrite"]])
+def test_a_download_never_replaces_a_file_of_somebody_else(server, capsys, tmp_path, command, overwrite):
+    server.answer = 200, sized(b"new"), b"new"
+    (tmp_path / "mine.html").write_text("mine")
+    assert ctl(server, *DOWNLOADS[command](str(tmp_path / "mine.html")), *overwrite) == BAD_INPUT
+    assert (tmp_path / "mine.html").read_text() == "mine"
+    assert _is_one_sentence(capsys)
+
+
+def test_a_download_replaces_an_earlier_one_on_request_alone(server, tmp_path):
+    page, file = b"<!doctype html><title>IntraSplat</title>", tmp_path / "report.html"
+    server.answer = 200, sized(page), page
+    assert ctl(server, *DOWNLOADS["result"](str(file))) == OK
+    assert ctl(server, *DOWNLOADS["result"](str(file))) == BAD_INPUT
+    assert ctl(server, *DOWNLOADS["result"](str(file)), "--overwrite") == OK
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Content-Length": "100"},
+        {"Content-Digest": "sha-256=:AAAA:", "Content-Length": "3"},
+        {},
+        {"Transfer-Encoding": "chunked"},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("command", DOWNLOADS)
+def test_a_download_that_is_not_whole_leaves_nothing(server, capsys, tmp_path, command, headers):
+    server.answer = 200, headers, b"new"
+    assert ctl(server, *DOWNLOADS[command](str(tmp_path / "x.html"))) == BAD_INPUT
+    assert list(tmp_path.iterdir()) == []
+    assert _is_one_sentence(capsys)
