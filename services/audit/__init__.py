@@ -1,8 +1,8 @@
 """The audit log: who did what, in lines that each hold the digest of the one before.
 
 AuditError
-├── AuditInUse (UserError)   another process writes this log
-└── AuditUnwritable          an entry could not be brought to the disk
+├── AuditInUse (UserError)        another process writes this log
+└── AuditUnwritable (UserError)   an entry could not be written to the disk
 """
 
 from services.audit.entries import Entry

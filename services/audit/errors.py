@@ -7,8 +7,8 @@ class AuditError(Exception):
     """Base of everything that the audit log raises on purpose."""
 
 
-class AuditUnwritable(AuditError):
-    """An entry could not be brought to the disk: what it was to record must not go on unseen."""
+class AuditUnwritable(AuditError, UserError):
+    """An entry, or the log itself, could not be written to the disk. The message names the file and the cause."""
 
 
 class AuditInUse(AuditError, UserError):

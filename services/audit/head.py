@@ -73,10 +73,14 @@ def _read(path: Path) -> Head | None:
 
 
 def _write(path: Path, head: Head) -> None:
+    """Replace a file as a whole. Nothing can fail after the rename: an error means that the earlier content is still there."""
     unfinished = path.with_suffix(f"{path.suffix}.new")
+    data = json.dumps(asdict(head)).encode()
     descriptor = os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(json.dumps(asdict(head)).encode())
-        file.flush()
-        os.fdatasync(file.fileno())
+    try:
+        if os.write(descriptor, data) != len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(unfinished))
+        os.fdatasync(descriptor)
+    finally:
+        os.close(descriptor)
     os.replace(unfinished, path)

@@ -1,11 +1,20 @@
-"""Writing the audit log: one line at a time, on the disk before `append` returns."""
+"""Writing the audit log: one line at a time, on the disk before `append` returns.
+
+An entry counts when its line *and* the head that names it are on the disk. Where either cannot be written the line is taken back, and
+`append` raises AuditUnwritable. A kill between the two leaves a log that is ahead of its head; the next start follows the chain from the head to
+the end and moves the head forward.
+"""
 
 from __future__ import annotations
 
+import errno
 import fcntl
+import logging
 import os
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -16,26 +25,33 @@ from services.audit.lines import lines_backwards, whole_lines_bytes
 from services.audit.pages import newest
 from services.audit.segments import Keeping, all_segments, closed_segments, segment_path, sync_folder, too_old
 
+log = logging.getLogger(__name__)
 
 class AuditLog:
     """The log at a path, for one process at a time; any thread may append. A file that is long is closed, and the next one goes on.
 
-    A line that a crash cut short is taken off when the log is opened, and an entry says so. A log whose end does not fit is put aside as
-    `…broken-TIME`, so that what happened to it can be looked into, and a new one begins with an entry that names it: the service goes on.
+    Opening it repairs the traces of a crash, and an entry `audit.recovered` tells of each repair: a last line without an end is taken off, and
+    a valid chain that is ahead of its head moves the head forward. A log whose end does not fit is put aside as `…broken-TIME` for inspection,
+    and a new log begins with an entry that names it.
     """
 
     def __init__(self, path: Path, keeping: Keeping | None = None) -> None:
+        """Open the log, which is made where it is missing. Raises AuditInUse, and AuditUnwritable for a disk that takes nothing."""
         self.path = path
         self._keeping = keeping or Keeping()
         self._lock = threading.Lock()
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        self._owned = _owned(path.with_suffix(".lock"), path)
-        self._descriptor = -1
+        self._descriptor = self._owned = -1
         self._head = Head()
+        self._untaken: int | None = None
+        """Length of the file without the line that a failed append left behind and that could not be taken back yet."""
+        self._failure: str | None = None
         try:
-            self._descriptor = self._open()
-            self._recover()
-            self._remove_old()
+            with self._unwritable():
+                path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                self._owned = _owned(path.with_suffix(".lock"), path)
+                self._descriptor = self._open()
+                self._recover()
+                self._remove_old()
         except BaseException:
             self.close()
             raise
@@ -46,12 +62,13 @@ class AuditLog:
     ) -> Entry:  # fmt: skip
         """Write an entry. Raises AuditUnwritable when it cannot be brought to the disk, ValueError for what must not be written."""
         with self._lock:
-            entry = self._next(event, actor, role, subject, outcome, request_id, detail or {})
-            if os.fstat(self._descriptor).st_size >= self._keeping.segment_bytes:
-                self._close_segment()
-                self._remove_old()
-                entry = self._next(event, actor, role, subject, outcome, request_id, detail or {})
-            return self._add(entry)
+            self._next(event, actor, role, subject, outcome, request_id, detail or {})  # before anything is changed
+            with self._unwritable():
+                self._take_back()
+                if os.fstat(self._descriptor).st_size >= self._keeping.segment_bytes:
+                    self._close_segment()
+                    self._remove_old()
+            return self._add(self._next(event, actor, role, subject, outcome, request_id, detail or {}))
 
     def newest(self, count: int, before: int | None = None) -> list[Entry]:
         """Up to `count` entries, the newest first; those before number `before`."""
@@ -61,6 +78,11 @@ class AuditLog:
     def head(self) -> Head:
         """Number and digest of the newest entry: keep a copy elsewhere, and nobody can shorten the log unseen."""
         return self._head
+
+    @property
+    def failure(self) -> str | None:
+        """Reason of the last failed write; None once an entry could be written again."""
+        return self._failure
 
     def close(self) -> None:
         """Let go of the file."""
@@ -83,65 +105,101 @@ class AuditLog:
         line = entry.line()
         if len(line) > MOST_LINE_BYTES:
             raise ValueError(f"audit: an entry of {len(line)} bytes; at most {MOST_LINE_BYTES}")
-        self._write(line)
-        self._head = Head(entry.seq, digest_of_entry(entry))
-        write_head(self.path, self._head)
+        with self._unwritable():
+            size = os.fstat(self._descriptor).st_size
+            head = Head(entry.seq, digest_of_entry(entry))
+            try:
+                if os.write(self._descriptor, line) != len(line):
+                    raise OSError(errno.ENOSPC, "the disk took only a part of the line")
+                os.fsync(self._descriptor)
+                write_head(self.path, head)
+            except OSError:
+                self._untaken = size
+                self._take_back()
+                raise
+        self._head, self._failure = head, None
         return entry
+
+    @contextmanager
+    def _unwritable(self) -> Iterator[None]:
+        """Turn errors of the disk into AuditUnwritable, and remember the reason for `failure`."""
+        try:
+            yield
+        except OSError as error:
+            self._failure = f"{self.path}: {error.strerror or error}; {_advice(error)}"
+            raise AuditUnwritable(self._failure) from error
+
+    def _take_back(self) -> None:
+        """Cut off what a failed append has left. Raises OSError where the disk does not even do that: the next append tries again first."""
+        if self._untaken is not None:
+            os.ftruncate(self._descriptor, self._untaken)
+            self._untaken = None
 
     def _say(self, event: str, outcome: Outcome = "done", **detail: str | int) -> None:
         self._add(self._next(event, "system", "", "audit", outcome, "", {**detail}))
 
-    def _write(self, line: bytes) -> None:
-        size = os.fstat(self._descriptor).st_size
-        try:
-            if os.write(self._descriptor, line) != len(line):
-                raise OSError("the disk took only a part of the line")
-            os.fsync(self._descriptor)
-        except OSError as error:
-            os.ftruncate(self._descriptor, size)
-            raise AuditUnwritable(f"{self.path}: {error.strerror or error}; free space on that disk") from error
-
     def _close_segment(self) -> None:
-        """Go on in a new file. A crash in between leaves none, or an empty one, after a closed one: it is opened as one that goes on."""
-        with self.path.open("rb") as file:
-            first, _ = parse_line(file.readline(MOST_LINE_BYTES + 1))
-        try:
+        """Go on in a new file. Every step may fail or be the last one before a crash: the next append, or start, goes on from there."""
+        if self._is_current():
+            with self.path.open("rb") as file:
+                try:
+                    first, _ = parse_line(file.readline(MOST_LINE_BYTES + 1))
+                except ValueError as error:
+                    raise OSError(errno.EIO, f"its first line was changed ({error})") from error
             os.rename(self.path, segment_path(self.path, first.seq))
-            sync_folder(self.path.parent)
-            descriptor = self._open()
-        except OSError as error:
-            raise AuditUnwritable(f"{self.path}: {error.strerror or error}; free space on that disk") from error
+        sync_folder(self.path.parent)
+        descriptor = self._open()
         os.close(self._descriptor)
         self._descriptor = descriptor
 
+    def _is_current(self) -> bool:
+        """Whether the file that is open is still the one at the log's path, and not a closed segment."""
+        try:
+            return os.path.samestat(os.stat(self.path, follow_symlinks=False), os.fstat(self._descriptor))
+        except FileNotFoundError:
+            return False
+
     def _remove_old(self) -> None:
-        """Remove closed segments that are kept no longer: first an entry says so, then the anchor takes their place, then they go."""
+        """Remove closed segments beyond what is kept: an entry says so first, then the anchor takes their place, then the files go.
+
+        What the disk refuses is logged and done the next time: old segments that stay are no reason to refuse an entry.
+        """
         old = too_old(closed_segments(self.path), self._keeping)
         if old:
             last, digest = old[-1].last()
             self._say("audit.retired", files=len(old), last=last.seq, digest=digest)
-            write_anchor(self.path, Head(last.seq, digest))
-        anchor = read_anchor(self.path)
-        gone = [each for each in all_segments(self.path) if anchor is not None and each.first_seq <= anchor.seq]
-        for each in gone:  # those of a service too that was killed here
-            each.path.unlink()
-        if gone:
-            sync_folder(self.path.parent)
+        try:
+            if old:
+                write_anchor(self.path, Head(last.seq, digest))
+            anchor = read_anchor(self.path)
+            gone = [each for each in all_segments(self.path) if anchor is not None and each.first_seq <= anchor.seq]
+            for each in gone:  # those of a service too that was killed here
+                each.path.unlink()
+            if gone:
+                sync_folder(self.path.parent)
+        except OSError as error:
+            log.error("old files of the audit log were not removed: %s", error)
 
     def _recover(self) -> None:
         size = os.fstat(self._descriptor).st_size
         whole = whole_lines_bytes(self.path, size)
         try:
+            kept = read_head(self.path) or Head()
             self._head = self._checked_end(whole)
         except ValueError as error:
             self._put_aside(str(error))
             return
+        found: dict[str, int] = {}
         if whole < size:
             os.ftruncate(self._descriptor, whole)
-            self._say("audit.recovered", bytes_of_a_cut_line=size - whole)
+            found["bytes_of_a_cut_line"] = size - whole
+        if self._head.seq > kept.seq + 1:
+            found["entries_ahead_of_the_head"] = self._head.seq - kept.seq
+        if found:
+            self._say("audit.recovered", **found)
 
     def _checked_end(self, whole_bytes: int) -> Head:
-        """The head that the last lines have; ValueError where it is not the one that was kept, nor one entry further."""
+        """The newest entry, which becomes the head. ValueError where the chain does not lead from the head that was kept to it."""
         kept = read_head(self.path)
         closed = closed_segments(self.path)
         last = next(lines_backwards(self.path, whole_bytes), None)
@@ -151,14 +209,29 @@ class AuditLog:
             return Head()
         entry, stated = closed[-1].last() if last is None else parse_line(last)
         here = Head(entry.seq, stated)
-        if stated != digest_of_entry(entry):
-            raise ValueError(f"entry {entry.seq} was changed")
-        # A crash between the line and its head leaves the head one entry behind.
-        if kept not in (here, Head(entry.seq - 1, entry.previous)) and not (kept is None and entry.seq == 0):
-            raise ValueError(f"it ends with entry {entry.seq}, which is not the newest one that was written")
+        if kept is None and entry.seq > 0:
+            raise ValueError(f"it ends with entry {entry.seq}, and the head beside it is missing")
+        self._check_chain(kept or Head(), whole_bytes)
         if kept != here:
             write_head(self.path, here)
         return here
+
+    def _check_chain(self, kept: Head, whole_bytes: int) -> None:
+        """Follow the digests from the newest entry back to the one that the head names. Raises ValueError where they do not lead there."""
+        files = [(self.path, whole_bytes), *((each.path, None) for each in reversed(closed_segments(self.path)))]
+        expected: Head | None = None
+        for line in (line for path, size in files for line in lines_backwards(path, size)):
+            entry, stated = parse_line(line)
+            here = Head(entry.seq, stated)
+            if stated != digest_of_entry(entry) or expected not in (None, here):
+                raise ValueError(f"entry {entry.seq} was changed")
+            if here == kept:
+                return
+            if entry.seq <= kept.seq:
+                raise ValueError(f"it ends with entry {entry.seq}, which is not the newest one that was written")
+            expected = Head(entry.seq - 1, entry.previous)
+        if expected != kept:
+            raise ValueError(f"its entries do not follow entry {kept.seq}, which was written")
 
     def _put_aside(self, why: str) -> None:
         aside = self.path.with_suffix(f".broken-{time.time_ns()}{self.path.suffix}")
@@ -172,6 +245,15 @@ class AuditLog:
         self._descriptor = self._open()
         self._head = Head()
         self._say("audit.broken", "failed", put_aside=aside.name, why=why[:200])
+
+
+def _advice(error: OSError) -> str:
+    """A remedy for an error of the disk."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "free space on that disk"
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP):
+        return "check its owner and its rights"
+    return "check that disk, and free space on it"
 
 
 def _owned(lock: Path, log: Path) -> int:

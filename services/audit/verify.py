@@ -145,7 +145,10 @@ def _misfits_at_the_end(
     elif last.seq > kept.seq + 1:  # a crash leaves the head one entry behind; a service that is writing moves it on
         now = read_head(path)
         if now is None or last.seq > now.seq + 1:
-            yield f"{last.seq - kept.seq} entries were added by something else than the service"
+            yield (
+                f"{last.seq - kept.seq} entries follow the newest one that the service confirmed: it was stopped before it could, or they were"
+                " added by something else; its next start checks their chain, and an entry tells of them"
+            )
 
 
 def _lines(path: Path) -> Iterator[bytes]:
