@@ -27,6 +27,7 @@ from services.audit.segments import Keeping, all_segments, closed_segments, segm
 
 log = logging.getLogger(__name__)
 
+
 class AuditLog:
     """The log at a path, for one process at a time; any thread may append. A file that is long is closed, and the next one goes on.
 

@@ -14,7 +14,7 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
-from services.audit import AuditLog, Keeping
+from services.audit import AuditLog, AuditUnwritable, Keeping
 from services.control.answers import answer_with_problems
 from services.control.auth.key_changes import changed_outside, keys_read_again
 from services.control.auth.keys import KeyStore, first_admin_key
@@ -28,6 +28,7 @@ from services.control.observed import Observed
 from services.control.parts import Parts
 from services.control.routes import ROUTERS
 from services.control.state import ControlState, Persons
+from services.control.storage import Storage, folders_of
 from services.control.viewer_count import ViewerCount
 from services.settings import ServiceSettings, SettingsInvalid
 from services.version import product_version
@@ -89,17 +90,19 @@ def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
         log.warning("the administrator's key was made: it is in %s", settings.admin_key_file)
     keys.watch(partial(changed_outside, audit))
     limits = settings.limits
+    storage = Storage(folders_of(settings), audit)
     return ControlState(
         settings=settings,
         parts=parts,
         keys=keys,
         tickets=Tickets(settings.auth.ticket_s),
         audit=audit,
-        measures=Measures(parts.collectors, lambda: audit.head.seq + 1),
+        measures=Measures([*parts.collectors, storage], lambda: audit.head.seq + 1),
         key_rate=TokenBuckets(limits.requests_per_s, limits.requests_per_s * limits.burst_s),
         uploads_dir=uploads,
         uploads=asyncio.Semaphore(limits.uploads),
         viewers=ViewerCount(limits.viewers),
+        storage=storage,
         persons=persons,
     )
 
@@ -130,7 +133,10 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             control.draining.set()
             if control.tasks:
                 await asyncio.wait(control.tasks, timeout=control.settings.server.drain_s)
-            await asyncio.to_thread(audit.append, "service.stop", actor="system")
+            try:
+                await asyncio.to_thread(audit.append, "service.stop", actor="system")
+            except AuditUnwritable as error:
+                log.error("the end of the service is not in the audit log: %s", error)
     control.audit.close()
 
 

@@ -16,10 +16,9 @@ from starlette.requests import Request
 
 from services.control.problems import NoSpace, TooManyRequests, Unprocessable
 from services.control.state import ControlState
+from services.control.storage import SPARE_BYTES
 
 PART_BYTES = 1 << 20
-SPARE_BYTES = 256 * 2**20
-"""Left free on the disk: for the audit log and the database, which must always be able to write."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from services.control.measures import Measures
 from services.control.parts import Parts
 from services.control.problems import NotBuiltIn
 from services.control.repeated import Repeated
+from services.control.storage import Storage
 from services.control.viewer_count import ViewerCount
 from services.settings import ServiceSettings
 
@@ -46,6 +47,7 @@ class ControlState:
     uploads_dir: Path
     uploads: asyncio.Semaphore
     viewers: ViewerCount
+    storage: Storage
     persons: Persons | None = None
     """Of an OpenID Connect issuer, where the settings name one."""
     draining: asyncio.Event = field(default_factory=asyncio.Event)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+import tempfile
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 import yaml
 
+from services.audit import AuditLog
 from services.control.measures import Measures
+from services.control.storage import Storage
 from services.server.measures import STATES, StreamMeasures
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -27,9 +31,13 @@ MATCHER = re.compile(r'([a-z_]+)\s*(?:=~|!~|!=|=)\s*"([^"]*)"')
 GROUPING = re.compile(r"\b(?:by|without)\s*\(([^)]*)\)")
 
 
+@cache
 def served() -> dict[str, set[str]]:
     """Labels of each sample that the service gives Prometheus, by the sample's name."""
-    measures = Measures([StreamMeasures()])
+    with tempfile.TemporaryDirectory() as folder:
+        audit = AuditLog(Path(folder) / "audit.jsonl")
+        audit.close()
+    measures = Measures([StreamMeasures(), Storage({}, audit)])
     found = dict(OF_PROMETHEUS)
     labels = {
         name: set(getattr(collector, "_labelnames", ()))

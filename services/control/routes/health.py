@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Literal
 
 from fastapi import Query, Response
@@ -64,18 +65,18 @@ async def ready(
 
 
 async def _checks(control: ControlState) -> dict[str, CheckResult]:
-    names = list(control.parts.checks)
-    results = await asyncio.gather(*(_result(control, name) for name in names))
+    checks = {"disk": control.storage.disk, "audit": control.storage.audit, **control.parts.checks}
+    results = await asyncio.gather(*(_result(check) for check in checks.values()))
     draining = control.draining.is_set()
     return {
         "server": CheckResult(not draining, "ending" if draining else "taking requests"),
-        **dict(zip(names, results, strict=True)),
+        **dict(zip(checks, results, strict=True)),
     }
 
 
-async def _result(control: ControlState, name: str) -> CheckResult:
+async def _result(check: Callable[[], Awaitable[CheckResult]]) -> CheckResult:
     try:
         async with asyncio.timeout(CHECK_TIMEOUT_S):
-            return await control.parts.checks[name]()
+            return await check()
     except TimeoutError:
         return CheckResult(False, f"no answer within {CHECK_TIMEOUT_S:g} s")

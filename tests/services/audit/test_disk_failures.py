@@ -77,7 +77,9 @@ def reopened(path: Path, keeping: Keeping) -> AuditLog:
 
 @pytest.mark.parametrize("keeping", [ONE_FILE, MANY_FILES], ids=["one file", "many files"])
 @pytest.mark.parametrize(
-    ("number", "times"), [(errno.ENOSPC, 1), (errno.EIO, 2), (errno.EDQUOT, 1000)], ids=["once", "twice", "from then on"]
+    ("number", "times"),
+    [(errno.ENOSPC, 1), (errno.EIO, 2), (errno.EDQUOT, 1000)],
+    ids=["once", "twice", "from then on"],
 )
 def test_an_error_at_any_step_is_refused_and_leaves_a_log_that_fits(tmp_path, wire, keeping, number, times):
     for step in range(100):
@@ -208,7 +210,9 @@ def test_a_chain_that_is_ahead_and_does_not_fit_is_put_aside(tmp_path, which, ch
     else:
         lines[number] = replace(parse_line(lines[number])[0], actor="y").line()
     path.write_bytes(b"".join(lines))
-    consistent = which == "the last" and change != "changed"  # without the head, nothing tells such a last entry from a true one
+    consistent = (
+        which == "the last" and change != "changed"
+    )  # without the head, nothing tells such a last entry from a true one
     log = AuditLog(path)
     assert log.newest(1)[0].event == ("audit.recovered" if consistent else "audit.broken")
     log.close()
