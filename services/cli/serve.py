@@ -13,6 +13,7 @@ from services.cli.exit_codes import OK
 from services.control.app import new_app
 from services.control.logs import log_to_stderr
 from services.control.server import bind, serve
+from services.private_files import keep_files_private, make_state_private
 from services.server.parts import assembled
 from services.settings import ServiceSettings, SettingsInvalid, load_settings
 
@@ -21,11 +22,13 @@ def serve_command(
     config: Path | None, host: str | None, port: int | None, data: Path | None, setting: Sequence[str]
 ) -> int:
     """Serve until the process is asked to end."""
+    keep_files_private()
     named = {"server.host": host, "server.port": port, "paths.data": data}
     flags = {name: json.dumps(str(value)) for name, value in named.items() if value is not None}
     settings = load_settings(config, {**_assigned(setting), **flags})
     log_to_stderr(settings.log)
     listener = bind(settings)  # before anything is made or started
+    make_state_private(settings.data_dir, settings.uploaded_recordings.folder, settings.jobs.folder)
     app = new_app(settings, assembled(settings))
     serve(app, settings, listener, lambda address: _say(address, settings))
     return OK

@@ -15,6 +15,7 @@ from pathlib import Path
 from gsplat_core.errors import UserError
 from gsplat_core.io.exports.formats import ExportWish
 from services.exports.formats import ALL, ISPLAT
+from services.private_files import keep_files_private
 from services.registry.bundle_file import pack
 
 NICENESS = 10
@@ -24,6 +25,7 @@ REFUSED = 2
 
 def main(arguments: list[str] | None = None) -> int:
     """Make one file."""
+    keep_files_private()
     parser = argparse.ArgumentParser(prog="python -m services.exports.make", description="Export an unpacked model.")
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("file", type=Path, metavar="FILE")

@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from services.jobs.task import Task
+from services.private_files import keep_files_private
 from services.registry.errors import StoreUnavailable
 
 ATTEMPTS_OF_A_PROCESS = 20
@@ -19,6 +20,7 @@ def _attempt(values: dict[str, Any]) -> None:
     """Runs in a process of Ray's."""
     from services.jobs.work import work
 
+    keep_files_private()
     work(Task(**values))
 
 

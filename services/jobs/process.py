@@ -18,6 +18,7 @@ from services.jobs.pool import JobPool, PoolSettings
 from services.jobs.results import Results
 from services.jobs.runner import Runner
 from services.jobs.tables import SCHEMA
+from services.private_files import keep_files_private
 from services.registry.database import Database
 from services.registry.errors import StoreUnavailable
 
@@ -60,6 +61,7 @@ def new_runner(ray: str | None) -> Runner:
 
 def main() -> int:
     """Run until the input ends; returns the exit code."""
+    keep_files_private()
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     logging.getLogger("alembic").setLevel(logging.WARNING)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

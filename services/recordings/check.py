@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_core.io.recordings import validate_recording
+from services.private_files import keep_files_private
 from services.recordings.archive_list import ArchiveInvalid
 from services.recordings.kinds import ARCHIVE
 from services.recordings.limits import RecordingLimits
@@ -30,6 +31,7 @@ MOST_PROBLEMS = 3
 
 def main(arguments: list[str] | None = None) -> int:
     """Check one upload and print what was found."""
+    keep_files_private()
     options = _options(arguments)
     limits = RecordingLimits(**json.loads(options.limits))
     _limit_resources(limits)

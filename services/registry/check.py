@@ -27,6 +27,7 @@ from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, parse_manifest
 from gsplat_core.io.model_files import open_model_file
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.scene.model import Model
+from services.private_files import keep_files_private
 from services.registry.check_limits import NICENESS, lower_limit, taken_bytes
 
 FAINTEST = 1 / 255
@@ -40,6 +41,7 @@ class Unusable(Exception):
 
 def main(arguments: list[str] | None = None) -> int:
     """Check one folder and print what was found."""
+    keep_files_private()
     options = _options(arguments)
     say = _say_json if options.json else _say_words
     _limit_resources(options)

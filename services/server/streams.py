@@ -17,6 +17,7 @@ from services.display.hub import DisplayHub
 from services.server.stream_specs import gpus, spec_of
 from services.supervisor.launching import ByLauncher
 from services.supervisor.process import ProcessState, StreamEvent
+from services.supervisor.scratch import remove_dead
 from services.supervisor.specs import StreamSpec, assigned
 from services.supervisor.stream import StreamSupervisor
 
@@ -89,6 +90,7 @@ class SupervisedStreams:
     @asynccontextmanager
     async def running(self, at_start: Sequence[NewStream], started: Sequence[str]) -> AsyncIterator[None]:
         """Make the streams `at_start`, start those named in `started`; when the server ends, they end with it."""
+        await asyncio.to_thread(remove_dead)
         for stream in at_start:
             await self.create(stream)
         for name in started:
@@ -98,6 +100,7 @@ class SupervisedStreams:
         finally:
             await asyncio.gather(*(self._stop(stream, "the server ends") for stream in self._streams.values()))
             await self._launcher.close(stop=True)
+            await asyncio.to_thread(remove_dead)
 
     def hub(self, name: str) -> DisplayHub | None:
         """The viewers of a stream; None while it does not run."""

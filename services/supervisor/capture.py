@@ -23,6 +23,7 @@ from operators.sources.wire import description_to, frame_header, planes_of
 from operators.sources.zeromq_message import pieces
 from services.bus.errors import CommandRefused
 from services.bus.pictures import PicturePublisher
+from services.private_files import keep_files_private
 from services.supervisor.exit_codes import NO_USE
 from services.supervisor.specs import SourceSpec
 from services.supervisor.worker import Worker, stream_folder_of
@@ -111,6 +112,7 @@ def _sentence(source: FrameSource) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until told to stop; returns the exit code."""
+    keep_files_private()
     parser = argparse.ArgumentParser(description="Capture process of a stream.")
     parser.add_argument("--spec", required=True, help="file with the specification")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")

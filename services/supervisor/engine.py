@@ -26,6 +26,7 @@ from operators.frame_clock import ClockSettings
 from operators.messages import ShownPicture
 from operators.metrics import ScoredFrame
 from services.bus.pictures import PicturePublisher
+from services.private_files import keep_files_private
 from services.supervisor.captured_source import CapturedSource
 from services.supervisor.exit_codes import NO_USE
 from services.supervisor.graph_measures import graph_measures
@@ -34,6 +35,7 @@ from services.supervisor.live_scene import scene_of
 from services.supervisor.live_snapshots import LiveSnapshots
 from services.supervisor.model_show import ModelShow
 from services.supervisor.priority import ENGINE_ON_CPU, step_back
+from services.supervisor.scratch import scratch_folder
 from services.supervisor.screen import Screen
 from services.supervisor.specs import EngineSpec, engine_scale_for
 from services.supervisor.worker import Worker, stream_folder_of
@@ -84,7 +86,7 @@ def reconstruct(
         worker.folder, stop_requested, lambda width, height: engine_scale_for(spec, width, height, cores)
     )
     check_picture(source.description.camera, 1.0)
-    with TemporaryDirectory(prefix="intrasplat-engine-") as folder, low_latency():
+    with TemporaryDirectory(prefix="run-") as folder, low_latency():
         settings = live_settings(spec, Path(folder), source.description.name)
         worker.say("starting", "prepares the reconstruction")
         parts = started(settings, source, again)
@@ -153,6 +155,7 @@ def graph_figures(graph: LiveApplication) -> dict[str, object]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until told to stop; returns the exit code."""
+    keep_files_private()
     parser = argparse.ArgumentParser(description="Engine process of a stream.")
     parser.add_argument("--spec", required=True, help="file with the specification")
     parser.add_argument("--again", action="store_true", help="an engine of this stream ran before: show a picture soon")
@@ -163,7 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         assert spec.engine is not None
         if spec.engine.device == "cpu":
             step_back(ENGINE_ON_CPU)
-        with Worker(folder, spec) as worker:
+        with scratch_folder(), Worker(folder, spec) as worker:
             publisher = PicturePublisher(folder.pictures("engine"))
             try:
                 layers = Layers(folder, spec.engine.device)

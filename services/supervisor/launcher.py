@@ -35,6 +35,7 @@ from services.bus.errors import AlreadyRunning, BadMessage
 from services.bus.messages import MOST_BYTES, packed_json, parsed_json
 from services.bus.process_identity import ProcessIdentity
 from services.bus.runtime import RuntimeFolder, check_path, write_json
+from services.private_files import keep_files_private
 from services.supervisor.launching import FORKED, RECORD, SOCKET, recorded_launcher
 from services.supervisor.process_end import ended_how
 
@@ -154,6 +155,7 @@ def _become(module: str, arguments: Sequence[str], environment: Mapping[str, str
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until told to stop; returns the exit code."""
+    keep_files_private()
     parser = argparse.ArgumentParser(description="Forks the processes of streams.")
     parser.add_argument("--folder", required=True, help="runtime folder")
     parser.add_argument("--orphan-after-s", type=float, default=600.0)

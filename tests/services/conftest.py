@@ -28,6 +28,15 @@ SERVER_STARTS_S = 30.0
 PATH = "source,tool_mask,reconstruct,deform,rasterize,video"
 
 
+@pytest.fixture(autouse=True)
+def same_umask() -> Iterator[None]:
+    """Programs of the service that a test calls in this process set a umask, which must end with the test."""
+    before = os.umask(0o022)
+    os.umask(before)
+    yield
+    os.umask(before)
+
+
 @pytest.fixture
 def report() -> RunReport:
     return RunReport.model_validate(

@@ -1,0 +1,126 @@
+"""Whatever the umask of the user, nobody else reads what the service keeps."""
+
+from __future__ import annotations
+
+import ast
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import services
+from services.private_files import KEPT, FolderNotPrivate, make_state_private
+
+SERVICES = Path(services.__file__).parent
+OF_THE_USER = {"services/cli/gpu_check.py"}
+"""Programs of the command line, whose files are the user's own."""
+
+
+def programs() -> list[Path]:
+    """Modules of the service that run as processes of their own."""
+    found = [path for path in SERVICES.rglob("*.py") if 'if __name__ == "__main__":' in path.read_text()]
+    return [path for path in found if str(path.relative_to(SERVICES.parent)) not in OF_THE_USER]
+
+
+@pytest.fixture
+def open_umask():
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
+def open_to_others(folder: Path) -> set[str]:
+    """Files and folders, itself among them, that somebody else has a right to."""
+    return {str(path) for path in [folder, *folder.rglob("*")] if path.lstat().st_mode & 0o077}
+
+
+@pytest.mark.parametrize("path", [*programs(), SERVICES / "cli" / "serve.py"], ids=lambda path: path.stem)
+def test_every_process_begins_with_a_umask_of_its_own(path):
+    functions = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)]
+    main = next(node for node in functions if node.name in ("main", "serve_command"))
+    first = next(node for node in main.body if not isinstance(getattr(node, "value", None), ast.Constant))
+    assert ast.unparse(first) == "keep_files_private()", "its first statement"
+
+
+def test_the_programs_are_found():
+    assert {"launcher", "capture", "engine", "process", "check", "make"} <= {path.stem for path in programs()}
+
+
+def test_a_process_and_what_it_starts_create_private_files(tmp_path, open_umask):
+    program = (
+        "import subprocess, sys, os\n"
+        "from services.private_files import keep_files_private\n"
+        "keep_files_private()\n"
+        "os.mkdir('folder'); open('folder/file', 'w').close()\n"
+        "subprocess.run([sys.executable, '-c', \"open('folder/of a child', 'w').close()\"], check=True)\n"
+        "if os.fork() == 0:\n    os.mkdir('folder/of a fork'); os._exit(0)\n"
+        "os.wait()\n"
+    )
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True)
+    assert len(list((tmp_path / "folder").iterdir())) == 3
+    assert open_to_others(tmp_path / "folder") == set()
+
+
+def test_state_of_an_earlier_version_is_closed(tmp_path, open_umask):
+    data, elsewhere = tmp_path / "data", tmp_path / "elsewhere"
+    for folder in (data, elsewhere):
+        (folder / "replays" / "a" / "model").mkdir(parents=True)
+        (folder / "replays" / "a" / "report.json").write_text("{}")
+    for name in ("audit.jsonl", "audit.000000000000.jsonl", "keys.json", "keys.lock", "mine.txt"):
+        (data / name).write_text("x")
+    (data / "registry").mkdir()
+    (data / "registry" / "registry.sqlite").write_text("x")
+    (data / "registry" / "link").symlink_to(data / "mine.txt")
+    assert make_state_private(data, elsewhere, None) == 16
+    assert open_to_others(data) == {str(data / "mine.txt"), str(data / "registry" / "link")}
+    assert open_to_others(elsewhere) == set()
+    assert make_state_private(data, elsewhere, None) == 0
+    assert os.access(data / "registry" / "registry.sqlite", os.W_OK)
+
+
+def test_a_missing_folder_is_made_for_its_owner_alone(tmp_path, open_umask):
+    assert make_state_private(tmp_path / "a" / "data", tmp_path / "b") == 0
+    for folder in (tmp_path / "a" / "data", tmp_path / "b"):
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+def test_an_open_folder_with_other_files_is_refused_and_stays_as_it_is(tmp_path, open_umask):
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "letter").write_text("x")
+    with pytest.raises(FolderNotPrivate, match="chmod 700"):
+        make_state_private(home)
+    assert stat.S_IMODE(home.stat().st_mode) == 0o755
+    home.chmod(0o700)
+    make_state_private(home)
+    assert stat.S_IMODE((home / "letter").stat().st_mode) == 0o644
+
+
+def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "geteuid", lambda: tmp_path.stat().st_uid + 4711)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(FolderNotPrivate, match="belongs to user"):
+        make_state_private(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["a file", "in a file"])
+def test_what_is_no_folder_is_refused(tmp_path, kind):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(FolderNotPrivate, match="folder of its own user"):
+        make_state_private(tmp_path / "file" if kind == "a file" else tmp_path / "file" / "data")
+
+
+def test_every_folder_of_the_service_is_known():
+    """A name that the service gives below its data folder and that is not listed would keep its rights."""
+    named = set()
+    for path in SERVICES.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div) and isinstance(node.right, ast.Constant):
+                left = ast.unparse(node.left)
+                if left in ("data", "settings.data_dir", "self.data_dir") and isinstance(node.right.value, str):
+                    named.add(node.right.value)
+    assert {"registry", "recordings", "replays", "snapshots", "uploads", "exports", "admin.key"} <= named
+    assert named - KEPT == set()
