@@ -48,16 +48,16 @@ inside sh -c "pip install --quiet --no-index --no-deps /wheels/*.whl"
 
 step "as user 10001: doctor, the service, its health check, its end"
 as_user() { inside setpriv --reuid 10001 --regid 10001 --clear-groups --no-new-privs --bounding-set=-all env HOME=/tmp PYTHONDONTWRITEBYTECODE=1 \
-  INTRASPLAT_PATHS__DATA=/var/lib/intrasplat INTRASPLAT_PATHS__RUNTIME=/run/intrasplat/sockets INTRASPLAT_SERVER__PORT=8791 "$@"; }
+  INTRASPLAT_PATHS__DATA=/var/lib/intrasplat INTRASPLAT_PATHS__RUNTIME=/run/intrasplat/sockets INTRASPLAT_SERVER__PORT=8791 INTRASPLAT_SERVER__PROBE_PORT=8792 "$@"; }
 as_user intrasplat doctor
 as_user python -c "import psycopg, s3fs, jwt"
 as_user tini -- intrasplat serve &
 served=$!
 for _ in $(seq 60); do
   sleep 1
-  if as_user env HEALTHCHECK_URL=http://127.0.0.1:8791/livez python -I /opt/intrasplat/healthcheck.py > /dev/null; then break; fi
+  if as_user env HEALTHCHECK_URL=http://127.0.0.1:8792/livez python -I /opt/intrasplat/healthcheck.py > /dev/null; then break; fi
 done
-as_user env HEALTHCHECK_URL=http://127.0.0.1:8791/livez python -I /opt/intrasplat/healthcheck.py
+as_user env HEALTHCHECK_URL=http://127.0.0.1:8792/livez python -I /opt/intrasplat/healthcheck.py
 pkill -TERM --parent $served  # tini, which hands it on
 wait $served
 step "done: the service ended with 0"

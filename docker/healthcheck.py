@@ -1,6 +1,7 @@
 """Whether the server of this container answers: exit code 0 when /livez says 200, else 1 and a line that says what came instead.
 
-The address is HEALTHCHECK_URL. A certificate is not checked: it names the server as others call it, and this asks at 127.0.0.1.
+The address is HEALTHCHECK_URL, by default that of the probe listener, which answers while the server's own port is full. A certificate is not
+checked: it names the server as others call it, and this asks at 127.0.0.1.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ TIMEOUT_S = 4.0
 
 
 def main() -> int:
-    url = os.environ.get("HEALTHCHECK_URL", "http://127.0.0.1:8000/livez")
+    url = os.environ.get("HEALTHCHECK_URL", "http://127.0.0.1:8001/livez")
     unchecked = ssl.create_default_context()
     unchecked.check_hostname = False
     unchecked.verify_mode = ssl.CERT_NONE

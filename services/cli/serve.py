@@ -12,6 +12,7 @@ import typer
 from services.cli.exit_codes import OK
 from services.control.app import new_app
 from services.control.logs import log_to_stderr
+from services.control.probe import bind_probe
 from services.control.server import bind, serve
 from services.private_files import keep_files_private, make_state_private
 from services.server.parts import assembled
@@ -30,7 +31,8 @@ def serve_command(
     listener = bind(settings)  # before anything is made or started
     make_state_private(settings.data_dir, settings.uploaded_recordings.folder, settings.jobs.folder)
     app = new_app(settings, assembled(settings))
-    serve(app, settings, listener, lambda address: _say(address, settings))
+    probes = bind_probe(settings)
+    serve(app, settings, listener, lambda address: _say(address, settings), probes)
     return OK
 
 

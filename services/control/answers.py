@@ -5,17 +5,18 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
+import anyio
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import JSONResponse, Response
-from starlette.types import Scope
+from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from services.audit import AuditUnwritable
-from services.control.problems import OF_STATUS, PROBLEM_JSON, Problem, Unavailable, Unprocessable
+from services.control.problems import OF_STATUS, PROBLEM_JSON, BadRequest, Problem, Unavailable, Unprocessable
 
 log = logging.getLogger(__name__)
 
@@ -30,18 +31,36 @@ PHRASES = {
 
 
 class ProblemResponse(JSONResponse):
-    """A problem as an answer."""
+    """A problem as an answer. Where the request's body is not read, the rest of it is thrown away after the answer for at most `drain_s`:
+    a connection that is closed on bytes which nobody has read is reset, and the client loses the answer."""
 
     media_type = PROBLEM_JSON
+    drain_s = 0.0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the answer, drain, and end."""
+        if not self.drain_s:
+            return await super().__call__(scope, receive, send)
+        await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
+        await send({"type": "http.response.body", "body": self.body, "more_body": True})
+        with anyio.move_on_after(self.drain_s):
+            message = await receive()
+            while message["type"] == "http.request" and message.get("more_body", False):
+                message = await receive()
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
 
 
 def response_of(problem: Problem, scope: Scope) -> Response:
     """The answer; closes the connection where a body was announced that nobody will read."""
     headers = dict(problem.headers)
-    if _has_unread_body(scope):
+    unread = _has_unread_body(scope)
+    if unread:
         headers["Connection"] = "close"
     document = problem.document(scope.get("state", {}).get("request_id", ""))
-    return ProblemResponse(document, problem.status, headers)
+    response = ProblemResponse(document, problem.status, headers)
+    if unread:
+        response.drain_s = scope["app"].state.control.settings.limits.stall_s
+    return response
 
 
 def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Problem]]) -> None:
@@ -61,6 +80,10 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
             headers["Allow"] = _methods_of(app, connection)
         return await _answer(connection, kind(PHRASES.get(error.status_code, str(error.detail)), headers=headers))
 
+    async def on_left(connection: HTTPConnection, error: Exception) -> Response | None:
+        assert isinstance(error, ClientDisconnect)
+        return await _answer(connection, BadRequest("the connection was closed before the whole body had come"))
+
     async def on_invalid(connection: HTTPConnection, error: Exception) -> Response | None:
         assert isinstance(error, RequestValidationError)
         return await _answer(connection, _of_validation(error))
@@ -74,6 +97,7 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
     known: dict[type, type[Problem]] = {**KNOWN, **errors}
     for each in known:
         app.add_exception_handler(each, on_known)  # type: ignore[arg-type]
+    app.add_exception_handler(ClientDisconnect, on_left)  # type: ignore[arg-type]
     app.add_exception_handler(Problem, on_problem)  # type: ignore[arg-type]
     app.add_exception_handler(HTTPException, on_http)  # type: ignore[arg-type]
     app.add_exception_handler(RequestValidationError, on_invalid)  # type: ignore[arg-type]

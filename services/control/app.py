@@ -21,6 +21,7 @@ from services.control.auth.keys import KeyStore, first_admin_key
 from services.control.auth.tickets import Tickets
 from services.control.documents import ABOUT, describe
 from services.control.headers import SecurityHeaders
+from services.control.heads import HeadLength
 from services.control.hosts import KnownHosts
 from services.control.limits import AddressRate, TokenBuckets
 from services.control.measures import Measures
@@ -66,6 +67,7 @@ def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:
     # Each is put around those before it.
     app.add_middleware(KnownHosts, server=settings.server, measures=control.measures)
     app.add_middleware(AddressRate, buckets=by_address, measures=control.measures)
+    app.add_middleware(HeadLength, measures=control.measures)
     app.add_middleware(Observed, measures=control.measures)
     app.add_middleware(SecurityHeaders)
     if settings.server.trusted_proxies:

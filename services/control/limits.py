@@ -62,10 +62,17 @@ class AddressRate:
 
 
 def network_of(scope: Scope) -> str:
-    """Who a caller's address stands for: of IPv6 its /64, which one host can fill with addresses."""
-    host = (scope.get("client") or ("unknown", 0))[0]
+    """The network of a request's client, to which rates apply."""
+    return network_of_address((scope.get("client") or ("unknown", 0))[0])
+
+
+def network_of_address(host: str) -> str:
+    """The network that an address stands for. Of IPv6 it is the /64, which one host can fill with addresses."""
     try:
         address = ipaddress.ip_address(host)
     except ValueError:
         return host
+    mapped = getattr(address, "ipv4_mapped", None)
+    if mapped is not None:
+        return str(mapped)
     return str(ipaddress.ip_network((address, 64), strict=False)) if address.version == 6 else host

@@ -13,6 +13,7 @@ Problem
 ├── Misdirected           421  for another server than this one
 ├── Unprocessable         422  understood, and refused for what it says
 ├── TooManyRequests       429  later
+├── HeadTooLarge          431  the head of the request is longer than it may be
 ├── Internal              500  a bug of ours: the log has it, the answer has not
 ├── Unavailable           503  not now
 │   └── NotBuiltIn        503  this server was put together without that part
@@ -137,6 +138,12 @@ class TooManyRequests(Problem):
         super().__init__(detail, headers={"Retry-After": str(max(1, round(after_s + 0.5)))})
 
 
+class HeadTooLarge(Problem):
+    """The head of the request is longer than it may be."""
+
+    status, title = 431, "Request header fields too large"
+
+
 class Internal(Problem):
     """A bug of ours: the log has it, the answer has not."""
 
@@ -163,7 +170,7 @@ OF_STATUS: dict[int, type[Problem]] = {
     kind.status: kind
     for kind in (
         BadRequest, Forbidden, Missing, WrongMethod, TooSlow, Conflicting, TooLarge, WrongContent, Misdirected, Unprocessable,
-        Internal, Unavailable, NoSpace,
+        HeadTooLarge, Internal, Unavailable, NoSpace,
     )
 }  # fmt: skip
 """Problems by status, for the framework's own errors."""

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 
 from services.audit.entries import Detail, Outcome
 from services.control.auth.roles import Caller
@@ -49,5 +49,7 @@ async def _write(request: Request, caller: Caller, event: str, subject: str, out
 def _status_of(request: Request, error: Exception) -> int:
     if isinstance(error, Problem):
         return error.status
+    if isinstance(error, ClientDisconnect):
+        return 400
     known = control_of(request).parts.errors
     return next((known[each].status for each in type(error).__mro__ if each in known), 500)

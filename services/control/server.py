@@ -6,7 +6,7 @@ import asyncio
 import ipaddress
 import signal
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Any
 
@@ -15,12 +15,14 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from gsplat_core.errors import UserError
+from services.control.connections import AddressBound, BoundedListener
+from services.control.errors import CannotServe
+from services.control.heads import MOST_HEAD_BYTES
+from services.control.probe import ProbeListener
 from services.control.state import ControlState
 from services.control.systemd import ServiceManager
 from services.settings import ServiceSettings
 
-MOST_HEAD_BYTES = 32 * 1024
 MOST_UNSENT_BYTES = 64 * 1024
 """What the system keeps of an answer that it has not sent yet: for a viewer who is slow the newest picture is to wait here, and not twenty old ones
 there."""
@@ -28,12 +30,18 @@ MOST_MESSAGE_BYTES = 4096
 """Of what a viewer sends by WebSocket: nothing that anybody reads."""
 
 
-class CannotServe(UserError):
-    """The server cannot listen where, or as, the settings say."""
-
-
-def serve(app: FastAPI, settings: ServiceSettings, listener: socket.socket, listening: Callable[[str], None]) -> None:
+def serve(
+    app: FastAPI,
+    settings: ServiceSettings,
+    listener: socket.socket,
+    listening: Callable[[str], None],
+    probes: Sequence[socket.socket] = (),
+) -> None:
     """Serve until SIGTERM or SIGINT, then drain. `listening` is called with the server's address once it can be connected to.
+
+    Args:
+        listener: socket from `bind`.
+        probes: sockets from `bind_probe`.
 
     Raises CannotServe for a certificate that cannot be read, and where the application does not start.
     """
@@ -45,9 +53,13 @@ def serve(app: FastAPI, settings: ServiceSettings, listener: socket.socket, list
     # uvicorn raises the signal that ended it again, for whoever handled it before: a server that has drained has done what it was asked to.
     signal.signal(signal.SIGTERM, _done)
     signal.signal(signal.SIGINT, _done)
-    with listener:
-        server = DrainingServer(config, app.state.control, lambda: listening(_address(listener, settings)))
-        server.run(sockets=[listener])
+    control: ControlState = app.state.control
+    refused = control.measures.refused.labels("connections")
+    bound = AddressBound(settings.limits.connections_per_address, settings.server.trusted_proxies, refused.inc)
+    probe = ProbeListener(control, probes)
+    with BoundedListener.of(listener, bound) as bounded:
+        server = DrainingServer(config, control, lambda: listening(_address(bounded, settings)), probe)
+        server.run(sockets=[bounded])
     if not server.started:
         raise CannotServe("the server could not start; its log says why")
 
@@ -56,7 +68,8 @@ def config_of(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
     """How uvicorn is run."""
     return uvicorn.Config(
         app,
-        http=with_head_timeout(settings.limits.head_s),
+        http=with_head_limits(settings.limits.head_s),
+        loop="asyncio",  # it accepts by the listener's own method, which counts
         ws="websockets-sansio",
         ws_max_size=MOST_MESSAGE_BYTES,
         ws_per_message_deflate=False,  # the pictures are compressed
@@ -75,9 +88,16 @@ def config_of(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
 class DrainingServer(uvicorn.Server):
     """A server that tells the application at once that it is to end, so that displays without an end do so."""
 
-    def __init__(self, config: uvicorn.Config, control: ControlState, listening: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        control: ControlState,
+        listening: Callable[[], None],
+        probe: ProbeListener | None = None,
+    ) -> None:
         super().__init__(config)
         self._control = control
+        self._probe = probe or ProbeListener(control, ())
         self._listening = listening
         self._loop: asyncio.AbstractEventLoop | None = None
         self._manager = ServiceManager()
@@ -88,9 +108,17 @@ class DrainingServer(uvicorn.Server):
         self._loop = asyncio.get_running_loop()
         await super().startup(sockets)
         if self.started:
+            await self._probe.open()
             self._listening()
             self._manager.tell("READY=1", "STATUS=serving")
             self._feeding = self._loop.create_task(self._manager.feed_watchdog(), name="watchdog")
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Drain; the probe listener says so to the end."""
+        try:
+            await super().shutdown(sockets)
+        finally:
+            await self._probe.close()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """The first signal drains; a second SIGINT ends at once."""
@@ -100,10 +128,10 @@ class DrainingServer(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
-def with_head_timeout(head_s: float) -> type[H11Protocol]:
-    """uvicorn's protocol, which closes a connection whose request has no whole head within `head_s`: uvicorn itself would wait for ever."""
+def with_head_limits(head_s: float) -> type[H11Protocol]:
+    """uvicorn's protocol with bounds on the head of a request: `head_s` until it is whole, where uvicorn waits for ever, and 431 for a long one."""
 
-    class HeadTimeout(H11Protocol):
+    class HeadLimits(H11Protocol):
         _timer: asyncio.TimerHandle | None = None
 
         def connection_made(self, transport: Any) -> None:
@@ -129,11 +157,27 @@ def with_head_timeout(head_s: float) -> type[H11Protocol]:
                 self._timer.cancel()
                 self._timer = None
 
+        def send_400_response(self, msg: str) -> None:
+            """Answer what is no request, or too long to be one. h11 has not found the end of the head within its bound."""
+            if len(self.conn.trailing_data[0]) <= MOST_HEAD_BYTES:
+                super().send_400_response(msg)
+                return
+            self._stop_watching()
+            body = b"the head of the request is too long"
+            headers = [
+                ("content-type", "text/plain; charset=utf-8"),
+                ("connection", "close"),
+                ("content-length", str(len(body))),
+            ]
+            for event in (h11.Response(status_code=431, headers=headers), h11.Data(data=body), h11.EndOfMessage()):
+                self.transport.write(self.conn.send(event) or b"")
+            self.transport.close()
+
         def _close(self) -> None:
             if self.conn.their_state is h11.IDLE and not self.transport.is_closing():
                 self.transport.close()
 
-    return HeadTimeout
+    return HeadLimits
 
 
 def bind(settings: ServiceSettings) -> socket.socket:

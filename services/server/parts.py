@@ -52,7 +52,7 @@ def assembled(settings: ServiceSettings) -> Parts:
     """Everything that the control plane serves. Raises RuntimeFolderUnusable, StoreUnavailable."""
     measures = StreamMeasures()
     events = SystemEvents()
-    streams = SupervisedStreams(RuntimeFolder(settings.runtime_dir), told(measures, events))
+    streams = SupervisedStreams(RuntimeFolder(settings.runtime_dir), told(measures, events), settings.limits.streams)
     measures.streams = streams
     models = registry_of(settings)
     snapshots = SnapshotStore(settings.data_dir / "snapshots")

@@ -22,7 +22,6 @@ from services.supervisor.specs import StreamSpec, assigned
 from services.supervisor.stream import StreamSupervisor
 
 log = logging.getLogger(__name__)
-MOST_STREAMS = 16
 
 
 @dataclass(frozen=True)
@@ -82,8 +81,9 @@ def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | Non
 class SupervisedStreams:
     """See `services.control.parts.Streams`; `running` is entered with the server."""
 
-    def __init__(self, runtime: RuntimeFolder, on_event: Callable[[StreamEvent], None]) -> None:
-        self._runtime, self._on_event = runtime, on_event
+    def __init__(self, runtime: RuntimeFolder, on_event: Callable[[StreamEvent], None], most: int = 16) -> None:
+        """most: streams at one time, stopped ones among them (`limits.streams`)."""
+        self._runtime, self._on_event, self._most = runtime, on_event, most
         self._launcher = ByLauncher(runtime)
         self._streams: dict[str, Stream] = {}
 
@@ -137,8 +137,8 @@ class SupervisedStreams:
         """See `Streams`. Raises Conflicting for a name that is taken, Unprocessable for what cannot be a stream."""
         if stream.name in self._streams:
             raise Conflicting(f"there is a stream {stream.name}; delete it first, or choose another name")
-        if len(self._streams) >= MOST_STREAMS:
-            raise Conflicting(f"there are {MOST_STREAMS} streams, which is as many as may be; delete one")
+        if len(self._streams) >= self._most:
+            raise Conflicting(f"there are {self._most} streams, which is limits.streams; delete one, or raise it")
         made = self._streams[stream.name] = Stream(stream, self._spec(stream))
         return made.facts()
 

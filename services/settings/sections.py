@@ -56,6 +56,14 @@ class ServerSettings(Section):
     trusted_proxies: tuple[Network, ...] = Field(
         default=(), description="Whose X-Forwarded-For and X-Forwarded-Proto are believed; nobody's by default."
     )
+    probe_host: str = Field(default="127.0.0.1", description="Address of the probe listener.")
+    probe_port: int | None = Field(
+        default=None,
+        ge=0,
+        le=65535,
+        description="Port of a second listener for /livez and /readyz alone, without TLS and keys, which answers while the first is full."
+        " Without it they are at the Unix socket probe.sock in paths.runtime, as always.",
+    )
     drain_s: float = Field(default=10.0, ge=0, le=600, description="How long requests may take to end after SIGTERM.")
 
     @model_validator(mode="after")
@@ -117,6 +125,13 @@ class LimitSettings(Section):
         default=2.0, ge=0.1, le=60, description="How many seconds' worth of requests may come at once."
     )
     connections: int = Field(default=512, ge=8, description="Open connections; more are refused.")
+    connections_per_address: int = Field(
+        default=128,
+        ge=0,
+        description="Open connections of one address, of IPv6 one /64; more are closed at once. server.trusted_proxies are not counted. 0: no"
+        " bound, for a service behind a proxy that has its own.",
+    )
+    streams: int = Field(default=16, ge=1, le=1000, description="Streams at one time, stopped ones among them.")
     viewers: int = Field(default=100, ge=1, description="Open displays.")
     viewer_stall_s: float = Field(
         default=15.0, gt=0, description="A viewer that takes no picture for so long is dropped."

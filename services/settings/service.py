@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from services.settings.addresses import masked_address
@@ -50,6 +50,14 @@ class ServiceSettings(BaseSettings):
         default={"endoscope": StreamSettings(source="synthetic:?width=320&height=256&frames=24&moving=1")},
         description="Streams that are there from the start.",
     )
+
+    @model_validator(mode="after")
+    def _no_more_streams_than_may_be(self) -> ServiceSettings:
+        if len(self.streams) > self.limits.streams:
+            raise ValueError(
+                f"{len(self.streams)} streams are listed and limits.streams is {self.limits.streams}; raise it"
+            )
+        return self
 
     @cached_property
     def data_dir(self) -> Path:

@@ -70,12 +70,15 @@ def test_one_pod_with_the_gpu(render):
     assert "nvidia.com/gpu" not in container(render(WITHOUT_A_GPU))["resources"]["limits"]
 
 
-def test_probes_speak_tls_where_the_server_does(render):
-    for values, scheme in ((FULL, "HTTPS"), (WITHOUT_A_GPU, "HTTP")):
+def test_probes_ask_the_probe_listener(render):
+    for values in (FULL, WITHOUT_A_GPU):
         probed = container(render(values))
-        paths = {name: probed[f"{name}Probe"]["httpGet"] for name in ("startup", "liveness", "readiness")}
-        assert {each["scheme"] for each in paths.values()} == {scheme}
-        assert paths["readiness"]["path"] == "/readyz" and paths["liveness"]["path"] == "/livez"
+        asked = {name: probed[f"{name}Probe"]["httpGet"] for name in ("startup", "liveness", "readiness")}
+        assert {(each["scheme"], each["port"]) for each in asked.values()} == {("HTTP", "probe")}
+        assert asked["readiness"]["path"] == "/readyz" and asked["liveness"]["path"] == "/livez"
+        ports = {port["name"]: port["containerPort"] for port in probed["ports"]}
+        variables = {each["name"]: each.get("value") for each in probed["env"]}
+        assert variables["INTRASPLAT_SERVER__PROBE_PORT"] == str(ports["probe"]) != variables["INTRASPLAT_SERVER__PORT"]
 
 
 def test_a_room_shares_nothing_with_another(render):

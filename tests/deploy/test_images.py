@@ -85,6 +85,11 @@ def test_images_have_no_compiler_and_do_not_run_as_root(stage):
     assert copied == ["--from=trimmed /opt/intrasplat /opt/intrasplat"]
 
 
+def test_the_health_check_asks_the_probe_listener():
+    variables = dict(re.findall(r"\b([A-Z_]+)=(\S+)", DOCKERFILE.read_text()))
+    assert variables["HEALTHCHECK_URL"] == f"http://127.0.0.1:{variables['INTRASPLAT_SERVER__PROBE_PORT']}/livez"
+
+
 def test_build_tools_are_taken_out_again():
     import tomllib
 

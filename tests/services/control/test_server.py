@@ -171,7 +171,7 @@ def test_a_head_without_an_end_is_refused(served):
         answer = raw(port, b"GET /livez HTTP/1.1\r\nHost: localhost\r\nA: " + 1_000_000 * b"a")
     except ConnectionResetError:
         return  # closed while there was more to read
-    assert answer.startswith(b"HTTP/1.1 400")
+    assert answer.startswith(b"HTTP/1.1 431")
 
 
 def test_logs_are_json_with_the_request_and_without_the_query(served):

@@ -12,13 +12,13 @@ from services.bus.runtime import RuntimeFolder
 from services.control.parts import NewStream
 from services.control.problems import Conflicting, Missing, Unprocessable
 from services.server.displays import StreamDisplays
-from services.server.streams import MOST_STREAMS, SupervisedStreams
+from services.server.streams import SupervisedStreams
 
 
 @pytest.fixture
 def streams():
     with tempfile.TemporaryDirectory(prefix="isp-") as folder:
-        yield SupervisedStreams(RuntimeFolder(Path(folder)), lambda event: None)
+        yield SupervisedStreams(RuntimeFolder(Path(folder)), lambda event: None, most=3)
 
 
 def stream(name="theatre-1", **options):
@@ -58,9 +58,9 @@ def test_what_cannot_be_is_refused_and_changes_nothing(streams):
                 await refused("nobody")
         with pytest.raises(Conflicting, match="stopped"):
             await StreamDisplays(streams).subscribe("theatre-1", "raw", 80).__aenter__()
-        for number in range(MOST_STREAMS - 1):
+        for number in range(2):
             await streams.create(stream(f"more-{number}"))
-        with pytest.raises(Conflicting, match="as many as may be"):
+        with pytest.raises(Conflicting, match=r"there are 3 streams, which is limits\.streams"):
             await streams.create(stream("too-many"))
 
     asyncio.run(run())

@@ -1,0 +1,42 @@
+"""Length of a request's head: its target and its fields."""
+
+from __future__ import annotations
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from services.control.answers import response_of
+from services.control.measures import Measures
+from services.control.problems import HeadTooLarge
+
+MOST_HEAD_BYTES = 32 * 1024
+_BETWEEN = len(": \r\n")
+
+
+class HeadLength:
+    """Middleware that answers 431 to a request whose head is longer than `MOST_HEAD_BYTES`.
+
+    The HTTP parser bounds only a head whose end has not come yet; one that arrives in a single piece passes it.
+    """
+
+    def __init__(self, app: ASGIApp, measures: Measures) -> None:
+        self._app = app
+        self._measures = measures
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan" or length_of(scope) <= MOST_HEAD_BYTES:
+            return await self._app(scope, receive, send)
+        self._measures.refused.labels("head").inc()
+        if scope["type"] == "websocket":
+            await receive()  # websocket.connect
+            return await send({"type": "websocket.close", "code": 1009})  # before it is accepted: 403 to the client
+        problem = HeadTooLarge(
+            f"the head of the request has {length_of(scope)} bytes; at most {MOST_HEAD_BYTES} are taken"
+        )
+        await response_of(problem, scope)(scope, receive, send)
+
+
+def length_of(scope: Scope) -> int:
+    """Bytes of a head, without the few of the method and the version."""
+    target = scope.get("raw_path") or scope["path"].encode()
+    fields = sum(len(name) + len(value) + _BETWEEN for name, value in scope["headers"])
+    return len(target) + len(scope["query_string"]) + fields
