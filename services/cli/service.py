@@ -22,6 +22,8 @@ def add_to(app: typer.Typer) -> None:
     """Give the program the service's commands."""
     app.command()(serve)
     app.command()(schema)
+    app.command()(backup)
+    app.command()(restore)
     app.command()(igtl)
     app.command()(view)
     app.add_typer(keys, name="keys")
@@ -51,6 +53,31 @@ def schema() -> int:
     from services.cli.serve import schema_command
 
     return schema_command()
+
+
+def backup(
+    target: Annotated[Path, path_argument("TARGET", "A folder that is not there yet.")],
+    config: ConfigOption = None,
+    data: DataOption = None,
+    json: JsonOption = False,
+) -> int:
+    """Copy all that the service keeps into a new folder, whether it runs or not."""
+    from services.cli.backup import backup_command
+
+    return backup_command(target, config, data, as_json=json)
+
+
+def restore(
+    backup: Annotated[Path, path_argument("BACKUP", "A folder that `intrasplat backup` has made.")],
+    config: ConfigOption = None,
+    data: DataOption = None,
+    check: Annotated[bool, typer.Option("--check", help="Only check the backup; change nothing.")] = False,
+    json: JsonOption = False,
+) -> int:
+    """Check a backup and put it into the service's folders, which must be empty."""
+    from services.cli.backup import restore_command
+
+    return restore_command(backup, config, data, check=check, as_json=json)
 
 
 def igtl(

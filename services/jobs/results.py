@@ -17,7 +17,7 @@ from gsplat_core.io.atomic_files import sync_folder
 from services.registry.errors import StoreUnavailable
 
 RUNNING, LOCK = ".running", "lock"
-OUT = "out"
+OUT, REPORT = "out", "report.json"
 FILES = {
     "report.html": "text/html; charset=utf-8",
     "report.json": "application/json",
@@ -42,7 +42,7 @@ class Results:
 
     def is_published(self, folder: str) -> bool:
         """Whether a result is there."""
-        return (self.folder / folder / "report.json").is_file()
+        return (self.folder / folder / REPORT).is_file()
 
     def files(self, folder: str) -> list[str]:
         """The files of a result that are handed out."""

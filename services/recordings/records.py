@@ -12,11 +12,12 @@ import sqlalchemy as sa
 
 
 class State(StrEnum):
-    """`uploaded` → `ready`, or `rejected` with a reason."""
+    """`uploaded` → `ready`, or `rejected` with a reason. `missing` where a start did not find its files."""
 
     UPLOADED = "uploaded"
     READY = "ready"
     REJECTED = "rejected"
+    MISSING = "missing"
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import secrets
 import shutil
@@ -29,6 +30,8 @@ from services.registry.rows import now
 PROGRAM = (sys.executable, "-P", "-m", "services.recordings.check")
 UPLOAD = "upload"
 MOST_REASON = 1000
+GONE = "its files are not on the disk; restore them from a backup, or delete the recording and upload it again"
+log = logging.getLogger(__name__)
 
 
 def _nobody(_: sa.Connection, __: str) -> bool:
@@ -59,6 +62,7 @@ class RecordingStore:
             raise StoreUnavailable(
                 f"recordings cannot be kept in {folder}: {error.strerror}; choose another one"
             ) from error
+        self.folder = folder
         self._checks = threading.BoundedSemaphore(limits.checks_at_once)
         self._running = RunningChecks()
         self._database = Database(database_url, SCHEMA)
@@ -119,7 +123,7 @@ class RecordingStore:
         row = _found(connection, name)
         if State(row["state"]) is not State.READY:
             raise Conflict(f"the recording {name} is {row['state']}, not ready; GET /v1/recordings/{name} says why")
-        return self._folder / row["folder"] / _file_name(row)
+        return self._folder / row["folder"] / file_name(row)
 
     def delete(self, name: str) -> RecordingRecord:
         """Remove a recording. Raises NotFound, Conflict while a job reads it or waits to."""
@@ -154,7 +158,10 @@ class RecordingStore:
         return removed
 
     def recover(self) -> list[str]:
-        """Called at start: remove folders without a row; returns the names of recordings that wait for their check."""
+        """Called at start: remove folders without a row, mark recordings without files as `missing`, and those whose files are back as they were.
+
+        Returns: names of recordings that wait for their check.
+        """
         on_disk = sorted(self._folder.iterdir())  # before the rows: one that comes in between has both
         with self._database.reading() as connection:
             rows = _rows(connection)
@@ -162,7 +169,26 @@ class RecordingStore:
         for path in on_disk:
             if path.name not in known:
                 shutil.rmtree(path, ignore_errors=True)
-        return [row["name"] for row in rows if State(row["state"]) is State.UPLOADED]
+        self._mark_missing(rows)
+        return [record.name for record in self.all() if record.state is State.UPLOADED]
+
+    def _mark_missing(self, rows: Sequence[sa.RowMapping]) -> None:
+        for row in rows:
+            folder, state = self._folder / row["folder"], State(row["state"])
+            ready, uploaded = os.path.lexists(folder / file_name(row)), (folder / UPLOAD).is_file()
+            if state is State.REJECTED:
+                continue
+            if state is State.READY or (state is State.MISSING and ready and not uploaded):
+                found = State.READY if ready else State.MISSING
+            else:
+                found = State.UPLOADED if uploaded else State.MISSING
+            if found is state:
+                continue
+            reason = GONE if found is State.MISSING else None
+            same = (RECORDINGS.c.name == row["name"], RECORDINGS.c.folder == row["folder"], RECORDINGS.c.state == state)
+            with self._database.writing() as connection:
+                connection.execute(sa.update(RECORDINGS).where(*same).values(state=str(found), reason=reason))
+            log.log(logging.ERROR if reason else logging.WARNING, "the recording %s is %s", row["name"], found)
 
     def close(self) -> None:
         """End the checks that run and close the connections."""
@@ -198,7 +224,7 @@ class RecordingStore:
     def _after_check(self, row: sa.RowMapping, verdict: dict[str, Any]) -> RecordingRecord:
         ready = verdict.pop("stage", None) == "ready"
         folder = self._folder / row["folder"]
-        path = folder / _file_name(row)
+        path = folder / file_name(row)
         reason = None if ready else str(verdict.pop("reason", "it cannot be read"))[:MOST_REASON]
         values = {
             "state": str(State.READY if ready else State.REJECTED), "reason": reason,
@@ -232,7 +258,8 @@ def _bytes_below(path: Path) -> int:
     return sum(each.lstat().st_size for each in path.rglob("*"))
 
 
-def _file_name(row: sa.RowMapping) -> str:
+def file_name(row: sa.RowMapping) -> str:
+    """Name of a checked recording in its folder."""
     return str(row["name"]) if row["kind"] == ARCHIVE else f"{row['name']}{row['kind']}"
 
 

@@ -75,7 +75,7 @@ class UnpackedModels:
             if not _is_intact(partial.path, row):
                 raise _damaged(row, "is not what was uploaded")
             for name in (MANIFEST, TENSORS):
-                os.chmod(partial.path / name, 0o444)
+                os.chmod(partial.path / name, 0o400)
             earlier = partial.finish()
         if earlier is not None:
             shutil.rmtree(earlier, ignore_errors=True)

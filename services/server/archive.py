@@ -16,6 +16,7 @@ from services.jobs.pool import PoolSettings
 from services.jobs.process import PoolProcess
 from services.jobs.results import Results
 from services.jobs.store import JobStore, uses_recording
+from services.missing_files import StoredFiles
 from services.recordings.limits import RecordingLimits
 from services.recordings.records import State
 from services.recordings.store import RecordingStore
@@ -25,6 +26,7 @@ from services.registry.models import DATABASE_FILE
 from services.server.pool_keeper import PoolKeeper
 from services.server.replays import Replays
 from services.server.retention import RecordingRetention, ReplayRetention
+from services.server.stored_files import StoredFilesWatch
 from services.settings import ServiceSettings
 
 log = logging.getLogger(__name__)
@@ -40,6 +42,7 @@ class Archive:
     replay_retention: ReplayRetention
     pool: PoolKeeper
     measures: ArchiveMeasures
+    files: StoredFilesWatch
 
 
 def new_archive(settings: ServiceSettings, events: SystemEvents) -> Archive:
@@ -70,6 +73,13 @@ def new_archive(settings: ServiceSettings, events: SystemEvents) -> Archive:
         ReplayRetention(replays, jobs.keep_days, jobs.keep_results, events),
         PoolKeeper(process, lambda: _open(store.counts())),
         ArchiveMeasures(recordings, store),
+        StoredFilesWatch(
+            store.database,
+            StoredFiles(
+                recordings.folder, results.folder, None if settings.registry.blobs else data / "registry" / "blobs"
+            ),
+            events,
+        ),
     )
 
 

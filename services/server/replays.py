@@ -12,7 +12,7 @@ from services.jobs.records import JobRecord, JobState, NewJob, Submission
 from services.jobs.results import FILES, Results
 from services.jobs.store import JobStore
 from services.recordings.records import Expired
-from services.registry.errors import NotFound
+from services.registry.errors import NotFound, StoreUnavailable
 
 
 class Replays:
@@ -63,8 +63,12 @@ class Replays:
         return self._results.files(job.folder) if job.state == JobState.DONE else []
 
     def file(self, job_id: str, name: str) -> Path:
-        """See `Jobs`. Raises NotFound."""
+        """See `Jobs`. Raises NotFound, and StoreUnavailable where the replay is done and its result is not on the disk."""
         job = self.get(job_id)
+        if job.state == JobState.DONE and not self._results.is_published(job.folder):
+            raise StoreUnavailable(
+                f"the result of the replay {job_id} is not on the disk; restore it from a backup, or delete the replay and make it again"
+            )
         if name not in FILES or name not in self.files(job):
             raise NotFound(
                 f"the replay {job_id} is {job.state} and has no {name[:40]}; GET /v1/replays/{job_id} lists its results"

@@ -15,7 +15,11 @@ import yaml
 from services.audit import AuditLog
 from services.control.measures import Measures
 from services.control.storage import Storage
+from services.control.system_events import SystemEvents
+from services.missing_files import StoredFiles
+from services.registry.database import Database
 from services.server.measures import STATES, StreamMeasures
+from services.server.stored_files import StoredFilesWatch
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 OF_PROMETHEUS = {"up": {"job", "instance"}}
@@ -37,7 +41,8 @@ def served() -> dict[str, set[str]]:
     with tempfile.TemporaryDirectory() as folder:
         audit = AuditLog(Path(folder) / "audit.jsonl")
         audit.close()
-    measures = Measures([StreamMeasures(), Storage({}, audit)])
+        files = StoredFilesWatch(Database("sqlite://"), StoredFiles(Path(folder), Path(folder), None), SystemEvents())
+    measures = Measures([StreamMeasures(), Storage({}, audit), files])
     found = dict(OF_PROMETHEUS)
     labels = {
         name: set(getattr(collector, "_labelnames", ()))

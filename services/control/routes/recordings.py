@@ -47,7 +47,7 @@ class RecordingDescription(BaseModel):
 
 
 class RecordingView(BaseModel):
-    """A recording. `state`: uploaded, ready, or rejected with a reason."""
+    """A recording. `state`: uploaded, ready, rejected with a reason, or missing where its files are not on the disk."""
 
     model_config = ConfigDict(from_attributes=True)
     name: str = Field(examples=["case-7"])

@@ -1,0 +1,402 @@
+"""Backups of all that the service keeps: made beside the running service, checked as a whole, restored into empty folders only.
+
+BACKUP/
+  backup.json                          what is in it: size and SHA-256 of each file, and what is not in it
+  data/registry/registry.sqlite        by SQLite's own backup, so that it is of one moment
+  data/registry/blobs/  data/recordings/  data/replays/  data/snapshots/
+  data/audit.*  data/keys.json  data/admin.key
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import sqlite3
+import stat
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import sqlalchemy as sa
+
+from gsplat_core.errors import UserError
+from gsplat_core.io.atomic_files import PartialFolder, sync_folder
+from services.audit import verify
+from services.audit.entries import MOST_LINE_BYTES, parse_line
+from services.audit.head import read_head
+from services.control.app import AUDIT_FILE, KEYS_FILE
+from services.jobs.results import RUNNING
+from services.missing_files import StoredFiles, missing_files
+from services.registry.models import DATABASE_FILE
+from services.settings import ServiceSettings
+from services.version import product_version
+
+MANIFEST = "backup.json"
+DATA = "data"
+FORMAT = 1
+TRIES = 5
+"""Times that a running service may change something while it is copied."""
+PIECE_BYTES = 1 << 20
+SPARE_BYTES = 64 << 20
+MOST_MANIFEST_BYTES = 256 << 20
+
+
+class BackupFailed(UserError):
+    """A backup cannot be made or restored; says why, and that nothing was changed."""
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where a service keeps what belongs into a backup."""
+
+    data: Path
+    recordings: Path
+    replays: Path
+    database_is_ours: bool
+    """False: PostgreSQL, which has its own backups."""
+    blobs_are_ours: bool
+    """False: an object store, which has its own backups."""
+
+    @classmethod
+    def of(cls, settings: ServiceSettings) -> Places:
+        """As the settings say."""
+        data, registry = settings.data_dir, settings.registry
+        return cls(
+            data=data,
+            recordings=settings.uploaded_recordings.folder or data / "recordings",
+            replays=settings.jobs.folder or data / "replays",
+            database_is_ours=registry.database is None,
+            blobs_are_ours=registry.blobs is None,
+        )
+
+    @property
+    def database(self) -> Path:
+        """The file of the database, where it is ours."""
+        return self.data / "registry" / DATABASE_FILE
+
+
+@dataclass(frozen=True)
+class Backup:
+    """A backup that was made or checked."""
+
+    files: int
+    size_bytes: int
+    made_at: str
+    version: str
+    """Of the program that made it."""
+    elsewhere: tuple[str, ...]
+    """What is not in it, and has to be backed up by its own means."""
+    missing: tuple[str, ...]
+    """Rows of the database whose files were missing already when it was made."""
+    audit: str
+    """`intact`, or what is wrong with the audit log."""
+
+
+def make_backup(settings: ServiceSettings, target: Path) -> Backup:
+    """Copy everything into a new folder; the service may run. Raises BackupFailed."""
+    places = Places.of(settings)
+    _refuse_target(places, target)
+    try:
+        with PartialFolder(target) as partial:
+            os.chmod(partial.path, 0o700)
+            backup = _fill(places, partial.path)
+            partial.finish()
+    except (OSError, sqlite3.Error) as error:
+        raise BackupFailed(f"{target}: the backup was not made: {error}; nothing is left of it") from error
+    return backup
+
+
+def check_backup(folder: Path) -> Backup:
+    """Hold a backup against its list, its database against its files, and its audit log against itself. Raises BackupFailed."""
+    described, files = _manifest(folder)
+    for name, (size, digest) in files.items():
+        path = folder / name
+        if not path.is_file() or path.is_symlink() or path.stat().st_size != size or _sha256(path) != digest:
+            raise BackupFailed(f"{path} is not as the backup was made: it is missing or changed; take another backup")
+    found = {path.relative_to(folder).as_posix() for path in _walk(folder)} - {MANIFEST}
+    if found != set(files):
+        raise BackupFailed(
+            f"{folder} has a file that {MANIFEST} does not list: {min(found - set(files))!r:.200}; remove it"
+        )
+    data = folder / DATA
+    known = tuple(described["missing"])
+    missing = _missing(data) if (data / "registry" / DATABASE_FILE).exists() else []
+    unknown = sorted(set(map(str, missing)) - set(known))
+    if unknown:
+        raise BackupFailed(f"{folder}: the files of {', '.join(unknown)[:300]} are not in the backup; take another one")
+    audit = _audit_of(data)
+    if audit != described["audit"]:
+        raise BackupFailed(f"{folder}: the audit log in it is not as it was: {audit}; take another backup")
+    return Backup(
+        len(files), sum(size for size, _ in files.values()), described["made_at"], described["version"],
+        tuple(described["elsewhere"]), known, audit,
+    )  # fmt: skip
+
+
+def restore_backup(settings: ServiceSettings, folder: Path) -> Backup:
+    """Check a backup and put it into the service's folders, which must be empty. Raises BackupFailed; nothing is ever replaced."""
+    backup = check_backup(folder)
+    places = Places.of(settings)
+    moves = _moves(places, folder / DATA)
+    for target in dict.fromkeys(target for _, target in moves):
+        if _is_within(target, folder) or _is_within(folder, target):
+            raise BackupFailed(f"{target} and the backup {folder} lie in each other; restore from elsewhere")
+        if os.path.lexists(target) and (not target.is_dir() or any(target.iterdir())):
+            raise BackupFailed(
+                f"{target} is not empty, and a backup replaces nothing; move what is there away, or give another --data"
+            )
+    _require_space(places.data, backup.size_bytes)
+    try:
+        _, files = _manifest(folder)
+        apart = {source.name for source, _ in moves} - {DATA}
+        staged = [(_stage(source, target, files, apart), target) for source, target in moves]
+        for stage_, target in staged:
+            for each in sorted(stage_.iterdir()):
+                os.rename(each, target / each.name)
+            stage_.rmdir()
+            sync_folder(target)
+    except OSError as error:
+        raise BackupFailed(
+            f"the backup was not restored as a whole: {error}; empty the folders and try again"
+        ) from error
+    return backup
+
+
+def _fill(places: Places, folder: Path) -> Backup:
+    data = folder / DATA
+    data.mkdir(mode=0o700)
+    known: set[str] = set()
+    for _ in range(TRIES):
+        if places.database_is_ours and places.database.exists():
+            _copy_database(places.database, data / "registry" / DATABASE_FILE)
+        _copy_files(places, data)
+        missing = set(map(str, _missing(data))) if (data / "registry" / DATABASE_FILE).exists() else set()
+        if missing in (set(), known):  # those that are missing twice are missing in the service
+            break
+        known = missing
+    _copy_audit(places.data, data)
+    for name in (KEYS_FILE, "admin.key"):
+        if (places.data / name).is_file():
+            _copy(places.data / name, data / name)
+    elsewhere = []
+    if not places.database_is_ours:
+        elsewhere.append("the database: take a pg_dump before the backup, and restore it first")
+    if not places.blobs_are_ours:
+        elsewhere.append("the models' files: back up the object store after the database")
+    files = {path.relative_to(folder).as_posix(): [path.stat().st_size, _sha256(path)] for path in _walk(folder)}
+    made = Backup(
+        len(files), sum(size for size, _ in files.values()), datetime.now(UTC).isoformat(timespec="seconds"),
+        product_version(), tuple(elsewhere), tuple(sorted(missing)), _audit_of(data),
+    )  # fmt: skip
+    described = {"format": FORMAT, **asdict(made), "files": files}
+    with open(folder / MANIFEST, "x", opener=_private) as file:
+        json.dump(described, file, indent=1)
+        file.flush()
+        os.fsync(file.fileno())
+    return made
+
+
+def _refuse_target(places: Places, target: Path) -> None:
+    if os.path.lexists(target):
+        raise BackupFailed(f"{target} is there already, and a backup replaces nothing; give a folder that is not there")
+    if not target.absolute().parent.is_dir():
+        raise BackupFailed(f"{target.absolute().parent} is no folder; make it, or give another place")
+    if not places.data.is_dir():
+        raise BackupFailed(f"{places.data} has no data of a service; give --config or --data as for `intrasplat serve`")
+    for folder in (places.data, places.recordings, places.replays):
+        if _is_within(target, folder):
+            raise BackupFailed(f"{target} lies in {folder}, which is what is backed up; give a place on another disk")
+    size = sum(path.stat().st_size for folder in _sources(places).values() for path in _walk(folder))
+    _require_space(target.absolute().parent, size)
+
+
+def _require_space(folder: Path, wanted: int) -> None:
+    while not folder.exists():
+        folder = folder.parent
+    free = shutil.disk_usage(folder).free
+    if free < wanted + SPARE_BYTES:
+        raise BackupFailed(
+            f"{folder} has {free >> 20} MiB free and {(wanted + SPARE_BYTES) >> 20} MiB are needed; free space"
+        )
+
+
+def _sources(places: Places) -> dict[str, Path]:
+    """Folders that are copied, by their place in the backup."""
+    found = {"recordings": places.recordings, "replays": places.replays, "snapshots": places.data / "snapshots"}
+    return found | ({"registry/blobs": places.data / "registry" / "blobs"} if places.blobs_are_ours else {})
+
+
+def _copy_files(places: Places, data: Path) -> None:
+    """Copy what is not copied yet. Files of the service never change once they have their name; one that goes meanwhile is left out."""
+    for name, source in _sources(places).items():
+        for path in _walk(source):
+            relative = path.relative_to(source)
+            if RUNNING in relative.parts[:1]:
+                continue
+            target = data / name / relative
+            if not target.exists() or target.stat().st_size != path.stat().st_size:
+                with contextlib.suppress(FileNotFoundError):
+                    _copy(path, target)
+
+
+def _copy_database(source: Path, target: Path) -> None:
+    _make_parents(target)
+    target.unlink(missing_ok=True)
+    with contextlib.closing(sqlite3.connect(f"file:{source}?mode=rw", uri=True)) as live:
+        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+        with contextlib.closing(sqlite3.connect(target)) as copy:
+            live.backup(copy)
+            copy.execute("PRAGMA journal_mode=DELETE")
+            (found,) = copy.execute("PRAGMA integrity_check").fetchone()
+    if found != "ok":
+        raise BackupFailed(f"the database {source} is damaged: {found:.200}; restore an older backup")
+
+
+def _copy_audit(source: Path, data: Path) -> None:
+    """Copy the audit log with its head, first the head: entries that are written meanwhile are cut off the copy."""
+    for _ in range(TRIES):
+        for left in data.glob("audit.*"):
+            left.unlink()
+        if not (source / AUDIT_FILE).exists():
+            return
+        for name in ("audit.head", "audit.anchor"):
+            if (source / name).exists():
+                _copy(source / name, data / name)
+        for path in sorted(source.glob("audit.*")):
+            if path.suffix == Path(AUDIT_FILE).suffix:
+                with contextlib.suppress(FileNotFoundError):
+                    _copy(path, data / path.name)
+        _cut_after_head(data / AUDIT_FILE)
+        if verify(data / AUDIT_FILE).intact:
+            return
+
+
+def _cut_after_head(log: Path) -> None:
+    with contextlib.suppress(ValueError, FileNotFoundError):
+        head = read_head(log)
+        kept = 0
+        with log.open("r+b") as file:
+            while head is not None and (line := file.readline(MOST_LINE_BYTES + 1)).endswith(b"\n"):
+                if parse_line(line)[0].seq > head.seq:
+                    break
+                kept += len(line)
+            else:
+                kept = kept if head is not None else log.stat().st_size
+            file.truncate(kept)
+
+
+def _audit_of(data: Path) -> str:
+    if not (data / AUDIT_FILE).exists():
+        return "intact"
+    findings = verify(data / AUDIT_FILE).findings
+    return "intact" if not findings else findings[0].what
+
+
+def _missing(data: Path) -> list[Any]:
+    blobs = data / "registry" / "blobs"
+    engine = sa.create_engine(f"sqlite:///{(data / 'registry' / DATABASE_FILE).absolute()}")
+    try:
+        with engine.connect() as connection:
+            # Without its folder of files the registry kept them elsewhere.
+            return missing_files(
+                connection, StoredFiles(data / "recordings", data / "replays", blobs if blobs.is_dir() else None)
+            )
+    except sa.exc.DBAPIError as error:
+        raise BackupFailed(f"the database of the backup cannot be read: {error.orig}; take another one") from error
+    finally:
+        engine.dispose()
+
+
+def _moves(places: Places, data: Path) -> list[tuple[Path, Path]]:
+    """Folders of the backup and where their contents go. What lies elsewhere than in the data folder comes first."""
+    apart = [(data / "recordings", places.recordings), (data / "replays", places.replays)]
+    apart = [(source, target) for source, target in apart if target != places.data / source.name]
+    return [*apart, (data, places.data)]
+
+
+def _stage(source: Path, target: Path, files: dict[str, tuple[int, str]], apart: set[str]) -> Path:
+    """Copy a folder of the backup into a new one in its target, each file against its digest. apart: folders with a target of their own."""
+    target.mkdir(mode=0o700, parents=True, exist_ok=True)
+    stage_ = target / f".restore-{os.getpid()}"
+    stage_.mkdir(mode=0o700)
+    within = PurePosixPath(DATA) if source.name == DATA else PurePosixPath(DATA, source.name)
+    for path in _walk(source):
+        relative = path.relative_to(source)
+        if source.name == DATA and relative.parts[0] in apart:
+            continue
+        if _copy(path, stage_ / relative) != files[(within / relative.as_posix()).as_posix()][1]:
+            raise BackupFailed(f"{path} changed while it was read; nothing was restored, empty {target}")
+    return stage_
+
+
+def _manifest(folder: Path) -> tuple[dict[str, Any], dict[str, tuple[int, str]]]:
+    path = folder / MANIFEST
+    try:
+        if not stat.S_ISREG(path.lstat().st_mode) or path.stat().st_size > MOST_MANIFEST_BYTES:
+            raise ValueError("it is no plain file, or too long")
+        described = json.loads(path.read_bytes())
+        if described["format"] != FORMAT:
+            raise ValueError(f"its format is {described['format']!r:.40}, and this program knows {FORMAT}")
+        files = {str(name): (int(size), str(digest)) for name, (size, digest) in described["files"].items()}
+        for name in files:
+            parts = PurePosixPath(name).parts
+            if parts[:1] != (DATA,) or len(parts) < 2 or ".." in parts or PurePosixPath(name).as_posix() != name:
+                raise ValueError(f"it lists {name!r:.100}")
+        for key, kind in (("missing", list), ("elsewhere", list), ("audit", str), ("made_at", str), ("version", str)):
+            if not isinstance(described[key], kind):
+                raise ValueError(f"{key} is no {kind.__name__}")
+    except FileNotFoundError as error:
+        raise BackupFailed(
+            f"{folder} is no backup: it has no {MANIFEST}; give a folder of `intrasplat backup`"
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise BackupFailed(f"{path} cannot be used: {error}; take another backup") from error
+    return described, files
+
+
+def _walk(folder: Path) -> Iterator[Path]:
+    """Plain files below a folder, in order. Links and special files are no part of a backup."""
+    for path, folders, files in os.walk(folder):
+        folders.sort()
+        for name in sorted(files):
+            with contextlib.suppress(FileNotFoundError):
+                if stat.S_ISREG(os.lstat(os.path.join(path, name)).st_mode):
+                    yield Path(path, name)
+
+
+def _copy(source: Path, target: Path) -> str:
+    """Copy a file for this user alone and force it to the disk. Returns its SHA-256."""
+    _make_parents(target)
+    digest = hashlib.sha256()
+    target.unlink(missing_ok=True)
+    with open(source, "rb") as read, open(target, "xb", opener=_private) as written:
+        while piece := read.read(PIECE_BYTES):
+            digest.update(piece)
+            written.write(piece)
+        written.flush()
+        os.fsync(written.fileno())
+    return digest.hexdigest()
+
+
+def _make_parents(target: Path) -> None:
+    for parent in reversed(target.parents):
+        if not parent.exists():
+            parent.mkdir(mode=0o700, exist_ok=True)
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _is_within(path: Path, folder: Path) -> bool:
+    return path.resolve().is_relative_to(folder.resolve())
+
+
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)

@@ -1,0 +1,360 @@
+"""A backup holds all that the service keeps, is found out when it does not, and replaces nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import os
+import shutil
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+
+from services import backup as backups
+from services.audit import AuditLog, verify
+from services.backup import MANIFEST, BackupFailed, check_backup, make_backup, restore_backup
+from services.cli.backup import backup_command, restore_command
+from services.control.app import AUDIT_FILE, KEYS_FILE
+from services.control.auth.keys import KeyStore
+from services.control.auth.roles import Role
+from services.control.system_events import SystemEvents
+from services.jobs.tables import JOBS
+from services.recordings.records import State
+from services.recordings.tables import RECORDINGS
+from services.registry.errors import StoreUnavailable
+from services.registry.tables import MODELS, VERSIONS
+from services.server.archive import Archive, new_archive
+from services.server.parts import registry_of
+from services.settings import ServiceSettings
+
+AT = "2026-01-01T00:00:00+00:00"
+
+
+@dataclass
+class Service:
+    """A service's data, with one of everything."""
+
+    settings: ServiceSettings
+    archive: Archive
+    token: str
+    audit: AuditLog
+
+    def close(self) -> None:
+        self.archive.recordings.close()
+        self.archive.replays._store.close()
+        self.audit.close()
+
+
+def new_service(data: Path, **elsewhere: Path) -> Service:
+    settings = ServiceSettings(
+        paths={"data": data},
+        uploaded_recordings={"folder": elsewhere.get("recordings")},
+        jobs={"folder": elsewhere.get("replays")},
+    )
+    data.mkdir(mode=0o700, exist_ok=True)
+    registry_of(settings).close()
+    archive = new_archive(settings, SystemEvents())
+    audit = AuditLog(data / AUDIT_FILE)
+    audit.append("service.start", actor="system")
+    return Service(settings, archive, KeyStore(data / KEYS_FILE).create("admin", Role.ADMIN)[1], audit)
+
+
+def filled(data: Path, **elsewhere: Path) -> Service:
+    service = new_service(data, **elsewhere)
+    files = service.archive.files._files
+    with service.archive.files._database.writing() as connection:
+        connection.execute(sa.insert(MODELS).values(name="liver", created_at=AT, last_version=1))
+        (files.blobs / "abc.isplat").write_bytes(b"model")
+        connection.execute(sa.insert(VERSIONS).values(
+            name="liver", version=1, state="ready", digest="d", size_bytes=5, manifest_sha256="m", tensors_sha256="t",
+            blob="abc.isplat", uploaded_by="x", uploaded_at=AT, changed_by="x", changed_at=AT, description={},
+        ))  # fmt: skip
+        for name, kind, state, file in (
+            ("case-1", "archive", "ready", "case-1/0.png"),
+            ("case-2", ".mp4", "uploaded", "upload"),
+        ):
+            path = files.recordings / f"{name}-1" / file
+            path.parent.mkdir(parents=True)
+            path.write_bytes(name.encode())
+            connection.execute(sa.insert(RECORDINGS).values(
+                name=name, folder=f"{name}-1", kind=kind, state=state, digest="d", size_bytes=6, kept_bytes=6,
+                uploaded_by="x", uploaded_at=AT, description={},
+            ))  # fmt: skip
+        (files.replays / "r1").mkdir()
+        (files.replays / "r1" / "report.json").write_text("{}")
+        (files.replays / ".running" / "pool").mkdir(parents=True)
+        (files.replays / ".running" / "pool" / "half").write_text("half")
+        connection.execute(sa.insert(JOBS).values(
+            id="0123456789abcdef", batch="b", recording="case-1", source="s", folder="r1", options={}, state="done",
+            attempts=1, frames_done=1, created_by="x", created_at=AT, ended_at=AT,
+        ))  # fmt: skip
+    snapshot = data / "snapshots" / "endoscope" / "1"
+    snapshot.mkdir(parents=True)
+    (snapshot / "snapshot.json").write_text("{}")
+    return service
+
+
+@pytest.fixture
+def service(tmp_path):
+    made = filled(tmp_path / "data")
+    yield made
+    made.close()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_everything_comes_back(service, tmp_path):
+    made = make_backup(service.settings, tmp_path / "backup")
+    assert (made.missing, made.elsewhere, made.audit) == ((), (), "intact")
+    assert check_backup(tmp_path / "backup") == made
+    assert not [path for path in (tmp_path / "backup").rglob("*") if path.stat().st_mode & 0o077]
+    settings = ServiceSettings(paths={"data": tmp_path / "new"})
+    restore_backup(settings, tmp_path / "backup")
+    before, after = contents(tmp_path / "data"), contents(tmp_path / "new")
+    assert not [path for path in (tmp_path / "new").rglob("*") if path.stat().st_mode & 0o077]
+    expected = {
+        "registry/registry.sqlite", "registry/blobs/abc.isplat", "recordings/case-1-1/case-1/0.png", "recordings/case-2-1/upload",
+        "replays/r1/report.json", "snapshots/endoscope/1/snapshot.json", "audit.jsonl", "audit.head", "keys.json",
+    }  # fmt: skip
+    assert set(after) == expected
+    assert all(after[name] == before[name] for name in expected - {"registry/registry.sqlite"})
+    archive = new_archive(settings, SystemEvents())
+    assert archive.files.missing() == []
+    assert archive.recordings.get("case-1").state is State.READY
+    assert archive.replays.file("0123456789abcdef", "report.json").read_text() == "{}"
+    assert KeyStore(tmp_path / "new" / KEYS_FILE).find(service.token) is not None
+    assert verify(tmp_path / "new" / AUDIT_FILE).intact
+    archive.recordings.close()
+    archive.replays._store.close()
+
+
+def test_folders_elsewhere_are_in_it_and_are_restored_elsewhere(tmp_path):
+    service = filled(tmp_path / "data", recordings=tmp_path / "rec", replays=tmp_path / "rep")
+    make_backup(service.settings, tmp_path / "backup")
+    service.close()
+    settings = ServiceSettings(paths={"data": tmp_path / "new"}, uploaded_recordings={"folder": tmp_path / "new-rec"})
+    (tmp_path / "new").mkdir()
+    restore_backup(settings, tmp_path / "backup")
+    assert (tmp_path / "new-rec" / "case-1-1" / "case-1" / "0.png").read_bytes() == b"case-1"
+    assert (tmp_path / "new" / "replays" / "r1" / "report.json").exists()
+    assert not (tmp_path / "new" / "recordings").exists()
+    assert not list(tmp_path.rglob(".restore-*"))
+
+
+def test_a_service_that_writes_meanwhile_gives_a_backup_that_fits(service, tmp_path, monkeypatch):
+    """While files are copied an upload is checked, another one ends, and audit entries are written."""
+    real, calls = backups._copy_files, []
+    database, files = service.archive.files._database, service.archive.files._files
+
+    def copy_files(places, data):
+        if not calls:
+            (files.recordings / "case-2-1" / "upload").rename(files.recordings / "case-2-1" / "case-2.mp4")
+            with database.writing() as connection:
+                connection.execute(sa.update(RECORDINGS).where(RECORDINGS.c.name == "case-2").values(state="ready"))
+        calls.append(1)
+        real(places, data)
+        service.audit.append("x", actor="system")
+
+    monkeypatch.setattr(backups, "_copy_files", copy_files)
+    real_copy = backups._copy
+
+    def copy(source, target):
+        if source.name == "audit.jsonl":
+            for _ in range(3):
+                service.audit.append("y", actor="system")
+        return real_copy(source, target)
+
+    monkeypatch.setattr(backups, "_copy", copy)
+    made = make_backup(service.settings, tmp_path / "backup")
+    assert made.missing == () and made.audit == "intact" and len(calls) == 2
+    check_backup(tmp_path / "backup")
+
+
+def test_files_that_are_missing_in_the_service_are_said(service, tmp_path, capsys):
+    shutil.rmtree(tmp_path / "data" / "replays" / "r1")
+    (tmp_path / "data" / "registry" / "blobs" / "abc.isplat").write_bytes(b"mode")
+    assert backup_command(tmp_path / "backup", None, tmp_path / "data", as_json=False) == 2
+    said = capsys.readouterr().out
+    assert "the files of replay 0123456789abcdef" in said and "the files of model liver/1" in said
+    assert check_backup(tmp_path / "backup").missing == ("model liver/1", "replay 0123456789abcdef")
+
+
+def damaged(folder: Path, how: str) -> None:
+    """Do one thing to a backup."""
+    path, described = folder / MANIFEST, json.loads((folder / MANIFEST).read_text())
+    recording = folder / "data" / "recordings" / "case-1-1" / "case-1" / "0.png"
+    if how == "changed":
+        recording.write_bytes(b"case-9")
+    elif how == "longer":
+        recording.write_bytes(b"case-1 ")
+    elif how == "gone":
+        recording.unlink()
+    elif how == "a link":
+        shutil.copy(recording, folder.parent / "elsewhere")
+        recording.unlink()
+        recording.symlink_to(folder.parent / "elsewhere")
+    elif how == "another file":
+        (folder / "data" / "more").write_text("x")
+    elif how == "no list":
+        path.unlink()
+    elif how == "the list is cut":
+        path.write_bytes(path.read_bytes()[:-10])
+    elif how == "the list is deep":
+        path.write_text(100_000 * "[")
+    elif how == "a list of another kind":
+        path.write_text("[]")
+    elif how == "a later format":
+        path.write_text(json.dumps({**described, "format": 2}))
+    elif how == "a path to the outside":
+        described["files"]["data/../../elsewhere"] = described["files"].pop("data/keys.json")
+        path.write_text(json.dumps(described))
+    elif how in ("a recording was left out", "an audit line was left out", "the database is none"):
+        name = {
+            "a recording was left out": "data/recordings/case-1-1/case-1/0.png",
+            "an audit line was left out": "data/audit.jsonl",
+            "the database is none": "data/registry/registry.sqlite",
+        }[how]
+        target = folder / name
+        if how.startswith("a recording"):
+            target.unlink()
+            target.parent.rmdir()
+            del described["files"][name]
+        else:
+            target.write_bytes(b"" if how.startswith("an audit") else bytes(4096))
+            described["files"][name] = [target.stat().st_size, hashlib.sha256(target.read_bytes()).hexdigest()]
+        path.write_text(json.dumps(described))
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        "changed", "longer", "gone", "a link", "another file", "no list", "the list is cut", "the list is deep", "a list of another kind",
+        "a later format", "a path to the outside", "a recording was left out", "an audit line was left out", "the database is none",
+    ],
+)  # fmt: skip
+def test_a_backup_that_is_not_whole_is_not_restored(service, tmp_path, how):
+    make_backup(service.settings, tmp_path / "backup")
+    damaged(tmp_path / "backup", how)
+    with pytest.raises(BackupFailed):
+        restore_backup(ServiceSettings(paths={"data": tmp_path / "new"}), tmp_path / "backup")
+    assert not (tmp_path / "new").exists()
+    with pytest.raises(BackupFailed):
+        restore_command(tmp_path / "backup", None, None, check=True, as_json=True)
+
+
+@pytest.mark.parametrize("there", ["data", "a file", "recordings", "itself", "inside"])
+def test_a_restore_replaces_nothing(service, tmp_path, there):
+    make_backup(service.settings, tmp_path / "backup")
+    new, recordings = tmp_path / "new", tmp_path / "rec"
+    if there == "data":
+        new.mkdir()
+        (new / "keys.json").write_text("mine")
+    elif there == "a file":
+        new.write_text("mine")
+    elif there == "recordings":
+        recordings.mkdir()
+        (recordings / "mine").write_text("mine")
+    elif there == "itself":
+        new = tmp_path / "backup"
+    else:
+        new = tmp_path / "backup" / "data" / "new"
+    before = contents(tmp_path)
+    settings = ServiceSettings(paths={"data": new}, uploaded_recordings={"folder": recordings})
+    with pytest.raises(BackupFailed):
+        restore_backup(settings, tmp_path / "backup")
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("target", ["data", "data/backup", "there", "a file", "no/such", "data/recordings/x"])
+def test_a_backup_replaces_nothing(service, tmp_path, target):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "a file").write_text("mine")
+    before = contents(tmp_path)
+    with pytest.raises(BackupFailed):
+        make_backup(service.settings, tmp_path / target)
+    assert contents(tmp_path) == before
+
+
+def test_a_full_disk_leaves_nothing(service, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(BackupFailed, match="No space left"):
+        make_backup(service.settings, tmp_path / "backup")
+    monkeypatch.undo()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data"]
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 1000})())
+    with pytest.raises(BackupFailed, match="free space"):
+        make_backup(service.settings, tmp_path / "backup")
+
+
+def test_a_place_without_a_service_is_no_backup(tmp_path):
+    with pytest.raises(BackupFailed, match="no data of a service"):
+        make_backup(ServiceSettings(paths={"data": tmp_path / "nope"}), tmp_path / "backup")
+
+
+def test_what_other_stores_keep_is_said(tmp_path):
+    settings = ServiceSettings(
+        paths={"data": tmp_path / "data"}, registry={"database": "postgresql://a@b/c", "blobs": "s3://bucket/x"}
+    )
+    (tmp_path / "data").mkdir()
+    made = make_backup(settings, tmp_path / "backup")
+    assert "pg_dump" in made.elsewhere[0] and "object store" in made.elsewhere[1]
+    restore_backup(ServiceSettings(paths={"data": tmp_path / "new"}), tmp_path / "backup")
+
+
+def test_a_service_without_its_files_says_so(service, tmp_path, caplog):
+    data = tmp_path / "data"
+    for folder in ("recordings", "replays"):
+        shutil.move(data / folder, tmp_path / folder)
+        (data / folder).mkdir()
+    (data / "registry" / "blobs" / "abc.isplat").unlink()
+    events = SystemEvents()
+    archive = new_archive(service.settings, events)
+    assert archive.recordings.recover() == []
+    for name in ("case-1", "case-2"):
+        record = archive.recordings.get(name)
+        assert record.state is State.MISSING and "restore them from a backup" in record.reason
+    with pytest.raises(StoreUnavailable, match="is not on the disk"):
+        archive.replays.file("0123456789abcdef", "report.json")
+
+    async def start() -> None:
+        async with archive.files.running():
+            found = await archive.files.check()
+            assert (found.ok, found.needed) == (False, False)
+            assert "1 of models, 2 of recordings, 1 of replays" in found.detail and "case" not in found.detail
+
+    asyncio.run(start())
+    for name in ("liver/1", "case-1", "case-2", "0123456789abcdef"):
+        assert name in caplog.text
+    assert [each.event for each in events._waiting] == ["files.missing"]
+    (family,) = archive.files.collect()
+    assert {each.labels["kind"]: each.value for each in family.samples} == {"model": 1, "recording": 2, "replay": 1}
+
+    for folder in ("recordings", "replays"):  # the files are back
+        shutil.rmtree(data / folder)
+        shutil.move(tmp_path / folder, data / folder)
+    assert archive.recordings.recover() == ["case-2"]
+    assert archive.recordings.get("case-1").state is State.READY and archive.recordings.get("case-1").reason is None
+    archive.files._looked_s = None
+    assert [str(each) for each in archive.files.missing()] == ["model liver/1"]
+    archive.recordings.close()
+    archive.replays._store.close()
+
+
+def test_a_damaged_database_is_not_backed_up_as_if_it_were_well(service, tmp_path):
+    service.close()
+    path = tmp_path / "data" / "registry" / "registry.sqlite"
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    connection.close()
+    content = bytearray(path.read_bytes())
+    content[5000:9000] = bytes(range(250)) * 16
+    path.write_bytes(content)
+    with pytest.raises(BackupFailed):
+        make_backup(service.settings, tmp_path / "backup")
+    assert not (tmp_path / "backup").exists()
