@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 from pydantic import ValidationError
 from starlette.websockets import WebSocketDisconnect
@@ -66,3 +68,36 @@ def test_a_page_of_another_name_gets_nothing(new_plane):
         pass
     assert closed.value.code == 1008
     assert 'refused_total{reason="host"}' in plane.ask("GET", "/metrics", headers={"Host": "localhost"}).text
+
+
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+@pytest.mark.parametrize(
+    ("hosts", "taken"),
+    [
+        ([b"localhost"], True),
+        ([], True),
+        ([b"localhost", b"localhost"], False),
+        ([b"localhost", b"evil.example"], False),
+        ([b"evil.example", b"localhost"], False),
+        ([b"127.0.0.1", b"127.0.0.1"], False),
+        ([b"LOCALHOST", b"localhost", b"localhost"], False),
+    ],
+)
+def test_a_request_has_one_host(plane, kind, hosts, taken):
+    """A server before this one may have looked at the other of the two."""
+    reached, sent = [], []
+
+    async def app(scope, receive, send):
+        reached.append(scope)
+
+    async def receive():
+        return {"type": "websocket.connect"}
+
+    async def send(message):
+        sent.append(message)
+
+    scope = {"type": kind, "headers": [(b"host", host) for host in hosts], "app": plane.app, "state": {}}
+    asyncio.run(KnownHosts(app, ServerSettings(), Measures())(scope, receive, send))
+    assert bool(reached) == taken
+    if not taken:
+        assert sent[0].get("status") == 421 or sent[0] == {"type": "websocket.close", "code": 1008}

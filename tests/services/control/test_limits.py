@@ -31,6 +31,17 @@ def test_buckets_are_bounded():
     assert len(buckets._buckets) == MOST_BUCKETS
 
 
+def test_the_bucket_that_leaves_is_of_whom_nothing_was_heard_for_longest():
+    buckets = TokenBuckets(1.0, 1.0, clock=lambda: 0.0)
+    for number in range(MOST_BUCKETS):
+        assert buckets.wait_s(f"{number}") == 0
+    assert buckets.wait_s("0") > 0, "heard again: now 1 is the oldest"
+    assert buckets.wait_s("new") == 0
+    for known in ("new", "0", "2", f"{MOST_BUCKETS - 1}"):
+        assert buckets.wait_s(known) > 0, f"{known} keeps its bucket, which is empty"
+    assert buckets.wait_s("1") == 0, "it was forgotten"
+
+
 @pytest.mark.parametrize(
     ("client", "network"),
     [
