@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import typer
@@ -12,6 +15,7 @@ import typer
 from gsplat_core.errors import UserError
 from services.audit import AuditInUse, AuditLog, AuditUnwritable, Keeping
 from services.cli.exit_codes import OK
+from services.cli.tables import KEY_COLUMNS, table
 from services.control.app import AUDIT_FILE, KEYS_FILE
 from services.control.auth.key_changes import append_key_change
 from services.control.auth.keys import ApiKey, KeyConflict, KeyStore
@@ -26,31 +30,59 @@ class KeyRefused(UserError):
 
 def keys_list_command(config: Path | None, data: Path | None, *, as_json: bool) -> int:
     """Print every key."""
-    keys = _store(config, data).all()
+    store = _store(config, data)
+    used = store.last_used()
+    rows = [
+        {
+            **{name: value for name, value in asdict(key).items() if name != "sha256"},
+            "last_used_at": used.get(key.id),
+            "expired": key.has_expired(),
+        }
+        for key in store.all()
+    ]
     if as_json:
-        shown = [{name: value for name, value in asdict(key).items() if name != "sha256"} for key in keys]
-        typer.echo(json.dumps(shown, indent=2))
+        typer.echo(json.dumps(rows, indent=2))
         return OK
-    for key in keys:
-        typer.echo(f"{key.id}  {key.role:8}  {key.created_at}  {key.name}")
+    for line in table(KEY_COLUMNS, rows):
+        typer.echo(line)
     return OK
 
 
-def keys_add_command(config: Path | None, data: Path | None, name: str, role: str) -> int:
+def keys_add_command(
+    config: Path | None, data: Path | None, name: str, role: str, expires_days: float | None, streams: Sequence[str]
+) -> int:
     """Make a key and print it, once, to standard output."""
-    import re
-
-    if not re.match(NAME_PATTERN, name):
-        raise KeyRefused(f"{name!r:.60} is no name of a key; use a-z, 0-9 and -, at most 40 of them")
+    _check_name(name, "a key")
+    for stream in streams:
+        _check_name(stream, "a stream")
     if role not in (Role.VIEWER, Role.OPERATOR, Role.ADMIN):
         raise KeyRefused(f"the role is {role!r:.60}; choose viewer, operator or admin")
     try:
-        key, token = _store(config, data).create(name, Role(role))
+        key, token = _store(config, data).create(
+            name, Role(role), expires_at=expiry_in(expires_days), streams=list(streams) or None
+        )
     except KeyConflict as error:
         raise KeyRefused(str(error)) from error
     _audited(config, data, "key.create", key)
     typer.echo(token)
     return OK
+
+
+def expiry_in(days: float | None) -> datetime | None:
+    """Return the moment in so many days; None for None. Raises KeyRefused for a number of days that no calendar has."""
+    if days is None:
+        return None
+    try:
+        if not days > 0:
+            raise ValueError
+        return datetime.now(UTC) + timedelta(days=days)
+    except (ValueError, OverflowError) as error:
+        raise KeyRefused(f"a key cannot expire in {days:g} days; give a number above 0, such as 90") from error
+
+
+def _check_name(name: str, of: str) -> None:
+    if not re.fullmatch(NAME_PATTERN, name):
+        raise KeyRefused(f"{name!r:.60} is no name of {of}; use a-z, 0-9 and -, at most 40 of them")
 
 
 def keys_revoke_command(config: Path | None, data: Path | None, key_id: str) -> int:

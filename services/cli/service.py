@@ -127,13 +127,20 @@ def keys_list(config: ConfigOption = None, data: DataOption = None, json: JsonOp
 def keys_add(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Who it is for, not a person.", show_default=False)],
     role: Annotated[str, typer.Option(help="viewer, operator or admin.")] = "viewer",
+    expires_days: Annotated[
+        float | None, typer.Option(help="Refused after so many days.", show_default="valid until it is revoked")
+    ] = None,
+    stream: Annotated[
+        list[str] | None,
+        typer.Option("--stream", metavar="<name>", help="Limit it to this stream; more than once for several."),
+    ] = None,
     config: ConfigOption = None,
     data: DataOption = None,
 ) -> int:
     """Make a key and print it; it is not kept and not shown again. A running server takes it at once."""
     from services.cli.keys import keys_add_command
 
-    return keys_add_command(config, data, name, role)
+    return keys_add_command(config, data, name, role, expires_days, stream or ())
 
 
 @keys.command("revoke")

@@ -20,6 +20,9 @@ JSON = "application/json"
 MOST_TOKEN_LENGTH = 256
 BodyLimit = Literal["body_bytes", "model_bytes", "recording_bytes"]
 """Which limit of the settings bounds a body."""
+Scope = Literal["all", "stream", "any"]
+"""What a key that is limited to streams may ask of a route. `all`: nothing. `stream`: what the path parameter `name` allows, which is a stream.
+`any`: everything, for the route itself looks at `Caller.streams`."""
 Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 
 
@@ -33,6 +36,7 @@ class Rule:
     takes: str | None = None
     """Content type of the body; JSON where the route declares a body."""
     most: BodyLimit = "body_bytes"
+    scope: Scope = "all"
 
 
 def requires(
@@ -41,9 +45,10 @@ def requires(
     ticket: bool = False,
     takes: str | None = None,
     most: BodyLimit = "body_bytes",
+    scope: Scope = "all",
 ) -> Callable[[Endpoint], Endpoint]:
     """Declare what a route asks for. It stands between the route's decorator and its function."""
-    rule = Rule(Role(role), ticket, takes, most)
+    rule = Rule(Role(role), ticket, takes, most, scope)
 
     def declare(endpoint: Endpoint) -> Endpoint:
         endpoint.__rule__ = rule  # type: ignore[attr-defined]
@@ -108,6 +113,11 @@ async def _caller_of(connection: HTTPConnection) -> Caller:
 CallerOf = Annotated[Caller, Depends(_caller_of)]
 
 
+def still_valid(control: ControlState, caller: Caller) -> bool:
+    """Return False once the caller's key was revoked or has expired. For connections that outlast their admission, such as displays."""
+    return caller.federated or not control.keys.is_revoked(caller.key_id)
+
+
 async def _admit(connection: HTTPConnection, rule: Rule, control: ControlState) -> Caller:
     if rule.role is Role.PUBLIC:
         return ANYBODY
@@ -123,7 +133,19 @@ async def _admit(connection: HTTPConnection, rule: Rule, control: ControlState) 
     if not caller.role.may(rule.role):
         control.measures.refused.labels("role").inc()
         raise Forbidden(f"this needs the role {rule.role}; the key {caller.name} has the role {caller.role}")
+    if caller.streams is not None:
+        _check_scope(connection, rule, caller)
     return caller
+
+
+def _check_scope(connection: HTTPConnection, rule: Rule, caller: Caller) -> None:
+    """Raise Forbidden where a key that is limited to streams asks for anything else. The answer does not tell whether a stream exists."""
+    if rule.scope == "any" or (rule.scope == "stream" and caller.may_use(str(connection.path_params["name"]))):
+        return
+    control_of(connection).measures.refused.labels("stream scope").inc()
+    raise Forbidden(
+        f"the key {caller.name} is limited to the streams {', '.join(sorted(caller.streams or ())):.400}; use a key for more"
+    )
 
 
 async def _authenticated(connection: HTTPConnection, rule: Rule, control: ControlState) -> Caller:
@@ -133,7 +155,7 @@ async def _authenticated(connection: HTTPConnection, rule: Rule, control: Contro
         raise Unauthenticated("more than one key or ticket was sent; send one")
     if tickets:
         caller = control.tickets.use(tickets[0][:MOST_TOKEN_LENGTH], connection.url.path)
-        if caller is None or (not caller.federated and control.keys.is_revoked(caller.key_id)):
+        if caller is None or not still_valid(control, caller):
             raise Unauthenticated(
                 "the ticket is unknown, used, too old or for another path; get one from POST /v1/tickets"
             )
@@ -143,10 +165,16 @@ async def _authenticated(connection: HTTPConnection, rule: Rule, control: Contro
         raise Unauthenticated("send an API key as `Authorization: Bearer KEY`")
     if control.persons is not None and token.count(".") == 2:  # a signed token's three parts; no API key has them
         return await control.persons.caller_of(token.strip())
-    key = control.keys.find(token.strip()) if len(token) <= MOST_TOKEN_LENGTH else None
+    token = token.strip()
+    known = len(token) <= MOST_TOKEN_LENGTH
+    key = control.keys.find(token) if known else None
     if key is None:
+        expired = control.keys.expired(token) if known else None
+        if expired is not None:
+            raise Unauthenticated(f"the API key {expired.name} has expired at {expired.expires_at}; get a new one")
         raise Unauthenticated("the API key is not known here; it may have been revoked")
-    return Caller(key.name, key.id, key.role)
+    control.keys.note_use(key.id)
+    return Caller(key.name, key.id, key.role, streams=None if key.streams is None else frozenset(key.streams))
 
 
 def _check_content_type(request: Request, takes: str) -> None:

@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from services.audit import AuditLog, AuditUnwritable
+from services.audit.entries import Detail
 from services.control.auth.keys import ApiKey, KeyStore
 
 log = logging.getLogger(__name__)
@@ -19,8 +20,21 @@ AGAIN_S = 2.0
 
 def append_key_change(audit: AuditLog, event: str, key: ApiKey) -> None:
     """Write the entry. Raises AuditUnwritable."""
-    subject, detail = (key.name, {"key_id": key.id}) if event == "key.create" else (key.id, {"name": key.name})
+    if event == "key.create":
+        subject, detail = key.name, {"key_id": key.id, **limits_of(key)}
+    else:
+        subject, detail = key.id, {"name": key.name}
     audit.append(event, actor=SHELL, subject=subject, detail={"role": str(key.role), **detail})
+
+
+def limits_of(key: ApiKey) -> Detail:
+    """Return the expiry and the streams of a key for the audit log; nothing where it has none."""
+    found: Detail = {}
+    if key.expires_at is not None:
+        found["expires_at"] = key.expires_at
+    if key.streams is not None:  # an entry's values are short: the first names, and how many there are
+        found["streams"] = f"{len(key.streams)}: {' '.join(key.streams)}"[:400]
+    return found
 
 
 def changed_outside(audit: AuditLog, event: str, key: ApiKey) -> None:
@@ -33,14 +47,15 @@ def changed_outside(audit: AuditLog, event: str, key: ApiKey) -> None:
 
 @asynccontextmanager
 async def keys_read_again(keys: KeyStore) -> AsyncIterator[None]:
-    """While the block lasts, and once more at its end, look whether the keys were changed: a request would see it, but none may come."""
+    """While the block lasts, and once more at its end, look for changes of the keys, for no request may come to see them; and write the times of
+    last use."""
     looking = asyncio.create_task(_look(keys), name="changes of keys")
     try:
         yield
     finally:
         looking.cancel()
         await asyncio.gather(looking, return_exceptions=True)
-        await asyncio.to_thread(_look_once, keys)
+        await asyncio.to_thread(_look_once, keys, ends=True)
 
 
 async def _look(keys: KeyStore) -> None:
@@ -49,8 +64,9 @@ async def _look(keys: KeyStore) -> None:
         await asyncio.to_thread(_look_once, keys)
 
 
-def _look_once(keys: KeyStore) -> None:
+def _look_once(keys: KeyStore, *, ends: bool = False) -> None:
     try:
         keys.all()
+        keys.save_used(now=ends)
     except (OSError, ValueError, TypeError, KeyError) as error:  # requests get an error until it can be read again
         log.error("the file of the API keys cannot be read: %s", error)

@@ -1,4 +1,8 @@
-"""API keys. Only their digests are kept: a key is 256 random bits, so that one SHA-256 is as good as a slow hash is for a password."""
+"""API keys. Only their digests are kept: a key is 256 random bits, so that one SHA-256 is as good as a slow hash is for a password.
+
+`keys.json` changes only when a key is made or revoked. When each key was last used is in `keys.used.json`, which the server
+writes once a minute at most: losing that file loses no key.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +10,32 @@ import fcntl
 import hashlib
 import hmac
 import json
+import logging
 import os
 import re
 import secrets
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from gsplat_core.errors import UserError
 from gsplat_core.io.regular_files import read_regular
 from services.control.auth.roles import Role
 
+log = logging.getLogger(__name__)
 PREFIX = "intrasplat"
 MOST_LIVE = 2
-"""Of one name: the old key and the new one, while callers change over."""
+"""Valid keys of one name: the old key and the new one, while callers change over."""
 MOST_KEYS = 1000
+MOST_STREAMS = 100
+"""Streams that one key may be limited to."""
+SAVE_USED_S = 60.0
+"""Shortest time between two writes of the file of last uses."""
 _NOBODY = 64 * "0"
 _SHA256 = re.compile("[0-9a-f]{64}")
 MOST_BYTES = 1 << 24
@@ -41,13 +53,21 @@ class KeysUnreadable(UserError, ValueError):
 
 @dataclass(frozen=True)
 class ApiKey:
-    """What is kept of a key."""
+    """A key as it is kept: never its secret. Times are UTC in ISO 8601."""
 
     id: str
     name: str
     role: Role
     sha256: str
     created_at: str
+    expires_at: str | None = None
+    """Refused from this moment on; None: valid until it is revoked."""
+    streams: tuple[str, ...] | None = None
+    """Streams that the key is limited to; None: not limited."""
+
+    def has_expired(self, now: datetime | None = None) -> bool:
+        """Return True from `expires_at` on."""
+        return self.expires_at is not None and datetime.fromisoformat(self.expires_at) <= (now or datetime.now(UTC))
 
 
 class KeyStore:
@@ -59,6 +79,8 @@ class KeyStore:
         self._lock = threading.Lock()
         self._read: tuple[int, int, int] | None = None
         self._keys: dict[str, ApiKey] = {}
+        self._used: dict[str, str] | None = None
+        self._saved: tuple[float, dict[str, str]] = float("-inf"), {}
 
     def watch(self, on_change: Callable[[str, ApiKey], None]) -> None:
         """From now on, call `on_change` with `key.create` or `key.revoke` and the key for each change by another process, when it is seen."""
@@ -66,52 +88,145 @@ class KeyStore:
         self._on_change = on_change
 
     def find(self, token: str) -> ApiKey | None:
-        """The key that a token is; takes the same time for a wrong token as for an unknown one."""
+        """Return the valid key that a token is; None for an unknown, revoked or expired one. Takes equally long for each of them."""
+        key = self._match(token)
+        return None if key is None or key.has_expired() else key
+
+    def expired(self, token: str) -> ApiKey | None:
+        """Return the key that a token is if it has expired, so that its owner can be told when."""
+        key = self._match(token)
+        return key if key is not None and key.has_expired() else None
+
+    def is_revoked(self, key_id: str) -> bool:
+        """Return True if a key was revoked or has expired. Cheap: for looking again while a connection lasts."""
+        key = self._current().get(key_id)
+        return key is None or key.has_expired()
+
+    def all(self) -> list[ApiKey]:
+        """Return every key, expired ones too, the oldest first."""
+        return list(self._current().values())
+
+    def note_use(self, key_id: str) -> None:
+        """Remember that a key is used now. `save_used` brings it to the disk."""
+        self._uses()[key_id] = _now()
+
+    def last_used(self) -> Mapping[str, str]:
+        """Return when each key was last used, by its id, in UTC. A key that was never used is absent."""
+        if self._used is None:  # a process without a server reads what the server has written, which may be newer now
+            return _parse_used(self._used_path)
+        return dict(self._used)
+
+    def save_used(self, *, now: bool = False) -> None:
+        """Write the times of last use if they changed, once a minute at most. With `now`, whatever the time.
+
+        An error is logged and not raised: no request depends on this file.
+        """
+        saved_s, saved = self._saved
+        if self._used is None or not (now or time.monotonic() - saved_s >= SAVE_USED_S):
+            return
+        keys = self._current()
+        used = {key_id: at for key_id, at in dict(self._used).items() if key_id in keys}
+        if used == saved:
+            return
+        self._saved = time.monotonic(), used
+        try:
+            _write_json(self._used_path, used)
+        except OSError as error:
+            log.error("%s cannot be written: %s; the times of last use are lost at the end", self._used_path, error)
+
+    def create(
+        self, name: str, role: Role, *, expires_at: datetime | None = None, streams: Sequence[str] | None = None
+    ) -> tuple[ApiKey, str]:
+        """Make a key.
+
+        Args:
+            name: whom it is for; at most two valid keys share a name.
+            role: what it may do.
+            expires_at: from when on it is refused, with a time zone; None: never.
+            streams: names of the streams that it is limited to; None: not limited.
+
+        Returns:
+            The key, and its token, which is not kept and cannot be shown again.
+
+        Raises:
+            KeyConflict: where such a key cannot be.
+        """
+        token = f"{PREFIX}_{secrets.token_hex(4)}_{secrets.token_urlsafe(32)}"
+        return self.add(name, role, token, expires_at=expires_at, streams=streams), token
+
+    def add(
+        self,
+        name: str,
+        role: Role,
+        token: str,
+        *,
+        expires_at: datetime | None = None,
+        streams: Sequence[str] | None = None,
+    ) -> ApiKey:
+        """Keep the digest of a token as a key; the rest as for `create`."""
+        if role is Role.PUBLIC:
+            raise KeyConflict("no key has the role public; give viewer, operator or admin")
+        if expires_at is not None:
+            expires_at = expires_at.replace(microsecond=0)  # as it is kept
+            if expires_at.tzinfo is None or expires_at <= datetime.now(UTC):
+                raise KeyConflict(
+                    f"a key cannot expire at {expires_at.isoformat()}; give a time to come, with its zone"
+                )
+        if streams is not None and role is Role.ADMIN:
+            raise KeyConflict("an administrator's key is not limited to streams; take the role operator or viewer")
+        if streams is not None and not 0 < len(streams) <= MOST_STREAMS:
+            raise KeyConflict(
+                f"a key is limited to 1 to {MOST_STREAMS} streams, and not to {len(streams)}; leave them out for all"
+            )
+        prefix, key_id, secret = (*token.split("_", 2), "", "")[:3]
+        if prefix != PREFIX or len(key_id) < 8 or not key_id.isalnum() or len(secret) < 32:
+            raise KeyConflict(f"a key looks like {PREFIX}_ID_SECRET, its secret 32 characters at least")
+        with self._changing() as keys:
+            live = [key for key in keys.values() if key.name == name and not key.has_expired()]
+            if len(live) >= MOST_LIVE:
+                raise KeyConflict(f"{name} has {len(live)} keys; revoke one before making another")
+            if len(keys) >= MOST_KEYS:
+                raise KeyConflict(
+                    f"there are {len(keys)} keys, expired ones among them; revoke one before making another"
+                )
+            if any(key.role is not role for key in live):
+                raise KeyConflict(f"{name} has a key with the role {live[0].role}; take another name for another role")
+            if key_id in keys:
+                raise KeyConflict("there is a key with this number already; make another one")
+            keys[key_id] = ApiKey(
+                key_id, name, role, _digest(secret), _now(),
+                None if expires_at is None else expires_at.astimezone(UTC).isoformat(timespec="seconds"),
+                None if streams is None else tuple(sorted(set(streams))),
+            )  # fmt: skip
+            return keys[key_id]
+
+    def revoke(self, key_id: str) -> ApiKey:
+        """End a key at once. Raises KeyError for an unknown id, KeyConflict for the last administrator's key."""
+        with self._changing() as keys:
+            key = keys[key_id]
+            admins = [each for each in keys.values() if each.role is Role.ADMIN and not each.has_expired()]
+            if admins == [key]:
+                raise KeyConflict("this is the only administrator's key; make another one first")
+            return keys.pop(key_id)
+
+    def _match(self, token: str) -> ApiKey | None:
+        """Return the key that a token is, expired or not. An unknown token takes as long as a wrong secret."""
         prefix, _, rest = token.partition("_")
         key_id, _, secret = rest.partition("_")
         key = self._current().get(key_id)
         same = hmac.compare_digest(_digest(secret), key.sha256 if key is not None else _NOBODY)
         return key if same and key is not None and prefix == PREFIX else None
 
-    def is_revoked(self, key_id: str) -> bool:
-        """Whether a key that was there is no longer."""
-        return key_id not in self._current()
+    @property
+    def _used_path(self) -> Path:
+        return self._path.with_suffix(".used.json")
 
-    def all(self) -> list[ApiKey]:
-        """Every key, the oldest first."""
-        return list(self._current().values())
-
-    def create(self, name: str, role: Role) -> tuple[ApiKey, str]:
-        """A new key and its token, which is shown once. Raises KeyConflict where the name has two already."""
-        token = f"{PREFIX}_{secrets.token_hex(4)}_{secrets.token_urlsafe(32)}"
-        return self.add(name, role, token), token
-
-    def add(self, name: str, role: Role, token: str) -> ApiKey:
-        """Keep the digest of a token as a key."""
-        if role is Role.PUBLIC:
-            raise KeyConflict("no key has the role public; give viewer, operator or admin")
-        prefix, key_id, secret = (*token.split("_", 2), "", "")[:3]
-        if prefix != PREFIX or len(key_id) < 8 or not key_id.isalnum() or len(secret) < 32:
-            raise KeyConflict(f"a key looks like {PREFIX}_ID_SECRET, its secret 32 characters at least")
-        with self._changing() as keys:
-            live = [key for key in keys.values() if key.name == name]
-            if len(live) >= MOST_LIVE or len(keys) >= MOST_KEYS:
-                raise KeyConflict(f"{name} has {len(live)} keys; revoke one before making another")
-            if any(key.role is not role for key in live):
-                raise KeyConflict(f"{name} has a key with the role {live[0].role}; take another name for another role")
-            if key_id in keys:
-                raise KeyConflict("there is a key with this number already; make another one")
-            keys[key_id] = ApiKey(key_id, name, role, _digest(secret), datetime.now(UTC).isoformat(timespec="seconds"))
-            return keys[key_id]
-
-    def revoke(self, key_id: str) -> ApiKey:
-        """End a key at once. Raises KeyError for one that is not there, KeyConflict for the last administrator's."""
-        with self._changing() as keys:
-            key = keys[key_id]
-            admins = [each for each in keys.values() if each.role is Role.ADMIN]
-            if admins == [key]:
-                raise KeyConflict("this is the only administrator's key; make another one first")
-            return keys.pop(key_id)
+    def _uses(self) -> dict[str, str]:
+        """The last uses in memory, read from the file at the first one."""
+        if self._used is None:
+            self._used = _parse_used(self._used_path)
+            self._saved = self._saved[0], dict(self._used)
+        return self._used
 
     def _current(self) -> dict[str, ApiKey]:
         with self._lock:
@@ -177,6 +292,10 @@ def first_admin_key(store: KeyStore, file: Path) -> bool:
     return True
 
 
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
 def _digest(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
 
@@ -199,16 +318,43 @@ def _read_keys(path: Path) -> dict[str, ApiKey]:
 
 
 def _parse(path: Path) -> dict[str, ApiKey]:
-    keys = [
-        ApiKey(**{**each, "role": Role(each["role"])}) for each in json.loads(read_regular(path, MOST_BYTES))["keys"]
-    ]
+    keys = [_key_of(each) for each in json.loads(read_regular(path, MOST_BYTES))["keys"]]
     return {key.id: key for key in keys}
 
 
+def _key_of(values: Mapping[str, Any]) -> ApiKey:
+    """Return a key from the file. Files of versions without expiry and streams lack these. An unknown field is refused: it may restrict."""
+    streams = values.get("streams")
+    key = ApiKey(
+        **{**values, "role": Role(values["role"]), "streams": None if streams is None else tuple(map(str, streams))}
+    )
+    if key.expires_at is not None and datetime.fromisoformat(key.expires_at).tzinfo is None:
+        raise ValueError(f"the key {key.id} expires at {key.expires_at}, which has no time zone")
+    return key
+
+
+def _parse_used(path: Path) -> dict[str, str]:
+    """Return the times of last use; none where the file is missing or damaged, for it is written anew."""
+    if not path.is_file():
+        return {}
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        log.error("%s cannot be read: %s; it is begun anew", path, error)
+        return {}
+    return {str(key): str(at) for key, at in found.items()} if isinstance(found, dict) else {}
+
+
 def _write(path: Path, keys: dict[str, ApiKey]) -> None:
+    """Write the keys. Fields that are not set are left out, so that an older version reads a file without them."""
+    values = [{name: value for name, value in asdict(key).items() if value is not None} for key in keys.values()]
+    _write_json(path, {"keys": values})
+
+
+def _write_json(path: Path, values: object) -> None:
     unfinished = path.with_suffix(".new")
     with open(unfinished, "w", opener=_private) as file:
-        json.dump({"keys": [asdict(key) for key in keys.values()]}, file, indent=1)
+        json.dump(values, file, indent=1)
         file.flush()
         os.fsync(file.fileno())
     os.replace(unfinished, path)

@@ -29,6 +29,12 @@ class Caller:
     role: Role
     federated: bool = False
     """A person of an OpenID Connect issuer: `key_id` is no key's number."""
+    streams: frozenset[str] | None = None
+    """Streams that the key is limited to; None: not limited."""
+
+    def may_use(self, stream: str) -> bool:
+        """Return True for a stream within the key's limits, whether there is such a stream or not."""
+        return self.streams is None or stream in self.streams
 
     def __str__(self) -> str:
         return f"{self.name} ({self.key_id})" if self.key_id else self.name

@@ -34,7 +34,7 @@ CLOSE_S = 1.0
 
 
 @router.websocket("/streams/{name}/display")
-@requires("viewer", ticket=True)
+@requires("viewer", ticket=True, scope="stream")
 async def display(
     socket: WebSocket,
     caller: CallerOf,
@@ -69,7 +69,7 @@ async def _left(socket: WebSocket) -> None:
         409: problem_answer("The stream is stopped."),
     },
 )
-@requires("viewer", ticket=True)
+@requires("viewer", ticket=True, scope="stream")
 async def mjpeg(
     request: Request, caller: CallerOf, name: ResourceName, kind: Kind = "shown", quality: Quality = 75
 ) -> Response:

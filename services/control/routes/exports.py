@@ -75,7 +75,7 @@ async def export_model(
 
 
 @router.get("/streams/{name}/snapshots/{number}/exports/{format}", response_class=Response, responses=ANSWER)
-@requires("operator")
+@requires("operator", scope="stream")
 async def export_snapshot(
     request: Request,
     caller: CallerOf,

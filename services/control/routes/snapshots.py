@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import Request
 
 from services.control.auth.guard import CallerOf, new_router, requires
+from services.control.problems import Forbidden
 from services.control.recorded import recorded
 from services.control.repeated import IdempotencyKey
 from services.control.routes.models import VersionView, registry_of
@@ -59,7 +60,7 @@ def snapshots_of(request: Request) -> Snapshots:
 
 
 @router.post("/streams/{name}/snapshots", status_code=201)
-@requires("operator")
+@requires("operator", scope="stream")
 async def take_snapshot(
     request: Request,
     response: Response,
@@ -81,6 +82,8 @@ async def take_snapshot(
             view = view.model_copy(update={"id": None, "version": VersionView.model_validate(version)})
         return view
 
+    if wanted.model is not None and caller.streams is not None:
+        raise Forbidden(f"the key {caller.name} is limited to streams; keep the snapshot as a file, without `model`")
     await streams_of(request).get(name)
     asked = f"snapshot {name} {wanted.model}"
     view: SnapshotView = await control_of(request).repeated.once(caller.key_id, idempotency_key, asked, take)
@@ -92,7 +95,7 @@ async def take_snapshot(
 
 
 @router.get("/streams/{name}/snapshots")
-@requires("viewer")
+@requires("viewer", scope="stream")
 async def snapshots(request: Request, name: ResourceName) -> list[SnapshotView]:
     """The snapshots of a stream that are kept, the newest first; they outlast the stream."""
     found = await asyncio.to_thread(snapshots_of(request).all, name)
@@ -100,14 +103,14 @@ async def snapshots(request: Request, name: ResourceName) -> list[SnapshotView]:
 
 
 @router.get("/streams/{name}/snapshots/{number}")
-@requires("viewer")
+@requires("viewer", scope="stream")
 async def snapshot(request: Request, name: ResourceName, number: SnapshotId) -> SnapshotView:
     """One snapshot."""
     return SnapshotView.model_validate(await asyncio.to_thread(snapshots_of(request).get, name, number))
 
 
 @router.delete("/streams/{name}/snapshots/{number}", status_code=204)
-@requires("admin")
+@requires("admin", scope="stream")
 async def delete_snapshot(request: Request, caller: CallerOf, name: ResourceName, number: SnapshotId) -> None:
     """Delete a snapshot."""
     found = snapshots_of(request)

@@ -10,6 +10,7 @@ from starlette.requests import Request
 
 from services.control.auth.guard import CallerOf, new_router, requires
 from services.control.parts import NewStream, Streams, StreamState
+from services.control.problems import Forbidden
 from services.control.recorded import recorded
 from services.control.sources import check_source
 from services.control.state import control_of, part
@@ -74,17 +75,19 @@ def streams_of(request: Request) -> Streams:
 
 
 @router.get("/streams")
-@requires("viewer")
-async def streams(request: Request) -> list[StreamView]:
-    """Every stream."""
-    return [_view(stream) for stream in await streams_of(request).all()]
+@requires("viewer", scope="any")
+async def streams(request: Request, caller: CallerOf) -> list[StreamView]:
+    """Every stream that the key is not kept from."""
+    return [_view(stream) for stream in await streams_of(request).all() if caller.may_use(stream.name)]
 
 
 @router.post("/streams", status_code=201)
-@requires("operator")
+@requires("operator", scope="any")
 async def create_stream(request: Request, caller: CallerOf, wanted: StreamWanted) -> StreamView:
     """Make a stream. Its source must be one that the settings allow (`sources`)."""
     found = streams_of(request)
+    if not caller.may_use(wanted.name):
+        raise Forbidden(f"the key {caller.name} is limited to other streams; make {wanted.name} with another key")
     detail = {"scheme": wanted.source.partition(":")[0][:20] if wanted.source.isascii() else "", "show": wanted.show}
     async with recorded(request, caller, "stream.create", wanted.name, {**detail}):
         check_source(wanted.source, control_of(request).settings.sources)
@@ -96,14 +99,14 @@ async def create_stream(request: Request, caller: CallerOf, wanted: StreamWanted
 
 
 @router.get("/streams/{name}")
-@requires("viewer")
+@requires("viewer", scope="stream")
 async def stream(request: Request, name: ResourceName) -> StreamView:
     """One stream, with its state and its processes."""
     return _view(await streams_of(request).get(name))
 
 
 @router.post("/streams/{name}/start")
-@requires("operator")
+@requires("operator", scope="stream")
 async def start_stream(request: Request, caller: CallerOf, name: ResourceName) -> StreamView:
     """Start a stream; one that runs goes on."""
     found = streams_of(request)
@@ -112,7 +115,7 @@ async def start_stream(request: Request, caller: CallerOf, name: ResourceName) -
 
 
 @router.post("/streams/{name}/stop")
-@requires("operator")
+@requires("operator", scope="stream")
 async def stop_stream(request: Request, caller: CallerOf, name: ResourceName) -> StreamView:
     """Stop a stream, its raw picture too."""
     found = streams_of(request)
@@ -121,7 +124,7 @@ async def stop_stream(request: Request, caller: CallerOf, name: ResourceName) ->
 
 
 @router.patch("/streams/{name}/options")
-@requires("operator")
+@requires("operator", scope="stream")
 async def set_stream_options(
     request: Request, caller: CallerOf, name: ResourceName, wanted: StreamOptions
 ) -> StreamView:
@@ -132,7 +135,7 @@ async def set_stream_options(
 
 
 @router.delete("/streams/{name}", status_code=204)
-@requires("admin")
+@requires("admin", scope="stream")
 async def delete_stream(request: Request, caller: CallerOf, name: ResourceName) -> None:
     """Stop a stream and forget it."""
     found = streams_of(request)

@@ -30,7 +30,7 @@ class Ticket(BaseModel):
 
 
 @router.post("/tickets", status_code=201)
-@requires("viewer")
+@requires("viewer", scope="any")
 async def give_ticket(request: Request, caller: CallerOf, wanted: TicketFor) -> Ticket:
     """Get a ticket with the role of this key; give it as `?ticket=…`."""
     tickets = control_of(request).tickets

@@ -26,7 +26,7 @@ class Version(BaseModel):
 
 
 @router.get("/version")
-@requires("viewer")
+@requires("viewer", scope="any")
 async def version(request: Request) -> Version:
     """Version of the server and of what it stands on."""
     parts = control_of(request).parts

@@ -24,7 +24,7 @@ class VirtualCamera(BaseModel):
 
 
 @router.put("/streams/{name}/camera")
-@requires("viewer")
+@requires("viewer", scope="stream")
 async def turn_virtual_camera(request: Request, name: ResourceName, wanted: VirtualCamera) -> VirtualCamera:
     """Turn the stream's virtual camera. There is one for all who watch, and the last one to turn it wins. It changes nothing else, and is not
     in the audit log. 409 where the stream is stopped or just starting."""

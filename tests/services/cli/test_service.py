@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from datetime import UTC, datetime, timedelta
 from functools import partial
 
 import pytest
@@ -68,9 +69,37 @@ def test_a_server_that_runs_writes_what_a_shell_changes(tmp_path, capsys):
     assert entry.detail["key_id"] in capsys.readouterr().out
 
 
+def test_a_key_with_limits(tmp_path, capsys):
+    data = ["--data", str(tmp_path)]
+    assert run(["keys", "add", "boss", "--role", "admin", *data]) == OK
+    assert run(["keys", "add", "wall", "--expires-days", "1.5", "--stream", "b", "--stream", "a", *data]) == OK
+    capsys.readouterr()
+    assert run(["keys", "list", "--json", *data]) == OK
+    boss, wall = json.loads(capsys.readouterr().out)
+    assert wall["streams"] == ["a", "b"] and boss["streams"] is None and boss["expires_at"] is None
+    left_s = datetime.fromisoformat(wall["expires_at"]) - datetime.now(UTC)
+    assert timedelta(days=1.4) < left_s < timedelta(days=1.6)
+    assert (wall["expired"], wall["last_used_at"]) == (False, None)
+    KeyStore(tmp_path / "keys.json").note_use(wall["id"])
+    assert run(["keys", "list", *data]) == OK
+    headings, *lines = capsys.readouterr().out.splitlines()
+    assert headings.split() == ["ID", "ROLE", "CREATED", "EXPIRES", "EXPIRED", "LAST", "USED", "STREAMS", "NAME"]
+    assert [line.index(name) for line, name in zip(lines, ("boss", "wall"), strict=True)] == 2 * [
+        headings.index("NAME")
+    ]
+    assert "a, b" in lines[1] and "never" in lines[0]
+
+
+@pytest.mark.parametrize("days", ["0", "-1", "nan", "inf", "1e300", "1e-9"])
+def test_a_key_cannot_expire_then(tmp_path, capsys, days):
+    assert run(["keys", "add", "wall", "--expires-days", days, "--data", str(tmp_path)]) == BAD_INPUT
+    assert "cannot expire" in capsys.readouterr().err
+    assert KeyStore(tmp_path / "keys.json").all() == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [(["Console"], "is no name of a key"), (["a/b"], "is no name of a key"), (["console", "--role", "public"], "choose viewer")],
+    [(["Console"], "is no name of a key"), (["wall", "--stream", "a/b"], "is no name of a stream"), (["a/b"], "is no name of a key"), (["console", "--role", "public"], "choose viewer")],
 )  # fmt: skip
 def test_refused_keys(tmp_path, capsys, arguments, said):
     assert run(["keys", "add", *arguments, "--data", str(tmp_path)]) == BAD_INPUT
