@@ -8,6 +8,7 @@ AuditError
 from services.audit.entries import Entry
 from services.audit.errors import AuditError, AuditInUse, AuditUnwritable
 from services.audit.log import AuditLog
+from services.audit.pages import ExportFormat, Wanted
 from services.audit.segments import Keeping
 from services.audit.verify import Finding, Verdict, verify
 
@@ -17,8 +18,10 @@ __all__ = [
     "AuditLog",
     "AuditUnwritable",
     "Entry",
+    "ExportFormat",
     "Finding",
     "Keeping",
     "Verdict",
+    "Wanted",
     "verify",
 ]

@@ -22,7 +22,7 @@ from services.audit.entries import MOST_LINE_BYTES, Detail, Entry, Outcome, dige
 from services.audit.errors import AuditInUse, AuditUnwritable
 from services.audit.head import Head, anchor_path, head_path, read_anchor, read_head, write_anchor, write_head
 from services.audit.lines import lines_backwards, whole_lines_bytes
-from services.audit.pages import newest
+from services.audit.pages import ExportFormat, Page, Wanted, exported, newest, search
 from services.audit.segments import Keeping, all_segments, closed_segments, segment_path, sync_folder, too_old
 
 log = logging.getLogger(__name__)
@@ -74,6 +74,14 @@ class AuditLog:
     def newest(self, count: int, before: int | None = None) -> list[Entry]:
         """Up to `count` entries, the newest first; those before number `before`."""
         return newest(self.path, count, before)
+
+    def search(self, wanted: Wanted, count: int, before: int | None = None) -> Page:
+        """Return up to `count` wanted entries, the newest first; those before number `before`."""
+        return search(self.path, wanted, count, before)
+
+    def exported(self, wanted: Wanted, form: ExportFormat) -> Iterator[bytes]:
+        """Yield the wanted entries as a file, the oldest first; see `services.audit.pages.exported`."""
+        return exported(self.path, wanted, form)
 
     @property
     def head(self) -> Head:

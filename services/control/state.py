@@ -54,6 +54,8 @@ class ControlState:
     """Set when the server is asked to end: what has no end of its own then ends."""
     repeated: Repeated = field(default_factory=Repeated)
     """Answers to requests that may be sent again."""
+    audit_reads: TokenBuckets = field(default_factory=lambda: TokenBuckets(1 / 60, 1))
+    """Readings of the audit log that are entries: the first of each key and filter in a minute."""
     tasks: set[asyncio.Task[None]] = field(default_factory=set)
     """What goes on after its request was answered."""
 

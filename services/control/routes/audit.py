@@ -1,18 +1,27 @@
-"""The audit log, read."""
+"""The audit log, read: its newest entries, a search, and a download."""
 
 from __future__ import annotations
 
 import asyncio
+from contextlib import AsyncExitStack
+from datetime import UTC, datetime
+from typing import Annotated, Any
 
-from fastapi import Query
-from pydantic import BaseModel, ConfigDict, Field
+from fastapi import Depends, Query
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 from starlette.requests import Request
+from starlette.responses import Response, StreamingResponse
 
+from services.audit import ExportFormat, Wanted
+from services.audit.entries import Outcome
 from services.control.auth.guard import CallerOf, new_router, requires
 from services.control.recorded import recorded
 from services.control.state import control_of
 
 router = new_router("audit")
+MEDIA_TYPES = {"csv": "text/csv; charset=utf-8", "jsonl": "application/jsonl"}
+Text = Annotated[str, Query(pattern=r"^[A-Za-z0-9_ .:@/+()-]{1,100}$")]
+"""As entries have it: what was looked for is an entry, too."""
 
 
 class EntryView(BaseModel):
@@ -20,7 +29,7 @@ class EntryView(BaseModel):
 
     model_config = ConfigDict(from_attributes=True)
     seq: int
-    at: str
+    at: str = Field(description="UTC.", examples=["2026-11-23T20:31:07.123+00:00"])
     event: str = Field(examples=["model.activate"])
     actor: str = Field(examples=["console (1f0c9a3b)"])
     role: str
@@ -36,21 +45,78 @@ class AuditPage(BaseModel):
     entries: list[EntryView]
     head_seq: int
     head_digest: str
-    next_before: int | None = Field(description="Give this as `before` for the next page; null on the last one.")
+    next_before: int | None = Field(
+        description="Give this as `before` for the next page; null on the last one. With a filter a page may have few entries, or none, and"
+        " be followed by another one: each reads a part of the log."
+    )
+
+
+def wanted_of(
+    event: Annotated[Text | None, Query(description="As `model.activate`, or `model` for all of its events.")] = None,
+    actor: Annotated[Text | None, Query(description="Part of the actor: the name or the number of a key.")] = None,
+    subject: Annotated[Text | None, Query(description="Part of the subject.")] = None,
+    outcome: Annotated[Outcome | None, Query()] = None,
+    since: Annotated[AwareDatetime | None, Query(description="From this moment on, with a time zone.")] = None,
+    until: Annotated[AwareDatetime | None, Query(description="Before this moment, with a time zone.")] = None,
+) -> Wanted:
+    """Return the entries to look for."""
+    return Wanted(event, actor, subject, outcome, since, until)
+
+
+WantedOf = Annotated[Wanted, Depends(wanted_of)]
 
 
 @router.get("/audit")
 @requires("admin")
 async def audit_entries(
-    request: Request, caller: CallerOf, count: int = Query(100, ge=1, le=500), before: int | None = Query(None, ge=0)
+    request: Request,
+    caller: CallerOf,
+    wanted: WantedOf,
+    count: int = Query(100, ge=1, le=500),
+    before: int | None = Query(None, ge=0),
 ) -> AuditPage:
-    """What was done, the newest first. That it was read is an entry, too."""
-    log = control_of(request).audit
-    async with recorded(request, caller, "audit.read", "audit"):
-        entries = await asyncio.to_thread(log.newest, count, before)
+    """What was done, the newest first. That it was read is an entry, too: one a minute for the same key and the same filter, so that a page that
+    follows the log does not fill it."""
+    control = control_of(request)
+    log = control.audit
+    async with AsyncExitStack() as entry:
+        if control.audit_reads.wait_s(f"{caller.key_id} {_said(wanted)}") == 0:
+            await entry.enter_async_context(recorded(request, caller, "audit.read", "audit", _said(wanted)))
+        page = await asyncio.to_thread(log.search, wanted, count, before)
     head = log.head
-    more = entries[-1].seq if entries and entries[-1].seq > 0 else None
     return AuditPage(
-        entries=[EntryView.model_validate(entry) for entry in entries],
-        head_seq=head.seq, head_digest=head.digest, next_before=more,
+        entries=[EntryView.model_validate(entry) for entry in page.entries],
+        head_seq=head.seq, head_digest=head.digest, next_before=page.before,
     )  # fmt: skip
+
+
+@router.get(
+    "/audit/export",
+    response_class=Response,
+    responses={
+        200: {"description": "The file.", "content": {kind.partition(";")[0]: {} for kind in MEDIA_TYPES.values()}}
+    },
+)
+@requires("admin")
+async def export_audit(
+    request: Request,
+    caller: CallerOf,
+    wanted: WantedOf,
+    format: Annotated[
+        ExportFormat, Query(description="`jsonl`: the lines as they were written, with their digests. `csv`: a table.")
+    ] = "jsonl",
+) -> Response:
+    """Download the log, or what a filter leaves of it, the oldest entry first. The download is an entry of it."""
+    log = control_of(request).audit
+    async with recorded(request, caller, "audit.export", "audit", {"format": format, **_said(wanted)}):
+        made = log.exported(wanted, format)
+    name = f"audit-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.{format}"
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return StreamingResponse(made, media_type=MEDIA_TYPES[format], headers=headers)
+
+
+def _said(wanted: Wanted) -> dict[str, Any]:
+    """Return a filter as the detail of an entry."""
+    times = {name: time.isoformat() for name in ("since", "until") if (time := getattr(wanted, name)) is not None}
+    names = ("event", "actor", "subject", "outcome")
+    return {name: value for name in names if (value := getattr(wanted, name)) is not None} | times

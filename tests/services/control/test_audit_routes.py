@@ -1,0 +1,141 @@
+"""The audit log over the API: searched, paged, downloaded; and what of that is an entry."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from services.audit import Wanted, pages, verify
+
+
+@pytest.fixture
+def kept(plane):
+    """A server whose log has 40 activations of two models and one key that was refused."""
+    audit = plane.control.audit
+    for number in range(40):
+        audit.append("model.activate", actor=f"console (1f{number % 2})", role="operator", subject=f"liver/{number}")
+    audit.append("model.rollback", actor="system", subject="liver", outcome="failed")
+    audit.append("key.revoke", actor="shell", subject="1f0", outcome="refused", detail={"error": "KeyConflict", "n": 3})
+    audit.append("modelling.start", actor="+cmd", subject="=1+1")
+    return plane
+
+
+def found(plane, **query):
+    answer = plane.ask("GET", "/v1/audit", params=query)
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+@pytest.mark.parametrize(
+    ("query", "events"),
+    [
+        ({"event": "key.revoke"}, {"key.revoke"}),
+        ({"event": "model"}, {"model.activate", "model.rollback"}),
+        ({"event": "model."}, {"model.activate", "model.rollback"}),
+        ({"event": "model.act"}, set()),
+        ({"outcome": "refused"}, {"key.revoke"}),
+        ({"outcome": "failed", "actor": "SYSTEM"}, {"model.rollback"}),
+        ({"actor": "1f1"}, {"model.activate"}),
+        ({"subject": "liver/3", "actor": "console (1f1)"}, {"model.activate"}),
+        ({"subject": "spleen"}, set()),
+    ],
+)
+def test_a_search_finds_what_fits_and_nothing_else(kept, query, events):
+    entries = [entry for entry in found(kept, count=500, **query)["entries"] if not entry["event"].startswith("audit.")]
+    assert {entry["event"] for entry in entries} == events
+    everything = found(kept, count=500)["entries"]
+    assert 0 <= len(entries) < len(everything)
+    assert all(entry in everything for entry in entries)
+
+
+def test_times_have_a_zone_and_bound_a_search(kept):
+    entries = found(kept, count=500, event="model.activate")["entries"]
+    assert all(datetime.fromisoformat(entry["at"]).tzinfo is not None for entry in entries)
+    at = datetime.fromisoformat(entries[20]["at"])
+    later = found(kept, count=500, event="model.activate", since=at.isoformat())["entries"]
+    earlier = found(kept, count=500, event="model.activate", until=at.isoformat())["entries"]
+    assert later + earlier == entries and entries[20] in later
+    zone = (at.astimezone(UTC) + timedelta(hours=2)).replace(tzinfo=None).isoformat() + "+02:00"
+    assert found(kept, count=500, event="model.activate", since=zone)["entries"] == later
+
+
+def test_pages_of_a_search_have_every_entry_once(kept, monkeypatch):
+    monkeypatch.setattr(pages, "MOST_LOOKED_AT", 7)
+    seen, before, asked = [], None, 0
+    while asked == 0 or before is not None:
+        page = found(kept, count=5, actor="1f1", **({} if before is None else {"before": before}))
+        seen += [entry["subject"] for entry in page["entries"]]
+        before, asked = page["next_before"], asked + 1
+    assert seen == [f"liver/{number}" for number in range(39, 0, -2)]
+    assert asked > 5, "each page looks at seven entries"
+
+
+@pytest.mark.parametrize(
+    "query",
+    [{"outcome": "well"}, {"since": "yesterday"}, {"since": "2026-01-01T00:00:00"}, {"actor": ""}, {"actor": "a\nb"}, {"subject": 101 * "a"}, {"event": "<b>"}],
+)  # fmt: skip
+def test_a_filter_that_makes_no_sense_is_refused(kept, query):
+    for path in ("/v1/audit", "/v1/audit/export"):
+        assert kept.ask("GET", path, params=query).status_code == 422
+
+
+def test_the_download_of_everything_can_be_verified(kept, tmp_path):
+    answer = kept.ask("GET", "/v1/audit/export")
+    assert 'filename="audit-' in answer.headers["content-disposition"]
+    assert answer.headers["content-type"].startswith("application/jsonl")
+    file = tmp_path / "copy.jsonl"
+    file.write_bytes(answer.content)
+    verdict = verify(file)
+    assert verdict.entries == kept.control.audit.head.seq + 1
+    assert verdict.head == kept.control.audit.head
+    (finding,) = verdict.findings  # of the chain nothing is wrong; a copy has no head beside it
+    assert "the head beside the log is missing" in finding.what
+    assert json.loads(answer.content.splitlines()[-1])["event"] == "audit.export"
+
+
+def test_a_table_for_spreadsheets_has_no_formulas(kept):
+    answer = kept.ask("GET", "/v1/audit/export", params={"format": "csv"})
+    assert answer.headers["content-type"] == "text/csv; charset=utf-8"
+    rows = list(csv.DictReader(io.StringIO(answer.text)))
+    assert [int(row["seq"]) for row in rows] == list(range(len(rows)))
+    assert not any(str(cell).startswith(("=", "+", "-", "@")) for row in rows for cell in row.values())
+    odd = next(row for row in rows if row["event"] == "modelling.start")
+    assert (odd["actor"], odd["subject"]) == ("'+cmd", "'=1+1")
+    refused = next(row for row in rows if row["outcome"] == "refused")
+    assert json.loads(refused["detail"]) == {"error": "KeyConflict", "n": 3}
+    one = kept.ask("GET", "/v1/audit/export", params={"format": "csv", "outcome": "refused"})
+    assert len(list(csv.DictReader(io.StringIO(one.text)))) == 1
+
+
+def test_a_download_reads_closed_files_and_those_that_are_removed_meanwhile(tmp_path):
+    from services.audit import AuditLog, Keeping
+
+    log = AuditLog(tmp_path / "audit.jsonl", Keeping(segment_bytes=2000))
+    for number in range(30):
+        log.append("model.activate", actor="console", subject=str(number))
+    assert len(list(tmp_path.glob("audit.0*.jsonl"))) > 3
+    pieces = log.exported(Wanted(subject="2"), "csv")
+    first = next(pieces)
+    assert first.startswith(b"seq,at,event")
+    lines = b"".join(pieces).splitlines()
+    assert [line.split(b",")[0] for line in lines] == [b"2", b"12", *(str(n).encode() for n in range(20, 30))]
+    log.close()
+
+
+def test_reading_is_an_entry_once_a_minute_and_each_download_is_one(plane):
+    for _ in range(5):
+        found(plane)
+    found(plane, outcome="refused")
+    for _ in range(2):
+        plane.ask("GET", "/v1/audit/export", params={"format": "csv"})
+    entries = [entry for entry in plane.control.audit.newest(50) if entry.event.startswith("audit.")]
+    assert [(entry.event, entry.detail) for entry in reversed(entries)] == [
+        ("audit.read", {}),
+        ("audit.read", {"outcome": "refused"}),
+        ("audit.export", {"format": "csv"}),
+        ("audit.export", {"format": "csv"}),
+    ]
