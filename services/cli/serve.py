@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import typer
@@ -13,7 +14,7 @@ from services.cli.exit_codes import OK
 from services.control.app import new_app
 from services.control.logs import log_to_stderr
 from services.control.probe import bind_probe
-from services.control.server import bind, serve
+from services.control.server import bind, certificate_of, serve
 from services.private_files import keep_files_private, make_state_private
 from services.server.parts import assembled
 from services.settings import ServiceSettings, SettingsInvalid, load_settings
@@ -30,9 +31,18 @@ def serve_command(
     log_to_stderr(settings.log)
     listener = bind(settings)  # before anything is made or started
     make_state_private(settings.data_dir, settings.uploaded_recordings.folder, settings.jobs.folder)
-    app = new_app(settings, assembled(settings))
+    parts = assembled(settings)
+    certificate = certificate_of(settings, parts.events)
+    if certificate is not None:
+        parts = replace(
+            parts,
+            background=[*parts.background, certificate.watched],
+            checks={**parts.checks, "certificate": certificate.check},
+            collectors=[*parts.collectors, certificate],
+        )
+    app = new_app(settings, parts)
     probes = bind_probe(settings)
-    serve(app, settings, listener, lambda address: _say(address, settings), probes)
+    serve(app, settings, listener, lambda address: _say(address, settings), certificate, probes)
     return OK
 
 

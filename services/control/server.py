@@ -15,11 +15,13 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from services.control.certificate import ServerCertificate
 from services.control.connections import AddressBound, BoundedListener
 from services.control.errors import CannotServe
 from services.control.heads import MOST_HEAD_BYTES
 from services.control.probe import ProbeListener
 from services.control.state import ControlState
+from services.control.system_events import SystemEvents
 from services.control.systemd import ServiceManager
 from services.settings import ServiceSettings
 
@@ -35,21 +37,29 @@ def serve(
     settings: ServiceSettings,
     listener: socket.socket,
     listening: Callable[[str], None],
+    certificate: ServerCertificate | None = None,
     probes: Sequence[socket.socket] = (),
 ) -> None:
-    """Serve until SIGTERM or SIGINT, then drain. `listening` is called with the server's address once it can be connected to.
+    """Serve until SIGTERM or SIGINT, then drain.
 
     Args:
-        listener: socket from `bind`.
+        app: the application.
+        settings: where and as what it is served.
+        listener: a socket that listens; see `bind`.
+        listening: called with the server's address once it can be connected to.
+        certificate: that of `certificate_of`, where the settings name one. New connections get its newest pair.
         probes: sockets from `bind_probe`.
 
-    Raises CannotServe for a certificate that cannot be read, and where the application does not start.
+    Raises:
+        CannotServe: for a certificate that cannot be read, and where the application does not start.
     """
     config = config_of(app, settings)
     try:
         config.load()
     except OSError as error:  # ssl.SSLError is one
         raise CannotServe(f"TLS: {error}; check server.certfile and server.keyfile") from error
+    if certificate is not None and config.ssl is not None:
+        certificate.attach(config.ssl)
     # uvicorn raises the signal that ended it again, for whoever handled it before: a server that has drained has done what it was asked to.
     signal.signal(signal.SIGTERM, _done)
     signal.signal(signal.SIGINT, _done)
@@ -62,6 +72,17 @@ def serve(
         server.run(sockets=[bounded])
     if not server.started:
         raise CannotServe("the server could not start; its log says why")
+
+
+def certificate_of(settings: ServiceSettings, events: SystemEvents) -> ServerCertificate | None:
+    """Load the certificate that the settings name; None where they name none. Raises CannotServe."""
+    if settings.server.certfile is None or settings.server.keyfile is None:
+        return None
+    try:
+        return ServerCertificate(settings.server.certfile, settings.server.keyfile, events)
+    except OSError as error:  # ssl.SSLError is one
+        said = error.strerror or error
+        raise CannotServe(f"TLS: {said}; check server.certfile and server.keyfile") from error
 
 
 def config_of(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:

@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from services.audit import AuditLog
+from services.control.certificate import ServerCertificate
 from services.control.measures import Measures
 from services.control.storage import Storage
 from services.control.system_events import SystemEvents
@@ -43,6 +44,9 @@ def served() -> dict[str, set[str]]:
         audit.close()
         files = StoredFilesWatch(Database("sqlite://"), StoredFiles(Path(folder), Path(folder), None), SystemEvents())
     measures = Measures([StreamMeasures(), Storage({}, audit), files])
+    certificate = object.__new__(ServerCertificate)  # of no files: only the names of its metrics are asked for
+    certificate._expires_s, certificate._failure = 0.0, None
+    measures.registry.register(certificate)
     found = dict(OF_PROMETHEUS)
     labels = {
         name: set(getattr(collector, "_labelnames", ()))

@@ -281,3 +281,27 @@ def test_tls(certificate, tmp_path):
             old.maximum_version = ssl.TLSVersion.TLSv1_1
         with pytest.raises((ssl.SSLError, OSError)), socket.create_connection(("127.0.0.1", port)) as client:
             old.wrap_socket(client)
+
+
+@pytest.mark.slow
+def test_a_renewed_certificate_is_taken_without_a_restart(tmp_path):
+    def renew(days: int) -> None:
+        files = ["-keyout", str(tmp_path / "key.pem"), "-out", str(tmp_path / "cert.pem")]
+        curve = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"]
+        command = ["openssl", "req", "-x509", *curve, "-nodes", "-days", str(days), "-subj", "/CN=localhost", *files]
+        subprocess.run(command, check=True, capture_output=True)
+
+    renew(2)
+    options = [f"--set=server.certfile={tmp_path / 'cert.pem'}", f"--set=server.keyfile={tmp_path / 'key.pem'}"]
+    with serving(tmp_path, *options) as (_, port, key):
+        url = f"https://127.0.0.1:{port}"
+        with Client(url, key, verify=False) as client:
+            before = re.search(r"expiry_timestamp_seconds ([0-9.e+]+)", client.metrics())[1]
+            renew(40)
+            end_s = time.monotonic() + 30
+            while (now := re.search(r"expiry_timestamp_seconds ([0-9.e+]+)", client.metrics())[1]) == before:
+                assert time.monotonic() < end_s
+                time.sleep(0.2)
+            assert float(now) - float(before) == pytest.approx(38 * 86400, abs=3600)
+        pem = ssl.get_server_certificate(("127.0.0.1", port))
+        assert pem.strip() == (tmp_path / "cert.pem").read_text().strip()
