@@ -6,14 +6,14 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from gsplat_core.errors import InvalidSetting
 from services.bus.runtime import Role, RuntimeFolder
 from services.control.parts import NewStream
 from services.control.problems import Conflicting, Missing, Unprocessable
-from services.display.hub import DisplayHub
+from services.display.hub import KINDS, DisplayHub
 from services.server.stream_specs import gpus, spec_of
 from services.supervisor.launching import ByLauncher
 from services.supervisor.process import ProcessState, StreamEvent
@@ -36,6 +36,7 @@ class StreamFacts:
     state: str
     reason: str | None
     processes: Mapping[str, Mapping[str, Any]]
+    viewers: Mapping[str, int] = field(default_factory=dict)
 
 
 class Stream:
@@ -58,7 +59,9 @@ class Stream:
             return StreamFacts(*about, "stopped", None, {})
         now = self.supervisor.state()
         state, reason = overall(now.capture, now.engine)
-        return StreamFacts(*about, state, reason, {"capture": asdict(now.capture), "engine": asdict(now.engine)})
+        processes = {"capture": asdict(now.capture), "engine": asdict(now.engine)}
+        viewers = {} if self.hub is None else {kind: self.hub.viewers(kind) for kind in KINDS}
+        return StreamFacts(*about, state, reason, processes, viewers)
 
 
 def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | None]:

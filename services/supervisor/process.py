@@ -6,7 +6,7 @@ import asyncio
 import logging
 import signal
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -35,6 +35,10 @@ FRESH_AFTER = 3
 """After so many ends in a row of a process that had not begun to work it is started by a new interpreter: what it was forked from may be what is
 wrong. One that has worked was forked well."""
 WELL = ("live", "running")
+RATE_S = 3.0
+"""Time over which a process' rate is taken."""
+COUNTED: dict[Role, str] = {"capture": "frames", "engine": "pictures"}
+"""Figure of the heartbeats whose rate is told."""
 
 Kind = Literal["started", "adopted", "replaced", "ended", "stopped", "left"]
 
@@ -62,6 +66,36 @@ class ProcessState:
     figures: Mapping[str, Any]
     heard_s: float | None
     """Seconds since its last heartbeat."""
+    rate_hz: float | None = None
+    """Frames captured, or new pictures shown, a second over the last `RATE_S`."""
+
+
+class Rate:
+    """Rate of a count that is told now and then."""
+
+    def __init__(self, over_s: float = RATE_S) -> None:
+        self._over_s = over_s
+        self._told: deque[tuple[float, int]] = deque()
+
+    def tell(self, count: int, now_s: float) -> None:
+        """Note the count at a moment. One that is smaller than before is that of a new process: the rate begins anew."""
+        if self._told and count < self._told[-1][1]:
+            self._told.clear()
+        self._told.append((now_s, count))
+        while len(self._told) > 2 and now_s - self._told[1][0] >= self._over_s:
+            self._told.popleft()
+
+    def clear(self) -> None:
+        """Forget what was told."""
+        self._told.clear()
+
+    @property
+    def hz(self) -> float | None:
+        """Counts a second; None until there are two moments at least half a second apart."""
+        if not self._told:
+            return None
+        (first_s, first), (last_s, last) = self._told[0], self._told[-1]
+        return round((last - first) / (last_s - first_s), 2) if last_s - first_s >= 0.5 else None
 
 
 class ManagedProcess:
@@ -85,6 +119,7 @@ class ManagedProcess:
         self._heard_s = self._well_s = 0.0
         self._shown: tuple[int, float] = 0, 0.0
         """How much was published, and since when that is so."""
+        self._rate = Rate()
         self._tasks: list[asyncio.Task[None]] = []
 
     @property
@@ -100,7 +135,12 @@ class ManagedProcess:
         said = str(heartbeat.get("state")), str(heartbeat.get("reason"))
         figures = heartbeat.get("figures")
         return ProcessState(
-            *said, identity.pid, restarts, figures if isinstance(figures, dict) else {}, round(silent_s, 3)
+            *said,
+            identity.pid,
+            restarts,
+            figures if isinstance(figures, dict) else {},
+            round(silent_s, 3),
+            self._rate.hz,
         )
 
     @property
@@ -180,6 +220,7 @@ class ManagedProcess:
             await self._end(record.identity)
             record = None
         self._heartbeat, self._well_s, self._shown = None, 0.0, (0, 0.0)
+        self._rate.clear()
         self._heard_s = time.monotonic()
         if record is not None:
             self._identity = record.identity
@@ -270,6 +311,9 @@ class ManagedProcess:
         self._heartbeat, self._heard_s = said, now_s
         figures = said.get("figures")
         published = figures.get("published", 0) if isinstance(figures, dict) else 0
+        count = figures.get(COUNTED[self._role]) if isinstance(figures, dict) else None
+        if isinstance(count, int):
+            self._rate.tell(count, now_s)
         if not self._well_s and said.get("state") in WELL and (published or self._role == "capture"):
             self._well_s = now_s
         if published != self._shown[0]:

@@ -56,14 +56,20 @@ class StreamView(BaseModel):
     options: dict[str, Any]
     state: str = Field(examples=["live"])
     reason: str | None = None
-    processes: dict[str, dict[str, Any]] = Field({}, description="Capture and engine.")
+    processes: dict[str, dict[str, Any]] = Field(
+        {},
+        description="Capture and engine: `state`, `reason`, `pid`, `restarts`, `rate_hz` (frames captured, pictures shown a second), `heard_s` since the"
+        " last heartbeat, and its `figures`. Those of the engine have the newest `picture` with its `age_ms` and its `psnr_db`: the training error"
+        " of the frame that is displayed, not of one that was held out.",
+    )
+    viewers: dict[str, int] = Field({}, description="Open displays, by picture.", examples=[{"raw": 1, "shown": 2}])
 
     @field_validator("source")
     @classmethod
     def _without_credentials(cls, source: str) -> str:
         return masked_address(source)
 
-    @field_validator("options", "processes", mode="before")
+    @field_validator("options", "processes", "viewers", mode="before")
     @classmethod
     def _as_dict(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         return dict(values)

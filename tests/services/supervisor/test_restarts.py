@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import pytest
+
+from services.supervisor.process import Rate
 from services.supervisor.restarts import Restarts
 
 
@@ -32,3 +35,24 @@ def test_ends_of_what_never_worked_are_counted_by_themselves():
 def test_many_ends_do_not_overflow():
     restarts = Restarts()
     assert [restarts.ended(0.0) for _ in range(5000)][-1] == 10.0
+
+
+def test_the_rate_of_a_count_is_that_of_the_last_seconds():
+    rate = Rate(over_s=3.0)
+    assert rate.hz is None
+    rate.tell(100, 10.0)
+    assert rate.hz is None
+    rate.tell(103, 10.25)
+    assert rate.hz is None, "too short a time to tell a rate from"
+    for quarter in range(2, 41):
+        rate.tell(100 + 15 * quarter // 2, 10.0 + 0.25 * quarter)
+    assert rate.hz == pytest.approx(30, abs=0.4)
+    for quarter in range(41, 60):  # the source gives nothing any more
+        rate.tell(400, 10.0 + 0.25 * quarter)
+    assert rate.hz == 0
+    rate.tell(5, 26.0)  # a new process
+    assert rate.hz is None
+    rate.tell(15, 27.0)
+    assert rate.hz == 10
+    rate.clear()
+    assert rate.hz is None
