@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter
+import httpx2
+from pydantic import TypeAdapter, ValidationError
 
+from services.client.errors import ClientError
 from services.client.pictures import Picture, pictures
 from services.client.replays import ReplayMethods
-from services.client.requests import waited_for
+from services.client.requests import refused_by, waited_for
 from services.client.snapshots import SnapshotMethods
 from services.control.routes.audit import AuditPage
-from services.control.routes.keys import KeyView, MadeKey
+from services.control.routes.health import Readiness
+from services.control.routes.keys import KeyView, MadeKey, Myself
 from services.control.routes.models import ModelView, VersionView
 from services.control.routes.streams import StreamView
 
@@ -119,18 +123,96 @@ class Client(ReplayMethods, SnapshotMethods):
         """Every API key, without what makes it one."""
         return TypeAdapter(list[KeyView]).validate_python(self._ask("GET", "/v1/keys"))
 
-    def make_key(self, name: str, role: str) -> MadeKey:
-        """Make a key; a name may have two, while its callers change over. It is shown this once."""
-        return MadeKey.model_validate(self._ask("POST", "/v1/keys", json={"name": name, "role": role}))
+    def make_key(
+        self, name: str, role: str, *, expires_at: datetime | None = None, streams: Sequence[str] | None = None
+    ) -> MadeKey:
+        """Make a key, which is shown this once. A name may have two valid ones, while its callers change over.
+
+        Args:
+            name: whom it is for.
+            role: viewer, operator or admin.
+            expires_at: from when on it is refused, with a time zone; None: never.
+            streams: names of the streams that it is limited to; None: not limited.
+        """
+        wanted = {
+            "name": name,
+            "role": role,
+            "expires_at": None if expires_at is None else expires_at.isoformat(),
+            "streams": None if streams is None else list(streams),
+        }
+        return MadeKey.model_validate(self._ask("POST", "/v1/keys", json=wanted))
+
+    def myself(self) -> Myself:
+        """Name, role and limits of this client's key."""
+        return Myself.model_validate(self._ask("GET", "/v1/me"))
+
+    def ready(self) -> Readiness:
+        """Each check of /readyz, whether the server is ready or not."""
+        try:
+            answer = self._http.request("GET", "/readyz", params={"verbose": "1"})
+        except httpx2.HTTPError as error:
+            raise self._unreachable(error) from error
+        if answer.status_code not in (200, 503):
+            raise refused_by(answer, self.url)
+        try:
+            return Readiness.model_validate_json(answer.content)
+        except ValidationError as error:
+            raise ClientError(f"{self.url}/readyz answers with something else; is it an IntraSplat server?") from error
 
     def revoke_key(self, key_id: str) -> None:
         """End a key at once."""
         self._ask("DELETE", f"/v1/keys/{key_id}")
 
-    def audit(self, count: int = 100, before: int | None = None) -> AuditPage:
-        """Entries of the audit log, the newest first; with `before`, those before that number."""
-        wanted = {"count": count} | ({} if before is None else {"before": before})
-        return AuditPage.model_validate(self._ask("GET", "/v1/audit", params=wanted))
+    def audit(
+        self,
+        count: int = 100,
+        before: int | None = None,
+        *,
+        event: str | None = None,
+        actor: str | None = None,
+        subject: str | None = None,
+        outcome: str | None = None,
+        since: datetime | None = None,
+        until: datetime | None = None,
+    ) -> AuditPage:
+        """Return entries of the audit log, the newest first.
+
+        Args:
+            count: at most so many.
+            before: those before that number.
+            event: as `model.activate`, or `model` for all of its events.
+            actor: part of the actor.
+            subject: part of the subject.
+            outcome: done, refused or failed.
+            since: from this moment on, with a time zone.
+            until: before this moment.
+        """
+        wanted = {"count": count, "before": before} | _filter(event, actor, subject, outcome, since, until)
+        given = {name: value for name, value in wanted.items() if value is not None}
+        return AuditPage.model_validate(self._ask("GET", "/v1/audit", params=given))
+
+    def export_audit(
+        self,
+        form: str = "jsonl",
+        *,
+        event: str | None = None,
+        actor: str | None = None,
+        subject: str | None = None,
+        outcome: str | None = None,
+        since: datetime | None = None,
+        until: datetime | None = None,
+    ) -> Iterator[str]:
+        """Yield the lines of the audit log as `jsonl` or `csv`, the oldest entry first. The filter is that of `audit`."""
+        wanted = {"format": form} | _filter(event, actor, subject, outcome, since, until)
+        given = {name: value for name, value in wanted.items() if value is not None}
+        try:
+            with self._http.stream("GET", "/v1/audit/export", params=given) as answer:
+                if not answer.is_success:
+                    answer.read()
+                    raise refused_by(answer, self.url)
+                yield from answer.iter_lines()
+        except httpx2.HTTPError as error:
+            raise self._unreachable(error) from error
 
     def metrics(self) -> str:
         """What is measured, in Prometheus' format."""
@@ -145,3 +227,15 @@ class Client(ReplayMethods, SnapshotMethods):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _filter(
+    event: str | None,
+    actor: str | None,
+    subject: str | None,
+    outcome: str | None,
+    since: datetime | None,
+    until: datetime | None,
+) -> dict[str, str | None]:
+    times = {name: None if time is None else time.isoformat() for name, time in (("since", since), ("until", until))}
+    return {"event": event, "actor": actor, "subject": subject, "outcome": outcome, **times}

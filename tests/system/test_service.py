@@ -203,6 +203,7 @@ def test_the_page_shows_camera_and_reconstruction(page):
 def test_a_stream_is_stopped_and_started_from_the_page(page):
     page.click("#tab-streams")
     page.click("#stream-rows >> text=Stop")
+    page.click("#confirm-yes")
     page.wait_for_selector("#stream-rows >> text=stopped")
     page.wait_for_selector("#state:not([data-state=live])")
     page.click("#stream-rows >> text=Start")
@@ -212,7 +213,11 @@ def test_a_stream_is_stopped_and_started_from_the_page(page):
 def test_pages_are_reached_by_the_keyboard(page):
     page.focus("#tab-streams")
     page.keyboard.press("ArrowRight")
+    page.wait_for_selector("#key-rows tr")
+    page.keyboard.press("ArrowRight")
     page.wait_for_selector("#entries >> text=stream.start")
+    page.keyboard.press("ArrowRight")
+    page.wait_for_selector("#health-checks tr")
     page.keyboard.press("ArrowRight")
     assert page.evaluate("document.activeElement.id") == "tab-live" and page.is_visible("#raw")
 

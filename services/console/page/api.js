@@ -6,6 +6,7 @@ const STORED = "intrasplat-key";
 let key = sessionStorage.getItem(STORED) ?? "";
 let askForKey = async () => { throw new Error("nobody asks for a key yet"); };
 let asked = null;
+let changed = () => {};
 
 /** An answer that is no success, with what the server says about it. */
 export class Problem extends Error {
@@ -15,9 +16,16 @@ export class Problem extends Error {
   }
 }
 
-/** Who asks for a key: an async function that resolves to one. It is called once for all requests that wait. */
-export function setKeyDialog(ask) {
+/** `ask` is an async function that resolves to a key; it is called once for all requests that wait. `onChange` is called after there is a new key. */
+export function setKeyDialog(ask, onChange) {
   askForKey = ask;
+  changed = onChange;
+}
+
+/** Forget the key of this tab, and all that was shown with it. */
+export function signOut() {
+  sessionStorage.removeItem(STORED);
+  location.reload();
 }
 
 /** The key of this tab from now on; kept until the tab is closed. */
@@ -27,7 +35,7 @@ export function useKey(given) {
 }
 
 async function newKey(reason) {
-  asked ??= askForKey(reason).then(useKey).finally(() => { asked = null; });
+  asked ??= askForKey(reason).then(useKey).finally(() => { asked = null; changed(); }); // nothing waits for it: it may need another key
   await asked;
 }
 
@@ -57,6 +65,7 @@ export async function useTicket(path) {
 }
 
 async function documentOf(answer) {
+  if (answer.status === 204) return null; // it has no body, whatever its type says
   return answer.headers.get("content-type")?.includes("json") ? answer.json() : null;
 }
 

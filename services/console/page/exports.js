@@ -2,6 +2,7 @@
 
 import { call, download } from "./api.js";
 import { button, size } from "./table.js";
+import { when } from "./times.js";
 
 const FORMATS = {
   isplat: "IntraSplat model (.isplat)",
@@ -34,6 +35,8 @@ export function snapshotsOf(place, report) {
   said.setAttribute("role", "status");
   const list = document.createElement("ul");
   list.className = "files";
+  const kept = document.createElement("details"), title = document.createElement("summary");
+  kept.append(title, list);
   const take = button("Take a snapshot", async () => {
     if (!name.reportValidity()) return;
     const key = crypto.randomUUID?.() ?? String(performance.now());
@@ -42,12 +45,13 @@ export function snapshotsOf(place, report) {
     said.textContent = `Frame ${taken.seq}, ${taken.gaussians} Gaussians: ${what}. Training stood still for ${taken.pause_ms.toFixed(1)} ms.`;
     if (taken.version) said.textContent += ` It is ${await checked(taken.version)}.`;
     await renew();
+    kept.open = !taken.version;
   }, report);
   take.id = "take-snapshot";
   const row = document.createElement("div");
   row.className = "row";
   row.append(take, label);
-  place.append(row, said, list);
+  place.append(row, said, kept);
 
   /** The state of a new version once the server has looked at it. */
   async function checked({ name: model, version }) {
@@ -60,10 +64,12 @@ export function snapshotsOf(place, report) {
 
   async function renew() {
     const found = stream ? await call("GET", `/v1/streams/${stream}/snapshots`) : [];
+    title.textContent = `Snapshots that are kept: ${found.length}`;
+    kept.hidden = found.length === 0;
     list.replaceChildren(...found.slice(0, 5).map((snapshot) => {
       const line = document.createElement("li");
       const text = document.createElement("span");
-      text.textContent = `${new Date(snapshot.taken_at).toLocaleTimeString()}, frame ${snapshot.seq}, ${size(snapshot.size_bytes)}`;
+      text.append(`${snapshot.id}, `, when(snapshot.taken_at), `, frame ${snapshot.seq}, ${size(snapshot.size_bytes)}`);
       line.append(text, ...exportControls(`/v1/streams/${stream}/snapshots/${snapshot.id}`, `the snapshot of frame ${snapshot.seq}`, report));
       return line;
     }));
@@ -72,6 +78,7 @@ export function snapshotsOf(place, report) {
   return (wanted) => {
     stream = wanted;
     place.hidden = !stream;
+    kept.open = false;
     said.textContent = "";
     if (stream) report(renew);
   };

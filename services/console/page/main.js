@@ -1,15 +1,18 @@
 // The console: which page is open, which stream is looked at, and what its picture says of itself.
 
-import { setKeyDialog, useKey } from "./api.js";
+import { call, setKeyDialog, signOut, useKey } from "./api.js";
 import { auditPage } from "./audit.js";
 import { Badge } from "./badge.js";
 import { snapshotsOf } from "./exports.js";
+import { healthPage } from "./health.js";
+import { keysPage } from "./keys.js";
 import { layersOf } from "./layers.js";
 import { modelsPage } from "./models.js";
 import { Plot } from "./plot.js";
 import { recordingsPage } from "./recordings.js";
 import { replaysPage } from "./replays.js";
-import { streamsPage } from "./streams.js";
+import { quality, streamsPage } from "./streams.js";
+import { age } from "./times.js";
 import { Viewer } from "./viewer.js";
 
 const at = (id) => document.getElementById(id);
@@ -50,12 +53,11 @@ function psnrs(header) {
 
 function say(state, age_ms) {
   const place = at("state");
-  const age = Number.isFinite(age_ms) ? (age_ms < 1000 ? ` ${Math.round(age_ms)} ms` : ` ${(age_ms / 1000).toFixed(1)} s`) : "";
   if (place.dataset.state !== state) { // once: it is read aloud
     place.dataset.state = state;
     place.firstElementChild.textContent = state;
   }
-  place.lastElementChild.textContent = age;
+  place.lastElementChild.textContent = Number.isFinite(age_ms) ? ` ${age(age_ms)}` : "";
 }
 
 function watch(stream) {
@@ -111,6 +113,24 @@ function chooseAmong(streams) {
   watch(choice.value);
 }
 
+let myself = null;
+/** What each page asks for; one that the key may not see is not offered. */
+const NEEDS = { models: "everything", recordings: "everything", replays: "everything", keys: "admin", audit: "admin" };
+
+/** Show whose key this page uses, and offer the pages that it may see. */
+async function renewAccount() {
+  myself = await call("GET", "/v1/me");
+  const limits = [myself.streams && `only ${myself.streams.join(", ")}`, myself.expires_at && `until ${new Date(myself.expires_at).toLocaleDateString()}`];
+  at("account-name").textContent = myself.name;
+  at("account-role").textContent = [`role ${myself.role}`, ...limits].filter(Boolean).join(", ");
+  at("account-name").title = `key ${myself.key_id}`;
+  at("account").hidden = false;
+  for (const [page, need] of Object.entries(NEEDS)) {
+    at(`tab-${page}`).hidden = need === "admin" ? myself.role !== "admin" : myself.streams !== null;
+    if (at(`tab-${page}`).hidden && !at(page).hidden) open("live");
+  }
+}
+
 const replays = replaysPage(report);
 
 /** Open the page of replays with a recording chosen, before its list has come. */
@@ -127,7 +147,9 @@ const pages = {
   recordings: recordingsPage(report, replay),
   replays: replays.renew,
   streams: streamsPage(report, chooseAmong),
+  keys: keysPage(report, () => myself?.key_id),
   audit: auditPage(report),
+  health: healthPage(),
 };
 
 function open(page) {
@@ -137,6 +159,7 @@ function open(page) {
     at(`tab-${name}`).setAttribute("aria-selected", String(chosen));
     at(`tab-${name}`).tabIndex = chosen ? 0 : -1;
   }
+  document.body.dataset.page = page;
   return report(pages[page]);
 }
 
@@ -146,7 +169,8 @@ tabs.forEach((tab, index) => {
   tab.addEventListener("keydown", (event) => {
     const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
     if (!step) return;
-    const next = tabs[(index + step + tabs.length) % tabs.length];
+    let next = tabs[index];
+    do next = tabs[(tabs.indexOf(next) + step + tabs.length) % tabs.length]; while (next.hidden);
     next.focus();
     next.click();
   });
@@ -158,7 +182,8 @@ setKeyDialog((reason) => new Promise((resolve) => {
   dialog.addEventListener("close", () => { resolve(at("key").value); at("key").value = ""; }, { once: true });
   dialog.addEventListener("cancel", (event) => event.preventDefault());
   if (!dialog.open) dialog.showModal();
-}));
+}), () => quietly(renewAccount));
+at("sign-out").addEventListener("click", signOut);
 
 // A key behind # is not sent to any server; it goes from the address at once.
 if (location.hash.startsWith("#key=")) {
@@ -167,7 +192,10 @@ if (location.hash.startsWith("#key=")) {
 }
 
 at("stream").addEventListener("change", (event) => watch(event.target.value));
+await report(renewAccount);
 await report(pages.streams);
 setInterval(() => {
-  if (!at("sign-in").open) quietly(pages.streams);
+  if (document.querySelector("dialog[open]")) return;
+  quietly(pages.streams);
+  if (!at("health").hidden) quietly(pages.health);
 }, RENEW_MS);

@@ -1,8 +1,10 @@
 // The page of models: upload, activate, roll back, delete.
 
 import { call, upload } from "./api.js";
+import { confirmed } from "./dialogs.js";
 import { exportControls } from "./exports.js";
-import { button, replaceRows, row, size } from "./table.js";
+import { button, digest, replaceRows, row, size } from "./table.js";
+import { when } from "./times.js";
 
 const at = (id) => document.getElementById(id);
 
@@ -27,13 +29,20 @@ export function modelsPage(report) {
       actions.push(button("Activate", then(() => call("POST", `${path}/activate`, body)), report));
     }
     if (version.state === "active") actions.push(button("Roll back", then(() => call("POST", `${path}/rollback`)), report));
-    else actions.push(button("Delete", then(() => call("DELETE", `${path}/versions/${version.version}`)), report));
+    else actions.push(button("Delete", async () => {
+      const sure = await confirmed({
+        title: `Delete version ${version.version} of the model ${model.name}?`,
+        what: `Version ${model.name}/${version.version}, ${version.state}, ${size(version.size_bytes)}, SHA-256 ${version.digest.slice(0, 12)}…, uploaded by ${version.uploaded_by}`,
+        consequence: "Its file is removed, and no stream can show it or roll back to it. This cannot be undone.",
+      });
+      if (sure) await then(() => call("DELETE", `${path}/versions/${version.version}`))();
+    }, report, `Delete version ${version.version} of the model ${model.name}`));
     if (["ready", "active", "retired"].includes(version.state)) {
       actions.push(...exportControls(`${path}/versions/${version.version}`, `${model.name} ${version.version}`, report));
     }
     const state = version.reason ? `${version.state}: ${version.reason}` : version.state;
-    const when = new Date(version.uploaded_at).toLocaleString();
-    return row(model.name, version.version, state, size(version.size_bytes), `${when}, ${version.uploaded_by}`, actions);
+    const uploaded = [when(version.uploaded_at), `, ${version.uploaded_by}`];
+    return row(model.name, version.version, digest(version.digest), state, size(version.size_bytes), uploaded, actions);
   }
 
   at("upload").addEventListener("submit", (event) => {

@@ -3,10 +3,11 @@
 const KEPT = 300;
 const STEPS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
 
-/** Draws the last values that it was given; null is a gap. */
+/** Draws the last values that it was given; null is a gap. It has as many pixels as the screen gives it, so that its text is never stretched. */
 export class Plot {
   constructor(canvas, { from_zero = true } = {}) {
     Object.assign(this, { canvas, from_zero, values: [], due: false });
+    new ResizeObserver(() => this.plan()).observe(canvas);
   }
 
   clear() {
@@ -27,14 +28,18 @@ export class Plot {
   }
 
   draw() {
-    const { width, height } = this.canvas;
-    const pen = this.canvas.getContext("2d");
-    pen.clearRect(0, 0, width, height);
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (!width || !height) return; // its page is not open
+    const pen = this.canvas.getContext("2d"), scale = window.devicePixelRatio || 1;
+    this.canvas.width = Math.round(width * scale); // empties it
+    this.canvas.height = Math.round(height * scale);
+    pen.scale(scale, scale);
     const known = this.values.filter((value) => value !== null);
     if (known.length === 0) return;
     const bottom = this.from_zero ? 0 : Math.min(...known);
     const span = Math.max(Math.max(...known) - bottom, 1);
-    const step = STEPS.find((each) => span / each <= 4) ?? STEPS.at(-1);
+    const lines = Math.max(1, Math.min(4, Math.floor((height - 24) / 22)));
+    const step = STEPS.find((each) => span / each <= lines) ?? STEPS.at(-1);
     const low = Math.floor(bottom / step) * step, high = Math.ceil((bottom + span) / step) * step;
     const y = (value) => height - 8 - ((value - low) / (high - low)) * (height - 24);
     pen.font = "16px system-ui, sans-serif";

@@ -1,7 +1,9 @@
 // The page of recordings: upload, what was found in each, delete.
 
 import { call, upload } from "./api.js";
-import { button, replaceRows, row, size } from "./table.js";
+import { confirmed } from "./dialogs.js";
+import { button, digest, replaceRows, row, size } from "./table.js";
+import { when } from "./times.js";
 
 const at = (id) => document.getElementById(id);
 
@@ -14,10 +16,19 @@ export function recordingsPage(report, replay) {
   function line(recording) {
     const actions = [];
     if (recording.state === "ready") actions.push(button("Replay", async () => replay(recording.name), report));
-    actions.push(button("Delete", async () => { await call("DELETE", `/v1/recordings/${recording.name}`); await renew(); }, report));
+    actions.push(button("Delete", async () => {
+      const sure = await confirmed({
+        title: `Delete the recording ${recording.name}?`,
+        what: [`Recording ${recording.name}`, found(recording.description), size(recording.kept_bytes), `uploaded by ${recording.uploaded_by}`].filter(Boolean).join(", "),
+        consequence: "The server's copy of it is removed. Replays that were made of it stay. This cannot be undone.",
+      });
+      if (!sure) return;
+      await call("DELETE", `/v1/recordings/${recording.name}`);
+      await renew();
+    }, report, `Delete the recording ${recording.name}`));
     const state = recording.reason ? `${recording.state}: ${recording.reason}` : recording.state;
-    const when = new Date(recording.uploaded_at).toLocaleString();
-    return row(recording.name, state, found(recording.description), size(recording.kept_bytes), `${when}, ${recording.uploaded_by}`, actions);
+    const uploaded = [when(recording.uploaded_at), `, ${recording.uploaded_by}`];
+    return row(recording.name, digest(recording.digest), state, found(recording.description), size(recording.kept_bytes), uploaded, actions);
   }
 
   at("add-recording").addEventListener("submit", (event) => {

@@ -1,7 +1,9 @@
 // The page of replays: started from an uploaded recording, watched as they run, their reports, videos and models.
 
 import { call, download, fetched, useTicket } from "./api.js";
+import { confirmed } from "./dialogs.js";
 import { button, replaceRows, row } from "./table.js";
+import { when } from "./times.js";
 
 const at = (id) => document.getElementById(id);
 const OPEN = ["queued", "running"];
@@ -67,12 +69,20 @@ export function replaysPage(report) {
         actions.push(button("Keep model", () => keep(replay), report));
         actions.push(button("Download", () => download(`${path}/results/model.isplat`), report));
       }
-      actions.push(button("Delete", then(() => call("DELETE", path)), report));
+      actions.push(button("Delete", async () => {
+        const sure = await confirmed({
+          title: `Delete the replay ${replay.id}?`,
+          what: `Replay ${replay.id} of the recording ${replay.recording}, ${replay.state}, with ${replay.results.join(", ") || "no results"}`,
+          consequence: "Its report, video and model are removed; the recording, and a model that was kept, stay. This cannot be undone.",
+        });
+        if (sure) await then(() => call("DELETE", path))();
+      }, report, `Delete the replay ${replay.id}`));
     }
     const options = Object.entries(replay.options).map(([name, value]) => `${name.replaceAll("_", " ")} ${value}`).join(", ");
     const state = replay.reason ? `${replay.state}: ${replay.reason}` : replay.state;
     const quality = Number.isFinite(replay.psnr_db) ? `${replay.psnr_db.toFixed(1)} dB` : "";
-    return row(replay.recording, state, progress(replay), quality, options, new Date(replay.created_at).toLocaleString(), actions);
+    const started = [when(replay.created_at), `, ${replay.created_by}`];
+    return row(replay.recording, replay.id, state, progress(replay), quality, options, started, actions);
   }
 
   /** In a page of its own, which may do nothing but show itself. */

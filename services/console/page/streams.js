@@ -1,7 +1,9 @@
 // The page of streams: made, started, stopped, and how their processes are.
 
 import { call } from "./api.js";
-import { button, replaceRows, row } from "./table.js";
+import { confirmed } from "./dialogs.js";
+import { button, long, replaceRows, row } from "./table.js";
+import { age } from "./times.js";
 
 const at = (id) => document.getElementById(id);
 
@@ -16,13 +18,28 @@ export function streamsPage(report, onStreams) {
   function line(stream) {
     const path = `/v1/streams/${stream.name}`;
     const then = (act) => async () => { await act(); await renew(); };
+    const asked = (question, act) => async () => { if (await confirmed(question)) await then(act)(); };
+    const what = `Stream ${stream.name}, source ${stream.source}, ${stream.state}, ${watching(stream) || "nobody"} watching`;
+    const stop = {
+      title: `Stop the stream ${stream.name}?`, what, verb: "Stop",
+      consequence: "Its pictures end for everybody, the camera's too. The live reconstruction is lost unless a snapshot was taken.",
+    };
+    const remove = {
+      title: `Delete the stream ${stream.name}?`, what,
+      consequence: "It is stopped and forgotten. The live reconstruction is lost unless a snapshot was taken. This cannot be undone.",
+    };
     const runs = stream.state !== "stopped";
     const actions = [
-      runs ? button("Stop", then(() => call("POST", `${path}/stop`)), report) : button("Start", then(() => call("POST", `${path}/start`)), report),
-      button("Delete", then(() => call("DELETE", path)), report),
+      runs ? button("Stop", asked(stop, () => call("POST", `${path}/stop`)), report, `Stop the stream ${stream.name}`)
+        : button("Start", then(() => call("POST", `${path}/start`)), report, `Start the stream ${stream.name}`),
+      button("Delete", asked(remove, () => call("DELETE", path)), report, `Delete the stream ${stream.name}`),
     ];
-    const state = stream.reason ? `${stream.state}: ${stream.reason}` : stream.state;
-    return row(stream.name, stream.source, stream.show, state, process(stream.processes.capture), process(stream.processes.engine), actions);
+    const { capture, engine } = stream.processes;
+    const picture = engine?.figures?.picture ?? {};
+    return row(
+      stream.name, long(stream.source), stream.show, stream.reason ? `${stream.state}: ${stream.reason}` : stream.state,
+      processFacts(capture), processFacts(engine), age(picture.age_ms), quality(picture), watching(stream), actions,
+    );
   }
 
   at("new-stream").addEventListener("submit", (event) => {
@@ -37,7 +54,29 @@ export function streamsPage(report, onStreams) {
   return renew;
 }
 
-function process(said) {
-  if (!said) return "";
-  return [said.state, said.restarts ? `${said.restarts} restarts` : "", said.reason ?? ""].filter(Boolean).join(", ");
+/** A process in a cell: its state, rate, restarts, and why it is not well. */
+export function processFacts(process) {
+  if (!process) return "";
+  const said = [process.state];
+  if (Number.isFinite(process.rate_hz)) said.push(`${process.rate_hz.toFixed(1)} frames/s`);
+  said.push(process.restarts === 1 ? "1 restart" : `${process.restarts ?? 0} restarts`);
+  if (process.pid) said.push(`process ${process.pid}`);
+  if (process.reason && !["live", "running"].includes(process.state)) said.push(process.reason);
+  return said.join(", ");
+}
+
+/** The PSNR that a picture or its header has, and the trivial predictors' next to it where the server tells them. */
+export function quality(told) {
+  const decibels = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
+  const own = decibels(told.psnr_db);
+  if (!own) return "";
+  const previous = decibels(told.previous_frame_psnr_db ?? told.previous_frame_psnr);
+  const next = decibels(told.next_frame_psnr_db ?? told.next_frame_psnr);
+  const beside = [previous && `previous frame ${previous}`, next && `next frame ${next}`].filter(Boolean).join(", ");
+  return beside ? `${own} (${beside})` : own;
+}
+
+function watching({ viewers }) {
+  const open = Object.entries(viewers ?? {}).filter(([, count]) => count > 0);
+  return open.map(([kind, count]) => `${count} ${kind}`).join(", ");
 }

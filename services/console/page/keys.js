@@ -1,0 +1,53 @@
+// The page of API keys: made, listed, revoked. Administrators alone.
+
+import { call } from "./api.js";
+import { confirmed, showKey } from "./dialogs.js";
+import { button, replaceRows, row } from "./table.js";
+import { when } from "./times.js";
+
+const at = (id) => document.getElementById(id);
+const DAY_MS = 86_400_000;
+
+/** Returns what renews the page. `mine()` is the number of the key that this page uses. */
+export function keysPage(report, mine) {
+  async function renew() {
+    replaceRows(at("key-rows"), (await call("GET", "/v1/keys")).map(line));
+  }
+
+  function line(key) {
+    const own = key.id === mine();
+    const streams = key.streams?.join(", ") ?? "all";
+    const revoke = button("Revoke", async () => {
+      const sure = await confirmed({
+        title: `Revoke the key ${key.name}?`,
+        what: `ID ${key.id}, ${key.role}, streams: ${streams}${own ? ". It is the key that this page uses." : ""}`,
+        consequence: "Whoever uses it is refused from the next request on. This cannot be undone: a new key has to be made.",
+        verb: "Revoke",
+      });
+      if (!sure) return;
+      await call("DELETE", `/v1/keys/${key.id}`);
+      await renew();
+    }, report, `Revoke the key ${key.name} ${key.id}`);
+    const expires = key.expired ? ["expired ", when(key.expires_at)] : when(key.expires_at, "never");
+    return row(own ? `${key.name} (this page)` : key.name, key.id, key.role, streams, when(key.created_at), expires, when(key.last_used_at, "never"), revoke);
+  }
+
+  at("new-key").addEventListener("submit", (event) => {
+    event.preventDefault();
+    report(async () => {
+      const days = Number(at("key-expires").value);
+      const streams = at("key-streams").value.split(/[\s,]+/).filter(Boolean);
+      const made = await call("POST", "/v1/keys", {
+        name: at("key-name").value,
+        role: at("key-role").value,
+        expires_at: days ? new Date(Date.now() + days * DAY_MS).toISOString() : null,
+        streams: streams.length ? streams : null,
+      });
+      event.target.reset();
+      await renew();
+      await showKey(made);
+    });
+  });
+
+  return renew;
+}

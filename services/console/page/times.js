@@ -1,0 +1,22 @@
+// Times for people: the browser's zone, named; UTC when the pointer rests on it.
+
+const LOCAL = new Intl.DateTimeFormat(undefined, {
+  year: "numeric", month: "2-digit", day: "2-digit", hour: "2-digit", minute: "2-digit", second: "2-digit", timeZoneName: "short",
+});
+
+/** An element with a time of the server's, in the zone of this browser. Text for null. */
+export function when(iso, otherwise = "") {
+  const time = new Date(iso ?? NaN);
+  if (Number.isNaN(time.getTime())) return iso ?? otherwise;
+  const place = document.createElement("time");
+  place.dateTime = time.toISOString();
+  place.title = `${time.toISOString().replace("T", " ").replace(/\.\d+Z$/, "")} UTC`;
+  place.textContent = LOCAL.format(time);
+  return place;
+}
+
+/** A length of time in a few characters. */
+export function age(ms) {
+  if (!Number.isFinite(ms)) return "";
+  return ms < 1000 ? `${Math.round(ms)} ms` : `${(ms / 1000).toFixed(1)} s`;
+}
