@@ -43,14 +43,6 @@ async function quietly(act) {
   }
 }
 
-/** The training error of the displayed frame, with the two figures that it is to be compared with. */
-function psnrs(header) {
-  if (!Number.isFinite(header.psnr_db)) return "";
-  const decibels = (value) => (Number.isFinite(value) ? value.toFixed(1) : "–");
-  const beside = `previous frame ${decibels(header.previous_frame_db)}, next frame ${decibels(header.next_frame_db)}`;
-  return `${header.psnr_db.toFixed(1)} (${beside})`;
-}
-
 function say(state, age_ms) {
   const place = at("state");
   if (place.dataset.state !== state) { // once: it is read aloud
@@ -92,7 +84,7 @@ function shown(header) {
   plots.age.add(header.age_ms);
   plots.psnr.add(header.psnr_db ?? null);
   at("age-now").value = header.age_ms.toFixed(0);
-  at("psnr-now").value = psnrs(header);
+  at("psnr-now").value = quality(header);
 }
 
 /** What is not said any more must not look as if it were: without pictures the state goes. */

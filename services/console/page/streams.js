@@ -70,8 +70,8 @@ export function quality(told) {
   const decibels = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
   const own = decibels(told.psnr_db);
   if (!own) return "";
-  const previous = decibels(told.previous_frame_psnr_db ?? told.previous_frame_psnr);
-  const next = decibels(told.next_frame_psnr_db ?? told.next_frame_psnr);
+  const previous = decibels(told.previous_frame_db);
+  const next = decibels(told.next_frame_db);
   const beside = [previous && `previous frame ${previous}`, next && `next frame ${next}`].filter(Boolean).join(", ");
   return beside ? `${own} (${beside})` : own;
 }
