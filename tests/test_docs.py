@@ -73,12 +73,6 @@ def test_relative_links_resolve(document):
     assert broken == []
 
 
-def test_every_file_of_results_is_on_the_front_page():
-    front = (ROOT / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
-    files = {f"results/{path.name}" for path in (ROOT / "benchmarks" / "results").glob("*.md")}
-    assert files and files <= set(LINK.findall(front))
-
-
 def commands() -> dict[str, set[str]]:
     """The options of each command, those of a group's commands under its name; those of the program itself under the empty name."""
     group = typer.main.get_command(app)
