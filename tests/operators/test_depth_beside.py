@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -172,6 +173,26 @@ def test_it_can_be_stopped_while_it_rests_and_started_again(estimator, frame):
         beside.stop()
         assert not thread.is_alive()
     assert [each.seq for each in estimator.asked] == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("cores", "rest_s", "binds"), [(2, 0.6, True), (4, 0.6, True), (5, 0.0, False), (64, 0.0, False)]
+)
+def test_depth_rests_three_times_as_long_as_it_works_where_cores_are_few(
+    estimator, frame, monkeypatch, cores, rest_s, binds
+):
+    bound, rested, clock = [], [], iter(range(1000))
+    monkeypatch.setattr("operators.depth_beside.usable_cores", lambda: cores)
+    monkeypatch.setattr("operators.depth_beside.use_one_core", lambda: bound.append(True))
+    beside = DepthBeside("gated", CAMERA)
+    monkeypatch.setattr(beside, "_rest", rested.append)
+    monkeypatch.setattr("operators.depth_beside.time", SimpleNamespace(thread_time=lambda: 0.2 * next(clock)))
+    estimator.gate.release(10)
+    beside.start()
+    beside.offer(frame(0))
+    taken(beside)
+    beside.stop()
+    assert rested == [pytest.approx(rest_s)] and bool(bound) == binds
 
 
 def test_few_cores_are_left_to_training():

@@ -221,3 +221,29 @@ def test_depth_that_the_model_does_not_take_is_counted_and_not_told(live, one_by
     outcome = OutcomeBuilder()
     live.operator.contribute(outcome)
     assert outcome.find(TakenDepth) == TakenDepth(0, 0.0, 1) and outcome.notes == ()
+
+
+@pytest.fixture
+def waits(live):
+    """Write the waits for a picture down among the reconstructor's calls."""
+    live.operator.clock.wait_until_shown = lambda: live.fake.calls.append(("wait",))
+    live.operator.clock.too_late = lambda frame, waiting: False
+    return live
+
+
+def test_a_picture_has_the_device_for_itself_until_it_is_shown(waits, frame, compute_queued):
+    waits.time.pass_ms(33)
+    compute_queued(waits.operator, frame=[arrived(frame, waits, 0)])
+    kinds = [call[0] for call in waits.fake.calls]
+    assert kinds[:2] == ["observe", "wait"] and kinds.count("wait") == 1
+
+
+def test_a_frame_that_waits_is_not_kept_waiting_by_a_picture_or_by_rehearsal(waits, frame, compute_queued):
+    waits.time.pass_ms(33)
+    came = [arrived(frame, waits, seq) for seq in range(3)]
+    for first in range(3):
+        compute_queued(waits.operator, frame=came[first:])
+    kinds = [call[0] for call in waits.fake.calls]
+    observed = [number for number, kind in enumerate(kinds) if kind == "observe"]
+    assert len(observed) == 3 and observed == list(range(observed[0], observed[0] + 3))
+    assert kinds[observed[-1] + 1] == "wait" and kinds.count("wait") == 1

@@ -101,6 +101,22 @@ def test_measured_depth_and_that_of_two_eyes_count_more_than_other_depth_that_wa
         assert starts.rates.right_share == (1.0 if all_known and origin is DepthOrigin.STEREO else 0.1)
 
 
+@pytest.mark.parametrize(
+    ("origin", "all_known", "factor"),
+    [
+        (DepthOrigin.MEASURED, True, 10.0), (DepthOrigin.MEASURED, False, 3.0), (None, True, 10.0), (None, False, 3.0),
+        (DepthOrigin.STEREO, True, 10.0), (DepthOrigin.STEREO, False, 1.0), (DepthOrigin.LIGHT, True, 1.0),
+        (DepthOrigin.LEARNED, False, 1.0), (DepthOrigin.PARALLAX, True, 1.0),
+    ],
+)  # fmt: skip
+def test_the_weight_of_depth_by_its_origin(make_frame, origin, all_known, factor):
+    """Numbers, not the constants: exchanged ones would be found in both places."""
+    frame = make_frame(depth=np.full((40, 48), 60.0, np.float32), depth_origin=origin)
+    assert ReconstructorConfig(depth_weight=0.1).starting_from(frame, all_known).depth_weight == pytest.approx(
+        0.1 * factor
+    )
+
+
 def test_without_depth_and_without_an_end_weights_stay_as_they_are(make_frame):
     config, deep = ReconstructorConfig(), make_frame(depth=np.full((40, 48), 60.0, np.float32))
     assert config.starting_from(make_frame(), True) is config

@@ -84,6 +84,30 @@ def test_black_white_and_mirrored_pictures_show_no_place(image):
     assert left(1, 2, 3).take(Frame(0, 0, np.ascontiguousarray(image, np.uint8))) is None
 
 
+def mixed(likeness):
+    """A picture of place 2 and of other tissue, mixed until it is as like the place as that."""
+    places = left(2)
+    low, high = 0.0, 1.0
+    for _ in range(30):
+        share = (low + high) / 2
+        image = np.rint(share * tissue(2) + (1 - share) * tissue(9)).astype(np.uint8)
+        if places._likeness(places._left[0], Frame(0, 0, image)) < likeness:
+            low = share
+        else:
+            high = share
+    return Frame(0, 0, image)
+
+
+@pytest.mark.parametrize(
+    ("likeness", "is_found"), [(0.3, False), (0.6, False), (0.7, False), (0.79, True), (0.9, True)]
+)
+def test_a_picture_shows_a_place_from_a_likeness_of_three_quarters_on(likeness, is_found):
+    """Different places reach 0.6; a place that is kept in view stays above 0.75."""
+    places, frame = left(1, 2, 3), mixed(likeness)
+    assert (places.take(frame) is not None) == is_found
+    assert len(places) == 3 - is_found
+
+
 def test_the_number_of_places_is_bounded():
     places = left(*range(MOST_PLACES + 3))
     assert len(places) == MOST_PLACES

@@ -12,6 +12,7 @@ import torch
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.initialisation import SIGMA_IN_SPACINGS
 from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.unseen import LastSeen, pixels_of
@@ -80,6 +81,31 @@ def test_only_what_the_picture_shows_falls_back_to_usual_values(make_frame, came
     assert bool((scene.sh[shown].abs() <= colours[shown].abs()).all()) and torch.equal(
         scene.sh[~shown], colours[~shown]
     )
+
+
+@pytest.mark.parametrize("every", [128, 400])
+def test_what_is_not_held_by_training_falls_to_a_third_within_3600_steps(make_frame, camera, every):
+    """The pace is one per step, however often the scene is looked after."""
+    step, observation = trained(make_frame, camera)
+    scene = step.gaussians
+    usual = math.log(SIGMA_IN_SPACINGS * SPACING_PX * step.distance(camera) / float(camera.K[0, 0]))
+    scene.logit_opacities.fill_(3.0)
+    scene.log_scales.fill_(usual + 1.0)
+    colours = scene.sh.clone()
+    step._adam.steps = 0
+    upkeep = Upkeep(camera, with_room(scene.count))
+    for passed in range(every, 3601, every):
+        step._adam.steps = passed
+        seen = upkeep._look(step, observation)
+        upkeep._relax(step, seen, camera)
+    shown = seen.shown & (pixels_of(step.at(observation.time_s).means, camera)[1])
+    kept = math.exp(-passed / 3600)
+    assert scene.logit_opacities[shown].median() == pytest.approx(3 * kept, rel=0.05)
+    share = (scene.sh[shown].abs().sum() / colours[shown].abs().sum()).item()
+    assert share == pytest.approx(kept, rel=0.05)
+    left = (scene.log_scales[shown] - usual).median().item()
+    assert left == pytest.approx(kept, rel=0.05)
+    assert bool((scene.logit_opacities[~seen.shown] == 3).all())
 
 
 def test_needles_and_sheets_are_no_thinner_and_wider_than_a_picture_shows(make_frame, camera):
