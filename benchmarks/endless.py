@@ -1,10 +1,12 @@
 """A recording looped for as long as a stream may last: are memory, time per frame and quality as flat as they should be?
 
 Usage: python benchmarks/endless.py RECORDING [--minutes 60] [--device cuda] [--steps 4] [--rehearse 4] [--scale 1] [--places] [--out FILE]
+       python benchmarks/endless.py RECORDING --clock [--once] [--fps 30] ...
 
-The stream is not played to a clock: each frame gets a fixed number of steps, so that an hour takes as long as its work. Per frame it does
-what a live run does: observe, publish, render, grow, rehearse. The next frame is begun while a GPU still works on the last picture, as a live
-run's threads do.
+Without `--clock` each frame gets a fixed number of steps, so that an hour takes as long as its work. With it, frames come at the recording's rate, or
+at `--fps`, and get the steps that a live run has time for. Per frame it does what a live run does: observe, publish, render, grow, rehearse. The
+next frame is begun while a GPU still works on the last picture, as a live run's threads do. With `--once` the recording is played once and does not
+repeat; nothing grows then that could be compared, and its one line and the retention are printed.
 
 One JSON line for each minute of stream, then one with the growth since the second minute and with what the last 5 s look like when they are
 rendered again at the end. A minute is as many whole turns of the recording as come closest to 60 s, and in each the same frames are scored, so
@@ -37,8 +39,12 @@ from gsplat_core.training.budget import Budget
 from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.metrics import psnr_tissue_db
 from operators.applications.live_settings import LiveSettings
+from operators.applications.warm_reconstructor import warm_reconstructor
+from operators.frame_clock import FrameClock
 
 SCORED_EVERY = 10
+REHEARSED_AT_ONCE = {"cpu": 1, "cuda": 3}
+"""Rehearsal steps between two looks at the clock, as in `operators.live_reconstruct`."""
 RETAINED_S = 5.0
 
 
@@ -70,7 +76,7 @@ class Stream:
     def __init__(self, arguments: argparse.Namespace) -> None:
         recording = open_recording(arguments.recording, scale=arguments.scale)
         self.frames = list(recording)
-        self.fps, self.device = recording.fps, arguments.device
+        self.fps, self.device = arguments.fps or recording.fps, arguments.device
         self.steps, self.rehearse = Budget.of_steps(arguments.steps), arguments.rehearse
         settings = LiveSettings(source=str(arguments.recording), out=Path("unused"), device=arguments.device)
         config = settings.reconstructor_config(recording.camera.width_px * recording.camera.height_px)
@@ -78,13 +84,26 @@ class Stream:
             config, recording.camera, live=settings.chosen_training, device=arguments.device
         )
         self.renderer = AlphaRenderer(recording.camera, torch.device(arguments.device))
-        self.new_scenes = arguments.places
+        self.new_scenes, self.once = arguments.places, arguments.once
+        self.clock: FrameClock | None = None
+        self.steps_taken = self.steps_rehearsed = 0
+        if arguments.clock:
+            warm_reconstructor(self.reconstructor)
+            self.clock = FrameClock(settings.chosen_clock, self.fps)
+            self.due_ns: int | None = None
         self.shown: PendingFrame | None = None
+
+    def wait_for_next(self) -> None:
+        """Wait until the next frame comes; a run that is late goes on at once and does not catch up."""
+        assert self.clock is not None
+        now_ns = self.clock.now_ns()
+        self.due_ns = now_ns if self.due_ns is None else max(now_ns, self.due_ns + round(1e9 / self.fps))
+        time.sleep(max(0, self.due_ns - now_ns) * 1e-9)
 
     @property
     def turns_of_minute(self) -> int:
         """Whole turns of the recording that come closest to a minute."""
-        return max(1, round(60 * self.fps / len(self.frames)))
+        return 1 if self.once else max(1, round(60 * self.fps / len(self.frames)))
 
     def show(self, frame: Frame) -> PendingFrame:
         """The picture of the newest model at a frame's time, queued. The one before is finished then."""
@@ -96,22 +115,47 @@ class Stream:
         return self.shown
 
     def work(self, frame: Frame) -> PendingFrame:
-        """What a live run does with a frame."""
+        """Do what a live run does with a frame."""
+        first = self.shown is None or frame.new_scene is not None
         if frame.new_scene is not None:
             self.reconstructor.begin_scene(frame)
-        self.reconstructor.observe(frame, budget=self.steps)
+        taken_ns, budget = 0, self.steps
+        if self.clock is not None:
+            taken_ns = self.clock.now_ns()
+            budget = self.clock.budget(replace(frame, arrived_ns=self.due_ns), first=first)
+        report = self.reconstructor.observe(frame, budget=budget)
         self.renderer.prepare(self.reconstructor.publish())
+        if self.clock is not None and not first:
+            self.clock.published(taken_ns, self.clock.now_ns(), report.steps, self.reconstructor.step_ns)
         picture = self.show(frame)
-        self.reconstructor.grow(frame)
-        if self.rehearse:
-            self.reconstructor.rehearse(self.rehearse)
+        if not first or self.clock is None:
+            self.reconstructor.grow(frame)
+        self.steps_taken += report.steps
+        self.rehearse_in_time()
         return picture
+
+    def rehearse_in_time(self) -> None:
+        """Take the rehearsal steps of a frame: the number asked for, or as many as the clock allows."""
+        made = 0
+        if self.clock is None:
+            self.reconstructor.rehearse(made := self.rehearse)
+        else:
+            at_once = REHEARSED_AT_ONCE[self.device]
+            while self.clock.may_rehearse(made, self.reconstructor.rehearsal_ns(at_once)):
+                self.reconstructor.rehearse(at_once)
+                made += at_once
+        self.steps_rehearsed += made
 
     def minute(self, frames: Iterator[Frame]) -> dict[str, Any]:
         """Work through a minute's frames."""
         took_ms, psnr_db = [], []
         turns, length = self.turns_of_minute, len(self.frames)
+        before: Frame | None = None
+        copied_db: list[float] = []
+        self.steps_taken = self.steps_rehearsed = 0
         for number, frame in enumerate(islice(frames, turns * length)):
+            if self.clock is not None:
+                self.wait_for_next()
             start = time.perf_counter()
             picture = self.work(frame)
             took_ms.append(1e3 * (time.perf_counter() - start))
@@ -119,6 +163,9 @@ class Stream:
             turn, index = divmod(number, length)
             if (turn + index) % SCORED_EVERY == 0:
                 psnr_db.append(self.score(picture, frame))
+                if before is not None:
+                    copied_db.append(psnr_tissue_db(before.image, frame.image, frame.mask))
+            before = frame
         if self.device == "cuda":
             start = time.perf_counter()
             torch.cuda.synchronize()
@@ -131,6 +178,9 @@ class Stream:
             "mean_ms": round(float(np.mean(took_ms)), 3),
             "psnr_db": round(float(np.mean(psnr_db)), 3),
             "worst_db": round(min(psnr_db), 2),
+            "previous_frame_db": round(float(np.mean(copied_db)), 3),
+            "steps_per_frame": round(self.steps_taken / len(took_ms), 1),
+            "rehearsed_per_frame": round(self.steps_rehearsed / len(took_ms), 1),
             **memory_mib(self.device),
             "gaussians": self.reconstructor.gaussians,
             **self.reconstructor.kept(),
@@ -142,10 +192,10 @@ class Stream:
         return psnr_tissue_db(image, frame.image, frame.mask)
 
     def retention(self, frames_so_far: int) -> dict[str, float]:
-        """What the last seconds look like now, from the model as it ended."""
+        """Return what the last seconds look like at the end, from the whole model: on a CPU `publish` leaves the past out."""
         newest = min(frames_so_far, round(RETAINED_S * self.fps))
         frames = islice(looped(self.frames, self.fps, False, frames_so_far - newest), newest)
-        self.renderer.prepare(self.reconstructor.publish())
+        self.renderer.prepare(self.reconstructor.snapshot())
         psnr_db = [self.score(self.show(frame), frame) for frame in frames]
         return {"retention_db": round(float(np.mean(psnr_db)), 2), "retention_worst_db": round(min(psnr_db), 2)}
 
@@ -186,6 +236,11 @@ def main() -> None:
     parser.add_argument("--rehearse", type=int, default=4)
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--places", action="store_true")
+    parser.add_argument(
+        "--clock", action="store_true", help="play at the recording's rate, with the steps that there is time for"
+    )
+    parser.add_argument("--once", action="store_true", help="play the recording once")
+    parser.add_argument("--fps", type=float)
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     signal.signal(signal.SIGTERM, interrupted)
@@ -193,14 +248,16 @@ def main() -> None:
     frames = looped(stream.frames, stream.fps, stream.new_scenes)
     minutes: list[dict[str, Any]] = []
     try:
-        while len(minutes) < arguments.minutes:
+        while len(minutes) < (1 if arguments.once else arguments.minutes):
             minutes.append(stream.minute(frames))
             lines.write(minute=len(minutes), **minutes[-1])
     except KeyboardInterrupt as stopped:
         lines.write(stopped=str(stopped) or "Ctrl-C", after_minutes=len(minutes))
     if minutes:
         seen = next(frames).seq
-        lines.write(recording=arguments.recording.name, **growth(minutes), **stream.retention(seen))
+        grown = {} if arguments.once else growth(minutes)
+        stated = {"device": arguments.device, "clock": arguments.clock, "once": arguments.once, "fps": stream.fps}
+        lines.write(recording=arguments.recording.name, **stated, **grown, **stream.retention(seen))
 
 
 if __name__ == "__main__":
