@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.live_training import LiveTraining
 from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.step import TrainingStep
 
 WIDTH, HEIGHT = 48, 40
 CAMERA = Camera.from_focal(40.0, WIDTH, HEIGHT)
@@ -227,3 +230,72 @@ def test_a_published_picture_stays_as_it_is_while_training_goes_on():
     assert all(torch.equal(tensor, before[name]) for name, tensor in published.gaussians.tensors().items())
     trained = made._step.gaussians.logit_opacities
     assert not torch.equal(trained, before["logit_opacities"])
+
+
+def test_rehearsal_corrects_colours_half_as_much_and_looks_at_depth_at_every_fourth_step():
+    training = LiveTraining(colour_relaxation=1.2)
+    assert [training.rehearsed_relaxation(k, False) for k in range(1, 9)] == pytest.approx([0.6] * 8)
+    with_depth = [training.rehearsed_relaxation(k, True) for k in range(1, 9)]
+    assert with_depth == pytest.approx([0.6, 0.6, 0.6, 0.0] * 2)
+
+
+def test_the_usual_rates_fall_from_2_to_a_half_within_30_steps():
+    training = LiveTraining()
+    assert (training.rate_at(0), training.rate_at(29), training.rate_at(500)) == pytest.approx((2.0, 0.5, 0.5))
+    assert training.rate_at(14.5) == pytest.approx(1.0)
+
+
+@pytest.fixture
+def steps_taken(monkeypatch):
+    """Rate and relaxation of every training step, with the number of its frame."""
+    taken = []
+    plain = TrainingStep.__call__
+
+    def recorded(self, observation, rate_scale=1.0, colour_relaxation=0.0):
+        taken.append((observation.seq, rate_scale, colour_relaxation))
+        return plain(self, observation, rate_scale, colour_relaxation)
+
+    monkeypatch.setattr(TrainingStep, "__call__", recorded)
+    return taken
+
+
+def test_a_scene_begins_at_the_plain_rate_and_goes_on_with_the_schedule(steps_taken):
+    made = reconstructor(first_rate=3.0, last_rate=0.25, rate_steps=3, colour_relaxation=0.8)
+    run(made, [(2, 0), (4, 1)])
+    assert [rate for _, rate, _ in steps_taken] == pytest.approx([1, 1, 3, 0.75**0.5, 0.25, 0.25, 0.25])
+    assert [relaxation for *_, relaxation in steps_taken] == pytest.approx([0.8] * 6 + [0.4])
+
+
+def test_six_in_ten_rehearsal_steps_go_to_the_newest_frame_and_the_others_are_spread(steps_taken):
+    made = reconstructor()
+    run(made, [(1, 0)] * 8)
+    del steps_taken[:]
+    made.rehearse(400)
+    counts = np.bincount([seq for seq, *_ in steps_taken], minlength=8)
+    assert counts[7] / 400 == pytest.approx(0.6 + 0.4 / 8, abs=0.06)
+    assert counts[:7] == pytest.approx([0.4 / 8 * 400] * 7, abs=13)
+
+
+def test_shorter_steps_are_believed_at_once_and_longer_ones_slowly():
+    made = reconstructor()
+    usual = []
+    for step_s in (0.010, 0.004, 0.006, 1.0):
+        made._learn_step_time(SimpleNamespace(all_finished=lambda: None, step_s=step_s))
+        usual.append(made.step_ns * 1e-9)
+    assert usual == pytest.approx([0.010, 0.004, 0.0042, 0.00462])
+    assert made.rehearsal_ns(5) == pytest.approx(5 * made.step_ns)
+    made.device = torch.device("cuda")  # steps that are queued there have to end first
+    assert made.rehearsal_ns(5) == pytest.approx(7 * made.step_ns)
+
+
+@pytest.mark.parametrize(("newer", "is_taken"), [(0, True), (29, True), (30, False)])
+def test_late_depth_is_taken_of_the_newest_30_frames(newer, is_taken):
+    config = ReconstructorConfig(gaussians=60, max_gaussians=60, window_frames=60)
+    made = LiveReconstructor(config, CAMERA)
+    for k in range(newer + 1):
+        made.observe(frame_at(k), budget=Budget.of_steps(1))
+    depth = np.full((HEIGHT, WIDTH), 40.0, np.float32)
+    deep = frame_at(0).with_fields(depth=depth, depth_origin=DepthOrigin.STEREO)
+    assert made.take_depth(deep) == is_taken
+    source = made.snapshot().depth_source
+    assert (source is not None and "stereo" in str(source).lower()) == is_taken
