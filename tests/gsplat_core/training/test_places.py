@@ -206,3 +206,15 @@ def test_a_cut_captures_nothing_again(gpu):
     watch(made, swinging(2, 10, 10, new_scene="cut"), steps=6)
     watch(made, swinging(1, 20, 10, new_scene="cut"), steps=6)
     assert made._step._captured._captured is graph
+
+
+@pytest.mark.parametrize(("share", "is_known"), [(0.25, False), (0.35, True)])
+def test_a_place_is_compared_where_three_tenths_of_the_picture_are_known(share, is_known):
+    picture = np.asarray(tissue(1), np.float32)
+    known = np.zeros((HEIGHT, WIDTH), bool)
+    known[:, : round(share * WIDTH)] = True
+    assert (likeness_of(picture, picture, known) > 0.99) == is_known
+
+
+def test_eight_places_are_kept_and_no_more():
+    assert len(left(*range(7))) == 7 and len(left(*range(8))) == len(left(*range(9))) == 8

@@ -260,3 +260,61 @@ def test_everything_can_be_done_once_before_it_is_time(make_frame, camera):
     assert step.gaussians.count == len(last_seen.times()) >= count
     assert not bool((step.gaussians.means == first).all(1).any())
     assert not torch.equal(step.gaussians.log_scales, sizes)
+
+
+def test_a_scene_is_relaxed_every_128_steps_and_renewed_every_512(make_frame, camera, monkeypatch):
+    step, observation = trained(make_frame, camera)
+    done = []
+    monkeypatch.setattr(Upkeep, "_relax", lambda *_: done.append("relax"))
+    monkeypatch.setattr(Upkeep, "_renew", lambda self, step, *_: done.append("renew"))
+    upkeep = Upkeep(camera, CONFIG)
+    for steps, expected in ((127, []), (128, ["relax"]), (511, ["relax"]), (512, ["relax", "renew"])):
+        del done[:]
+        step._adam.steps = steps
+        upkeep(step, observation)
+        assert done == expected
+
+
+def test_a_gaussian_is_no_thinner_than_a_fifth_of_a_pixel_and_no_wider_than_eight_usual_ones(make_frame, camera):
+    step, observation = trained(make_frame, camera)
+    pixel = step.distance(camera) / float(camera.K[0, 0])
+    step.gaussians.log_scales[:, 0], step.gaussians.log_scales[:, 1] = -20.0, 20.0
+    step._adam.second_moments["logit_opacities"].fill_(1.0)  # none leaves
+    upkeep = Upkeep(camera, with_room(step.gaussians.count))
+    upkeep._relax(step, upkeep._look(step, observation), camera)
+    across, along = (step.gaussians.log_scales[:, axis].exp() / pixel for axis in (0, 1))
+    assert across == pytest.approx(0.2, rel=1e-3)
+    assert along == pytest.approx(8 * SIGMA_IN_SPACINGS * SPACING_PX, rel=1e-3)
+
+
+@pytest.mark.parametrize(("part", "are_idle"), [(2e-3, False), (0.5e-3, True)])
+def test_idle_is_what_no_picture_showed_for_7000_steps(make_frame, camera, part, are_idle):
+    """The mean of squared gradients falls by 0.999 per step, to a thousandth of the usual one in 7,000."""
+    step, observation = trained(make_frame, camera)
+    step.gaussians.means[:20] += 1000.0  # out of the picture
+    moments = step._adam.second_moments["logit_opacities"]
+    moments[: step.gaussians.count] = 1.0
+    moments[:20] = part
+    upkeep = Upkeep(camera, CONFIG)
+    assert bool(upkeep._useless(step, upkeep._look(step, observation))[:20].any()) == are_idle
+
+
+def test_depths_come_two_thirds_of_the_way_back_within_100000_steps(make_frame, camera):
+    step, observation = trained(make_frame, camera)
+    upkeep = Upkeep(camera, CONFIG)
+    upkeep._has_moved = True  # distances are left to training
+    seen = upkeep._look(step, observation)
+    whole, some = (
+        upkeep._towards_surface(step, seen, since, observation)[seen.shown] - 1 for since in (10**9, 100_000)
+    )
+    assert float((some / whole).nanmedian()) == pytest.approx(1 - math.exp(-1), rel=0.01)
+
+
+def test_a_fiftieth_of_the_gaussians_is_split_in_one_round(make_frame, camera):
+    step, observation = trained(make_frame, camera)
+    inside = pixels_of(step.at(observation.time_s).means, camera)[1]
+    step.remove(inside & (torch.arange(len(inside)) % 3 == 0))
+    step._adam.second_moments["logit_opacities"][: step.gaussians.count] = 1.0
+    count = step.gaussians.count
+    round_of(step, observation, camera, Upkeep(camera, CONFIG))
+    assert step.gaussians.count - count == round(0.02 * count) > 0
