@@ -31,6 +31,7 @@ from operators.applications.trial_run import trial_run
 from operators.applications.working_size import (
     SHARE_OF_INTERVAL,
     PacedTissue,
+    WorkingSize,
     choose_working_size,
     measured_frame_s,
 )
@@ -51,7 +52,7 @@ from operators.sinks.keyframes import KeyframesOp
 from operators.sources.options import SourceOptions
 from operators.sources.registry import open_source
 from operators.sources.scaled import ScaledSource, scaled_description
-from operators.sources.source import FrameSource
+from operators.sources.source import FrameSource, SourceDescription
 from operators.storage import StorageReserve
 
 
@@ -181,27 +182,31 @@ def live(
     return delivered(settings, "live", run, report)
 
 
-def on_trial(
-    settings: LiveSettings, source: FrameSource, notes: list[str], share: float = SHARE_OF_INTERVAL
-) -> tuple[LiveSettings, FrameSource]:
-    """Run the graph on trial; returns the settings and the source at the size that the run works at.
+def measured_size(settings: LiveSettings, about: SourceDescription, share: float = SHARE_OF_INTERVAL) -> WorkingSize:
+    """Choose the size at which this machine keeps up with a stream; runs the graph at several sizes on trial.
 
-    Where no scale was given, a run on a CPU chooses it by what this machine measures, and says so in `notes`. share: of the time between two
-    frames that a frame may take.
+    share: of the time between two frames that a frame may take.
     """
-    if settings.device != "cpu" or settings.scale is not None:
-        trial_run(settings, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
-        return settings, source
-    about = source.description
 
     def paced(tissue: PacedTissue, tried: LiveSettings) -> LiveApplication:
         return LiveApplication(tissue, tried, new_parts(tried, tissue), on_shown=tissue.shown)
 
-    chosen = choose_working_size(
+    return choose_working_size(
         about,
         lambda scale: measured_frame_s(replace(settings, scale=scale), scaled_description(about, scale), paced),
         share,
     )
+
+
+def on_trial(settings: LiveSettings, source: FrameSource, notes: list[str]) -> tuple[LiveSettings, FrameSource]:
+    """Run the graph on trial; returns the settings and the source at the size that the run works at.
+
+    Where no scale was given, a run on a CPU chooses it by what this machine measures, and says so in `notes`.
+    """
+    if settings.device != "cpu" or settings.scale is not None:
+        trial_run(settings, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
+        return settings, source
+    chosen = measured_size(settings, source.description)
     notes.append(chosen.sentence)
     settings = replace(settings, scale=chosen.scale)
     return settings, source if chosen.scale == 1 else ScaledSource(source, chosen.scale)

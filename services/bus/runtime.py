@@ -97,6 +97,11 @@ class StreamFolder:
         """The file with its specification."""
         return self.path / f"{role}.spec"
 
+    @property
+    def engine_size(self) -> Path:
+        """The file with the size that the engine works at."""
+        return self.path / "engine.size"
+
     def log(self, role: Role) -> Path:
         """The file that it prints to."""
         return self.path / f"{role}.log"
@@ -146,6 +151,7 @@ class StreamFolder:
             self.clean(role)
             for path in (self.spec(role), self.log(role), self.path / f"{role}.lock", self.path / f"{role}.show"):
                 path.unlink(missing_ok=True)
+        self.engine_size.unlink(missing_ok=True)
         self.path.rmdir()
 
 

@@ -192,12 +192,12 @@ class SynthesizeOptions:
 class LiveOptions(RunOptions):
     """What `live` takes besides; the names are those of `LiveSettings`."""
 
-    scale: Annotated[  # type: ignore[assignment]
+    scale: Annotated[
         float | None,
         typer.Option(
             help="Resize the frames by this factor.", show_default="1; on a CPU what this machine keeps up with"
         ),
-    ] = None
+    ] = None  # type: ignore[assignment]
     eyes: Annotated[str, typer.Option(help=EYES)] = "left"
     seconds: Annotated[
         float | None, typer.Option(help="End after so many seconds.", show_default="when the source ends")

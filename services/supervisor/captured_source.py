@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import zmq
@@ -16,6 +15,7 @@ from gsplat_core.scene.frames import Frame
 from operators.errors import SourceUnavailable
 from operators.sources.live import LiveSource
 from operators.sources.order import FrameOrder
+from operators.sources.scaled import scaled_description
 from operators.sources.shared_memory import BadHeader
 from operators.sources.source import SourceDescription, SourceState
 from operators.sources.wire import description_from, frame_from
@@ -45,18 +45,17 @@ class CapturedSource(LiveSource):
         self,
         folder: StreamFolder,
         stop_requested: Callable[[], bool] = lambda: False,
-        scale_for: Callable[[int, int], float] = lambda width_px, height_px: 1.0,
+        scale_for: Callable[[SourceDescription], float] = lambda about: 1.0,
     ) -> None:
-        """Waits until the source is open there. scale_for: from the size of its pictures, what they are scaled by. Raises SourceUnavailable when it is
-        told to stop before."""
+        """Waits until the source is open there. scale_for: from the description of the source, what its pictures are scaled by. Raises
+        SourceUnavailable when it is told to stop before."""
         super().__init__(waiting=WAITING, order=FrameOrder(trusted=True))
         self._folder = folder
         self._told: tuple[SourceState, str] | None = None
         self._heard_s = time.monotonic()
         about = self._described(stop_requested)
-        self._scale = scale_for(about.width_px, about.height_px)
-        camera = about.camera.scaled(self._scale)
-        self.description = replace(about, width_px=camera.width_px, height_px=camera.height_px, camera=camera)
+        self._scale = scale_for(about)
+        self.description = scaled_description(about, self._scale)
 
     @property
     def state(self) -> SourceState:

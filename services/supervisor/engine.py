@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,18 +15,21 @@ from gsplat_core.errors import UserError
 from gsplat_core.rendering.registry import check_renderer
 from operators.applications.device import check_device
 from operators.applications.limits import check_picture
-from operators.applications.live import LiveApplication
+from operators.applications.live import LiveApplication, measured_size
 from operators.applications.live_settings import LiveSettings
 from operators.applications.live_start import LiveParts, low_latency, new_parts, warm_up
 from operators.applications.session import Session
 from operators.applications.trial_run import trial_run
+from operators.applications.working_size import WorkingSize
 from operators.errors import SourceUnavailable
 from operators.frame_clock import ClockSettings
 from operators.messages import ShownPicture
 from operators.metrics import ScoredFrame
+from operators.sources.source import SourceDescription
 from services.bus.pictures import PicturePublisher
 from services.private_files import keep_files_private
 from services.supervisor.captured_source import CapturedSource
+from services.supervisor.engine_size import engine_scale
 from services.supervisor.exit_codes import NO_USE
 from services.supervisor.graph_measures import graph_measures
 from services.supervisor.layers import Layers
@@ -37,7 +39,7 @@ from services.supervisor.model_show import ModelShow
 from services.supervisor.priority import ENGINE_ON_CPU, step_back
 from services.supervisor.scratch import scratch_folder
 from services.supervisor.screen import Screen
-from services.supervisor.specs import EngineSpec, engine_scale_for
+from services.supervisor.specs import EngineSpec
 from services.supervisor.worker import Worker, stream_folder_of
 
 LOOK_S = 0.05
@@ -64,7 +66,7 @@ def live_settings(spec: EngineSpec, out: Path, source: str) -> LiveSettings:
 
 
 def started(settings: LiveSettings, source: CapturedSource, again: bool) -> LiveParts:
-    """What a live run works with. The first time everything is done once before the first frame; again, a picture soon counts for more."""
+    """Return the components of a live run. The first time everything is done once before the first frame; again, a picture soon counts for more."""
     if again:
         return new_parts(settings, source)
     trial_run(settings, source, lambda made_up, tried: LiveApplication(made_up, tried, new_parts(tried, source)))
@@ -81,12 +83,17 @@ def reconstruct(
         return worker.stop_requested() or screen.wanted != "live"
 
     worker.say("starting", "waits for the source to be opened by the capture process")
-    cores = len(os.sched_getaffinity(0))
-    source = CapturedSource(
-        worker.folder, stop_requested, lambda width, height: engine_scale_for(spec, width, height, cores)
-    )
-    check_picture(source.description.camera, 1.0)
     with TemporaryDirectory(prefix="run-") as folder, low_latency():
+
+        def measure(about: SourceDescription, share: float) -> WorkingSize:
+            worker.say("starting", "measures at which size it keeps up")
+            return measured_size(live_settings(spec, Path(folder), about.name), about, share)
+
+        def scale_for(about: SourceDescription) -> float:
+            check_picture(about.camera, 1.0)
+            return engine_scale(spec, about, worker.folder.engine_size, measure)
+
+        source = CapturedSource(worker.folder, stop_requested, scale_for)
         settings = live_settings(spec, Path(folder), source.description.name)
         worker.say("starting", "prepares the reconstruction")
         parts = started(settings, source, again)

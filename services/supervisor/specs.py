@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -38,7 +37,8 @@ class EngineSpec(_Strict):
     gpu: int | None = Field(default=None, ge=0, le=1023)
     """Which GPU (`CUDA_VISIBLE_DEVICES`); None: whichever is the first."""
     engine_scale: float | None = Field(default=None, gt=0, le=1)
-    """Size of what is reconstructed beside the stream's pictures. None: the whole, and on a CPU what it keeps up with (`engine_scale_for`)."""
+    """Size of what is reconstructed beside the stream's pictures. None: the whole, and on a CPU what this machine keeps up with
+    (`services.supervisor.engine_size`)."""
     field: str = "auto"
     renderer: str = "alpha"
     seed: int = Field(default=0, ge=0, lt=2**31)
@@ -51,24 +51,6 @@ class EngineSpec(_Strict):
     poses: Literal["given", "estimated"] = "given"
     """Where the scope is: as the frames say, or as is estimated from the pictures."""
     out_of_body: Literal["withhold", "off"] = "withhold"
-
-
-CPU_PIXELS = 320 * 256
-"""Two cores keep up with so many at 30 frames/s while nobody watches (docs/live.md). With more cores it was not measured."""
-FEW_CORES, FEW_CORES_PIXELS = 2, 200 * 160
-"""So many two cores keep up with beside 50 viewers and 200 requests/s, too (benchmarks/notes/service.md)."""
-SCALE_STEPS = 16
-
-
-def engine_scale_for(spec: EngineSpec, width_px: int, height_px: int, cores: int) -> float:
-    """What a stream's pictures are scaled by before they are reconstructed; viewers of the raw picture see all of it in any case."""
-    if spec.engine_scale is not None:
-        return spec.engine_scale
-    if spec.device != "cpu":
-        return 1.0
-    pixels = FEW_CORES_PIXELS if cores <= FEW_CORES else CPU_PIXELS
-    fits = math.floor(SCALE_STEPS * math.sqrt(pixels / (width_px * height_px))) / SCALE_STEPS
-    return min(1.0, max(1 / SCALE_STEPS, fits))
 
 
 class ProcessLimits(_Strict):

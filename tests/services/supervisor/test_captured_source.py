@@ -142,8 +142,8 @@ def test_frames_are_scaled_to_what_the_engine_keeps_up_with(folder):
     capture = StandIn(folder, run=1)
     sizes: list[tuple[int, int]] = []
 
-    def scale_for(width_px: int, height_px: int) -> float:
-        sizes.append((width_px, height_px))
+    def scale_for(about: SourceDescription) -> float:
+        sizes.append((about.width_px, about.height_px))
         return 0.5
 
     source = CapturedSource(folder, scale_for=scale_for)

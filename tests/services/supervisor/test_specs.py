@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidSetting
 from services.bus.runtime import write_json
-from services.supervisor.specs import EngineSpec, ProcessSpec, SourceSpec, StreamSpec, assigned, engine_scale_for
+from services.supervisor.specs import EngineSpec, ProcessSpec, SourceSpec, StreamSpec, assigned
 
 
 def spec(**changes) -> StreamSpec:
@@ -59,22 +59,3 @@ def test_streams_are_spread_over_gpus():
     streams = [spec(engine=engine) for engine in (cuda, cpu, fixed, cuda, cuda)]
     assert [each.engine.gpu for each in assigned(streams, 2)] == [1, None, 0, 0, 1]
     assert assigned(streams, 0) == streams
-
-
-@pytest.mark.parametrize(
-    ("engine", "size", "cores", "scale"),
-    [
-        ({}, (320, 256), 4, 1.0),
-        ({}, (320, 256), 2, 0.625),
-        ({}, (64, 64), 1, 1.0),
-        ({}, (640, 512), 4, 0.5),
-        ({}, (640, 512), 2, 0.3125),
-        ({}, (1920, 1080), 4, 0.1875),
-        ({}, (8192, 8192), 4, 1 / 16),
-        ({"engine_scale": 0.75}, (640, 512), 2, 0.75),
-        ({"device": "cuda"}, (1920, 1080), 2, 1.0),
-        ({"device": "cuda", "engine_scale": 0.5}, (1920, 1080), 2, 0.5),
-    ],
-)
-def test_an_engine_on_a_cpu_reconstructs_what_it_keeps_up_with(engine, size, cores, scale):
-    assert engine_scale_for(EngineSpec(**engine), *size, cores) == scale

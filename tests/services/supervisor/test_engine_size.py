@@ -1,0 +1,68 @@
+"""An engine on a CPU works at the size that the machine keeps up with beside viewers, and measures it once."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from gsplat_core.scene.cameras import Camera
+from operators.applications.working_size import choose_working_size
+from operators.sources.source import SourceDescription
+from services.supervisor.engine_size import SHARE_OF_INTERVAL, engine_scale
+from services.supervisor.specs import EngineSpec
+
+
+def stream(width_px=640, height_px=512, fps=30.0):
+    return SourceDescription("scope", width_px, height_px, fps, Camera.from_focal(width_px, width_px, height_px))
+
+
+class Machine:
+    """Takes 2 ms for a frame and 180 ms for each million of its pixels."""
+
+    def __init__(self):
+        self.measured = 0
+
+    def __call__(self, about, share):
+        self.measured += 1
+        pixels = about.width_px * about.height_px
+        return choose_working_size(about, lambda scale: 2e-3 + 0.18e-6 * scale**2 * pixels, share)
+
+
+def test_the_size_leaves_half_of_the_time_to_viewers(tmp_path):
+    scale = engine_scale(EngineSpec(), stream(), tmp_path / "size", Machine())
+    pixels = scale**2 * 640 * 512
+    assert 0.75 < (2e-3 + 0.18e-6 * pixels) * 30 / SHARE_OF_INTERVAL <= 1
+
+
+def test_it_is_measured_once_and_taken_again_by_the_next_engine(tmp_path):
+    machine, kept = Machine(), tmp_path / "size"
+    first = engine_scale(EngineSpec(), stream(), kept, machine)
+    assert engine_scale(EngineSpec(), stream(), kept, machine) == first and machine.measured == 1
+
+
+@pytest.mark.parametrize("other", [stream(1280, 1024), stream(fps=60.0)])
+def test_another_source_is_measured_anew(tmp_path, other):
+    machine, kept = Machine(), tmp_path / "size"
+    engine_scale(EngineSpec(), stream(), kept, machine)
+    engine_scale(EngineSpec(), other, kept, machine)
+    assert machine.measured == 2
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "7", "{}", '{"size": [640, 512, 30.0], "scale": "x"}', '{"size": [640, 512, 30.0], "scale": null}',
+             '{"size": [640, 512, 30.0], "scale": 0}', '{"size": [640, 512, 30.0], "scale": 9}', '{"size": 3, "scale": 0.5}'],
+)  # fmt: skip
+def test_a_damaged_file_is_replaced(tmp_path, text):
+    machine, kept = Machine(), tmp_path / "size"
+    kept.write_text(text)
+    scale = engine_scale(EngineSpec(), stream(), kept, machine)
+    assert machine.measured == 1 and json.loads(kept.read_text())["scale"] == scale
+
+
+def test_what_is_asked_for_is_taken_and_a_gpu_reconstructs_all_of_it(tmp_path):
+    machine, kept = Machine(), tmp_path / "size"
+    assert engine_scale(EngineSpec(engine_scale=0.75), stream(), kept, machine) == 0.75
+    assert engine_scale(EngineSpec(device="cuda"), stream(), kept, machine) == 1.0
+    assert engine_scale(EngineSpec(device="cuda", engine_scale=0.5), stream(), kept, machine) == 0.5
+    assert machine.measured == 0 and not kept.exists()
