@@ -33,7 +33,7 @@ def served():
         config = Path(folder) / "service.yaml"
         config.write_text(
             f"server: {{port: 0}}\npaths: {{data: {data}, runtime: {folder}/r}}\nlog: {{format: text}}\n"
-            f'streams: {{theatre: {{source: "{SOURCE}", device: cpu}}}}\n'
+            f'streams: {{theatre: {{source: "{SOURCE}", device: cpu, options: {{engine_scale: 1}}}}}}\n'
         )
         with log.open("w") as output:
             process = subprocess.Popen(
