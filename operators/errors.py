@@ -22,6 +22,7 @@ OperatorsError
 └── RunError
     ├── DeviceMissing (UserError)          the device asked for is not there or not supported
     ├── MemoryTooSmall (UserError)         what a run needs does not fit into this machine's memory
+    ├── NothingShown (UserError)           a run ended as it should, and no frame was shown
     └── RunFailed                          a run ended early; carries what it had reached
 """
 
@@ -136,6 +137,10 @@ class DeviceMissing(RunError, UserError):
 
 class MemoryTooSmall(RunError, UserError):
     """What a run needs does not fit into this machine's memory, or into what this process may take."""
+
+
+class NothingShown(RunError, UserError):
+    """A run ended as it should, and no frame was shown: none came, or all were withheld."""
 
 
 class RunFailed(RunError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -35,6 +36,8 @@ class SourceResult:
     """Whether the source gave all that it had; False when the run ended before."""
     damaged: int = 0
     """How many of the frames were damaged: shown, but neither trained on nor scored."""
+    withheld: Mapping[str, int] = field(default_factory=dict)
+    """Frames that came from the source withheld, by reason, as those of a recorded session may be."""
     counts: Mapping[str, int] = field(default_factory=dict)
     """What the source dropped or repaired, by reason (`docs/sources.md`)."""
     state_s: Mapping[str, float] = field(default_factory=dict)
@@ -75,6 +78,7 @@ class SourceOp(Operator):
         self.reached_end = False
         self.damaged = DamagedFrames()
         """Those of the emitted frames that are damaged."""
+        self.withheld: Counter[str] = Counter()
         self._last_seq: int | None = None
         self._states = _TimeInStates()
         super().__init__(fragment, *args, **kwargs)
@@ -85,6 +89,7 @@ class SourceOp(Operator):
     def start(self) -> None:
         self.emitted, self.reached_end, self._last_seq = 0, False, None
         self.damaged = DamagedFrames()
+        self.withheld.clear()
         self._states = _TimeInStates()
         self._out_of_time = False
         self.source.open()
@@ -104,6 +109,8 @@ class SourceOp(Operator):
         self._last_seq = frame.seq
         if frame.status is FrameStatus.DAMAGED:
             self.damaged.add(frame.seq)
+        if frame.withheld is not None:
+            self.withheld[frame.withheld] += 1
         self.metadata["seq"] = frame.seq
         self.metadata["pts_ns"] = frame.pts_ns
         op_output.emit(frame, "frame")
@@ -121,6 +128,7 @@ class SourceOp(Operator):
                 self.emitted,
                 self.reached_end,
                 self.damaged.count,
+                dict(self.withheld),
                 counts,
                 self._states.seconds(),
                 self._states.sentence,

@@ -47,7 +47,8 @@ class ReconstructOp(Operator):
 
     Params:
         make_reconstructor: called in `start()`; what it returns is owned by this operator alone.
-        held_out: frames for which it answers True are passed on with the newest model and never trained on. Damaged and withheld frames are too.
+        held_out: frames for which it answers True are passed on with the newest model and never trained on. Damaged and withheld frames are
+            too; withheld frames before the first model are dropped.
     """
 
     def __init__(
@@ -89,6 +90,8 @@ class ReconstructOp(Operator):
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         assert self._reconstructor is not None
         frame = op_input.receive("frame")
+        if self.newest is None and frame.withheld is not None:
+            return  # there is nothing to show it with, and a model must not begin with it
         # Without a first frame there is no model that a held-out one could be shown with.
         kept_out = frame.status is FrameStatus.DAMAGED or frame.withheld is not None or self.held_out(frame)
         train = self.newest is None or not kept_out

@@ -98,7 +98,7 @@ def reconstruct(
 
 
 def _trains(frame: Frame) -> bool:
-    return not is_heldout(frame.seq) and frame.status is not FrameStatus.DAMAGED
+    return not is_heldout(frame.seq) and frame.status is not FrameStatus.DAMAGED and frame.withheld is None
 
 
 def _fit(

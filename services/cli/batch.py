@@ -16,7 +16,7 @@ import typer
 from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidSetting
-from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK
+from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, NOTHING_SHOWN, OK
 from services.cli.interrupt import ASKING
 from services.cli.streams import printable
 from services.jobs.batch import Batch, Counts, Summary
@@ -30,7 +30,7 @@ SAY_S = 5.0
 def batch_command(
     folder: Path, out: Path | None, workers: int | None, options: Mapping[str, Any], *, as_json: bool
 ) -> int:
-    """Replay the recordings of a folder and print a summary; returns the exit code."""
+    """Replay the recordings of a folder and print a summary; returns the exit code, NOTHING_SHOWN where no recording showed a frame."""
     out = out or folder.absolute().with_name(f"{folder.absolute().name}-replays")
     batch = Batch(folder, out, _checked(options))
     cores = os.cpu_count() or 1
@@ -42,7 +42,10 @@ def batch_command(
     if asked():
         typer.echo("interrupted: the same command goes on with what is left", err=True)
         return INTERRUPTED
-    return OK if summary.is_whole else BAD_INPUT
+    if summary.is_whole:
+        return OK
+    nothing = [str(job.reason).startswith("nothing was shown") for job in summary.failed]
+    return NOTHING_SHOWN if nothing and all(nothing) and not summary.counts["done"] else BAD_INPUT
 
 
 def _checked(options: Mapping[str, Any]) -> ReplayOptions:

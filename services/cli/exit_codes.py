@@ -14,6 +14,8 @@ from services.cli.streams import printable
 OK = 0
 BUG = 1
 BAD_INPUT = 2
+NOTHING_SHOWN = 3
+"""The run ended as it should, and no frame was shown."""
 
 _MACHINE = {
     errno.ENOSPC: "free space on that disk",
@@ -33,8 +35,8 @@ _MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memo
 def exit_code_of(error: BaseException, arguments: Iterable[str] = ()) -> int:
     """Print what went wrong to stderr and return the exit code.
 
-    What the user can change (UserError: a file, an option, a disk) is one sentence and 2. Everything else is a bug in this program: traceback
-    and 1. arguments: the command line; the system's errors about files that it names are the user's too.
+    What the user can change (UserError: a file, an option, a disk) is one sentence and 2, or 3 for a run that showed nothing. Everything else
+    is a bug in this program: traceback and 1. arguments: the command line; the system's errors about files that it names are the user's too.
     """
     if isinstance(error, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)  # noqa: T201
@@ -42,7 +44,7 @@ def exit_code_of(error: BaseException, arguments: Iterable[str] = ()) -> int:
     sentence = user_sentence(error, arguments)
     if sentence is not None:
         print(f"error: {sentence}", file=sys.stderr)  # noqa: T201
-        return BAD_INPUT
+        return NOTHING_SHOWN if _showed_nothing(error) else BAD_INPUT
     traceback.print_exception(error)
     print("error: this is a bug in intrasplat; please report it with the lines above", file=sys.stderr)  # noqa: T201
     return BUG
@@ -63,6 +65,12 @@ def user_sentence(error: BaseException, arguments: Iterable[str] = ()) -> str | 
             said = str(link) if isinstance(link, UserError) else _of_the_machine(link, arguments)
             return None if said is None else printable(said) + where
     return None
+
+
+def _showed_nothing(error: BaseException) -> bool:
+    from operators.errors import NothingShown
+
+    return isinstance(error, NothingShown)
 
 
 def _of_the_machine(error: BaseException, arguments: Iterable[str]) -> str | None:

@@ -28,6 +28,7 @@ from services.cli.interrupt import InterruptRequest
 from services.cli.runs import next_frame_line, quality_line
 from services.cli.streams import printable
 from services.reports.build import write_reports
+from services.reports.nothing_shown import require_shown
 from services.reports.schema import LiveFacts, RunReport
 
 _KEPT = re.compile(r"(\d+(?:\.\d+)?) *([A-Za-z]+)")
@@ -137,18 +138,23 @@ def recording_kept(texts: Sequence[str]) -> WriterOptions:
 
 
 def live_command(settings: LiveSettings, *, keep: bool, as_json: bool) -> int:
-    """Run live, write the reports whatever the end, print the result; returns the exit code. Without `keep` nothing stays on the disk."""
+    """Run live, write the reports whatever the end, print the result; returns the exit code. Without `keep` nothing stays on the disk.
+
+    Raises NothingShown for a run that showed no frame.
+    """
     written: list[RunReport] = []
 
     def report(outcome: RunOutcome, folder: Path) -> None:
         written.append(write_reports(outcome, folder))
 
     with InterruptRequest() as interrupt, LiveStatus(quiet=as_json) as status:
-        live(settings, stop_requested=interrupt, on_scored=status, report=report)
+        outcome = live(settings, stop_requested=interrupt, on_scored=status, report=report)
+    if written:
+        print_live(written[0], settings.out if keep else None, as_json=as_json)
+    require_shown(outcome)
     if not written:
         typer.echo("ended before there was anything to show", err=True)
         return INTERRUPTED if interrupt.requested else OK
-    print_live(written[0], settings.out if keep else None, as_json=as_json)
     # A stream has no end of its own: to interrupt it is how it is ended.
     return OK
 

@@ -15,24 +15,27 @@ from services.cli.interrupt import InterruptRequest
 from services.cli.progress import ProgressPrinter
 from services.cli.streams import printable
 from services.reports.build import write_reports
+from services.reports.nothing_shown import require_shown
 from services.reports.schema import RunReport
 
 Run = Callable[[ProgressCallback, Callable[[], bool], Report], RunOutcome]
 
 
 def report_run(run: Run, out: Path, *, as_json: bool) -> int:
-    """Run, write the reports whatever the end, print the result; returns the exit code."""
+    """Run, write the reports whatever the end, print the result; returns the exit code. Raises NothingShown for a run that showed no frame."""
     written: list[RunReport] = []
 
     def report(outcome: RunOutcome, folder: Path) -> None:
         written.append(write_reports(outcome, folder))
 
     with InterruptRequest() as interrupt, ProgressPrinter(quiet=as_json) as progress:
-        run(progress, interrupt, report)
+        outcome = run(progress, interrupt, report)
+    if written:
+        print_report(written[0], out, as_json=as_json)
+    if not interrupt.requested or not written:
+        require_shown(outcome)
     if not written:
         typer.echo("interrupted before there was anything to write", err=True)
-        return INTERRUPTED
-    print_report(written[0], out, as_json=as_json)
     return INTERRUPTED if interrupt.requested else OK
 
 

@@ -18,6 +18,7 @@ from services.jobs.records import JobProgress, JobState
 from services.jobs.task import Task
 from services.registry.bundle_file import SUFFIX, pack
 from services.reports.build import write_reports
+from services.reports.nothing_shown import require_shown
 
 SAY_S = 0.2
 MODEL = "model"
@@ -28,7 +29,7 @@ def work(task: Task) -> None:
     torch.set_num_threads(task.threads)
     try:
         settings = ReplaySettings(recording=Path(task.source), out=task.out, **task.options)
-        replay(settings, _Teller(task), report=_write_reports)
+        require_shown(replay(settings, _Teller(task), report=_write_reports))
         if task.pack_model:
             _pack(task.out)
     except Exception as error:  # noqa: BLE001 - whoever waits for this job gets to know it as its reason

@@ -57,7 +57,7 @@ def build_report(outcome: RunOutcome) -> RunReport:
         run=_run(outcome),
         frames=FrameCounts(
             ingested=source.frames,
-            displayed=_displayed(outcome, quality),
+            displayed=displayed(outcome),
             dropped=outcome.dropped + (0 if training is None else training.passed_over),
             damaged=source.damaged,
         ),
@@ -88,11 +88,14 @@ def build_report(outcome: RunOutcome) -> RunReport:
     )
 
 
-def _displayed(outcome: RunOutcome, quality: QualityResult) -> int:
-    video, screen = outcome.find(DisplayResult), outcome.find(LiveDisplayResult)
-    if screen is not None:
+def displayed(outcome: RunOutcome) -> int:
+    """Return the number of frames that a run showed."""
+    video, screen, quality = (outcome.find(kind) for kind in (DisplayResult, LiveDisplayResult, QualityResult))
+    if isinstance(screen, LiveDisplayResult):
         return screen.pictures
-    return quality.frames if video is None else video.frames
+    if isinstance(video, DisplayResult):
+        return video.frames
+    return quality.frames if isinstance(quality, QualityResult) else 0
 
 
 def _entry(entry: Entry, kind: type[FrameEntry]) -> FrameEntry:

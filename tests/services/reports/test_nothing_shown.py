@@ -1,0 +1,135 @@
+"""A run that showed nothing says how many frames came, why they were withheld, and what changes that."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import pytest
+
+from gsplat_core.scene.cameras import Camera
+from operators.applications.result import RunOutcome, RunSettings
+from operators.display import LiveDisplayResult
+from operators.endoscope.stages import PICTURE_STAGES, TISSUE_STAGES
+from operators.errors import NothingShown
+from operators.ingest import SourceResult
+from operators.live_reconstruct import TrainingCounts
+from operators.metrics import QualityResult
+from operators.out_of_body import OutOfBodyFrames
+from operators.sinks.video import DisplayResult
+from operators.sources.source import SourceDescription
+from services.cli.exit_codes import BAD_INPUT, NOTHING_SHOWN, exit_code_of
+from services.reports.nothing_shown import REMEDIES, require_shown
+
+CAMERA = Camera.from_focal(60.0, 64, 48)
+
+
+def ended(command, *parts, interrupted=False, wall_s=3.0, stop_reason="end of stream"):
+    """The outcome of a run with these parts."""
+    return RunOutcome(
+        command=command,
+        settings=RunSettings("cpu", "embedded", "basis", "alpha", 0, 1.0, None, False),
+        started_at=datetime.now(UTC),
+        wall_s=wall_s,
+        stop_reason=stop_reason,
+        interrupted=interrupted,
+        dropped=0,
+        dropped_by_edge={},
+        latency={},
+        latency_quantiles_ms={},
+        operators={},
+        parts={type(part): part for part in parts},
+        notes=(),
+        outputs={},
+        peak_memory_bytes=1,
+    )
+
+
+def source(frames, **more):
+    description = SourceDescription(name="theatre 3", camera=CAMERA, width_px=64, height_px=48, fps=25.0)
+    return SourceResult(description, frames, True, **more)
+
+
+def withheld(**counts):
+    return TrainingCounts(withheld={reason.replace("_", " "): count for reason, count in counts.items()})
+
+
+def sentence(outcome):
+    with pytest.raises(NothingShown) as error:
+        require_shown(outcome)
+    assert exit_code_of(error.value) == NOTHING_SHOWN == 3
+    return str(error.value)
+
+
+def test_withheld_frames_are_counted_by_reason_with_what_changes_it():
+    gate = OutOfBodyFrames("withhold", 10, {"even light, little red": 30, "not yet certain again": 10})
+    said = sentence(ended("live", source(50), withheld(out_of_body=40, no_tissue=6, blur=4), gate))
+    assert said == (
+        "nothing was shown: 50 frames came, 50 withheld (out of body, mostly for even light, little red: 40, no tissue: 6, blur: 4);"
+        " --out-of-body off lets these frames pass; --tool-mask none takes every pixel for tissue;"
+        " a longer run shows such a stream after a second or two"
+    )
+
+
+def test_only_the_remedies_of_the_reasons_that_occurred_are_named():
+    said = sentence(ended("live", source(1), withheld(black=1)))
+    assert said == "nothing was shown: 1 frame came, 1 withheld (black: 1); check what the source sends"
+
+
+def test_a_source_that_never_gave_a_frame_says_what_state_it_was_in():
+    said = sentence(ended("live", source(0, state_sentence="no data since 3 s"), withheld()))
+    assert said.startswith(
+        "nothing was shown: no frame came from theatre 3 in 3.0 s (no data since 3 s); check that it"
+    )
+    assert "(end of stream)" in sentence(ended("live", source(0), withheld()))
+    assert sentence(ended("replay", source(0))).endswith("check that it holds frames")
+
+
+def test_frames_that_never_reached_the_screen():
+    said = sentence(ended("live", source(3), withheld(), stop_reason="end of the time asked for"))
+    assert "3 frames came, and the run ended before one was on the screen (end of the time asked for)" in said
+
+
+def test_a_replayed_session_says_that_its_frames_were_withheld_before():
+    said = sentence(ended("replay", source(8, withheld={"out of body": 8}), DisplayResult(0)))
+    assert said.startswith(
+        "nothing was shown: 8 frames came, 8 withheld when they were recorded (out of body: 8); record"
+    )
+    assert "check the connection, or the file" in sentence(ended("replay", source(2, damaged=2)))
+
+
+@pytest.mark.parametrize(
+    "parts", [(LiveDisplayResult(1, None, {}, None),), (DisplayResult(1),), (QualityResult(None, None, (), 1, "", 1),)]
+)
+def test_a_run_that_showed_a_frame_is_left_alone(parts):
+    require_shown(ended("live", source(5), withheld(blur=4), *parts))
+
+
+def test_a_run_that_was_interrupted_before_its_first_picture_is_no_failure_unless_frames_were_withheld():
+    require_shown(ended("live", source(0), withheld(), interrupted=True))
+    require_shown(ended("live", source(2), withheld(), interrupted=True))
+    assert "withheld (blur: 2)" in sentence(ended("live", source(2), withheld(blur=2), interrupted=True))
+
+
+def test_another_error_of_the_user_keeps_its_exit_code(capsys):
+    from gsplat_core.errors import InvalidSetting
+
+    assert exit_code_of(InvalidSetting("fps is nan")) == BAD_INPUT
+
+
+def test_every_reason_of_a_gate_has_a_remedy():
+    """Reasons are the words that stages withhold with, read from their sources."""
+    import inspect
+    import re
+
+    words = set()
+    for make in (*PICTURE_STAGES.values(), *TISSUE_STAGES.values()):
+        module = inspect.getsource(inspect.getmodule(make))
+        for core in re.findall(r"from gsplat_core\.endoscope\.(\w+) import", module):
+            text = inspect.getsource(__import__(f"gsplat_core.endoscope.{core}", fromlist=["x"]))
+            words |= {
+                each
+                for line in re.findall(r"One of (.*)|\"\"\" ?(\".*?None.*)", text)
+                for each in re.findall(r'"([^"]+)"', "".join(line))
+            }
+    assert {"black", "torn", "no tissue"} <= words
+    assert words - set(REMEDIES) <= {"depth repaired", "depth not usable", "depth at another scale"}

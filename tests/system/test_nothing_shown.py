@@ -1,0 +1,60 @@
+"""`intrasplat live`, `replay` and `batch` end with 3 and a sentence where no frame was shown."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from services.cli.app import run
+from services.cli.exit_codes import NOTHING_SHOWN, OK
+
+
+@pytest.fixture
+def drapes(tmp_path):
+    """A recording of nothing but blue drapes, whose light changes a little from frame to frame."""
+    folder = tmp_path / "in" / "drapes"
+    (folder / "images").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    folds = cv2.GaussianBlur(rng.normal(0, 1, (96, 128)), (0, 0), 10)
+    for k in range(6):
+        light = 1 + (0.2 + 0.02 * k) * folds / np.abs(folds).max()
+        picture = np.clip(np.array([160, 110, 60]) * light[..., None] + rng.normal(0, 3, (96, 128, 3)), 0, 255)
+        cv2.imwrite(str(folder / "images" / f"{k:06d}.png"), picture.astype(np.uint8))
+    return folder
+
+
+def test_a_live_run_and_the_replay_of_its_session(drapes, tmp_path, capsys):
+    """One test: a live run takes seconds."""
+    assert (
+        run(["live", str(drapes), "--out", str(tmp_path / "out"), "--record", "--max-frames", "6", "--fps", "20"])
+        == NOTHING_SHOWN
+    )
+    said = capsys.readouterr().err
+    assert "nothing was shown: 6 frames came, 6 withheld (out of body" in said and "--out-of-body off" in said
+    (session,) = (tmp_path / "out" / "recordings").iterdir()
+    for more in ([], ["--ignore-schedule"]):
+        assert run(["replay", str(session), "--out", str(tmp_path / "again"), *more]) == NOTHING_SHOWN
+        said = capsys.readouterr().err
+        assert "6 withheld when they were recorded (out of body: 6)" in said and "interrupted" not in said
+
+
+def test_with_the_gate_off_the_same_run_shows_its_frames(drapes, tmp_path, capsys):
+    assert (
+        run(
+            [
+                "live",
+                str(drapes),
+                "--out",
+                str(tmp_path / "out"),
+                "--out-of-body",
+                "off",
+                "--max-frames",
+                "6",
+                "--fps",
+                "20",
+            ]
+        )
+        == OK
+    )
+    assert "nothing was shown" not in capsys.readouterr().err
