@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import shutil
 import threading
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -97,13 +99,18 @@ class SessionRecorder:
         self._thread: threading.Thread | None = None
 
     def open(self) -> None:
-        """Begin the recording. Raises OutputError where the folder does not take it, or holds one already."""
+        """Begin the recording. Raises OutputError where the folder does not take it, or holds one already; it is then left as it was."""
         if (self.folder / SESSION_FILE).exists():
             raise OutputError(f"{self.folder} already holds a recording; choose another folder")
+        made = [path for path in (self.folder, *self.folder.parents) if not path.exists()]
         with storage_errors(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._reserve.require()
-            writer = SessionWriter(self.folder, self.info, self.options)
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                self._reserve.require()
+                writer = SessionWriter(self.folder, self.info, self.options)
+            except BaseException:
+                _remove(made)
+                raise
         name = f"record {self.folder.name}"
         self._thread = threading.Thread(target=self._run, args=(writer,), name=name, daemon=True)
         self._thread.start()
@@ -260,6 +267,15 @@ class SessionRecorder:
         with self._changed:
             self._end(why)
         writer.abandon(why[:1000])
+
+
+def _remove(made: Sequence[Path]) -> None:
+    """Remove folders that were made for a recording that did not begin, the recording's own first; those that hold something else stay."""
+    for folder in made:
+        if folder == made[0]:
+            shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def _bytes(frame: Frame, arrived: Frame | None = None) -> int:

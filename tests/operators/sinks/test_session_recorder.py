@@ -277,9 +277,35 @@ def test_a_folder_with_a_recording_is_refused(tmp_path):
         recorder_in(tmp_path)
 
 
-def test_a_disk_that_is_full_at_the_beginning_is_refused(tmp_path):
+def recorder_of(folder, reserve=None):
+    return SessionRecorder(folder, session_info(), reserve=reserve)
+
+
+def test_a_disk_that_is_full_at_the_beginning_is_refused_and_nothing_is_left(tmp_path):
+    full = StorageReserve(tmp_path, lambda: 2**62)
+    (tmp_path / "out").mkdir()
+    for folder in (tmp_path / "out" / "recordings" / "s", tmp_path / "s", tmp_path / "out" / "s"):
+        with pytest.raises(StorageFull):
+            recorder_of(folder, full).open()
+    assert [path.name for path in tmp_path.rglob("*")] == ["out"], "folders that were there before stay"
+
+
+def test_a_recording_that_cannot_begin_leaves_earlier_recordings_beside_it(tmp_path, monkeypatch):
+    (tmp_path / "recordings" / "earlier").mkdir(parents=True)
+
+    def begun(folder, *_):
+        (folder / "segments").mkdir()
+        (folder / "session.json").write_text("{")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("operators.sinks.session_recorder.SessionWriter", begun)
     with pytest.raises(StorageFull):
-        recorder_in(tmp_path, reserve=StorageReserve(tmp_path, lambda: 2**62))
+        recorder_of(tmp_path / "recordings" / "s").open()
+    assert [path.name for path in (tmp_path / "recordings").iterdir()] == ["earlier"]
+    (tmp_path / "recordings" / "empty").mkdir()
+    with pytest.raises(StorageFull):
+        recorder_of(tmp_path / "recordings" / "empty").open()
+    assert (tmp_path / "recordings" / "empty").is_dir(), "it was there before"
 
 
 def _root() -> Path:
