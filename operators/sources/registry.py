@@ -45,8 +45,8 @@ _BLOCKING = frozenset({*_URLS, "v4l2"})
 _BUILT_IN = frozenset(SOURCES)
 _SLOW_TO_OPEN_S = {"synthetic": 900.0}
 """It renders before it plays."""
-_STUCK_AFTER_S = {"v4l2": 5.0}
-"""A driver may wait for a camera for ever; only the end of its process ends that."""
+STUCK_AFTER_S = {"v4l2": 5.0}
+"""A driver may wait for a camera for ever; only the end of the process that reads ends that."""
 _TWO_SOURCES = "stereo:"
 _STEREO = re.compile(r"(?P<before>[?&#])stereo=(?P<layout>[^&#]*)")
 
@@ -75,18 +75,27 @@ def open_source(address: str | os.PathLike[str], options: SourceOptions | None =
     """
     options = options or SourceOptions()
     text = os.fspath(address)
+    if not text.strip():
+        raise InvalidSetting("the source is empty; give a recording, or an address such as rtsp://host/path")
     if text.startswith(_TWO_SOURCES):
         return _joined(text[len(_TWO_SOURCES) :], options)
     text, layout = _stereo_of(text, options)
     options = replace(options, stereo=None)
     scheme, rest = split_address(text)
+    if scheme in _OF_PATHS and not rest.partition("?")[0].strip():
+        raise InvalidSetting(f"{scheme}: the path is empty; give it as {scheme}:PATH")
+    if scheme in _URLS and scheme in _BUILT_IN:
+        from operators.sources.url_address import UrlAddress
+
+        # A malformed address is refused here, and not once the reading process has started and the connection has timed out.
+        UrlAddress.parse(scheme, rest)
     if _reads_in_a_process(scheme, rest, options):
         from operators.sources.process import OPEN_TIMEOUT_S, ProcessSource
 
         source: FrameSource = ProcessSource(
             text,
             replace(options, process=False),
-            stuck_after_s=_STUCK_AFTER_S.get(scheme, math.inf),
+            stuck_after_s=STUCK_AFTER_S.get(scheme, math.inf),
             open_timeout_s=_SLOW_TO_OPEN_S.get(scheme, OPEN_TIMEOUT_S),
         )
     else:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ipaddress
 import re
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
@@ -27,6 +29,7 @@ FORMATS = (
     "yuv4mpegpipe,hls,jpeg_pipe,png_pipe"
 )
 """Demuxers that a stream may turn out to be for; none that reads other files by name, but for HLS, whose parts are bound by `PROTOCOLS`."""
+_LABEL = re.compile(r"(?![-])[\w-]{1,63}(?<!-)")
 _SECRET = re.compile(r"(?<=://)[^/@\s'\"]*@")
 
 
@@ -60,8 +63,16 @@ class UrlAddress:
             host, port = parts.hostname, parts.port
         except ValueError as error:
             raise InvalidSetting(f"a {scheme} address is wrong: its host or its port cannot be read") from error
-        if not host and scheme not in ("udp", "rtp"):
+        listens = scheme in ("udp", "rtp")
+        if not host and not listens:
             raise InvalidSetting(f"a {scheme} address names no host; give it as {scheme}://host:port/path")
+        if host and not _is_host(host):
+            raise InvalidSetting(
+                f"a {scheme} address names {host!r:.80}, which is no host; give a name or an IP address"
+            )
+        if port == 0 or (port is None and (listens or scheme in ("tcp", "srt"))):
+            what = "names no port" if port is None else "has the port 0"
+            raise InvalidSetting(f"a {scheme} address {what}; give one from 1 to 65535, as in {scheme}://host:5000")
         shown = f"[{host}]" if host and ":" in host else host or ""
         name = f"{scheme}://{shown}{'' if port is None else f':{port}'}{parts.path}"
         address = cls(
@@ -87,6 +98,16 @@ class UrlAddress:
         if self.scheme in ("rtsp", "rtsps"):
             options["rtsp_transport"] = self.transport
         return options
+
+
+def _is_host(host: str) -> bool:
+    """True for an IP address and for a name that could be one: labels of letters, digits, - and _ with dots between them."""
+    with contextlib.suppress(ValueError):
+        ipaddress.ip_address(host.partition("%")[0])
+        return True
+    labels = host.removesuffix(".").split(".")
+    # What ends in a number is an IPv4 address, and has not been one.
+    return len(host) <= 253 and not labels[-1].isdigit() and all(_LABEL.fullmatch(label) for label in labels)
 
 
 def without_secrets(text: str) -> str:

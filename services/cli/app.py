@@ -44,6 +44,10 @@ app = typer.Typer(
 def run(arguments: list[str]) -> int:
     """Run a command line; returns the exit code. Every error ends here."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    if "" in arguments:
+        at = arguments.index("") + 1
+        typer.echo(f"error: argument {at} is empty; a variable of the shell may be unset", err=True)
+        return BAD_INPUT
     try:
         code = typer.main.get_command(app).main(arguments, prog_name="intrasplat", standalone_mode=False)
     except typer.Abort:

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
+import os
 import sys
 import threading
 import time
@@ -17,17 +19,18 @@ from gsplat_core.scene.frames import Frame
 from operators.errors import SourceError, SourceUnavailable
 from operators.sources.backoff import Backoff
 from operators.sources.options import SourceOptions
-from operators.sources.registry import open_source
+from operators.sources.registry import STUCK_AFTER_S, open_source, split_address
 from operators.sources.source import FrameSource, ReportingSource, SourceState
 from operators.sources.wire import description_to, frame_header, planes_of
 from operators.sources.zeromq_message import pieces
 from services.bus.errors import CommandRefused
 from services.bus.pictures import PicturePublisher
 from services.private_files import keep_files_private
-from services.supervisor.exit_codes import NO_USE
+from services.supervisor.exit_codes import FAILED, NO_USE
 from services.supervisor.specs import SourceSpec
 from services.supervisor.worker import Worker, stream_folder_of
 
+log = logging.getLogger(__name__)
 LOOK_S = 0.1
 """How often the source is asked for its state while no frame comes."""
 
@@ -83,13 +86,17 @@ class Capture:
 
     def _options(self) -> SourceOptions:
         spec = self.spec
-        return SourceOptions(scale=spec.scale, fps=spec.fps, loop=spec.loop, realtime=True)
+        # This process exists for the source alone: when the source hangs or dies, the supervisor starts the process again.
+        return SourceOptions(scale=spec.scale, fps=spec.fps, loop=spec.loop, realtime=True, process=False)
 
     def _publish(self, source: FrameSource, worker: Worker, publisher: PicturePublisher, backoff: Backoff) -> None:
         source.open()
+        stuck_after_s = STUCK_AFTER_S.get(split_address(self.spec.address)[0], math.inf)
+        given_s = time.monotonic()
         while not worker.stop_requested():
             frame = source.read(LOOK_S)
             if frame is not None:
+                given_s = time.monotonic()
                 self._send(frame, publisher)
                 backoff.worked()
                 worker.say("live", f"{source.description.name} gives frames")
@@ -98,6 +105,12 @@ class Capture:
                 worker.say(state.value, _sentence(source))
                 if state is SourceState.ENDED:
                     worker.wait(LOOK_S)
+                elif time.monotonic() - given_s > stuck_after_s:
+                    log.error(
+                        "the camera's driver has given nothing for %g s; the process ends to be started again",
+                        stuck_after_s,
+                    )
+                    os._exit(FAILED)  # the thread that waits for the driver cannot be ended otherwise
 
     def _send(self, frame: Frame, publisher: PicturePublisher) -> None:
         header = {**frame_header(frame), "run": self._run}

@@ -73,3 +73,19 @@ def test_what_is_no_address_and_not_there_is_a_missing_recording(address, tmp_pa
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RecordingMissing):
         open_source(address or tmp_path / "empty")
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["", " ", "\t\n", "recording:", "realtime:", "folder:", "v4l2:", "zmq+ipc://", "pipe:", "folder:?pattern=x"],
+)
+def test_an_empty_address_is_refused_and_is_not_the_current_folder(address, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InvalidSetting, match="is empty"):
+        open_source(address, SourceOptions(process=True, realtime=True))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 0.0, -1.0, 1e9])
+def test_a_frame_rate_that_is_none_is_refused(value):
+    with pytest.raises(InvalidSetting, match="fps is"):
+        SourceOptions(fps=value)

@@ -259,3 +259,58 @@ def test_names_and_texts_without_secrets():
     assert name == "https://host.example:8443/a/b"
     assert UrlAddress.parse("rtsp", "u:p@[::1]:554/x").name == "rtsp://[::1]:554/x"
     assert without_secrets("cannot open rtsp://me:secret@host/x now") == "cannot open rtsp://host/x now"
+
+
+MALFORMED = [
+    *(
+        (f"{scheme}://{rest}", says)
+        for scheme in ("rtsp", "rtsps", "rtp", "udp", "tcp", "srt", "rtmp", "rtmps", "http", "https")
+        for rest, says in (
+            ("host:0/x", "has the port 0"),
+            ("host:65536/x", "its host or its port cannot be read"),
+            ("host:-1/x", "its host or its port cannot be read"),
+            ("host:port/x", "its host or its port cannot be read"),
+            ("[::1/x", "its host or its port cannot be read"),
+            ("a host:5000/x", "blank or a control character"),
+            ("host\x00:5000/x", "blank or a control character"),
+            ("a..b:5000/x", "no host"),
+            ("-a:5000/x", "no host"),
+            ("a;b:5000/x", "no host"),
+            ("999.1.1.1:5000/x", "no host"),
+            ("1.2.3:5000/x", "no host"),
+            (f"{'a' * 64}:5000/x", "no host"),
+            (f"{'a.' * 127}b:5000/x", "no host"),
+            ("host:5000/x#open_s=nan", "open_s is 'nan'"),
+            ("host:5000/x#stall_s=0", "stall_s is '0'"),
+            ("host:5000/x#speed=2", "unknown option 'speed'"),
+        )
+    ),
+    *((f"{scheme}://", "names no port") for scheme in ("udp", "rtp")),
+    *((f"{scheme}://host", "names no port") for scheme in ("udp", "rtp", "tcp", "srt")),
+    *((f"{scheme}://:5000", "names no host") for scheme in ("tcp", "srt", "http", "rtsp")),
+    *((f"{scheme}:", "names no (host|port)") for scheme in ("udp", "tcp", "rtsp", "http")),
+]
+
+
+@pytest.mark.parametrize(("address", "says"), MALFORMED)
+def test_a_malformed_address_is_refused_before_anything_is_started(monkeypatch, address, says):
+    monkeypatch.setattr(
+        "operators.sources.process.ProcessSource", lambda *_, **__: pytest.fail("a process was started")
+    )
+    monkeypatch.setattr("operators.sources.url.ConnectedSource", lambda *_, **__: pytest.fail("a connection was tried"))
+    for process in (None, True, False):
+        with pytest.raises(InvalidSetting, match=says):
+            open_source(address, SourceOptions(process=process))
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "udp://:5000", "udp://@:5000", "udp://@239.0.0.1:1234", "rtp://127.0.0.1:5004", "tcp://localhost:65535",
+        "rtsp://user:p%40ss@camera-3.theatre_2.local./h264", "rtsp://[fe80::1%25eth0]:554/x", "http://10.0.0.7/stream",
+        "https://caméra.example:8443/x?y=z", "srt://[::1]:9000", "rtmp://host/app/key",
+    ],
+)  # fmt: skip
+def test_an_address_that_can_be_one_is_taken(address):
+    scheme, _, rest = address.partition("://")
+    assert UrlAddress.parse(scheme, rest).scheme == scheme
