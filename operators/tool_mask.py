@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.endoscope.mask_and_depth import MaskAndDepthSettings
 from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
 from gsplat_core.endoscope.tools import ToolFinder
 from gsplat_core.errors import InvalidSetting
@@ -21,6 +22,12 @@ from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
 
 log = logging.getLogger(__name__)
+
+
+LEAST_TISSUE = MaskAndDepthSettings().least_tissue
+"""A found mask with a smaller share of tissue says that the whole picture is tool ..."""
+BELIEVED_FRAMES = 10
+"""... and is believed for so many frames after one with tissue: a tool in front of the lens. After that, the finder takes tissue for tool."""
 
 
 class MaskFinder(Protocol):
@@ -47,6 +54,8 @@ class FoundMasks:
     """Frames that came with a mask, which they kept."""
     tool_share: float
     """Share of tool pixels, the mean over the frames whose mask was found."""
+    disbelieved: int = 0
+    """Frames in which everything was found to be tool for so long that all of it counted as tissue."""
 
 
 class RecordedToolMaskOp(Operator):
@@ -99,15 +108,25 @@ class FoundToolMaskOp(Operator):
     Params:
         make_finder: called by `start()`.
         method: its name in `FoundMasks`.
+        doubts: take a picture that is all tool for all tissue, unless it comes soon after one that shows tissue. Grey tissue may look like
+            steel, and a stream of it must pass.
     """
 
     def __init__(
-        self, fragment: Any, *args: Any, make_finder: Callable[[], MaskFinder], method: str, **kwargs: Any
+        self,
+        fragment: Any,
+        *args: Any,
+        make_finder: Callable[[], MaskFinder],
+        method: str,
+        doubts: bool = False,
+        **kwargs: Any,
     ) -> None:
         self.make_finder = make_finder
         self.method = method
+        self.doubts = doubts
         self._finder: MaskFinder | None = None
-        self._found = self._recorded = 0
+        self._found = self._recorded = self._disbelieved = 0
+        self._since_tissue = BELIEVED_FRAMES
         self._tool_shares = 0.0
         super().__init__(fragment, *args, **kwargs)
 
@@ -117,7 +136,8 @@ class FoundToolMaskOp(Operator):
 
     def start(self) -> None:
         self._finder = self.make_finder()
-        self._found = self._recorded = 0
+        self._found = self._recorded = self._disbelieved = 0
+        self._since_tissue = BELIEVED_FRAMES
         self._tool_shares = 0.0
 
     def stop(self) -> None:
@@ -128,8 +148,9 @@ class FoundToolMaskOp(Operator):
         assert self._finder is not None
         if frame.new_scene is not None:
             self._finder.reset()
+            self._since_tissue = BELIEVED_FRAMES
         if frame.mask is None:
-            mask = self._finder.find(frame.image)
+            mask = self._believed(frame, self._finder.find(frame.image))
             self._found += 1
             self._tool_shares += 1 - cv2.countNonZero(mask) / mask.size
             frame = frame.with_fields(mask=mask)
@@ -137,17 +158,34 @@ class FoundToolMaskOp(Operator):
             self._recorded += 1
         op_output.emit(frame, "frame")
 
+    def _believed(self, frame: Frame, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the found mask, or one without tools where the finder has found no tissue for too long."""
+        if frame.withheld is not None or not self.doubts:
+            return mask
+        if cv2.countNonZero(mask) >= LEAST_TISSUE * mask.size:
+            self._since_tissue = 0
+            return mask
+        self._since_tissue += 1
+        if self._since_tissue <= BELIEVED_FRAMES:
+            return mask
+        self._disbelieved += 1
+        return all_tissue(frame)
+
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """See `Contributor`."""
         share = self._tool_shares / self._found if self._found else 0.0
-        outcome.add(FoundMasks(self.method, self._found, self._recorded, share))
+        outcome.add(FoundMasks(self.method, self._found, self._recorded, share, self._disbelieved))
+        if self._disbelieved:
+            outcome.note(
+                f"in {self._disbelieved} frames everything looked like a tool for too long; all of their pixels counted as tissue"
+            )
 
 
 class BuiltInToolMaskOp(FoundToolMaskOp):
     """Finds tools by colour, edges and consistency in time (`ToolFinder`)."""
 
     def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
-        super().__init__(fragment, *args, make_finder=ToolFinder, method="builtin", **kwargs)
+        super().__init__(fragment, *args, make_finder=ToolFinder, method="builtin", doubts=True, **kwargs)
 
 
 class NoToolMaskOp(Operator):

@@ -13,6 +13,7 @@ from onnx import TensorProto, helper
 from gsplat_core.errors import InvalidSetting
 from operators.outcome import OutcomeBuilder
 from operators.tool_mask import (
+    BELIEVED_FRAMES,
     TOOL_MASKS,
     FoundMasks,
     FoundToolMaskOp,
@@ -169,3 +170,45 @@ def test_what_a_network_could_not_say_is_stated(frame, compute, tmp_path):
     outcome = OutcomeBuilder()
     operator.contribute(outcome)
     assert outcome.notes == ("the tool network gave NaN for 1 frames; all of their pixels counted as tool",)
+
+
+class Says:
+    """Finds masks whose share of tissue it is told, one after another."""
+
+    def __init__(self, *shares):
+        self.shares = list(shares)
+
+    def reset(self): ...
+
+    def find(self, image):
+        mask = np.zeros(image.shape[:2], np.uint8)
+        mask[: round(self.shares.pop(0) * len(mask))] = 1
+        return mask
+
+
+def tissue_shares(frame, compute, *shares, **fields):
+    operator = FoundToolMaskOp(None, make_finder=lambda: Says(*shares), method="fake", doubts=True)
+    operator.start()
+    frames = [frame(k, image=np.zeros((100, 60, 3), np.uint8), **fields.get(str(k), {})) for k in range(len(shares))]
+    found = [float(compute(operator, frame=each)[0].mask.mean()) for each in frames]
+    return found, operator
+
+
+def test_a_stream_in_which_everything_looks_like_a_tool_is_tissue(frame, compute):
+    found, operator = tissue_shares(frame, compute, *[0.0] * 5, 0.01)
+    assert found == [1.0] * 6
+    assert found_masks(operator) == FoundMasks("fake", 6, 0, 0.0, 6)
+    assert "in 6 frames everything looked like a tool" in " ".join(notes(operator))
+
+
+def test_a_tool_before_the_lens_is_believed_for_a_while(frame, compute):
+    found, operator = tissue_shares(frame, compute, 0.5, *[0.0] * BELIEVED_FRAMES, 0.0, 0.0, 0.02, 0.0)
+    assert found == [0.5] + [0.0] * BELIEVED_FRAMES + [1.0, 1.0, 0.02, 0.0]
+    assert found_masks(operator).disbelieved == 2
+
+
+def test_another_scene_has_shown_no_tissue_yet_and_withheld_frames_say_nothing(frame, compute):
+    found, _ = tissue_shares(frame, compute, 0.5, 0.0, 0.0, 0.0, **{"2": {"new_scene": "cut"}})
+    assert found == [0.5, 0.0, 1.0, 1.0]
+    found, operator = tissue_shares(frame, compute, 0.0, 0.0, **{"0": {"withheld": "out of body"}})
+    assert found == [0.0, 1.0] and found_masks(operator).disbelieved == 1
