@@ -39,6 +39,10 @@ class StreamFacts:
     viewers: Mapping[str, int] = field(default_factory=dict)
 
 
+OUT_OF_BODY = "out of body"
+"""Reason with which the engine's out-of-body gate withholds a frame."""
+
+
 class Stream:
     """A stream that was asked for: its supervisor and its viewers, while it runs."""
 
@@ -78,7 +82,17 @@ def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | Non
     shown = (engine.figures.get("picture") or {}).get("state")
     if shown in ("live", "stale", "frozen", "source lost"):
         return str(shown), None
-    return "starting", "the first picture is being made"
+    return "starting", _withheld(engine) or "the first picture is being made"
+
+
+def _withheld(engine: ProcessState) -> str | None:
+    """Say why a running engine has shown nothing although frames came; None where none was withheld."""
+    frames, withheld = engine.figures.get("frames"), engine.figures.get("withheld")
+    if not frames or not isinstance(withheld, Mapping) or not withheld:
+        return None
+    counts = ", ".join(f"{reason}: {count}" for reason, count in sorted(withheld.items(), key=lambda each: -each[1]))
+    hint = "; the stream's option out_of_body: off lets those out of body pass" if OUT_OF_BODY in withheld else ""
+    return f"nothing is shown: of {frames} frames {sum(withheld.values())} were withheld ({counts}){hint}"
 
 
 class SupervisedStreams:

@@ -67,6 +67,33 @@ def test_a_stream_is_what_its_processes_are(capture, engine, expected):
     assert overall(capture, engine) == expected
 
 
+def test_a_stream_whose_frames_are_all_withheld_says_why_nothing_is_shown():
+    capture = ProcessState("live", "", 1, 0, {}, 0.1)
+
+    def reason(picture=None, **figures):
+        engine = ProcessState(
+            "running", "reconstructs", 2, 0, {**figures, **({"picture": picture} if picture else {})}, 0.1
+        )
+        return overall(capture, engine)
+
+    withheld = {"blur": 2, "out of body": 40}
+    assert reason(frames=45, withheld=withheld) == (
+        "starting",
+        "nothing is shown: of 45 frames 42 were withheld (out of body: 40, blur: 2);"
+        " the stream's option out_of_body: off lets those out of body pass",
+    )
+    assert reason(frames=2, withheld={"black": 2})[1] == "nothing is shown: of 2 frames 2 were withheld (black: 2)"
+    for figures in (
+        {},
+        {"frames": 3},
+        {"frames": 3, "withheld": {}},
+        {"frames": 0, "withheld": {"blur": 1}},
+        {"frames": 3, "withheld": None},
+    ):
+        assert reason(**figures) == ("starting", "the first picture is being made")
+    assert reason(picture={"state": "live"}, frames=45, withheld=withheld) == ("live", None)
+
+
 def test_what_is_asked_of_depth_eyes_and_poses_reaches_the_reconstruction(tmp_path):
     asked = spec_of(wanted(depth="stereo", eyes="both", poses="estimated")).engine
     settings = live_settings(asked, tmp_path, "a source")
