@@ -78,7 +78,7 @@ def test_runs(path, tmp_path, server):
         env={**os.environ, "PYTHONPATH": search, "OMP_NUM_THREADS": "2"},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr
     said = re.search(expected, done.stdout)

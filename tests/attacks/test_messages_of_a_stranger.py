@@ -34,7 +34,7 @@ def opened(address):
 
 
 def next_frame(source):
-    end = time.monotonic() + 30
+    end = time.monotonic() + 300
     while (frame := source.read(0.1)) is None:
         assert time.monotonic() < end, source.state_sentence
     return frame

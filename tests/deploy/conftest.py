@@ -50,7 +50,7 @@ def tool() -> Run:
         program = shutil.which(name, path=places)
         if program is None:
             missing(f"{name} is not installed; it is in {WHERE[name]}")
-        return subprocess.run([program, *map(str, arguments)], capture_output=True, text=True, timeout=60, **options)  # type: ignore[call-overload]
+        return subprocess.run([program, *map(str, arguments)], capture_output=True, text=True, timeout=300, **options)  # type: ignore[call-overload]
 
     return run
 

@@ -40,7 +40,7 @@ def server(status: int) -> Iterator[str]:
 def check(url: str) -> subprocess.CompletedProcess[str]:
     environment = {"HEALTHCHECK_URL": url, "http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
     return subprocess.run(
-        [sys.executable, "-I", SCRIPT], env=environment, capture_output=True, text=True, timeout=30, check=False
+        [sys.executable, "-I", SCRIPT], env=environment, capture_output=True, text=True, timeout=300, check=False
     )
 
 

@@ -79,6 +79,6 @@ def test_an_argument_is_refused_with_a_static_runtime():
     (linked,) = build.rglob("gsplat_core_cpu_static_runtime.so")
     needed = subprocess.run(["readelf", "-d", linked], check=True, capture_output=True, text=True).stdout
     assert "libstdc++" not in needed and "libgcc_s" not in needed
-    result = subprocess.run([sys.executable, "-c", REFUSED, linked], capture_output=True, text=True, timeout=120)
+    result = subprocess.run([sys.executable, "-c", REFUSED, linked], capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
     assert "capacity must be 0 to 2^31 - 1, got -7" in result.stdout

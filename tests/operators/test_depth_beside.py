@@ -23,7 +23,7 @@ from operators.outcome import OutcomeBuilder
 CAMERA = Camera.from_focal(30.0, 24, 16)
 PLANE = np.full((16, 24), 50, np.float32)
 SURE = np.ones((16, 24), np.float32)
-WAIT_S = 20
+WAIT_S = 300.0
 
 
 class Gated:

@@ -100,7 +100,7 @@ def test_the_third_chain_sees_what_both_found(make, frame, compute):
 
 
 def test_the_chains_run_at_the_same_time(make, frame, compute):
-    meet = threading.Barrier(2, timeout=20)
+    meet = threading.Barrier(2, timeout=300)
 
     def wait(found):
         meet.wait()

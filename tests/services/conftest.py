@@ -23,7 +23,7 @@ from services.reports.schema import RunReport
 from tests.missing import missing
 from tests.services.registry.servers import new_database
 
-SERVER_STARTS_S = 30.0
+SERVER_STARTS_S = 300.0
 
 PATH = "source,tool_mask,reconstruct,deform,rasterize,video"
 

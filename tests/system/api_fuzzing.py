@@ -32,7 +32,7 @@ CHECKS = (
 ENDLESS = "/v1/streams/{name}/mjpeg"
 """Has no end while a stream runs, so that nobody could wait for it: it is called while none does. `tests/services/control/test_display.py` has
 the pictures."""
-ANSWER_S = 30
+ANSWER_S = 300.0
 
 
 def with_models(client: Client, folder: Path) -> None:

@@ -18,7 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from tests.missing import missing
 
-START_S = 60
+START_S = 300.0
 PROGRAMS = {"chromium": ("chromium", "chromium-browser", "google-chrome"), "firefox": ("firefox-esr", "firefox")}
 
 

@@ -31,13 +31,13 @@ def serving(folder: Path) -> Iterator[tuple[str, str]]:
         command = [sys.executable, "-m", "services.cli", "serve", "--config", settings]
         process = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=output)
     try:
-        end_s = time.monotonic() + 60
+        end_s = time.monotonic() + 300
         while not (found := re.search(r"IntraSplat is on (http://[^/\s]+)", log.read_text())):
             assert time.monotonic() < end_s and process.poll() is None, log.read_text()
             time.sleep(0.05)
         yield found[1], (folder / "data" / "admin.key").read_text().strip()
         process.terminate()
-        assert process.wait(60) == 0, log.read_text()[-4000:]
+        assert process.wait(300) == 0, log.read_text()[-4000:]
         assert "Traceback" not in log.read_text(), log.read_text()
     finally:
         process.kill()

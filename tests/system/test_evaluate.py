@@ -224,7 +224,7 @@ def test_an_interrupted_evaluation_leaves_what_it_reached(long, offline, tmp_pat
         if line.startswith("causal 1/"):
             break
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     assert process.returncode == 130, err
     report = EvaluationReport.read(tmp_path / "out" / "evaluation.json")
     assert report.evaluated.interrupted and any("interrupted" in note for note in report.notes)

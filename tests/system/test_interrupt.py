@@ -35,7 +35,7 @@ def test_an_interrupted_replay_writes_what_it_has(request, long, tmp_path, start
     process = start("replay", long, "--out", out, "--engine", engine, "--steps-per-frame", 12)
     wait_for_line(process, "replay 1")
     process.send_signal(signal.SIGINT)
-    stdout, stderr = process.communicate(timeout=60)
+    stdout, stderr = process.communicate(timeout=300)
     assert process.returncode == 130, stderr
     assert "Traceback" not in stderr
     assert stdout.strip().endswith(str(out / "report.html"))
@@ -52,7 +52,7 @@ def test_an_interrupted_reconstruction_keeps_the_model_as_it_is(long, tmp_path, 
     process = start("reconstruct", long, "--out", out, "--steps", 100_000)
     wait_for_line(process, "train 1/100000")
     process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
+    _, stderr = process.communicate(timeout=300)
     assert process.returncode == 130, stderr
     assert "Traceback" not in stderr
     assert load_bundle(out / "model").gaussians.count > 0

@@ -67,7 +67,7 @@ def one_sentence(err):
 def test_a_signal_is_how_a_stream_is_ended(scope, tmp_path, start, number):
     process = showing(start, scope, tmp_path / "out")
     process.send_signal(number)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 0 and "Traceback" not in err
     assert "ended: interrupted" in out and "error" not in err
     report = reached(tmp_path / "out")
@@ -132,7 +132,7 @@ def test_a_disk_that_fills_up(scope, small_disk, start):
     process = showing(start, scope, small_disk / "out")
     with open(small_disk / "ballast", "ab") as ballast:
         os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(small_disk).free - (6 << 20))
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     assert process.returncode == 2
     assert "is full" in one_sentence(err) and "free some space" in one_sentence(err)
     assert "is full" in reached(small_disk / "out").run.stop_reason

@@ -45,7 +45,7 @@ def test_a_killed_session_is_replayed_and_stays_when_the_next_one_is_recorded(sc
     out = tmp_path / "out"
     process = recording_under_way(start, scope, out)
     process.kill()
-    process.communicate(timeout=60)
+    process.communicate(timeout=300)
     (killed,) = (out / "recordings").iterdir()
     frames = open_recording(killed).frame_count
     assert frames >= 5  # six were shown, and FFmpeg keeps the newest picture until the next one
@@ -73,7 +73,7 @@ def test_a_killed_session_is_replayed_and_stays_when_the_next_one_is_recorded(sc
 def test_an_interrupted_session_is_complete(scope, tmp_path, start, intrasplat):
     process = recording_under_way(start, scope, tmp_path / "out")
     process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
+    _, stderr = process.communicate(timeout=300)
     assert "Traceback" not in stderr
     (folder,) = (tmp_path / "out" / "recordings").iterdir()
     assert open_recording(folder).notes == ()

@@ -41,7 +41,7 @@ def test_the_life_cycle_with_curl(tiny, tmp_path):
     with tempfile.TemporaryDirectory(prefix="isg-") as folder, serving(Path(folder)) as (url, _):
         environment = {**os.environ, "URL": url, "KEY_FILE": f"{folder}/data/admin.key"}
         done = subprocess.run(
-            ["bash", "-euc", commands], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
+            ["bash", "-euc", commands], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
         )
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "pictures.mjpeg").read_bytes().count(b"\xff\xd8\xff") >= 1

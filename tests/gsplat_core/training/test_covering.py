@@ -66,7 +66,7 @@ def test_what_is_under_way_for_a_scene_that_is_left_joins_no_other(step, seen, f
     gate = threading.Event()
 
     def pictures():
-        assert gate.wait(20)
+        assert gate.wait(300)
         return frame
 
     late.look(step, seen, pictures)

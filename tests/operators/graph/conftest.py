@@ -22,7 +22,7 @@ from operators.graph import (
     run,
 )
 
-GUARD_S = 20.0
+GUARD_S = 300.0
 ENGINES = [
     pytest.param(("embedded", GreedyScheduler), id="greedy"),
     pytest.param(("embedded", MultiThreadScheduler), id="threads"),

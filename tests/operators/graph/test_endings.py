@@ -118,11 +118,11 @@ def test_stop_execution_from_another_thread(kit, runner, waiting_for):
 
     app = kit.Wired(wire)
     thread, outcome = runner.in_background(app)
-    assert begun.wait(10)
+    assert begun.wait(300)
     with pytest.raises(GraphBusy):
         app.run()
     app.stop_execution()
-    thread.join(10)
+    thread.join(300)
     assert not thread.is_alive(), "stop_execution did not end the run"
     assert outcome[0].reason is StopReason.STOPPED
 
@@ -165,17 +165,17 @@ def test_an_outside_event_wakes(kit, runner):
 
     app = kit.Wired(wire)
     thread, outcome = runner.in_background(app)
-    assert ready.wait(10)
+    assert ready.wait(300)
     event = app.ops.conditions[0]
     for _ in range(3):
-        assert app.ops.asleep.wait(10)
+        assert app.ops.asleep.wait(300)
         app.ops.asleep.clear()
         time.sleep(0.02)
         event.event_state = AsynchronousEventState.EVENT_DONE
-    assert app.ops.asleep.wait(10)
+    assert app.ops.asleep.wait(300)
     time.sleep(0.02)
     event.event_state = AsynchronousEventState.EVENT_NEVER
-    thread.join(10)
+    thread.join(300)
     assert not thread.is_alive(), "EVENT_NEVER did not end the run"
     assert outcome[0].reason is StopReason.FINISHED
     assert app.ops.computes == 4

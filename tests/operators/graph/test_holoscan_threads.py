@@ -91,10 +91,10 @@ def test_an_operator_that_two_threads_look_at_when_it_stops_is_not_started_again
 
     app = kit.Wired(wire)
     thread, outcome = runner.in_background(app)
-    assert computed.wait(10)
+    assert computed.wait(300)
     time.sleep(0.05)  # one thread looks because it has computed,
     app.ops.wake_scheduler()  # another because of this
     time.sleep(0.05)
     app.stop_execution()
-    thread.join(10)
+    thread.join(300)
     assert outcome[0].reason is StopReason.STOPPED

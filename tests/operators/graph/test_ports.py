@@ -45,7 +45,7 @@ def test_a_dropping_edge_does_not_hold_up_its_producer(kit, runner):
         source = app.counted(100, kit.Source, name="source")
         slow, fast = kit.Collect(app, name="viewer"), kit.Collect(app, name="recorder")
         if runner.threads:
-            slow.function = lambda value: seen.wait(10)
+            slow.function = lambda value: seen.wait(300)
             fast.function = lambda value: seen.set() if value == 99 else None
         app.add_flow(source, slow, policy="drop_oldest")
         app.add_flow(source, fast)

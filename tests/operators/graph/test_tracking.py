@@ -101,7 +101,7 @@ def test_flow_is_readable_while_running(kit, runner):
     def pause(value):
         if value == 5:
             passed.set()
-            assert go_on.wait(10)
+            assert go_on.wait(300)
 
     def wire(app):
         app.chain(app.counted(9, kit.Source, name="src"), kit.Collect(app, name="sink", function=pause))
@@ -109,14 +109,14 @@ def test_flow_is_readable_while_running(kit, runner):
     app = kit.Wired(wire)
     tracker = app.track()
     thread, outcome = runner.in_background(app)
-    assert passed.wait(10)
+    assert passed.wait(300)
     assert app.result is None
     assert tracker.latency()["src,sink"].count == 5
     assert tracker.compute()["sink"].count == 5 == app.compute_counts()["sink"]
     (edge,) = app.edge_stats()
     assert (edge.edge, edge.received) == ("src.out -> sink.in", 6)
     go_on.set()
-    thread.join(10)
+    thread.join(300)
     assert outcome and outcome[0] is app.result
     assert tracker.latency()["src,sink"].count == 9
 

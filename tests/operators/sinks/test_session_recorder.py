@@ -34,7 +34,7 @@ def gate(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
     written = SessionWriter.frame
 
     def slow(self, frame):
-        assert opened.wait(20)
+        assert opened.wait(300)
         written(self, frame)
 
     monkeypatch.setattr(SessionWriter, "frame", slow)
@@ -79,7 +79,7 @@ def test_a_slow_disk_loses_frames_says_so_and_makes_nobody_wait(tmp_path, gate):
     begin = time.monotonic()
     for frame in frames:
         recorder.frame(frame)
-    assert time.monotonic() - begin < 15, "a frame waited for the disk"  # which opens after 20 s at the earliest
+    assert time.monotonic() - begin < 200, "a frame waited for the disk"  # which takes nothing for 300 s
     gate.set()
     recorder.close()
     assert [frame.seq for frame in frames_of(tmp_path)] == list(range(10))

@@ -13,7 +13,7 @@ from operators.sources.live import LiveSource
 from operators.sources.order import FrameOrder
 from operators.sources.source import FrameSource, SourceDescription, SourceState
 
-SOON_S = 10.0
+SOON_S = 300.0
 """Longer than anything here takes."""
 
 

@@ -66,7 +66,7 @@ def written():
 
     yield begin
     for thread in threads:
-        thread.join(30)
+        thread.join(300)
 
 
 def test_raw_frames_become_pictures_with_even_times(fifo, reading):

@@ -21,7 +21,7 @@ from operators.sources.process import ProcessSource
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, SourceState
 
-SOON_S = 30.0
+SOON_S = 300.0
 ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -233,7 +233,7 @@ import sys, time
 from operators.sources.process import ProcessSource
 source = ProcessSource("frames=1,block", opener="stand_in_source:opener")
 source.open()
-assert source.read(30).seq == 0
+assert source.read(300).seq == 0
 print(source._child._process.pid, flush=True)
 time.sleep(1000)
 """
@@ -245,8 +245,11 @@ def test_when_the_parent_dies_the_process_ends(number):
     with subprocess.Popen(
         [sys.executable, "-c", PARENT], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=env
     ) as parent:
-        child = int(parent.stdout.readline())
-        assert not is_gone(child)
-        parent.send_signal(number)
-        parent.wait(SOON_S)
+        try:
+            child = int(parent.stdout.readline())
+            assert not is_gone(child)
+            parent.send_signal(number)
+            parent.wait(SOON_S)
+        finally:
+            parent.kill()
     until(lambda: is_gone(child) or Path(f"/proc/{child}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z")

@@ -18,7 +18,7 @@ from operators.sources.recording import RecordingSource
 from operators.sources.registry import open_source
 from operators.sources.source import FrameSource, SourceState
 
-SOON_S = 10.0
+SOON_S = 300.0
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
 from operators.sources.stereo import JoinedSource, SplitSource
 
-SOON_S = 10.0
+SOON_S = 300.0
 MS = 1_000_000
 
 

@@ -12,7 +12,7 @@ from operators.sources import synthetic
 from operators.sources.options import SourceOptions
 from operators.sources.registry import open_source
 
-SOON_S = 10.0
+SOON_S = 300.0
 SMALL = "width=48&height=40&frames=5"
 
 

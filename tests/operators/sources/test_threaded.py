@@ -10,7 +10,7 @@ from gsplat_core.errors import InvalidInput
 from operators.sources.source import FrameSource, SourceDescription, SourceState
 from operators.sources.threaded import ThreadedSource
 
-SOON_S = 10.0
+SOON_S = 300.0
 """Longer than anything here takes."""
 
 

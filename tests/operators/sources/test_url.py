@@ -23,7 +23,7 @@ from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
 from operators.sources.url_address import UrlAddress, without_secrets
 
-SOON_S = 30.0
+SOON_S = 300.0
 HERE = SourceOptions(process=False)
 """In the test's own process, where nothing has to be started."""
 

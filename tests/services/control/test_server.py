@@ -57,7 +57,7 @@ def serving(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen, int
         reader.start()
         yield process, int(found[1]), (folder / "admin.key").read_text().strip()
         process.terminate()  # not killed: it ends what it has started
-        process.wait(20)
+        process.wait(300)
         reader.join()
     finally:
         process.kill()
@@ -73,7 +73,7 @@ def served(tmp_path_factory):
 
 
 def ask(port: int, path: str, key: str | None = None, method: str = "GET", **headers: str):
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=300)
     if key is not None:
         headers["Authorization"] = f"Bearer {key}"
     connection.request(method, path, headers=headers)
@@ -205,7 +205,7 @@ def test_sigterm_ends_it_with_0_and_the_log_has_it(tmp_path):
     with serving(tmp_path) as (process, port, key):
         assert ask(port, "/v1/version", key)[0].status == 200
         process.send_signal(signal.SIGTERM)
-        assert process.wait(20) == 0
+        assert process.wait(300) == 0
     last = (tmp_path / "audit.jsonl").read_text().splitlines()[-1]
     assert json.loads(last)["event"] == "service.stop"
 
@@ -260,7 +260,7 @@ def test_tls(certificate, tmp_path):
     ]
     with serving(tmp_path, *options) as (_, port, key):
         context = ssl.create_default_context(cafile=str(certificate / "cert.pem"))
-        connection = http.client.HTTPSConnection("127.0.0.1", port, context=context, timeout=10)
+        connection = http.client.HTTPSConnection("127.0.0.1", port, context=context, timeout=300)
         connection.request("GET", "/livez")
         answer = connection.getresponse()
         assert answer.status == 200 and answer.headers["strict-transport-security"]

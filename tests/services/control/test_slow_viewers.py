@@ -32,10 +32,10 @@ def served(tmp_path) -> Iterator[tuple[int, str, FakeDisplay, DrainingServer]]:
     server = DrainingServer(config_of(app, settings), app.state.control, ready.set)
     thread = threading.Thread(target=lambda: server.run(sockets=[listener]))
     thread.start()
-    assert ready.wait(20)
+    assert ready.wait(300)
     yield listener.getsockname()[1], (tmp_path / "admin.key").read_text().strip(), display, server
     server.should_exit = True
-    thread.join(20)
+    thread.join(300)
     listener.close()
     assert not thread.is_alive()
 
@@ -74,7 +74,7 @@ def test_a_viewer_that_takes_nothing_is_dropped_and_others_go_on(served, path, m
         healthy.settimeout(10)
         until(lambda: display.open == 2 or not healthy.recv(65536))
         taken = 0
-        deadline_s = time.monotonic() + 20
+        deadline_s = time.monotonic() + 300
         while display.open == 2 and time.monotonic() < deadline_s:
             taken += len(healthy.recv(1 << 20))
         assert display.open == 1, "the stuck one was dropped"

@@ -18,7 +18,7 @@ from services.openigtlink.sender import folder_of, send
 from services.openigtlink.server import MessageServer
 
 pyigtl = pytest.importorskip("pyigtl", reason="pip install 'intrasplat[igtl]'")
-SOON_S = 20.0
+SOON_S = 300.0
 POSE = np.array([[0.0, -1, 0, 5], [1, 0, 0, -6], [0, 0, 1, 7], [0, 0, 0, 1]])
 
 

@@ -13,7 +13,7 @@ import pytest
 from services.registry.models import ModelRegistry
 from tests.services.registry.stub_check import ALWAYS_READY
 
-SERVER_STARTS_S = 30.0
+SERVER_STARTS_S = 300.0
 
 
 @pytest.fixture(scope="session")

@@ -29,8 +29,8 @@ def test_of_two_processes_that_activate_at_once_one_wins(new_registry, files, da
         process.start()
     try:
         for _ in range(ROUNDS):
-            gate.wait(60)
-            said = [results.get(timeout=60), results.get(timeout=60)]
+            gate.wait(300)
+            said = [results.get(timeout=300), results.get(timeout=300)]
             (won,) = [each for each in said if isinstance(each, int)]
             (lost,) = [each for each in said if isinstance(each, str)]
             assert (
@@ -39,10 +39,10 @@ def test_of_two_processes_that_activate_at_once_one_wins(new_registry, files, da
             assert registry.active("liver").version == won
             assert_whole(registry)
             registry.rollback("liver", "admin", expected_current=won)
-            gate.wait(60)
+            gate.wait(300)
     finally:
         for process in processes:
-            process.join(60)
+            process.join(300)
             process.close()
         results.close()
         results.join_thread()

@@ -87,7 +87,7 @@ def test_a_second_writer_waits_for_the_first(database):
     with database.writing():
         thread = threading.Thread(target=second)
         thread.start()
-        assert started.wait(5)
+        assert started.wait(300)
         thread.join(0.3)
         order.append("first")
     thread.join()

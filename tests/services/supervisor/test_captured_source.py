@@ -17,7 +17,7 @@ from services.bus.heartbeats import Heartbeats
 from services.bus.pictures import PicturePublisher
 from services.supervisor.captured_source import CapturedSource
 
-SOON_S = 20.0
+SOON_S = 300.0
 ABOUT = SourceDescription("made up", 6, 4, 25.0, Camera.from_focal(5.0, 6, 4), fields=frozenset({"depth", "mask"}))
 
 

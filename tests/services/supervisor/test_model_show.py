@@ -24,7 +24,7 @@ from services.supervisor.screen import Screen
 from services.supervisor.specs import EngineSpec
 
 COLOURS = {1: (0.9, 0.1, 0.1), 2: (0.1, 0.9, 0.1), 3: (0.1, 0.1, 0.9)}
-SOON_S = 30.0
+SOON_S = 300.0
 
 
 class Published:

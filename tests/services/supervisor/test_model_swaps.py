@@ -18,7 +18,7 @@ from services.supervisor.launching import Direct
 from services.supervisor.specs import SourceSpec, StreamSpec
 from services.supervisor.stream import StreamSupervisor
 
-SOON_S = 60.0
+SOON_S = 300.0
 SWAPS = 12
 
 

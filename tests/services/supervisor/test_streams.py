@@ -28,7 +28,7 @@ from services.supervisor.specs import ProcessLimits, SourceSpec, StreamSpec
 from services.supervisor.stream import StreamSupervisor
 
 SMALL = SourceSpec(address="synthetic:?width=64&height=64&frames=3&fps=20")
-SOON_S = 60.0
+SOON_S = 300.0
 
 
 def spec(**limits) -> StreamSpec:

@@ -41,7 +41,7 @@ def test_at_most_so_many_items_are_made_and_not_taken():
 
     reader = read_ahead(items(), NAME, ahead=2)
     assert next(reader) == 0
-    assert third.wait(10)
+    assert third.wait(300)
     assert not threading.Event().wait(0.05)
     assert made == [0, 1, 2]
     reader.close()
