@@ -13,7 +13,7 @@ CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*
 CUDA_ARCHITECTURES ?= native
 CUDA_TOOLKIT := build/cuda-toolkit
 
-.PHONY: demo results mutants test test-of-programs test-of-parts lint format fuzz bench native cuda compilers lock licences sbom clean always
+.PHONY: demo results mutants test test-all test-isa test-of-programs test-of-parts lint format fuzz bench native cuda compilers lock licences sbom clean always
 
 # On the NVIDIA GPU where there is one that torch can use: the CUDA kernels are built for it first. A build that fails ends it.
 demo: native
@@ -21,11 +21,19 @@ demo: native
 	@set -e; if $(BIN)/python -m services.cli.gpu_check; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
 	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --depth stereo --device $$device
 
-# All tests, in two groups beside each other, which take equally long: whole programs, whose tests often wait, with geometry, whose tests compute; and
-# all the others, most of which use one core. What a group says is printed when it is over.
-PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py tests/gsplat_core/geometry
+# The fast tests (`test`), or all of them (`test-all`: also those that are marked as slow), in two groups beside each other that take about equally
+# long. What a group says is printed when it is over.
+PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py tests/gsplat_core/geometry tests/operators
+TEST_GROUPS = @$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going test-of-programs test-of-parts
 test: native .venv/.development
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going test-of-programs test-of-parts
+	$(TEST_GROUPS) MARKED='not slow'
+
+test-all: native .venv/.development
+	$(TEST_GROUPS) MARKED=
+
+# The numeric tests with each instruction set of this processor, in torch, its BLAS, numpy's BLAS and our own kernels.
+test-isa: native .venv/.development
+	tests/instruction_sets.sh
 
 # One thread for each of their processes: most arrays in tests are so small that more of them would mostly wait for one another. Tests of what
 # threads do ask for them.
@@ -34,10 +42,10 @@ test-of-programs test-of-parts: export OPENBLAS_NUM_THREADS ?= 1
 test-of-programs test-of-parts: export OPENCV_FOR_THREADS_NUM ?= 1
 
 test-of-programs:
-	$(BIN)/python -m pytest $(PROGRAM_TESTS)
+	$(BIN)/python -m pytest $(if $(MARKED),-m "$(MARKED)") $(PROGRAM_TESTS)
 
 test-of-parts:
-	$(BIN)/python -m pytest $(PROGRAM_TESTS:%=--ignore=%)
+	$(BIN)/python -m pytest $(if $(MARKED),-m "$(MARKED)") $(PROGRAM_TESTS:%=--ignore=%)
 
 lint: .venv/.development
 	$(BIN)/ruff check .

@@ -18,6 +18,7 @@ from tests.system.servers import serving
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
+SLOW = ("06_service_life_cycle.py",)
 RUNS = {
     "01_render.py": (["--out", "sphere.png"], r"600 Gaussians, 600 in view", ["sphere.png"]),
     "02_fit_an_image.py": (["--steps", "40"], r"(\d+\.\d) dB before, (\d+\.\d) dB after", []),
@@ -65,7 +66,10 @@ def server():
         yield start
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path", [pytest.param(path, marks=pytest.mark.slow if path.name in SLOW else ()) for path in EXAMPLES],
+    ids=lambda path: path.name,
+)  # fmt: skip
 def test_runs(path, tmp_path, server):
     options, expected, files = RUNS[path.name]
     if "URL" in options:

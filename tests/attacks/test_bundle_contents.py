@@ -74,6 +74,7 @@ def test_weights_that_are_not_finite_are_rejected(rejected, bundle):
     assert "field.weights holds 390 of 390 values that are NaN" in rejected()
 
 
+@pytest.mark.slow
 def test_overlapping_tensors_are_rejected(rejected, bundle):
     header = json.loads(bundle.header_and_data()[0])
     header["gaussians.means"]["data_offsets"] = header["gaussians.log_scales"]["data_offsets"]
@@ -81,11 +82,13 @@ def test_overlapping_tensors_are_rejected(rejected, bundle):
     assert "not a safetensors file" in rejected()
 
 
+@pytest.mark.slow
 def test_a_giant_header_is_rejected(rejected, bundle):
     bundle.replace_tensors(struct.pack("<Q", 2**40) + bundle.tensors.read_bytes()[8:])
     assert "states a header of 1099511627776 bytes" in rejected()
 
 
+@pytest.mark.slow
 def test_tensors_that_the_manifest_does_not_name_are_rejected(rejected, bundle):
     bundle.replace_tensors(save(dict(load_bundle(bundle.folder).tensors()) | {"__reduce__": torch.zeros(0)}))
     assert "unknown __reduce__" in rejected()
@@ -101,11 +104,13 @@ def test_a_picture_beyond_the_budget_is_rejected_unrendered(rejected, bundle):
     assert "16384x4096" in rejected()
 
 
+@pytest.mark.slow
 def test_more_gaussians_than_the_file_has_are_rejected(rejected, bundle):
     bundle.edit(lambda manifest: manifest["gaussians"].update(count=1_900_000))
     assert "describes" in rejected()
 
 
+@pytest.mark.slow
 def test_a_model_that_shows_nothing_is_rejected(rejected, bundle):
     """Every value is finite, and so is the picture: the Gaussians are moved out of it."""
     tensors = dict(load_bundle(bundle.folder).tensors())

@@ -97,6 +97,7 @@ def test_a_scheme_within_the_place_opens_no_file(scheme, secret):
         ("<MPD><BaseURL>file://{0}</BaseURL></MPD>", "application/dash+xml"),
     ],
 )
+@pytest.mark.slow
 def test_a_playlist_opens_no_file(answering, secret, body, kind):
     answering.update(body=body.format(secret).encode(), type=kind)
     refused(answering["url"])
@@ -119,6 +120,7 @@ def test_a_redirection_leads_to_no_file(answering, secret, location):
         b"\x1a\x45\xdf\xa3" + b"\xff" * 300,
     ],
 )
+@pytest.mark.slow
 def test_what_is_no_video_is_a_sentence(answering, body):
     answering["body"] = body
     assert "cannot be opened" in refused(answering["url"])

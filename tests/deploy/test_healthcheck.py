@@ -65,6 +65,7 @@ def test_nobody_there_is_not_well():
     assert "refused" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_server_that_says_nothing_is_not_well():
     with socket.create_server(("127.0.0.1", 0)) as silent:
         done = check(f"http://127.0.0.1:{silent.getsockname()[1]}/livez")

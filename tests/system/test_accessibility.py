@@ -12,6 +12,8 @@ import pytest
 from tests.system.browsers import chromium_by_playwright
 from tests.system.servers import serving
 
+pytestmark = pytest.mark.slow
+
 axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="it comes with the development packages")
 STATES = ("live", "stale", "frozen", "source lost", "no connection", "no picture", "virtual")
 

@@ -11,6 +11,8 @@ import pytest
 from tests.system.api_fuzzing import fuzz
 from tests.system.servers import serving
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("schemathesis", reason="schemathesis comes with the development packages")
 
 

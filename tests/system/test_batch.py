@@ -36,6 +36,7 @@ def recordings(tiny, tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_each_result_is_there_once_although_processes_are_killed(batch_kill, tmp_path):
     recordings, out = tmp_path / "recordings", tmp_path / "out"
     batch_kill.make_recordings(recordings, 6, frames=4)
@@ -46,6 +47,7 @@ def test_each_result_is_there_once_although_processes_are_killed(batch_kill, tmp
     assert figures["attempts"] > 6
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_was_ended_and_says_what_failed(start, recordings):
     command = ("batch", recordings, "--workers", "1", *QUICK, "--json")
     first = start(*command)
@@ -68,6 +70,7 @@ def test_it_goes_on_where_it_was_ended_and_says_what_failed(start, recordings):
     assert "was begun with steps_per_frame 2" in err and "seed 1" in err
 
 
+@pytest.mark.slow
 def test_a_signal_ends_it_and_leaves_nothing_half_made(start, recordings, tmp_path):
     out = tmp_path / "out"
     batch = start("batch", recordings, "--out", out, "--workers", "1", "--steps-per-frame", "3000")

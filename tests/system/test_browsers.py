@@ -15,6 +15,8 @@ import pytest
 
 from tests.system.browsers import PROGRAMS, Page, page, required
 
+pytestmark = pytest.mark.slow
+
 STATE = "(() => { const v = document.querySelector('video'); return [v.readyState, v.currentTime, v.videoWidth, v.error && v.error.message]; })()"
 PIXELS = """(async () => {
   const video = document.querySelector('video');

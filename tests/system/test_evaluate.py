@@ -215,6 +215,7 @@ def test_places_are_named_by_their_times(intrasplat, long, offline):
         assert done.code == 2 and "such as 0:2,60:62" in done.err, wrong
 
 
+@pytest.mark.slow
 def test_an_interrupted_evaluation_leaves_what_it_reached(long, offline, tmp_path, start):
     process = start(
         "evaluate", offline, long, "--protocol", "causal", "--steps-per-frame", 3000, "--out", tmp_path / "out"

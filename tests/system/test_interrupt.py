@@ -12,6 +12,8 @@ from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import synthesize
 from services.reports.schema import RunReport
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def long(tmp_path_factory) -> Path:

@@ -64,6 +64,7 @@ def one_sentence(err):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.slow
 def test_a_signal_is_how_a_stream_is_ended(scope, tmp_path, start, number):
     process = showing(start, scope, tmp_path / "out")
     process.send_signal(number)
@@ -95,6 +96,7 @@ class Dying(RealtimeSource):
             yield frame
 
 
+@pytest.mark.slow
 def test_a_source_that_dies(scope, tmp_path, intrasplat, monkeypatch):
     def dying(address, options):
         source = play(address, options)
@@ -107,6 +109,7 @@ def test_a_source_that_dies(scope, tmp_path, intrasplat, monkeypatch):
     assert "the scope was pulled out" in reached(tmp_path / "out").run.stop_reason
 
 
+@pytest.mark.slow
 def test_a_device_without_memory(scope, tmp_path, monkeypatch):
     observe = LiveReconstructor.observe
 
@@ -127,6 +130,7 @@ def test_a_device_without_memory(scope, tmp_path, monkeypatch):
     assert len(list(read_frames(tmp_path / "out" / "frames.jsonl"))) >= 5
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up(scope, small_disk, start):
     """Somebody else takes the room: the model and the report find what was kept free for them."""
     process = showing(start, scope, small_disk / "out")

@@ -53,6 +53,18 @@ def test_ci_builds_the_cuda_kernels_and_requires_them():
     assert "cuda CUDA_ARCHITECTURES=portable" in script
 
 
+@pytest.mark.parametrize(("target", "selected"), [("test", True), ("test-all", False)])
+def test_slow_tests_are_left_out_by_the_fast_command_alone(target, selected):
+    commands = [line for line in dry_run(target).splitlines() if "-m pytest " in line]
+    assert len(commands) == 2
+    assert all(('-m "not slow"' in line) == selected for line in commands)
+
+
+def test_ci_runs_all_tests():
+    script = (ROOT / ".ci" / "run").read_text().splitlines()
+    assert "make test-all" in script and "make test" not in script
+
+
 def test_the_two_groups_of_tests_are_all_of_them():
     lines = [line for group in ("test-of-programs", "test-of-parts") for line in dry_run(group).splitlines()]
     programs, parts = (line.partition("-m pytest ")[2].split() for line in lines if "-m pytest " in line)

@@ -13,6 +13,8 @@ from gsplat_core.io.recordings import open_recording, synthesize
 from services.reports.evaluation_schema import EvaluationReport
 from services.reports.schema import RunReport
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def scope(tmp_path_factory):

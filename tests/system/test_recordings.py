@@ -6,7 +6,7 @@ import pytest
 
 from services.reports.schema import RunReport
 
-pytestmark = pytest.mark.recordings
+pytestmark = [pytest.mark.recordings, pytest.mark.slow]
 
 
 def replayed(intrasplat, recording, out, *options) -> RunReport:

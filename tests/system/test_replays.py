@@ -18,6 +18,8 @@ import pytest
 from services.client import Client, Refused
 from tests.system.browsers import chromium_by_playwright
 
+pytestmark = pytest.mark.slow
+
 WITHIN_S = 300.0
 QUICK = {"steps_per_frame": 2}
 LONG = {"steps_per_frame": 300}

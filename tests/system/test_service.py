@@ -21,6 +21,8 @@ from services.registry.bundle_file import pack
 from tests.services.supervisor.test_model_show import uniform
 from tests.system.browsers import chromium_by_playwright
 
+pytestmark = pytest.mark.slow
+
 SOURCE = "synthetic:?width=160&height=128&frames=12&fps=15"
 WITHIN_S = 300.0
 

@@ -19,6 +19,8 @@ from tests.missing import missing
 from tests.services.supervisor.test_model_show import uniform
 from tests.system.servers import ROOT, serving
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def programs() -> None:

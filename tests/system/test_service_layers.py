@@ -18,6 +18,8 @@ from services.registry.bundle_file import unpack
 from tests.gsplat_core.io.exports.glb_reader import read_glb
 from tests.system.test_service import brightness, page, served, until, walls  # noqa: F401 - fixtures
 
+pytestmark = pytest.mark.slow
+
 
 def layers_of(client):
     return client.stream("theatre").processes["engine"]["figures"]["layers"]

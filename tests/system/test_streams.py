@@ -34,6 +34,7 @@ def shell(command: str, folder: Path, **environment: str) -> subprocess.Complete
         ("2>&1 | true", 141),
     ],
 )
+@pytest.mark.slow
 def test_a_run_writes_all_whatever_becomes_of_its_streams(tiny, tmp_path, redirection, code):
     done = shell(f"$I replay {tiny} --out out --max-frames 2 --steps-per-frame 1 {redirection}", tmp_path)
     assert done.returncode == code, done.stderr
@@ -51,6 +52,7 @@ def test_help_too(tmp_path, command, code):
 
 
 @pytest.mark.parametrize(("name", "locale"), [(b"caf\xe9", "C.UTF-8"), ("\u00e9\u2192\n\U0001f600".encode(), "C")])
+@pytest.mark.slow
 def test_names_that_are_not_ascii_or_not_text(tiny, tmp_path, name, locale):
     folder = os.fsencode(tmp_path) + b"/" + name
     os.symlink(tiny, folder)
@@ -64,6 +66,7 @@ def test_names_that_are_not_ascii_or_not_text(tiny, tmp_path, name, locale):
     assert done.stdout.rstrip(b"\n").endswith(name + b".mp4"), "a name is printed as the bytes that it is"
 
 
+@pytest.mark.slow
 def test_a_file_size_limit_is_a_sentence_and_the_earlier_run_stays(finished, tiny, tmp_path, fingerprints):
     import shutil
 

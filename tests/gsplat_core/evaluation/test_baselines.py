@@ -179,6 +179,7 @@ def test_the_protocols_figures_on_the_cutting_recording():
 
 
 @pytest.mark.recordings
+@pytest.mark.slow
 def test_the_causal_baselines_of_fast_motion(recordings_dir):
     heart = measure_baselines(open_recording(recordings_dir / "heart" / "left.mp4"), ages=(1, 2, 5), flow=True)
     assert heart.previous_frame_db == pytest.approx(23.30, abs=0.05)

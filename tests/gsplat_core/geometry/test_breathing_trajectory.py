@@ -54,6 +54,7 @@ def test_poses_start_at_the_identity_and_the_unit_is_the_distance(breathing):
     assert float(found.points[:, 2].median()) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_the_same_is_found_again(breathing):
     sightings, _, found = breathing
     again = found_in(sightings)
@@ -62,6 +63,7 @@ def test_the_same_is_found_again(breathing):
     assert found.frequencies_hz == again.frequencies_hz
 
 
+@pytest.mark.slow
 def test_what_is_pulled_about_does_not_take_the_way_with_it():
     sightings, true = seen_for(12.0, rate_hz=4.0, pulled=60)
     found = found_in(sightings)
@@ -69,6 +71,7 @@ def test_what_is_pulled_about_does_not_take_the_way_with_it():
     assert off_share(found.poses, true) < 0.01
 
 
+@pytest.mark.slow
 def test_smaller_and_faster_breaths_are_told_too():
     sightings, true = seen_for(14.0, breathes=0.5)
     faster = replace(sightings, times_s=sightings.times_s / 1.5)
@@ -100,6 +103,7 @@ def test_few_points_or_few_placed_frames_tell_nothing():
     assert breathing_trajectory(sightings, torch.arange(len(sightings.times_s)) < 30) is None
 
 
+@pytest.mark.slow
 def test_points_that_start_behind_the_scope_or_far_away_do_no_harm():
     sightings, true = seen_for(12.0, rate_hz=4.0)
     points = sightings.points.clone()
@@ -110,6 +114,7 @@ def test_points_that_start_behind_the_scope_or_far_away_do_no_harm():
     assert off_share(found.poses, true) < 0.01
 
 
+@pytest.mark.slow
 def test_frames_that_are_not_placed_take_no_part_and_lie_between_the_others():
     sightings, true = seen_for(12.0, rate_hz=4.0)
     placed = torch.ones(len(sightings.times_s), dtype=torch.bool)
@@ -126,6 +131,7 @@ def test_frames_that_are_not_placed_take_no_part_and_lie_between_the_others():
     assert off_share(found.poses, true) < 0.01
 
 
+@pytest.mark.slow
 def test_frequencies_are_found_without_knowing_the_way_and_none_at_rest():
     for breathes, expected in ((1.0, (BREATHING_HZ, HEART_HZ)), (0.0, ())):
         sightings, _ = seen_for(12.0, breathes, rate_hz=4.0)

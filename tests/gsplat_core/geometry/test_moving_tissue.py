@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+import pytest
 
 from gsplat_core.geometry import moving_tissue
 from gsplat_core.geometry.depth_map import BELIEVED
@@ -30,6 +31,7 @@ def given(frames: slice = slice(None)) -> tuple[list[Frame], list[Camera]]:
     ]
 
 
+@pytest.mark.slow
 def test_depth_of_every_frame() -> None:
     frames, cameras = given()
     found = MovingTissue(frames, cameras)
@@ -51,6 +53,7 @@ def test_depth_of_every_frame() -> None:
     assert np.mean(shares) > 0.6
 
 
+@pytest.mark.slow
 def test_a_frame_that_is_not_looked_at_is_between_its_neighbours(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     monkeypatch.setattr(moving_tissue, "RATE_HZ", FPS / 2)
     frames, cameras = given()
@@ -59,6 +62,7 @@ def test_a_frame_that_is_not_looked_at_is_between_its_neighbours(monkeypatch) ->
     assert np.median(np.abs(here / (0.5 * before + 0.5 * after) - 1)) < 0.01
 
 
+@pytest.mark.slow
 def test_too_short_a_recording_is_not_believed() -> None:
     found = MovingTissue(*given(slice(0, 14)))
     assert found.doubts == (TOO_SHORT,)
@@ -67,6 +71,7 @@ def test_too_short_a_recording_is_not_believed() -> None:
     assert not depth.confidence.any()
 
 
+@pytest.mark.slow
 def test_poses_of_another_way_are_not_believed() -> None:
     frames, cameras = given(slice(0, 40))
     poses = np.random.default_rng(0).permutation(len(cameras))

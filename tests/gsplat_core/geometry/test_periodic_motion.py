@@ -67,6 +67,7 @@ def test_still_tissue_has_none() -> None:
 
 
 @pytest.mark.parametrize(("length_s", "reach"), [(1.2, 1.0), (5.0, 0.02)], ids=["short", "hardly moving"])
+@pytest.mark.slow
 def test_distances_that_cannot_be_told_are_said_to_be_uncertain(length_s: float, reach: float) -> None:
     tracks, _ = seen(length_s, reach=reach)
     found = found_in(tracks)

@@ -46,6 +46,7 @@ def drift(recording: RenderedRecording) -> tuple[float, LiveOdometry]:
     return float(np.linalg.norm(places[-1] - places[0]) / np.ptp(places[:, 0])), odometry
 
 
+@pytest.mark.slow
 def test_what_is_seen_again_takes_most_of_the_drift_away(there_and_back, monkeypatch):
     with_return, odometry = drift(there_and_back)
     assert odometry.returned >= 3 and odometry.begun == 1

@@ -34,6 +34,7 @@ def breathing() -> np.ndarray:
     return places(TIMES_S, count=600)
 
 
+@pytest.mark.slow
 def test_a_pull_does_not_disturb_what_repeats_itself(breathing) -> None:
     poses = swaying(TIMES_S)
     tracks = tracks_of(pulled(breathing), poses, TIMES_S)
@@ -47,6 +48,7 @@ def test_a_pull_does_not_disturb_what_repeats_itself(breathing) -> None:
     assert again.error.max() < 0.2, "each point keeps sightings that say how far away it is"
 
 
+@pytest.mark.slow
 def test_without_a_pull_hardly_anything_changes(breathing) -> None:
     tracks = tracks_of(breathing, swaying(TIMES_S), TIMES_S)
     first = fitted(tracks, HZ, rounds=16)

@@ -182,6 +182,7 @@ def test_the_reference_gradient_is_the_derivative() -> None:
 
 
 @pytest.mark.parametrize("isa", ["baseline", "avx2"])
+@pytest.mark.slow
 def test_other_instruction_sets_agree(isa: str, tmp_path: Path) -> None:
     s = scene(300, channels=4, backgrounds=torch.rand(1, 4, generator=torch.Generator().manual_seed(0)))
     torch.save(s, tmp_path / "scene.pt")

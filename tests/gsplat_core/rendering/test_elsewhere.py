@@ -51,6 +51,7 @@ def squared_error(recorded, shown):
     return np.mean(errors)
 
 
+@pytest.mark.slow
 def test_a_camera_that_training_never_had_sees_highlights_nearer_to_where_they_are(recorded):
     before = squared_error(recorded, lambda model, *_: model)
     after = squared_error(recorded, lambda model, camera, time_s: model.seen_from(camera, time_s))

@@ -71,6 +71,7 @@ def test_reference_gradcheck_end_to_end(make_scene):
 
 
 @pytest.mark.parametrize("instructions", ["baseline", "avx2", "avx512"])
+@pytest.mark.slow
 def test_every_instruction_set_gives_the_image(tmp_path, make_scene, assert_near, instructions):
     scene = make_scene(80, cameras=2)
     image, alpha, gradients, _ = run(reference.rasterization, scene.to(torch.float64), render_mode="RGB+ED")

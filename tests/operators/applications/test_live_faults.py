@@ -67,6 +67,7 @@ def everything_came(watch: Watched) -> None:
     assert watch.part(SourceResult).reached_end
 
 
+@pytest.mark.slow
 def test_pictures_that_are_none(watched):
     """Black, duplicated, frozen, torn and damaged."""
     script = Script()
@@ -97,6 +98,7 @@ def test_pictures_that_are_none(watched):
     watch.learned_nothing_bad()
 
 
+@pytest.mark.slow
 def test_late_frames_and_a_clock_that_is_set(watched):
     """Forwards by an hour, backwards by two: the model's time goes on as it did."""
     script = Script()
@@ -121,6 +123,7 @@ def test_late_frames_and_a_clock_that_is_set(watched):
     assert 0 <= model.time_window_s[0] <= model.time_window_s[1] < 60
 
 
+@pytest.mark.slow
 def test_frames_that_a_sender_mixes_up(watched):
     """Numbers that come twice, late, or begin anew are put right or dropped where the frames come in."""
     script = Script()
@@ -140,6 +143,7 @@ def test_frames_that_a_sender_mixes_up(watched):
     watch.learned_nothing_bad()
 
 
+@pytest.mark.slow
 def test_a_stream_that_changes_its_size_and_back(watched):
     """Each size begins a new scene, also where its first pictures are black."""
     script = Script()
@@ -197,6 +201,7 @@ def test_masks_and_depth_that_cannot_be(watched):
     watch.learned_nothing_bad()
 
 
+@pytest.mark.slow
 def test_a_source_that_is_gone_for_five_seconds(watched):
     script = Script()
     script.good(20)
@@ -219,6 +224,7 @@ def test_a_source_that_is_gone_for_five_seconds(watched):
     watch.learned_nothing_bad()
 
 
+@pytest.mark.slow
 def test_behind_the_gate_that_keeps_the_outside_of_the_body_away(watched):
     """Nothing is learned or shown of a picture from outside, and the stream is believed again after ten from inside."""
     room = np.full((HEIGHT, WIDTH, 3), (90, 140, 200), np.uint8) + np.arange(WIDTH, dtype=np.uint8)[:, None] // 2
@@ -240,6 +246,7 @@ def test_behind_the_gate_that_keeps_the_outside_of_the_body_away(watched):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.slow
 def test_faults_one_upon_the_other(watched, seed):
     """Any mixture, from the first frame on."""
     rng = np.random.default_rng(seed)

@@ -133,6 +133,7 @@ def test_every_picture_comes_out_again(tmp_path, change):
     assert any("byte for byte" in note for note in outcome.notes)
 
 
+@pytest.mark.slow
 def test_depth_that_was_found_beside_the_stream_is_given_again(tmp_path):
     live = record(tmp_path, of_two_eyes)
     found, taken = live.find(FoundDepth), live.find(TakenDepth)
@@ -146,6 +147,7 @@ def test_depth_that_was_found_beside_the_stream_is_given_again(tmp_path):
     assert comparison is not None and comparison.different == 0 and comparison.same >= 5
 
 
+@pytest.mark.slow
 def test_without_the_late_depth_the_pictures_are_others(tmp_path):
     """The comparison can fail: without one of the depths it does, and the replay says which is not there."""
     assert record(tmp_path, of_two_eyes).find(TakenDepth).frames >= 2

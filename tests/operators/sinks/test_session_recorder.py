@@ -160,6 +160,7 @@ def test_a_disk_that_fails_ends_the_recording_with_one_sentence(tmp_path, monkey
     assert "\n" not in recorder.recorded.ended
 
 
+@pytest.mark.slow
 def test_a_file_that_may_not_grow_any_more_ends_the_recording(tmp_path):
     """A real limit of the system, in a process of its own."""
     program = f"""
@@ -185,6 +186,7 @@ print(recorder.recorded.ended)
         assert same_frame(frame, new_frame(frame.seq))
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment_it_plays_up_to_there(tmp_path):
     program = f"""
 from pathlib import Path

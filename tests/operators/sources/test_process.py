@@ -127,6 +127,7 @@ def test_an_exception_in_the_source_is_a_reason_to_start_again(stand_in, caplog)
     assert "ValueError: what is this" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_process_that_says_nothing_is_replaced(stand_in):
     source = stand_in("frames=1,crash=SIGSTOP", hung_after_s=0.5)
     source.open()
@@ -135,6 +136,7 @@ def test_a_process_that_says_nothing_is_replaced(stand_in):
     assert is_gone(first), "one that is stopped is ended, too"
 
 
+@pytest.mark.slow
 def test_a_source_that_is_stuck_in_its_driver_gets_another_process(stand_in):
     source = stand_in("frames=1,block", stuck_after_s=1.5)
     source.open()
@@ -144,6 +146,7 @@ def test_a_source_that_is_stuck_in_its_driver_gets_another_process(stand_in):
     assert read(source).seq == 1 and source.counts()["process_restarts"] == 1
 
 
+@pytest.mark.slow
 def test_one_that_never_gives_a_frame_is_given_up_with_a_sentence(stand_in, monkeypatch):
     monkeypatch.setattr(process, "MOST_FAILURES", 3)
     source = stand_in("crash=SIGABRT")
@@ -195,6 +198,7 @@ def children():
 
 
 @pytest.mark.parametrize("address", ["frames=2,block", "block", "crash=SIGSTOP"])
+@pytest.mark.slow
 def test_closing_leaves_no_process_no_memory_and_no_open_file(stand_in, address):
     gc.collect()
     files = len(os.listdir("/proc/self/fd"))
@@ -207,6 +211,7 @@ def test_closing_leaves_no_process_no_memory_and_no_open_file(stand_in, address)
     assert len(os.listdir("/proc/self/fd")) == files
 
 
+@pytest.mark.slow
 def test_one_that_was_never_opened_or_is_forgotten_ends_too(stand_in):
     source = stand_in("frames=1,block")
     number = pid(source)

@@ -69,6 +69,7 @@ def test_rtsp_motion_jpeg_by_tcp_and_udp(rtsp_server, reading, fragment):
     assert all(frame.image.shape == (240, 320, 3) and frame.damage is None for frame in frames)
 
 
+@pytest.mark.slow
 def test_a_server_that_is_killed_and_comes_back_after_five_seconds(rtsp_server, reading):
     rtsp_server.start()
     stream = reading(open_source(rtsp_server.url("camera"), HERE))
@@ -85,6 +86,7 @@ def test_a_server_that_is_killed_and_comes_back_after_five_seconds(rtsp_server, 
     assert stream.frame().seq > after.seq
 
 
+@pytest.mark.slow
 def test_what_piled_up_before_the_source_was_opened_is_not_shown(rtsp_server, reading):
     rtsp_server.start()
     source = open_source(rtsp_server.url("camera"), HERE)
@@ -94,6 +96,7 @@ def test_what_piled_up_before_the_source_was_opened_is_not_shown(rtsp_server, re
     assert source.counts().get("reconnections", 0) == 0
 
 
+@pytest.mark.slow
 def test_a_server_that_hangs_is_a_stall_and_then_a_lost_connection(rtsp_server, reading):
     rtsp_server.start()
     stream = reading(open_source(rtsp_server.url("camera") + "#stall_s=2&open_s=2", HERE))
@@ -106,6 +109,7 @@ def test_a_server_that_hangs_is_a_stall_and_then_a_lost_connection(rtsp_server, 
     stream.until(lambda: stream.source.state is SourceState.LIVE)
 
 
+@pytest.mark.slow
 def test_another_size_after_a_reconnection_is_passed_on(rtsp_server, reading):
     rtsp_server.start()
     source = open_source(rtsp_server.url("camera"), HERE)
@@ -121,6 +125,7 @@ def test_another_size_after_a_reconnection_is_passed_on(rtsp_server, reading):
     assert frame.image.shape == (120, 160, 3)
 
 
+@pytest.mark.slow
 def test_a_password_opens_the_stream_and_appears_nowhere(rtsp_server, reading, caplog):
     caplog.set_level(0)
     rtsp_server.start("surgeon:s3cr3t")

@@ -174,6 +174,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_kill_at_any_moment_leaves_a_log_that_fits(tmp_path):
     path = tmp_path / "audit.jsonl"
     for round_ in range(6):
@@ -189,6 +190,7 @@ def test_kill_at_any_moment_leaves_a_log_that_fits(tmp_path):
         assert verdict.head.seq >= int(confirmed[-1]) and verdict.removed > 0
 
 
+@pytest.mark.slow
 def test_a_log_is_read_and_verified_while_it_is_written(tmp_path):
     log = AuditLog(tmp_path / "audit.jsonl", Keeping(segment_bytes=600, segments=3))
     ended = threading.Event()

@@ -81,6 +81,7 @@ def test_only_so_many_frames_are_read(clip, capsys):
     assert said_of(capsys, clip(), "--max-frames", "5")["frames"] == 5
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_not_known_is_said(clip, capsys):
     said = said_of(capsys, clip(calibrated=False))
     assert any("there is no calibration; a pinhole with f = 144.0 px" in note for note in said["notes"])

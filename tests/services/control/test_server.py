@@ -188,6 +188,7 @@ def test_logs_are_json_with_the_request_and_without_the_query(served):
 
 
 @pytest.mark.parametrize("form", ["json", "text"])
+@pytest.mark.slow
 def test_logs_do_not_have_the_ticket_of_a_websocket(tmp_path, form):
     with serving(tmp_path, "--set", f"log.format={form}") as (process, port, _):
         with pytest.raises(InvalidStatus):
@@ -210,6 +211,7 @@ def test_sigterm_ends_it_with_0_and_the_log_has_it(tmp_path):
     assert json.loads(last)["event"] == "service.stop"
 
 
+@pytest.mark.slow
 def test_a_second_server_of_the_same_folder_is_refused(served, tmp_path):
     folder = next(argument for argument in served[0].args if "server" in str(argument) and os.path.isdir(argument))
     done = subprocess.run([*SERVE, "--data", folder], capture_output=True, text=True, cwd=ROOT)
@@ -251,6 +253,7 @@ def test_a_certificate_that_cannot_be_used_is_refused(certificate, files):
         serve(FastAPI(), settings, listener, print)
 
 
+@pytest.mark.slow
 def test_tls(certificate, tmp_path):
     options = [
         "--set",

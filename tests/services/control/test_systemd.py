@@ -90,6 +90,7 @@ def _received(heard: socket.socket) -> bytes:
         return b""
 
 
+@pytest.mark.slow
 def test_a_server_says_that_it_is_ready_lives_and_ends(manager, tmp_path):
     heard, address = manager
     process = subprocess.Popen(

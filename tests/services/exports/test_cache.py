@@ -141,6 +141,7 @@ def test_what_was_left_half_made_goes_at_start(tmp_path):
     assert list((tmp_path / "x").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_program_itself(tmp_path):
     save_bundle(uniform((0.9, 0.1, 0.1)), tmp_path / "model")
     cache = ExportCache(tmp_path / "exports")
@@ -160,6 +161,7 @@ def test_the_program_itself(tmp_path):
 @pytest.mark.parametrize(
     "module", ["services.exports.cache", "services.exports.snapshots", "services.server.snapshots"]
 )
+@pytest.mark.slow
 def test_this_process_loads_no_torch(module):
     program = f"import sys, {module}; assert not {{'torch', 'cv2'}} & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

@@ -29,6 +29,7 @@ def submitted(store, count=1):
     return list(store.submit([NewJob(f"r{number}") for number in range(count)], {}, "operator").ids)
 
 
+@pytest.mark.slow
 def test_many_owners_never_share_a_job(new_store):
     ids = submitted(new_store(), 20)
     taken = []

@@ -12,6 +12,8 @@ from services.jobs.records import JobState, NewJob
 from services.jobs.results import RUNNING, Results
 from services.registry.errors import StoreUnavailable
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
 WITHIN_S = 300.0
 

@@ -165,6 +165,7 @@ def test_a_check_that_fails_by_itself_leaves_the_recording_waiting(new_store, ad
     assert new_store().check("case").state is State.READY
 
 
+@pytest.mark.slow
 def test_a_check_that_takes_too_much_rejects_the_recording(new_store, add, packed):
     store = new_store(limits=RecordingLimits(check_s=1), check_program=(sys.executable, "-c", BURNS))
     add(store, "case", packed())

@@ -57,6 +57,7 @@ def test_a_good_model_is_described_and_rendered(tmp_path):
     assert verdict.description.keys() - validated.keys() == {"render_ms", "covered"}
 
 
+@pytest.mark.slow
 def test_words_for_people(tmp_path):
     folder = save_model(tmp_path / "model")
     done = subprocess.run([*PROGRAM, folder], capture_output=True, text=True, check=True)
@@ -83,6 +84,7 @@ def test_a_model_without_gaussians_is_rejected(tmp_path, checked):
     assert verdict["stage"] == "rejected" and "no Gaussians" in verdict["reason"]
 
 
+@pytest.mark.slow
 def test_a_check_without_enough_memory_is_a_verdict(tmp_path):
     folder = save_model(tmp_path / "model", count=40_000)
     verdict = run_check(folder, RegistryLimits(check_memory_bytes=50 << 20))
@@ -106,6 +108,7 @@ def test_the_reason_names_no_folder_of_the_machine(tmp_path, checked):
     assert verdict["stage"] == "rejected" and verdict["reason"].startswith("model.safetensors has")
 
 
+@pytest.mark.slow
 def test_a_check_that_computes_too_long_is_ended(tmp_path):
     endless = (
         "from services.registry import check\n"

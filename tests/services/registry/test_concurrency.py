@@ -14,6 +14,7 @@ from tests.services.registry.made import add_ready, assert_whole, packed_model
 from tests.services.registry.stub_check import says
 
 
+@pytest.mark.slow
 def test_of_two_processes_that_activate_at_once_one_wins(new_registry, files, database_url, tmp_path):
     registry = new_registry()
     for seed in range(3):

@@ -16,6 +16,8 @@ from tests.services.registry import dying
 from tests.services.registry.made import add_ready, assert_whole, packed_model
 from tests.services.registry.stub_check import ALWAYS_READY
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[3]
 COMMITTED = {
     "upload": "upload committed",

@@ -11,6 +11,8 @@ from services.registry.models import ModelRegistry
 from tests.services.registry.made import add_ready, assert_whole, packed_model, sha256
 from tests.services.registry.stub_check import ALWAYS_READY
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def credentials(monkeypatch):

@@ -18,6 +18,8 @@ from services.supervisor.launching import Direct
 from services.supervisor.specs import SourceSpec, StreamSpec
 from services.supervisor.stream import StreamSupervisor
 
+pytestmark = pytest.mark.slow
+
 SOON_S = 300.0
 SWAPS = 12
 

@@ -27,6 +27,8 @@ from services.supervisor.process import ManagedProcess, StreamEvent
 from services.supervisor.specs import ProcessLimits, SourceSpec, StreamSpec
 from services.supervisor.stream import StreamSupervisor
 
+pytestmark = pytest.mark.slow
+
 SMALL = SourceSpec(address="synthetic:?width=64&height=64&frames=3&fps=20")
 SOON_S = 300.0
 
