@@ -24,12 +24,12 @@ demo: native
 # The fast tests (`test`), or all of them (`test-all`: also those that are marked as slow), in two groups beside each other that take about equally
 # long. What a group says is printed when it is over.
 PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py tests/gsplat_core/geometry tests/operators
-TEST_GROUPS = @$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going test-of-programs test-of-parts
+BESIDE := --no-print-directory --jobs=2 --output-sync=target --keep-going
 test: native .venv/.development
-	$(TEST_GROUPS) MARKED='not slow'
+	@$(MAKE) $(BESIDE) MARKED='not slow' test-of-programs test-of-parts
 
 test-all: native .venv/.development
-	$(TEST_GROUPS) MARKED=
+	@$(MAKE) $(BESIDE) MARKED= test-of-programs test-of-parts
 
 # The numeric tests with each instruction set of this processor, in torch, its BLAS, numpy's BLAS and our own kernels.
 test-isa: native .venv/.development
