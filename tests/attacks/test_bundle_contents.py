@@ -67,6 +67,7 @@ def test_a_pickle_as_tensors_is_rejected_by_the_check(rejected, bundle, tmp_path
     assert not (tmp_path / "executed").exists()
 
 
+@pytest.mark.slow
 def test_weights_that_are_not_finite_are_rejected(rejected, bundle):
     tensors = dict(load_bundle(bundle.folder).tensors())
     tensors["field.weights"] = torch.full_like(tensors["field.weights"], float("nan"))
@@ -94,11 +95,13 @@ def test_tensors_that_the_manifest_does_not_name_are_rejected(rejected, bundle):
     assert "unknown __reduce__" in rejected()
 
 
+@pytest.mark.slow
 def test_a_nested_manifest_is_rejected(rejected, bundle):
     bundle.manifest.write_bytes(b"[" * 100_000 + b"]" * 100_000)
     assert "not valid JSON" in rejected()
 
 
+@pytest.mark.slow
 def test_a_picture_beyond_the_budget_is_rejected_unrendered(rejected, bundle):
     bundle.edit(lambda manifest: manifest["camera"].update(width_px=16384, height_px=4096))
     assert "16384x4096" in rejected()

@@ -121,6 +121,7 @@ def test_a_sender_of_nonsense_takes_nothing_down(tmp_path, monkeypatch):
     assert not (tmp_path / "unpickled").exists()
 
 
+@pytest.mark.slow
 def test_a_message_larger_than_any_frame_is_never_received(monkeypatch):
     monkeypatch.setattr("operators.sources.zeromq.MOST_BYTES", 10_000)
     with zmq.Context() as context, context.socket(zmq.PUB) as socket:

@@ -33,6 +33,7 @@ def verdicts(images, withheld=()):
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
 @pytest.mark.parametrize("every", [1, 4, 8])
+@pytest.mark.slow
 def test_no_recording_has_a_cut_even_with_frames_left_out(recordings_dir, name, every):
     assert verdicts(clip(recordings_dir, name)[::every]) == {}
 

@@ -164,6 +164,7 @@ class CuttingRecording:
 @pytest.mark.skipif(
     not CuttingRecording.folder.exists() and "CI" not in os.environ, reason=f"no recording at {CuttingRecording.folder}"
 )
+@pytest.mark.slow
 def test_the_protocols_figures_on_the_cutting_recording():
     assert sum(is_heldout(index) for index in range(156)) == 20
     measured = measure_baselines(CuttingRecording(), ages=AGES, flow=True)

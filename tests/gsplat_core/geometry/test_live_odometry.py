@@ -163,6 +163,7 @@ def centres(poses: np.ndarray) -> np.ndarray:
     return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
 
 
+@pytest.mark.slow
 def test_memory_is_bounded(rigid, monkeypatch):
     monkeypatch.setattr(local_map, "MOST_KEY_FRAMES", 5)
     monkeypatch.setattr(local_map, "WINDOW", 3)

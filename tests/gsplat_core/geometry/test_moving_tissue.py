@@ -80,6 +80,7 @@ def test_poses_of_another_way_are_not_believed() -> None:
     assert found.doubts
 
 
+@pytest.mark.slow
 def test_pictures_without_texture_are_not_believed() -> None:
     frames, cameras = given(slice(0, 16))
     grey = [frame.with_fields(image=np.full_like(frame.image, 120)) for frame in frames]

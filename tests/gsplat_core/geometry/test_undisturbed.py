@@ -73,6 +73,7 @@ def test_how_far_neighbours_are_off_together() -> None:
     assert together[0].max() < 0.9 and together[1][~left[1] & far[1]].max() < 0.9
 
 
+@pytest.mark.slow
 def test_a_point_that_is_always_off_keeps_its_sightings() -> None:
     """All points there move otherwise than breathing does: there is nothing else to know them by."""
     points = places(TIMES_S)

@@ -68,6 +68,7 @@ class _Scope(ThreadedSource):
             yield frame.with_fields(pose=None, depth=None, depth_origin=None, arrived_ns=time.monotonic_ns())
 
 
+@pytest.mark.slow
 def test_a_session_with_estimated_poses_comes_out_again(tmp_path):
     recording = render_recording(Asked(FRAMES, 160, 128, fps=20, seed=1, camera="moving"))
     settings = LiveSettings(

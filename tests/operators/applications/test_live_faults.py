@@ -167,6 +167,7 @@ def test_a_stream_that_changes_its_size_and_back(watched):
     assert (camera.width_px, camera.height_px) == sizes[-1]
 
 
+@pytest.mark.slow
 def test_masks_and_depth_that_cannot_be(watched):
     """A mask that is all tool, for a moment and for a second; one that is all tissue at once; depth of NaN, infinity and nonsense."""
     tool = np.ones((HEIGHT, WIDTH), np.uint8)

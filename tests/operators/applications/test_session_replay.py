@@ -169,6 +169,7 @@ def leaving_the_body(frame: Frame) -> Frame:
     return frame
 
 
+@pytest.mark.slow
 def test_what_the_out_of_body_gate_holds_back_is_not_recorded(tmp_path):
     record(tmp_path, leaving_the_body)
     reader = SessionReader(tmp_path / "session")
@@ -183,6 +184,7 @@ def test_what_the_out_of_body_gate_holds_back_is_not_recorded(tmp_path):
     assert comparison is not None and comparison.different == 0 and comparison.same > 0
 
 
+@pytest.mark.slow
 def test_without_the_schedule_the_pictures_are_others(session):
     with_it, without = replayed(session), replayed(session, ignore_schedule=True)
     digests = [outcome.find(QualityResult).frames_sha256 for outcome in (with_it, without)]
@@ -219,6 +221,7 @@ def test_a_cut_session_gives_the_same_pictures_up_to_there(session):
 
 
 @pytest.mark.parametrize("options", [{"scale": 0.5}, {"heldout": True}, {"steps_per_frame": 3}])
+@pytest.mark.slow
 def test_what_the_session_did_not_have_is_replayed_like_any_recording(session, options):
     outcome = replayed(session, **options)
     assert outcome.find(ShownComparison) is None

@@ -111,6 +111,7 @@ def test_a_process_that_crashes_is_replaced_and_numbers_and_times_go_on(stand_in
     assert source.state is SourceState.LIVE
 
 
+@pytest.mark.slow
 def test_while_another_process_starts_the_state_says_why(stand_in, caplog):
     source = stand_in("frames=1,crash=SIGKILL")
     source.open()

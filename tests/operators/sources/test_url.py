@@ -45,6 +45,7 @@ def encoded(path, count=30, codec="mpeg4", container="mpegts", **options):
     return path
 
 
+@pytest.mark.slow
 def test_rtsp_in_a_process_of_its_own_gives_live_frames(rtsp_server, reading):
     rtsp_server.start()
     source = open_source(rtsp_server.url("camera"), SourceOptions(scale=0.5))
@@ -62,6 +63,7 @@ def test_rtsp_in_a_process_of_its_own_gives_live_frames(rtsp_server, reading):
 
 
 @pytest.mark.parametrize("fragment", ["", "#transport=udp"])
+@pytest.mark.slow
 def test_rtsp_motion_jpeg_by_tcp_and_udp(rtsp_server, reading, fragment):
     rtsp_server.start()
     stream = reading(open_source(rtsp_server.url("motion") + fragment, HERE))
@@ -180,6 +182,7 @@ def test_a_video_by_http_ends_with_its_last_frame(web, tmp_path, reading):
     assert stream.source.state_sentence.endswith("has given its last frame")
 
 
+@pytest.mark.slow
 def test_a_transport_stream_by_udp_that_is_joined_in_its_middle(reading, free_port):
     port, stop = free_port(socket.SOCK_DGRAM), threading.Event()
 

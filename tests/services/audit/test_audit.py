@@ -204,6 +204,7 @@ def test_only_short_plain_texts_get_in(path, values):
     assert verify(path).entries == ENTRIES
 
 
+@pytest.mark.slow
 def test_pages_are_read_from_the_end(tmp_path):
     log = AuditLog(tmp_path / "audit.jsonl")
     for number in range(400):

@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PUBLIC = {"/livez", "/readyz", "/openapi.json", "/docs", "/docs/{file}"}
 
 
+@pytest.mark.slow
 def test_the_control_plane_loads_neither_torch_nor_opencv(tmp_path):
     code = (
         "import sys, services.control, services.settings, services.audit, services.cli.serve, services.cli.keys, services.cli.audit\n"

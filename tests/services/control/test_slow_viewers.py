@@ -62,6 +62,7 @@ def until(condition) -> None:
 
 
 @pytest.mark.parametrize(("path", "more"), [("mjpeg", ()), ("display", UPGRADE)])
+@pytest.mark.slow
 def test_a_viewer_that_takes_nothing_is_dropped_and_others_go_on(served, path, more):
     port, key, display, server = served
     address = f"/v1/streams/endoscope/{path}"

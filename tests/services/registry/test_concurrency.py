@@ -80,6 +80,7 @@ def test_checks_wait_for_each_other(tmp_path, files):
             } == {"ready"}
 
 
+@pytest.mark.slow
 def test_readers_always_see_one_active_version(registry, files):
     """Activations and rollbacks go on beside them."""
     for seed in range(2):
