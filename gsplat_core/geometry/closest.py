@@ -17,6 +17,8 @@ CANDIDATES = 6
 """So many of the nearest samples are looked at; the closest point is taken from their triangles. Where triangles of very different sizes meet it may be on
 another one; the error is less than the distance between samples."""
 MOST_TRIANGLES = 5_000_000
+LEAST_EXTENT, MOST_EXTENT = 1e-6, 1e9
+"""Diagonal of a mesh, in its unit."""
 EXACT_KD_TREE = 4
 """FLANN's single k-d tree: an exact search; its other indices are approximate."""
 
@@ -49,12 +51,16 @@ class ClosestPoints:
         self._corners, areas = corners[usable], areas[usable]
         self._normals = normals[usable] / (2 * areas[:, None])
         self.extent = float(np.linalg.norm(np.ptp(self._corners.reshape(-1, 3), axis=0)))
+        if not LEAST_EXTENT <= self.extent <= MOST_EXTENT:
+            raise InvalidSetting(
+                f"the mesh is {self.extent:.3g} across; from {LEAST_EXTENT:g} to {MOST_EXTENT:g} is taken, export it again in millimetres"
+            )
         samples, self._triangle = _sampled(self._corners, areas)
         self._centre = samples.mean(0)
-        # float32 is enough to find candidates once the middle is taken off.
+        # float32 is enough to find candidates once the middle is taken off, and the size divided out.
         import cv2
 
-        self._samples = np.ascontiguousarray((samples - self._centre).astype(np.float32))
+        self._samples = np.ascontiguousarray(((samples - self._centre) / self.extent).astype(np.float32))
         self._tree = cv2.flann_Index(  # type: ignore[attr-defined]
             self._samples, {"algorithm": EXACT_KD_TREE, "leaf_max_size": 10}
         )
@@ -62,7 +68,7 @@ class ClosestPoints:
     def closest(self, points: Array) -> Closest:
         """The closest points of the mesh to points [N, 3]."""
         count = min(CANDIDATES, len(self._samples))
-        asked = np.ascontiguousarray((points - self._centre).astype(np.float32))
+        asked = np.ascontiguousarray(((points - self._centre) / self.extent).astype(np.float32))
         found, _ = self._tree.knnSearch(asked, count, params={"checks": -1, "eps": 0.0, "sorted": True})
         best = Closest(np.zeros_like(points), np.zeros_like(points), np.full(len(points), np.inf))
         for candidate in range(count):

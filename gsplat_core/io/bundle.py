@@ -80,6 +80,10 @@ def load_bundle(folder: str | Path) -> Model:
     """
     folder = Path(folder)
     path = folder / TENSORS
+    if folder.exists() and not folder.is_dir():
+        raise BundleError(
+            f"{folder} is a file, and a model is a folder with {TENSORS} and {MANIFEST}; give that folder"
+        )
     try:
         with open_model_file(path, folder) as file:
             size = os.fstat(file.fileno()).st_size

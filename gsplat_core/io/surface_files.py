@@ -18,6 +18,8 @@ from gsplat_core.io.regular_files import read_regular
 
 MOST_BYTES = 1 << 30
 MOST_HEADER_BYTES = 1 << 16
+MOST_COORDINATE = 1e9
+MOST_ELEMENTS = 20_000_000
 STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
 
 
@@ -42,12 +44,17 @@ def read_surface(path: Path) -> TriangleMesh:
         raise InvalidSetting(f"cannot read {path}: {error.strerror or error}") from error
     try:
         vertices, triangles = reader(data)
-    except (ValueError, IndexError, KeyError, OverflowError, TypeError) as error:
+    except (ValueError, IndexError, KeyError, OverflowError, TypeError, MemoryError) as error:
         raise InvalidSetting(f"{path} is no plain {path.suffix.lower()} mesh: {error!s:.120}") from error
     if not len(vertices):
         raise InvalidSetting(f"{path} has no vertices")
     if not np.isfinite(vertices).all():
         raise InvalidSetting(f"{path} has vertices that are not finite")
+    farthest = float(np.abs(vertices).max())
+    if farthest > MOST_COORDINATE:
+        raise InvalidSetting(
+            f"{path} has a coordinate of {farthest:.3g}; at most {MOST_COORDINATE:g} is taken, export it again in millimetres"
+        )
     if len(triangles) and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
         raise InvalidSetting(f"{path} has a triangle with a vertex that is not there; it has {len(vertices)}")
     return TriangleMesh(vertices, triangles)
@@ -92,9 +99,11 @@ def _read_ply(data: bytes) -> TriangleMesh:
     if not data.startswith(b"ply") or end < 0:
         raise ValueError("it has no header")
     lines = [line.split() for line in data[:end].decode("ascii").splitlines()]
-    kind = next(words[1] for words in lines if words[:1] == ["format"])
-    if kind not in ("ascii", "binary_little_endian"):
-        raise ValueError(f"its format is {kind}; it must be ascii or binary_little_endian")
+    kind, version = next((words[1:] for words in lines if words[:1] == ["format"] and len(words) == 3), ("missing", ""))
+    if kind not in ("ascii", "binary_little_endian") or version != "1.0":
+        raise ValueError(
+            f"its format is {kind} {version}; it must be ascii 1.0 or binary_little_endian 1.0".replace("  ", " ")
+        )
     elements: list[tuple[str, int, list[list[str]]]] = []
     for words in lines:
         if words[:1] == ["element"]:
@@ -105,8 +114,8 @@ def _read_ply(data: bytes) -> TriangleMesh:
     reader = _AsciiPly(body) if kind == "ascii" else _BinaryPly(body)
     vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     for name, count, properties in elements:
-        if not 0 <= count <= len(body):
-            raise ValueError(f"{count} of {name} are more than the file has bytes")
+        if not 0 <= count <= min(len(body), MOST_ELEMENTS):
+            raise ValueError(f"{count} of {name} are more than the file has bytes, or more than {MOST_ELEMENTS}")
         if any(words[0] == "list" for words in properties):
             if len(properties) != 1:
                 raise ValueError(f"{name} has further properties beside a list")
@@ -125,8 +134,8 @@ class _AsciiPly:
         self._at = 0
 
     def _take(self, count: int) -> list[str]:
-        taken = self._words[self._at : self._at + count]
-        if len(taken) < count:
+        taken = self._words[self._at : self._at + max(count, 0)]
+        if len(taken) < count or count < 0:
             raise ValueError("it was cut short")
         self._at += count
         return taken
@@ -157,6 +166,8 @@ class _BinaryPly:
         for _ in range(count):
             (corners,) = np.frombuffer(self._body, length, 1, self._at)
             self._at += length.itemsize
+            if corners < 0:
+                raise ValueError(f"a list has {corners} items")
             found.append(np.frombuffer(self._body, item, int(corners), self._at).tolist())
             self._at += item.itemsize * int(corners)
         return found

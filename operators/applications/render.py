@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import RecordingError, UserError
 from gsplat_core.io.atomic_files import PartialFile
-from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.model_sources import is_scene_file, load_model
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.rendering.registry import check_renderer, new_renderer
 from gsplat_core.rendering.renderer import Renderer
@@ -67,7 +67,9 @@ def render_model(
         _check_video_path(inputs, out, overwrite)
     check_device(device)
     check_renderer(renderer, device)
-    model = load_bundle(bundle).to(device)
+    model = load_model(bundle).to(device)
+    if is_scene_file(bundle) and view.name == RECORDED.name:  # no camera was recorded
+        view = ViewWish("orbit")
     camera = model.camera.scaled(scale)
     check_picture(camera, scale)
     if device == "cpu":

@@ -13,12 +13,18 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.closest import ClosestPoints
 from gsplat_core.geometry.mesh import mesh_of
 from gsplat_core.geometry.registration import distances, from_pairs, moved_by, register
-from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.model_sources import load_model
 from gsplat_core.io.surface_files import read_surface
-from services.cli.exit_codes import OK
+from services.cli.exit_codes import BAD_INPUT, OK
 
 INLIER_SHARE = 0.02
 """Of the surface's extent: an inlier's distance unless it is given."""
+MOST_SIZE_RATIO = 20.0
+"""Largest ratio of the sizes of two surfaces that are laid onto each other without pairs of points."""
+MOST_SCALE = 1.25
+"""Largest ratio of the distances between pairs of points, in the mesh and in a model with a known unit."""
+LEAST_INLIERS = 0.05
+"""Share of inliers below which two surfaces are not one."""
 
 
 def compare_command(
@@ -30,7 +36,7 @@ def compare_command(
     """
     if inlier is not None and not 0 < inlier < float("inf"):
         raise InvalidSetting(f"the distance of inliers is {inlier:g}; it must be positive")
-    loaded = load_bundle(model)
+    loaded = load_model(model)
     if pairs is None and not loaded.metric:
         raise InvalidSetting(
             "the model's lengths have no known unit, so that its size beside the mesh is not known; give --pairs, three or more"
@@ -38,16 +44,25 @@ def compare_command(
     time_s = loaded.time_window_s[1] if time_s is None else time_s
     seen = mesh_of(loaded, time_s)
     surface = ClosestPoints(*read_surface(mesh))
-    initial = None if pairs is None else from_pairs(*_read_pairs(pairs), with_scale=not loaded.metric)
     points = seen.vertices.astype(np.float64)
+    if pairs is None:
+        initial = None
+        _check_sizes(points, surface)
+    else:
+        model_points, mesh_points = _read_pairs(pairs)
+        initial = from_pairs(model_points, mesh_points, with_scale=not loaded.metric)
+        if loaded.metric:
+            _check_scale(from_pairs(model_points, mesh_points, with_scale=True))
     found = register(points, surface, initial)
     _, summary = distances(moved_by(found.transform, points), surface, inlier or INLIER_SHARE * surface.extent)
+    lies_apart = summary.inlier_share < LEAST_INLIERS
     said = {
         "unit": "the mesh's",
         "metric": loaded.metric,
         "time_s": time_s,
         "registration": {**asdict(found), "transform": found.transform.tolist()},
         "signed_distances": asdict(summary),
+        "surfaces_match": not lies_apart,
     }
     if as_json:
         typer.echo(json.dumps(said, indent=2))
@@ -57,7 +72,34 @@ def compare_command(
             f" {summary.absolute_p50:.3f}, 90 % within {summary.absolute_p90:.3f}, 95 % within {summary.absolute_p95:.3f};"
             f" {summary.inlier_share:.1%} are closer than {summary.inlier_distance:.3g}"
         )
+    if lies_apart:
+        typer.echo(
+            f"error: the surfaces do not lie on each other: only {summary.inlier_share:.1%} of the points are closer than"
+            f" {summary.inlier_distance:.3g}; give --pairs, or check that both have the same unit",
+            err=True,
+        )
+        return BAD_INPUT
     return OK
+
+
+def _check_sizes(points: np.ndarray, surface: ClosestPoints) -> None:
+    """Raise InvalidSetting where two surfaces are of such different sizes that one of them has another unit."""
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    if not surface.extent / MOST_SIZE_RATIO < extent < surface.extent * MOST_SIZE_RATIO:
+        raise InvalidSetting(
+            f"the model's surface is {extent:.3g} mm across and the mesh {surface.extent:.3g}, a factor of {surface.extent / max(extent, 1e-300):.3g}:"
+            " they cannot have the same unit; export the mesh in millimetres, or give --pairs where the model shows a small part of it"
+        )
+
+
+def _check_scale(with_scale: np.ndarray) -> None:
+    """Raise InvalidSetting where pairs of points are not as far from each other in the mesh as in a model with a known unit."""
+    scale = float(np.cbrt(np.linalg.det(with_scale[:3, :3])))
+    if not 1 / MOST_SCALE < scale < MOST_SCALE:
+        raise InvalidSetting(
+            f"the pairs are {scale:.3g} times as far from each other in the mesh as in the model, which is in millimetres;"
+            " export the mesh in millimetres, or check the pairs"
+        )
 
 
 def _read_pairs(text: str) -> tuple[np.ndarray, np.ndarray]:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import typer
 
-from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.exports.export import export_model
 from gsplat_core.io.exports.formats import ExportWish, format_named, format_of
+from gsplat_core.io.model_sources import load_model
 from operators.errors import OutputError
 from operators.output_paths import check_file_path
 from services.cli.exit_codes import OK
@@ -29,7 +29,7 @@ def export_command(
             f"{file} does not end in {wish.format.suffix}, as a file of the format {wish.format.name} does; give such a name"
         )
     check_file_path(file, [model], overwrite=overwrite, option="FILE")
-    loaded = load_bundle(model)
+    loaded = load_model(model)
     try:
         size = export_model(loaded, file, wish, overwrite=overwrite)
     except OSError as error:

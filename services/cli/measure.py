@@ -11,7 +11,7 @@ import typer
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.measure import Length, Measurement, SurfacePoint
-from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.model_sources import load_model
 from services.cli.exit_codes import OK
 
 PIXEL = re.compile(r"\s*(\d+(?:\.\d+)?)\s*,\s*(\d+(?:\.\d+)?)\s*")
@@ -22,7 +22,7 @@ def measure_command(model: Path, time_s: float | None, start: str, end: str | No
 
     Raises BundleError where the model cannot be used, InvalidSetting for what cannot be measured: outside of the picture, never observed.
     """
-    loaded = load_bundle(model)
+    loaded = load_model(model)
     time_s = loaded.time_window_s[1] if time_s is None else time_s
     pixels = [pixel_of(text) for text in (start, end) if text is not None]
     measurement = Measurement(loaded, time_s)

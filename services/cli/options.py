@@ -40,7 +40,13 @@ SourceArgument = Annotated[
         show_default=False,
     ),
 ]
-ModelArgument = Annotated[Path, path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
+ModelArgument = Annotated[
+    Path,
+    path_argument(
+        "MODEL",
+        "A model folder that replay or reconstruct wrote; render, view, export and measure also take a scene.ply or .splat of other programs.",
+    ),
+]
 PackedFileArgument = Annotated[Path, path_argument("FILE", "The packed file, which ends in .isplat.")]
 MeshArgument = Annotated[Path, path_argument("MESH", "A triangle mesh: .ply, .stl or .obj.")]
 ExportedFileArgument = Annotated[Path, path_argument("FILE", "The exported file.")]

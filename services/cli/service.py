@@ -102,7 +102,12 @@ def igtl(
 
 
 def view(
-    model: Annotated[Path, path_argument("MODEL", "A model folder, or a packed model (.isplat).")],
+    model: Annotated[
+        Path,
+        path_argument(
+            "MODEL", "A model folder, a packed model (.isplat), or a scene of other programs (.ply, .splat)."
+        ),
+    ],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on.", min=1, max=65535)] = 8080,
     plaintext: Annotated[

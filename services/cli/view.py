@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,7 +10,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from gsplat_core.errors import BundleError
-from gsplat_core.io.bundle import load_bundle
+from gsplat_core.io.model_files import open_model_file
+from gsplat_core.io.model_sources import load_model
 from services.cli.exit_codes import OK
 from services.cli.interrupt import InterruptRequest
 from services.cli.listening import check_host
@@ -21,7 +23,7 @@ def view_command(model: Path, host: str, port: int, *, plaintext: bool) -> int:
     """Serve a model to browsers until asked to end."""
     check_host(host, plaintext, "the viewer has no keys, and shows the model to whoever connects")
     with bundle_in(model) as folder:
-        loaded = load_bundle(folder)
+        loaded = load_model(folder)
     with InterruptRequest() as interrupt, ModelView(loaded, host, port) as view:
         print(f"the model is on http://{view.address[0]}:{view.address[1]}/", file=sys.stderr, flush=True)  # noqa: T201
         view.run(interrupt)
@@ -36,8 +38,8 @@ def bundle_in(model: Path) -> Iterator[Path]:
         return
     with TemporaryDirectory(prefix="intrasplat-view-") as folder:
         try:
-            with model.open("rb") as file:
-                unpack(file, model.stat().st_size, Path(folder))
+            with open_model_file(model) as file:
+                unpack(file, os.fstat(file.fileno()).st_size, Path(folder))
         except OSError as error:
             raise BundleError(f"{model} cannot be read: {error.strerror or error}; check the name") from error
         yield Path(folder)

@@ -99,3 +99,66 @@ def test_files_that_are_no_meshes_are_refused(name, content, said, tmp_path, cap
     (tmp_path / name).write_bytes(content)
     assert run(["compare", str(tmp_path / "model"), str(tmp_path / name)]) == BAD_INPUT
     assert said in capsys.readouterr().err
+
+
+@pytest.fixture
+def metric_model(tmp_path):
+    model = bumpy(DepthSource(DepthOrigin.MEASURED, metric=True))
+    save_bundle(model, tmp_path / "model")
+    return tmp_path / "model", mesh_of(model, 0.0)
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e-12, 1e-7, 1e-3, 0.0254, 39.37, 1e3, 1e7, 1e30])
+@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj"])
+def test_a_mesh_of_another_unit_is_never_compared(metric_model, tmp_path, capsys, suffix, factor):
+    model, mesh = metric_model
+    with np.errstate(over="ignore", under="ignore"):
+        vertices = (mesh.vertices.astype(np.float64) * factor).astype(np.float32)
+    write(Mesh(vertices, mesh.normals, mesh.colours, mesh.triangles), tmp_path / f"ct{suffix}")
+    assert run(["compare", str(model), str(tmp_path / f"ct{suffix}")]) == BAD_INPUT
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and len(said.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("factor", [0.001, 0.1, 2.0, 1000.0])
+def test_pairs_that_state_another_unit_are_refused(metric_model, tmp_path, capsys, factor):
+    model, mesh = metric_model
+    write(
+        Mesh((mesh.vertices * factor).astype(np.float32), mesh.normals, mesh.colours, mesh.triangles),
+        tmp_path / "ct.stl",
+    )
+    chosen = mesh.vertices[[5, 40, 900, 1500]].astype(float).tolist()
+    pairs = ";".join(f"{x},{y},{z}={factor * x},{factor * y},{factor * z}" for x, y, z in chosen)
+    assert run(["compare", str(model), str(tmp_path / "ct.stl"), "--pairs", pairs]) == BAD_INPUT
+    assert "as far from each other" in capsys.readouterr().err
+
+
+def test_surfaces_that_do_not_lie_on_each_other_end_with_an_error(metric_model, tmp_path, capsys):
+    model, mesh = metric_model
+    write(Mesh((mesh.vertices * 3).astype(np.float32), mesh.normals, mesh.colours, mesh.triangles), tmp_path / "ct.stl")
+    code = run(["compare", str(model), str(tmp_path / "ct.stl"), "--inlier", "0.01", "--json"])
+    said = capsys.readouterr()
+    assert code == BAD_INPUT and "do not lie on each other" in said.err
+    assert json.loads(said.out)["surfaces_match"] is False
+
+
+PLY = "ply\nformat {}\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face {}\nproperty list {} int v\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"", b"ply\n", b"ply\nend_header\n", PLY.format("ascii 9.9", 0, 0, "uchar").encode(), PLY.format("binary_little_endian 9.9", 0, 0, "uchar").encode(),
+        PLY.format("binary_big_endian 1.0", 0, 0, "uchar").encode(), PLY.format("ascii", 0, 0, "uchar").encode(), PLY.format("ascii 1.0", 10**12, 0, "uchar").encode(),
+        PLY.format("ascii 1.0", -1, 0, "uchar").encode(), PLY.format("binary_little_endian 1.0", 1, 1, "char").encode() + bytes(12) + b"\xff" + bytes(40),
+        PLY.format("binary_little_endian 1.0", 1, 1, "float").encode() + bytes(12) + b"\x00\x00\xc0\x7f" + bytes(40),
+        PLY.format("ascii 1.0", 1, 1, "uchar").encode() + b"0 0 0 -3 0 0 0", PLY.format("ascii 1.0", 1, 1, "uchar").encode() + b"nan inf 0 3 0 0 0",
+        PLY.format("ascii 1.0", 3, 1, "uchar").encode() + b"0 0 0 1 0 0 0 1e30 0 3 0 1 2", PLY.format("ascii 1.0", 3, 1, "uchar").encode() + b"0 0 0 1 0 0 0 1 0 3 0 1 9" + b"9" * 5000,
+    ],
+    ids=range(15),
+)  # fmt: skip
+def test_a_damaged_mesh_is_one_sentence(metric_model, tmp_path, capsys, content):
+    (tmp_path / "ct.ply").write_bytes(content)
+    assert run(["compare", str(metric_model[0]), str(tmp_path / "ct.ply")]) == BAD_INPUT
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and "Traceback" not in said
