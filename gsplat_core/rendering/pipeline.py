@@ -24,6 +24,7 @@ from gsplat_core.rendering.settings import (
     RasterizeMode,
     RenderMode,
     RenderSettings,
+    check_tensors,
     refuse_unsupported,
 )
 from gsplat_core.rendering.view_colors import view_colors
@@ -141,6 +142,7 @@ class Operations(StepOperations):
             constants=constants,
         )  # fmt: skip
         arguments = Arguments(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
+        check_tensors(arguments)
         rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
         if rendered is not None:
             return _named_as_in_gsplat(rendered, arguments, settings)

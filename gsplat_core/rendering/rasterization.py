@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
+import functools
+import inspect
+from collections.abc import Collection
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,7 +36,40 @@ step_by_step = Operations(
 )
 """The chain of compiled operations, on any device they run on."""
 _operations = replace(step_by_step, in_one_call=rasterize_in_one_call)
-rasterization = _operations.rasterization
+_PARAMETERS = inspect.signature(_operations.rasterization).parameters
+_POSITIONAL = [name for name, each in _PARAMETERS.items() if each.kind is each.POSITIONAL_OR_KEYWORD]
+_REQUIRED = [name for name in _POSITIONAL if _PARAMETERS[name].default is inspect.Parameter.empty]
+
+
+@functools.wraps(_operations.rasterization)
+def rasterization(*arguments: Any, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    # Its documentation and signature are those of `Operations.rasterization`, whose name Python would put into errors about arguments.
+    unknown = options.keys() - _PARAMETERS.keys()
+    if (
+        unknown
+        or len(arguments) > len(_POSITIONAL)
+        or len(arguments) < len(_REQUIRED)
+        or options.keys() & set(_POSITIONAL[: len(arguments)])
+    ):
+        _check_names(len(arguments), options.keys())
+    return _operations.rasterization(*arguments, **options)
+
+
+def _check_names(positional: int, named: Collection[str]) -> None:
+    """Raise TypeError for arguments of `rasterization` that are unknown, too many, given twice or missing."""
+    for name in named:
+        if name not in _PARAMETERS:
+            close = difflib.get_close_matches(name, _PARAMETERS, n=3, cutoff=0.5)
+            advice = f"did you mean {' or '.join(close)}?" if close else f"it takes {', '.join(_PARAMETERS)}"
+            raise TypeError(f"rasterization() has no argument {name!r}; {advice}")
+    if positional > len(_POSITIONAL):
+        raise TypeError(f"rasterization() takes at most {len(_POSITIONAL)} arguments by position, got {positional}")
+    twice = [name for name in _POSITIONAL[:positional] if name in named]
+    if twice:
+        raise TypeError(f"rasterization() got {', '.join(twice)} by position and by name; give it once")
+    missing = [name for name in _REQUIRED[positional:] if name not in named]
+    if missing:
+        raise TypeError(f"rasterization() needs {', '.join(missing)}; {', '.join(_REQUIRED)} are required")
 
 
 INSTANCES_PER_GAUSSIAN = 8

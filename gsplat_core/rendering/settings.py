@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
+import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
@@ -19,6 +20,7 @@ NEAR_PLANE, FAR_PLANE = 0.01, 1e10
 """Default range of z that is rendered, in the scene's unit."""
 EPS2D = 0.3
 """Default blur, pixels² added to the diagonal of a splat's covariance."""
+MOST_SIDE_PX = 1 << 16
 TILE_SIZE = 16
 """Default side of a tile in pixels."""
 
@@ -50,6 +52,20 @@ class Arguments(NamedTuple):
     covars: Tensor | None
 
 
+_SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
+    "means": ("[..., N, 3]", (3,)),
+    "quats": ("[..., N, 4]", (4,)),
+    "scales": ("[..., N, 3]", (3,)),
+    "opacities": ("[..., N]", ()),
+    "colors": ("[..., N, D], or harmonics [..., N, K, 3]", ()),
+    "viewmats": ("[..., C, 4, 4]", (4, 4)),
+    "Ks": ("[..., C, 3, 3]", (3, 3)),
+    "backgrounds": ("[..., C, D]", ()),
+    "covars": ("[..., N, 3, 3]", (3, 3)),
+}
+"""How each tensor is shaped, for messages, and how its shape ends."""
+
+
 @dataclass(frozen=True)
 class RenderSettings:
     """What `rasterization` was asked for, beyond tensors; the checks that need no tensor are made here."""
@@ -70,16 +86,28 @@ class RenderSettings:
     constants: GsplatVersion = "1.6"
 
     def __post_init__(self) -> None:
+        for name, least in (("width", 1), ("height", 1), ("tile_size", 1)):
+            number = getattr(self, name)
+            if isinstance(number, bool) or not hasattr(number, "__index__"):
+                raise InvalidInput(f"{name} must be a whole number of pixels, got {_shown(number)}")
+            if not least <= number <= MOST_SIDE_PX:
+                raise InvalidInput(f"{name} must be from {least} to {MOST_SIDE_PX} px, got {number}")
+        for name in ("near_plane", "far_plane", "radius_clip", "eps2d"):
+            number = getattr(self, name)
+            if isinstance(number, bool) or not isinstance(number, int | float) or number != number:
+                raise InvalidInput(f"{name} must be a number, got {_shown(number)}")
+        if self.sh_degree is not None and (
+            isinstance(self.sh_degree, bool) or not hasattr(self.sh_degree, "__index__")
+        ):
+            raise InvalidInput(f"sh_degree must be None or 0 to {MAX_SH_DEGREE}, got {_shown(self.sh_degree)}")
         for name, value, known in (
             ("render_mode", self.render_mode, _RENDER_MODES),
             ("rasterize_mode", self.rasterize_mode, _RASTERIZE_MODES),
         ):
-            if value not in known:
+            if not isinstance(value, str) or value not in known:
                 raise InvalidInput(f"unknown {name} {value!r}; the modes are {', '.join(known)}")
         if self.constants not in tuple(CONSTANTS):
             raise InvalidInput(f"unknown constants {self.constants!r}; the versions are {', '.join(CONSTANTS)}")
-        if self.tile_size < 1:
-            raise InvalidInput(f"tile_size must be at least 1 px, got {self.tile_size}")
         if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise InvalidInput(f"sh_degree must be None or 0 to {MAX_SH_DEGREE}, got {self.sh_degree}")
 
@@ -97,6 +125,34 @@ class RenderSettings:
     def has_depth(self) -> bool:
         """Whether depth is the last channel."""
         return self.render_mode.endswith("D")
+
+
+def check_tensors(arguments: Arguments) -> None:
+    """Raise InvalidInput for an argument of `rasterization` that is missing or is no floating-point tensor, and for a shape that ends wrongly."""
+    by_covars = arguments.covars is not None
+    for name, value in arguments._asdict().items():
+        if value is None:
+            if name in ("backgrounds", "covars") or (by_covars and name in ("quats", "scales")):
+                continue
+            also = ", or covars in place of quats and scales" if name in ("quats", "scales") else ""
+            raise InvalidInput(f"{name} is None; it must be a tensor {_SHAPES[name][0]}{also}")
+        if not isinstance(value, Tensor):
+            raise InvalidInput(f"{name} must be a tensor {_SHAPES[name][0]}, got {_shown(value)}")
+        if not value.is_floating_point() or value.is_meta or value.layout != torch.strided:
+            raise InvalidInput(
+                f"{name} must be a dense floating-point tensor, got {value.dtype} on {value.device}, {value.layout}"
+            )
+        shape, trailing = _SHAPES[name]
+        if value.dim() < max(1, len(trailing)) or tuple(value.shape[value.dim() - len(trailing) :]) != trailing:
+            raise InvalidInput(f"{name} must be {shape}, got {list(value.shape)}")
+    devices = {name: value.device for name, value in arguments._asdict().items() if value is not None}
+    if len(set(devices.values())) > 1:
+        found = ", ".join(f"{name}: {device}" for name, device in devices.items())
+        raise InvalidInput(f"all tensors must be on one device, got {found}")
+
+
+def _shown(value: object) -> str:
+    return f"{value!r:.80} ({type(value).__name__})"
 
 
 def refuse_unsupported(**arguments: Any) -> None:

@@ -275,7 +275,7 @@ def test_wrong_arguments_are_refused(scene):
         ({"sh_degree": None, "colors": scene.sh[:, :0, 0]}, "at least one channel"),
         ({"viewmats": scene.viewmats[0, 0]}, r"viewmats must be \[..., C, 4, 4\]"),
         ({"Ks": scene.Ks[:1]}, r"Ks .*\[2, 3, 3\], got \[1, 3, 3\]"),
-        ({"covars": torch.zeros(50, 6)}, r"covars .*\[50, 3, 3\], got \[50, 6\]"),
+        ({"covars": torch.zeros(50, 6)}, r"covars .*3, 3\], got \[50, 6\]"),
         ({"backgrounds": torch.zeros(3)}, r"backgrounds .*\[2, 3\], got \[3\]"),
         ({"render_mode": "RGBD"}, r"render_mode 'RGBD'.*RGB\+ED"),
         ({"rasterize_mode": "smooth"}, "'smooth'"),

@@ -1,0 +1,107 @@
+"""Arguments of `rasterization` that cannot be used: a sentence that names the argument and nothing of the implementation."""
+
+from __future__ import annotations
+
+import inspect
+
+import numpy as np
+import pytest
+import torch
+
+import gsplat_core
+from gsplat_core.errors import InvalidInput
+
+
+def arguments() -> dict:
+    return {
+        "means": torch.tensor([[0.0, 0, 5], [1, 0, 6]]), "quats": torch.tensor([[1.0, 0, 0, 0]] * 2), "scales": torch.ones(2, 3),
+        "opacities": torch.ones(2), "colors": torch.ones(2, 3), "viewmats": torch.eye(4)[None], "Ks": torch.tensor([[[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]]),
+        "width": 16, "height": 16,
+    }  # fmt: skip
+
+
+TENSORS = ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks"]
+WRONG = {
+    "None": lambda t: None, "a list": lambda t: t.tolist(), "an array": lambda t: t.numpy(), "text": lambda t: "x", "a number": lambda t: 1.0,
+    "integers": lambda t: t.int(), "booleans": lambda t: t.bool(), "complex": lambda t: t.to(torch.complex64), "a scalar": lambda t: torch.tensor(1.0), "meta": lambda t: t.to("meta"),
+    "half": lambda t: t.half(), "sparse": lambda t: t.to_sparse(), "one more dimension": lambda t: t[..., None], "a longer end": lambda t: torch.cat([t, t, t], -1),
+    "empty": lambda t: t[..., :0],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TENSORS)
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_wrong_tensor_is_named(name, wrong):
+    given = arguments()
+    given[name] = WRONG[wrong](given[name])
+    if name == "colors" and wrong in ("a longer end", "empty"):
+        pytest.skip("any number of channels is allowed")
+    with pytest.raises((InvalidInput, NotImplementedError), match=name) as refused:
+        gsplat_core.rasterization(**given)
+    assert len(str(refused.value)) < 600
+
+
+@pytest.mark.parametrize("name", ["width", "height", "tile_size"])
+@pytest.mark.parametrize("value", [0, -1, 1.5, 16.0, "16", True, [16], 10**30, np.float32(16)])
+def test_a_wrong_size_is_named(name, value):
+    with pytest.raises(InvalidInput, match=name):
+        gsplat_core.rasterization(**{**arguments(), name: value})
+
+
+@pytest.mark.parametrize("name", ["width", "height"])
+def test_a_size_that_is_none_is_named(name):
+    with pytest.raises(InvalidInput, match=name):
+        gsplat_core.rasterization(**{**arguments(), name: None})
+
+
+@pytest.mark.parametrize("name", ["near_plane", "far_plane", "radius_clip", "eps2d"])
+@pytest.mark.parametrize("value", [None, "x", [1], True, float("nan")])
+def test_a_wrong_number_is_named(name, value):
+    with pytest.raises(InvalidInput, match=name):
+        gsplat_core.rasterization(**{**arguments(), name: value})
+
+
+@pytest.mark.parametrize("name", ["render_mode", "rasterize_mode", "camera_model", "constants", "sh_degree"])
+@pytest.mark.parametrize("value", ["x", [], 9, 1.5])
+def test_a_wrong_mode_is_named(name, value):
+    with pytest.raises(InvalidInput, match=name):
+        gsplat_core.rasterization(**{**arguments(), name: value})
+
+
+@pytest.mark.parametrize(
+    ("keyword", "close"),
+    [
+        ("colours", "colors"),
+        ("sh_degre", "sh_degree"),
+        ("background", "backgrounds"),
+        ("K", "Ks"),
+        ("zzz", "takes means"),
+        ("image_width", "width"),
+        ("viewmat", "viewmats"),
+    ],
+)
+def test_an_unknown_keyword_is_named_with_its_neighbours(keyword, close):
+    with pytest.raises(TypeError, match=rf"^rasterization\(\) has no argument '{keyword}'; .*{close}"):
+        gsplat_core.rasterization(**arguments(), **{keyword: 1})
+
+
+@pytest.mark.parametrize("name", list(arguments()))
+def test_a_missing_argument_is_named(name):
+    given = arguments()
+    del given[name]
+    with pytest.raises(TypeError, match=rf"^rasterization\(\) needs {name}; "):
+        gsplat_core.rasterization(**given)
+
+
+def test_too_many_and_doubled_arguments_are_named():
+    with pytest.raises(TypeError, match="by position, got 60"):
+        gsplat_core.rasterization(*[None] * 60)
+    given = arguments()
+    with pytest.raises(TypeError, match="means by position and by name"):
+        gsplat_core.rasterization(given["means"], **given)
+
+
+def test_the_signature_and_the_call_by_position_stay():
+    assert next(iter(inspect.signature(gsplat_core.rasterization).parameters)) == "means"
+    image, _, _ = gsplat_core.rasterization(*arguments().values())
+    assert image.shape == (1, 16, 16, 3) and float(image.max()) > 0.5
