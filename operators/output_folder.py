@@ -148,6 +148,16 @@ def check_output_folder(folder: Path) -> bool:
     return False
 
 
+def is_whole_output(folder: Path) -> bool:
+    """Return True for the output folder of a run in which every file that the run wrote is there."""
+    marker = _read_marker(folder)
+    if marker is None:
+        return False
+    listed = marker.get("files")
+    names = [*(listed if isinstance(listed, list) else ()), *(_contents(marker, "contents") or ())]
+    return all(os.path.lexists(folder / str(name)) for name in names)
+
+
 def _check_results(folder: Path, marker: dict[str, object]) -> None:
     """Raise OutputFolderInUse when a file that no run of ours wrote would be replaced: one among the results, or one with a result's name."""
     ours = _results(folder)

@@ -107,7 +107,8 @@ def check_depth(choice: str) -> None:
 def depth_inputs(choice: str) -> tuple[Path, ...]:
     """Return the files that a depth source reads: those of a name in `WITH_ADDRESS`."""
     name, _, address = choice.partition(":")
-    return (Path(address),) if name in WITH_ADDRESS and address else ()
+    path = address.partition("?")[0]
+    return (Path(path),) if name in WITH_ADDRESS and path else ()
 
 
 def new_estimator(choice: str) -> Estimator:

@@ -144,12 +144,13 @@ def batch(
     heldout: Annotated[
         bool, typer.Option("--heldout/--no-heldout", help="As for replay: score frames that were not trained on.")
     ] = False,
+    poses: PosesFromOption = "given",
     json: JsonOption = False,
 ) -> int:
     """Replay every recording of a folder; called again, it goes on where it was ended, however that was."""
     from services.cli.batch import batch_command
 
-    chosen = {**options.settings(), "steps_per_frame": steps_per_frame, "heldout": heldout}
+    chosen = {**options.settings(), "steps_per_frame": steps_per_frame, "heldout": heldout, "poses": poses}
     return batch_command(folder, out, workers, chosen, as_json=json)
 
 

@@ -16,6 +16,7 @@ import typer
 from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.registry import check_depth
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, NOTHING_SHOWN, OK
 from services.cli.interrupt import ASKING
 from services.cli.streams import printable
@@ -50,7 +51,9 @@ def batch_command(
 
 def _checked(options: Mapping[str, Any]) -> ReplayOptions:
     try:
-        return ReplayOptions(**options)
+        chosen = ReplayOptions(**options)
+        check_depth(chosen.depth)  # the network of onnx:FILE is read once before the recordings are
+        return chosen
     except ValidationError as error:
         first = error.errors()[0]
         raise InvalidSetting(f"--{str(first['loc'][0]).replace('_', '-')}: {first['msg']}") from error
@@ -88,6 +91,7 @@ class _Teller:
 
 def _print(summary: Summary, out: Path, as_json: bool) -> None:
     failed = [{"recording": job.recording, "reason": job.reason} for job in summary.failed]
+    failed += [{"recording": name, "reason": reason} for name, reason in summary.unusable]
     if as_json:
         told = {**summary.counts, "already": summary.already, "seconds": round(summary.seconds, 1), "failures": failed}
         typer.echo(json.dumps(told, indent=2))
@@ -96,6 +100,6 @@ def _print(summary: Summary, out: Path, as_json: bool) -> None:
         typer.echo(f"failed: {printable(str(each['recording']))}: {printable(str(each['reason']))}", err=True)
     done, new = summary.counts["done"], summary.counts["done"] - summary.already
     typer.echo(
-        f"{done} of {sum(summary.counts.values())} recordings have their result, {new} of them new, in {summary.seconds:.1f} s"
+        f"{done} of {sum(summary.counts.values()) + len(summary.unusable)} recordings have their result, {new} of them new, in {summary.seconds:.1f} s"
     )
     typer.echo(str(out))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.io.atomic_files import PartialFile
+from gsplat_core.io.recordings.eyes import split_eyes
+from gsplat_core.io.recordings.poses_file import POSES_FILE
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES
+from gsplat_core.io.regular_files import open_regular, read_regular
+from operators.output_folder import is_whole_output
+from operators.output_paths import DESCRIPTIONS
+from operators.storage import storage_errors
 from services.jobs.options import ReplayOptions
 from services.jobs.pool import JobPool, PoolSettings
 from services.jobs.records import JobRecord, JobState, NewJob
@@ -21,6 +30,10 @@ from services.jobs.store import MOST_AT_ONCE, JobStore
 DATABASE = "batch.sqlite"
 WHO = "batch"
 SAY_S = 0.5
+RECORDINGS = ".recordings.json"
+"""Fingerprints of the recordings, by name."""
+MOST_NOTES_BYTES = 1 << 26
+FINGERPRINT_BYTES = 4096
 Counts = Mapping[str, int]
 
 
@@ -33,18 +46,20 @@ class Summary:
     """Results that were there before."""
     failed: Sequence[JobRecord]
     seconds: float
+    unusable: Sequence[tuple[str, str]] = ()
+    """Recordings that were not begun: their names, and why."""
 
     @property
     def is_whole(self) -> bool:
         """Whether every recording has its result."""
-        return sum(self.counts.values()) == self.counts["done"]
+        return sum(self.counts.values()) == self.counts["done"] and not self.unusable
 
 
 class Batch:
     """The recordings of a folder and their results in another one. Raises InvalidSetting where that makes no sense, StoreUnavailable."""
 
     def __init__(self, folder: Path, out: Path, options: ReplayOptions) -> None:
-        recordings = recordings_in(folder)
+        recordings, self.unusable = recordings_in(folder)
         _check_out(out, folder)
         self._results = Results(out.absolute())
         self._store = JobStore(f"sqlite:///{(out / DATABASE).absolute()}")
@@ -72,13 +87,14 @@ class Batch:
             JobPool(self._store.database, self._results, runner, settings).run(is_over)
             counts = self._store.counts()
             failed = self._store.newest(counts["failed"], state=str(JobState.FAILED)) if counts["failed"] else []
-            return Summary(counts, self.already, failed[::-1], time.monotonic() - began_s)
+            return Summary(counts, self.already, failed[::-1], time.monotonic() - began_s, self.unusable)
         finally:
             self._store.close()
 
     def _submit(self, recordings: Sequence[Path]) -> None:
         """Queue what is new, and what has failed before: its recording may have been mended."""
         known = self._known()
+        self._check_same(recordings)
         self._store.retry([JobState.FAILED, JobState.CANCELLED])
         fresh = [NewJob(path.name, str(path.absolute()), path.name) for path in recordings if path.name not in known]
         for start in range(0, len(fresh), MOST_AT_ONCE):
@@ -94,15 +110,84 @@ class Batch:
                         f"{self._results.folder} was begun with {_said(job.options)}, and now {_said(self._options)} is asked for;"
                         " give another --out"
                     )
-                known.add(job.folder)
+                if job.state == JobState.DONE and not self._has_result(job.folder):
+                    self._store.forget(job.id)  # its result was removed: it is made anew
+                else:
+                    known.add(job.folder)
             before = page[-1].number
         return known
 
+    def _has_result(self, name: str) -> bool:
+        """Return True for a whole result, False for none. Raises InvalidSetting for one of which files were removed."""
+        folder = self._results.folder / name
+        if not os.path.lexists(folder):
+            return False
+        if self._results.is_published(name) and is_whole_output(folder):
+            return True
+        raise InvalidSetting(f"files of the result {folder} are missing; remove that folder, and it is made anew")
 
-def recordings_in(folder: Path) -> list[Path]:
-    """Videos and folders in a folder, by name. Raises InvalidSetting where there are none."""
+    def _check_same(self, recordings: Sequence[Path]) -> None:
+        """Raise InvalidSetting where a recording is another one than that of its result. What is new is noted."""
+        notes = self._results.folder / RECORDINGS
+        try:
+            noted = json.loads(read_regular(notes, MOST_NOTES_BYTES)) if notes.exists() else {}
+            if not isinstance(noted, dict):
+                raise ValueError("it holds no names")
+        except (OSError, ValueError, RecursionError) as error:
+            raise InvalidSetting(
+                f"{notes} cannot be read ({error}); put a copy of it back, or give another --out"
+            ) from error
+        for path in recordings:
+            now = fingerprint_of(path)
+            if noted.get(path.name, now) != now and os.path.lexists(self._results.folder / path.name):
+                raise InvalidSetting(
+                    f"{path} is another recording than the one whose result is in {self._results.folder / path.name}; remove that folder,"
+                    " or give another --out"
+                )
+            noted[path.name] = now
+        with storage_errors(notes.parent), PartialFile(notes) as partial:
+            partial.file.write(json.dumps(noted, indent=0).encode())
+
+
+def fingerprint_of(recording: Path) -> str:
+    """Return a digest of the names, sizes, beginnings and ends of a recording's files, which takes far less time than reading all of it."""
+    digest = hashlib.sha256()
+    for path in sorted(each for each in recording.rglob("*") if each.is_file()) if recording.is_dir() else [recording]:
+        try:
+            with open_regular(path) as file:
+                size = os.fstat(file.fileno()).st_size
+                digest.update(
+                    os.fsencode(path.relative_to(recording)) + f"\0{size}\0".encode() + file.read(FINGERPRINT_BYTES)
+                )
+                file.seek(max(0, size - FINGERPRINT_BYTES))
+                digest.update(file.read(FINGERPRINT_BYTES))
+        except OSError as error:
+            digest.update(f"{path.name} {error.errno}".encode("utf-8", "surrogateescape"))
+    return digest.hexdigest()
+
+
+def _check_no_recording(folder: Path) -> None:
+    """Raise InvalidSetting for a folder that is one recording itself, whose parts would be taken for recordings."""
+    names = sorted(entry.name for entry in folder.iterdir())
+    videos = [folder / name for name in names if Path(name).suffix.lower() in VIDEO_SUFFIXES and name[0] != "."]
+    eyes = split_eyes(videos)
+    found = [name for name in (*DESCRIPTIONS, "images", "images_right", "masks", "depth", POSES_FILE) if name in names]
+    if eyes is not None and len(eyes.left) == 1 and not eyes.others:
+        found += [eyes.left[0].name, eyes.right[0].name]
+    if found:
+        raise InvalidSetting(
+            f"{folder} is a recording itself (it holds {', '.join(found[:4])}); replay it with `intrasplat replay`, or give the folder around it"
+        )
+
+
+def recordings_in(folder: Path) -> tuple[list[Path], list[tuple[str, str]]]:
+    """Return the videos and folders in a folder, by name, and those whose names cannot be used, with the reason.
+
+    Raises InvalidSetting where there are none, and for a folder that is a recording itself.
+    """
     if not folder.is_dir():
         raise InvalidSetting(f"{folder} is no folder; give one with recordings in it")
+    _check_no_recording(folder)
     found = sorted(
         path
         for path in folder.iterdir()
@@ -110,10 +195,12 @@ def recordings_in(folder: Path) -> list[Path]:
     )
     if not found:
         raise InvalidSetting(f"{folder} has no videos and no folders in it; give a folder of recordings")
-    for path in found:
-        if not path.name.isprintable():
-            raise InvalidSetting(f"the name {path.name!r} has signs that cannot be printed; rename that recording")
-    return found
+    unusable = [
+        (path.name, "its name has characters that cannot be printed; rename it")
+        for path in found
+        if not path.name.isprintable()
+    ]
+    return [path for path in found if path.name.isprintable()], unusable
 
 
 def _check_out(out: Path, folder: Path) -> None:

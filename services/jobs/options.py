@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from gsplat_core.geometry.registry import DEPTHS, WITH_ADDRESS
+
+DEPTH_CHOICES = ("auto", *(WITH_ADDRESS.get(name, name) for name in DEPTHS))
 
 
 class ReplayOptions(BaseModel):
@@ -21,8 +25,14 @@ class ReplayOptions(BaseModel):
     )
     max_frames: int | None = Field(default=None, ge=1, le=10_000_000, description="Stop after this many frames.")
     scale: float = Field(default=1.0, gt=0, le=4, allow_inf_nan=False, description="Resize the frames by this factor.")
-    depth: Literal["auto", "recorded", "stereo", "none"] = Field(
-        default="auto", description="Where the frames' depth comes from; `stereo`: from the two eyes."
+    depth: str = Field(
+        default="auto",
+        max_length=1000,
+        description=f"Where the frames' depth comes from: {', '.join(DEPTH_CHOICES)}.",
+        json_schema_extra={"examples": ["auto", "parallax"]},
+    )
+    poses: Literal["given", "estimated"] = Field(
+        default="given", description="Where the scope was: as the recording says, or estimated from the pictures."
     )
     eyes: Literal["left", "both"] | None = Field(
         default=None, description="Pictures of a stereo scope that are trained on; null: the left ones."
@@ -34,6 +44,29 @@ class ReplayOptions(BaseModel):
         default=False, description="Replay a recorded session like any recording, without the steps that it made."
     )
 
+    @field_validator("depth")
+    @classmethod
+    def _registered(cls, choice: str) -> str:
+        name, colon, address = choice.partition(":")
+        if choice == "auto" or (name in DEPTHS and (bool(colon and address) if name in WITH_ADDRESS else not colon)):
+            return choice
+        raise ValueError(f"there is no depth {choice!r:.60}; choose {', '.join(DEPTH_CHOICES)}")
+
     def chosen(self) -> dict[str, Any]:
         """Those that differ from the defaults: what is kept with the job."""
         return self.model_dump(exclude_defaults=True)
+
+
+class RemoteReplayOptions(ReplayOptions):
+    """Options of a replay that a caller of the API may choose: those that name no file of the server's machine."""
+
+    @field_validator("depth")
+    @classmethod
+    def _names_no_file(cls, choice: str) -> str:
+        name = choice.partition(":")[0]
+        if name in WITH_ADDRESS:
+            raise ValueError(
+                f"{WITH_ADDRESS[name]} names a file of the server, which callers may not choose; replay the recording on that machine with"
+                " `intrasplat replay` or `intrasplat batch`"
+            )
+        return choice

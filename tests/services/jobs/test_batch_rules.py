@@ -1,0 +1,138 @@
+"""`batch`: recordings and results that changed between two calls, folders that are no batch, names and options."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.registry import DEPTHS
+from operators.output_folder import OutputFolder
+from services.jobs.batch import Batch, recordings_in
+from services.jobs.options import RemoteReplayOptions, ReplayOptions
+from services.jobs.records import JobState
+from services.jobs.tables import JOBS
+
+
+@pytest.fixture
+def place(tmp_path):
+    """Two recordings that have their results."""
+    for name in ("a.mp4", "b.mp4"):
+        (tmp_path / "in").mkdir(exist_ok=True)
+        (tmp_path / "in" / name).write_bytes(name.encode() * 10_000)
+    begin(tmp_path)
+    for name in ("a.mp4", "b.mp4"):
+        with OutputFolder(tmp_path / "out" / name, "replay") as output:
+            for file in ("report.json", "frames.jsonl"):
+                (output.path / file).write_text("{}")
+            output.publish()
+    return tmp_path
+
+
+def begin(place: Path, done: bool = True) -> dict[str, int]:
+    """Begin the batch as the command does, and let every job end well."""
+    batch = Batch(place / "in", place / "out", ReplayOptions())
+    counts = batch._store.counts()
+    with batch._store.database.writing() as connection:
+        connection.execute(JOBS.update().values(state=str(JobState.DONE)))
+    batch._store.close()
+    return counts
+
+
+def test_a_result_that_is_there_is_not_made_again(place):
+    assert begin(place)["done"] == 2
+
+
+def test_a_result_that_was_removed_is_made_again(place):
+    shutil.rmtree(place / "out" / "a.mp4")
+    counts = begin(place)
+    assert (counts["done"], counts["queued"]) == (1, 1)
+
+
+@pytest.mark.parametrize("file", ["report.json", "frames.jsonl", ".intrasplat.json"])
+def test_a_result_without_one_of_its_files_is_refused(place, file):
+    (place / "out" / "a.mp4" / file).unlink()
+    with pytest.raises(InvalidSetting, match=r"out/a\.mp4 are missing"):
+        begin(place)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda path: path.write_bytes(b"a longer one" * 10_000),
+        lambda path: path.write_bytes(path.read_bytes()[:-1] + b"x"),
+        lambda path: (path.unlink(), path.mkdir(), (path / "0.png").touch()),
+        lambda path: shutil.copy(path.with_name("b.mp4"), path),
+    ],
+)
+def test_another_recording_under_an_old_name_is_refused_until_its_result_is_removed(place, change):
+    change(place / "in" / "a.mp4")
+    with pytest.raises(InvalidSetting, match=r"a\.mp4 is another recording"):
+        begin(place)
+    shutil.rmtree(place / "out" / "a.mp4")
+    assert begin(place)["queued"] == 1
+
+
+def test_a_recording_that_was_copied_with_another_date_is_the_same(place):
+    os.utime(place / "in" / "a.mp4", (0, 0))
+    assert begin(place)["done"] == 2
+
+
+@pytest.mark.parametrize("content", [b"", b"[", b"[]", b"\xff", b"[" * 50_000])
+def test_damaged_notes_are_one_sentence(place, content):
+    (place / "out" / ".recordings.json").write_bytes(content)
+    with pytest.raises(InvalidSetting, match="cannot be read"):
+        begin(place)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["video.mp4", "masks/0.png"], ["video.mp4", "depth/0.png"], ["video.mp4", "recording.json"], ["images/0.png", "poses_bounds.npy"], ["images/0.png"],
+        ["session.json", "segments/0"], ["cameras.json", "views/0.png"], ["video.mp4", "valid_mask.png"], ["left.mp4", "right.mp4"], ["video.mp4", "poses.npy"],
+    ],
+)  # fmt: skip
+def test_a_folder_that_is_a_recording_is_refused(tmp_path, names):
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(InvalidSetting, match="is a recording itself"):
+        recordings_in(tmp_path)
+
+
+@pytest.mark.parametrize("name", [b"\xff\xfe.mp4", b"a\nb.mp4", b"a\x1b[2J.mp4", b"\xc3.mkv"])
+def test_a_name_that_is_no_text_refuses_itself_alone(tmp_path, name):
+    for each in (b"good.mp4", name):
+        with open(os.path.join(os.fsencode(tmp_path), each), "wb"):
+            pass
+    found, unusable = recordings_in(tmp_path)
+    assert [path.name for path in found] == ["good.mp4"]
+    assert [os.fsencode(name) for name, _ in unusable] == [name]
+
+
+@pytest.mark.parametrize("depth", ["auto", *(name for name in DEPTHS if name != "onnx")])
+def test_jobs_take_every_registered_depth(depth):
+    assert ReplayOptions(depth=depth).depth == RemoteReplayOptions(depth=depth).depth == depth
+
+
+@pytest.mark.parametrize("depth", ["onnx", "onnx:", "nothing", "", "stereo:x", "auto:x", "ONNX:x", "light:"])
+def test_a_depth_that_there_is_not_is_refused(depth):
+    for kind in (ReplayOptions, RemoteReplayOptions):
+        with pytest.raises(ValidationError):
+            kind(depth=depth)
+
+
+def test_a_network_is_for_the_machine_itself():
+    assert ReplayOptions(depth="onnx:/a/b.onnx").depth == "onnx:/a/b.onnx"
+    with pytest.raises(ValidationError, match="names a file of the server"):
+        RemoteReplayOptions(depth="onnx:/a/b.onnx")
+
+
+def test_jobs_take_estimated_poses():
+    assert RemoteReplayOptions(poses="estimated").chosen() == {"poses": "estimated"}
+    with pytest.raises(ValidationError):
+        RemoteReplayOptions(poses="x")
