@@ -11,6 +11,7 @@ from enum import Enum
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Protocol, Union, get_args, get_origin
 
+from gsplat_core.errors import UserError
 from operators.errors import GraphDeadlock, GraphInvalid, OperatorFailed, OperatorStuck
 from operators.graph.clock import Clock
 from operators.graph.conditions import MessageOrTimeoutCondition, SchedulingStatus
@@ -185,14 +186,14 @@ class Graph:
         if self.failure is None:
             self.failure = failure
         else:
-            logger.error("%s (after %s)", failure, self.failure, exc_info=failure.__cause__)
+            logger.error("%s (after %s)", failure, self.failure, exc_info=_traceback_of(failure))
         self.stop()
 
     def record_fault(self, failure: OperatorFailed, action: FaultAction) -> None:
         """Keep a fault for the result."""
         self.faults.append(Fault(failure, action))
         if action is not FaultAction.STOP_GRAPH:
-            logger.warning("%s; %s", failure, action.value, exc_info=failure.__cause__)
+            logger.warning("%s; %s", failure, action.value, exc_info=_traceback_of(failure))
 
     def settle(self, now_ns: int) -> bool:
         """Finish what is done, and again what is done because of it. Whether all operators are finished."""
@@ -257,3 +258,8 @@ def _topological(tasks: list[OperatorTask], arrows: list[tuple[OperatorTask, Ope
         left.remove(task)
         ordered.append(task)
     return ordered
+
+
+def _traceback_of(failure: OperatorFailed) -> BaseException | None:
+    """Return the cause of a failure for the log. A cause that the user can change is a sentence, which needs no traceback."""
+    return None if isinstance(failure.__cause__, UserError) else failure.__cause__

@@ -25,6 +25,8 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 
 TIMES_FILE = "times.json"
+NODE_NAME = "reconstruction"
+"""Name of the object in a `.glb`. The file's own name is not in it: the same model gives the same bytes under every name."""
 LONG_AGO = (1980, 1, 1, 0, 0, 0)
 """The earliest date that an archive holds: the same model gives the same bytes."""
 
@@ -42,30 +44,30 @@ def export_model(model: Model, path: Path, wish: ExportWish, *, overwrite: bool 
         if wish.format.is_sequence:
             _write_sequence(model, partial.file, times_s)
         elif wish.format.is_surface:
-            for piece in _surface_pieces(wish.format.name, model, path.stem, times_s[0]):
+            for piece in _surface_pieces(wish.format.name, model, times_s[0]):
                 partial.file.write(piece)
         else:
-            for piece in _pieces(wish.format.name, model.at(times_s[0]), path.stem, times_s[0]):
+            for piece in _pieces(wish.format.name, model.at(times_s[0]), times_s[0]):
                 partial.file.write(piece)
         return partial.file.seek(0, io.SEEK_END)
 
 
-def _pieces(format_name: str, gaussians: Gaussians, name: str, time_s: float) -> Iterator[bytes]:
+def _pieces(format_name: str, gaussians: Gaussians, time_s: float) -> Iterator[bytes]:
     rows = rows_of(gaussians)
     if format_name == "splat":
         yield splat_bytes(rows)
     elif format_name == "glb":
-        yield from glb_pieces(rows, name, time_s)
+        yield from glb_pieces(rows, NODE_NAME, time_s)
     else:
         yield from ply_pieces(with_unit_rotations(gaussians))
 
 
-def _surface_pieces(format_name: str, model: Model, name: str, time_s: float) -> Iterator[bytes]:
+def _surface_pieces(format_name: str, model: Model, time_s: float) -> Iterator[bytes]:
     rows_of(model.at(time_s))  # refuses what is not finite
     mesh = mesh_of(model, time_s)
     unit = "millimetre" if model.metric else "relative"
     if format_name == "mesh-glb":
-        yield from mesh_glb_pieces(mesh, name, time_s, unit)
+        yield from mesh_glb_pieces(mesh, NODE_NAME, time_s, unit)
     else:
         yield from mesh_ply_pieces(mesh, unit, with_triangles=format_name == "mesh-ply")
 

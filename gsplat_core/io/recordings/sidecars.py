@@ -128,6 +128,14 @@ def _read_valid_mask(path: Path, size: tuple[int, int], findings: Findings) -> n
             "Give a grey PNG of their size",
         )
         return None
+    values = np.unique(mask)
+    if len(values) > 2 or values[-1] not in (0, 1, 255):
+        findings.problem(
+            path,
+            f"it has {len(values)} different values, up to {values[-1]}",
+            "Give two: 0 outside the scope's circle, 255 (or 1) inside",
+        )
+        return None
     if not mask.any():
         findings.problem(path, "it marks no pixel as valid", "255 means inside the scope's circle")
         return None

@@ -154,3 +154,12 @@ def test_what_is_no_model_is_one_sentence(tmp_path, capsys, command, name):
 def test_a_scene_of_another_program_without_our_mark_is_read(tmp_path):
     (tmp_path / "scene.ply").write_bytes(_header() + BODY)
     assert load_ply(tmp_path / "scene.ply").count == 2
+
+
+@pytest.mark.parametrize("format_name", ["glb", "ply", "splat"])
+def test_the_bytes_of_an_export_do_not_depend_on_its_name(tmp_path, format_name):
+    save_ply(cloud(), tmp_path / "scene.ply")
+    model = load_model(tmp_path / "scene.ply")
+    for name in ("a", "another name"):
+        export_model(model, tmp_path / f"{name}.{format_name}", ExportWish(format_named(format_name)))
+    assert (tmp_path / f"a.{format_name}").read_bytes() == (tmp_path / f"another name.{format_name}").read_bytes()
