@@ -5,17 +5,24 @@ from __future__ import annotations
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import anyio
 from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketDisconnect
 
+from services.control.auth.guard import still_valid
+from services.control.auth.roles import Caller
 from services.control.parts import EncodedPicture, PictureKind
 from services.control.problems import Missing, Unavailable
-from services.control.state import control_of, part
+from services.control.state import ControlState, control_of, part
 
 log = logging.getLogger(__name__)
+LOOK_S = 1.0
+"""Time between two looks at a viewer's key."""
+REFUSED = 1008
+REFUSED_WHY = "the key was revoked or has expired"
 
 
 class ViewerStalled(Exception):
@@ -55,22 +62,40 @@ def in_time(send: Callable[[Any], Awaitable[None]], connection: HTTPConnection) 
     return send_in_time
 
 
+@dataclass
+class Ending:
+    """Why a display has ended, once it has."""
+
+    refused: bool = False
+    """The viewer's key was revoked or has expired."""
+
+
 @asynccontextmanager
-async def until_ended(connection: HTTPConnection, left: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
-    """A block that is left when the server drains, when `left` returns, and when the viewer's connection breaks. Raises ViewerStalled where
-    nothing more can be sent: whoever waited for that would wait for ever."""
-    draining = control_of(connection).draining
+async def until_ended(
+    connection: HTTPConnection, left: Coroutine[Any, Any, None], caller: Caller
+) -> AsyncIterator[Ending]:
+    """A block that is left when the server drains, when `left` returns, when the viewer's connection breaks, and when the caller would not be
+    let in any more. Raises ViewerStalled where nothing more can be sent: whoever waited for that would wait for ever."""
+    control = control_of(connection)
     stalled: ViewerStalled | None = None
+    ending = Ending()
     async with anyio.create_task_group() as group:
 
         async def end_after(over: Coroutine[Any, Any, Any]) -> None:
             await over
             group.cancel_scope.cancel()
 
-        group.start_soon(end_after, draining.wait())
+        async def refused() -> None:
+            await _no_longer_admitted(control, caller)
+            ending.refused = True
+            control.measures.viewers_dropped.labels("not admitted").inc()
+            log.info("a display of %s was closed: its key was revoked or has expired", caller)
+
+        group.start_soon(end_after, control.draining.wait())
         group.start_soon(end_after, left)
+        group.start_soon(end_after, refused())
         try:
-            yield
+            yield ending
         except ViewerStalled as error:
             stalled = error
         except (WebSocketDisconnect, OSError) as error:
@@ -79,3 +104,15 @@ async def until_ended(connection: HTTPConnection, left: Coroutine[Any, Any, None
     if stalled is not None:
         log.info("a viewer was dropped: %s", stalled)
         raise stalled
+
+
+async def _no_longer_admitted(control: ControlState, caller: Caller) -> None:
+    """Return when the caller would be refused. A key file that cannot be read refuses nobody who was let in: an error of the disk must not end
+    the pictures in a room, and no new caller gets in."""
+    while True:
+        await anyio.sleep(LOOK_S)
+        try:
+            if not await anyio.to_thread.run_sync(still_valid, control, caller):
+                return
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            log.warning("whether the key of %s is still valid is not known: %s", caller, error)

@@ -65,7 +65,7 @@ class Replays:
     def file(self, job_id: str, name: str) -> Path:
         """See `Jobs`. Raises NotFound, and StoreUnavailable where the replay is done and its result is not on the disk."""
         job = self.get(job_id)
-        if job.state == JobState.DONE and not self._results.is_published(job.folder):
+        if job.state == JobState.DONE and not self.files(job):
             raise StoreUnavailable(
                 f"the result of the replay {job_id} is not on the disk; restore it from a backup, or delete the replay and make it again"
             )

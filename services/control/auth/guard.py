@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar
@@ -114,8 +115,13 @@ CallerOf = Annotated[Caller, Depends(_caller_of)]
 
 
 def still_valid(control: ControlState, caller: Caller) -> bool:
-    """Return False once the caller's key was revoked or has expired. For connections that outlast their admission, such as displays."""
-    return caller.federated or not control.keys.is_revoked(caller.key_id)
+    """Return False once the caller's key was revoked or has expired, or the person's token has expired.
+
+    For connections that outlast their admission, such as displays.
+    """
+    if caller.federated:
+        return caller.expires_at is None or time.time() < caller.expires_at
+    return not control.keys.is_revoked(caller.key_id)
 
 
 async def _admit(connection: HTTPConnection, rule: Rule, control: ControlState) -> Caller:

@@ -55,7 +55,8 @@ class OpenIdPersons:
             raise Forbidden(
                 f"the token's claim {settings.role_claim} gives {name} no role here; auth.oidc.roles maps its values"
             )
-        return Caller(name, number, max(roles, key=list(Role).index), federated=True)
+        expires_at = float(claims["exp"]) + settings.leeway_s
+        return Caller(name, number, max(roles, key=list(Role).index), federated=True, expires_at=expires_at)
 
 
 def _claim(claims: Mapping[str, Any], path: str) -> Any:

@@ -31,6 +31,8 @@ class Caller:
     """A person of an OpenID Connect issuer: `key_id` is no key's number."""
     streams: frozenset[str] | None = None
     """Streams that the key is limited to; None: not limited."""
+    expires_at: float | None = None
+    """Seconds of the wall clock (Unix time) after which the person's token is not valid any more."""
 
     def may_use(self, stream: str) -> bool:
         """Return True for a stream within the key's limits, whether there is such a stream or not."""

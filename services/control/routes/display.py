@@ -14,9 +14,10 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketState
 
 from services.control.auth.guard import CallerOf, new_router, requires
+from services.control.auth.roles import Caller
 from services.control.parts import BOUNDARY, EncodedPicture, PictureKind
 from services.control.problems import problem_answer
-from services.control.viewers import ViewerStalled, in_time, until_ended, viewing
+from services.control.viewers import REFUSED, REFUSED_WHY, ViewerStalled, in_time, until_ended, viewing
 from services.settings import ResourceName
 
 router = new_router("display")
@@ -47,12 +48,15 @@ async def display(
         await socket.accept()
         send = in_time(socket.send_bytes, socket)
         with suppress(ViewerStalled):  # the server closes the connection, and the system cuts it off
-            async with until_ended(socket, _left(socket)):
+            async with until_ended(socket, _left(socket), caller) as ending:
                 async for picture in pictures:
                     await send(picture.message)
             if socket.client_state is WebSocketState.CONNECTED and socket.application_state is WebSocketState.CONNECTED:
                 with anyio.move_on_after(CLOSE_S):
-                    await socket.close(GOING_AWAY, "the stream or the server has ended")
+                    if ending.refused:
+                        await socket.close(REFUSED, REFUSED_WHY)
+                    else:
+                        await socket.close(GOING_AWAY, "the stream or the server has ended")
 
 
 async def _left(socket: WebSocket) -> None:
@@ -76,7 +80,7 @@ async def mjpeg(
     """Pictures as `multipart/x-mixed-replace`, which an `<img>` shows."""
     opened = AsyncExitStack()
     pictures = await opened.enter_async_context(viewing(request, "mjpeg", name, kind, quality))
-    return MjpegResponse(request, pictures, opened)
+    return MjpegResponse(request, caller, pictures, opened)
 
 
 class MjpegResponse(Response):
@@ -84,10 +88,12 @@ class MjpegResponse(Response):
 
     media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
 
-    def __init__(self, request: Request, pictures: AsyncIterator[EncodedPicture], opened: AsyncExitStack) -> None:
+    def __init__(
+        self, request: Request, caller: Caller, pictures: AsyncIterator[EncodedPicture], opened: AsyncExitStack
+    ) -> None:
         super().__init__()
         del self.headers["content-length"]
-        self._request = request
+        self._request, self._caller = request, caller
         self._pictures = pictures
         self._opened = opened
 
@@ -96,7 +102,7 @@ class MjpegResponse(Response):
             await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
             send_part = in_time(send, self._request)
             with suppress(ViewerStalled):
-                async with until_ended(self._request, _hung_up(receive)):
+                async with until_ended(self._request, _hung_up(receive), self._caller):
                     async for picture in self._pictures:
                         await send_part({"type": "http.response.body", "body": picture.part, "more_body": True})
                 with anyio.move_on_after(CLOSE_S):

@@ -20,7 +20,7 @@ from services.control.routes.jobs import JobId, ReplayView, jobs_of, view_of
 from services.control.routes.models import VersionView, registry_of
 from services.control.routes.uploads import check_soon
 from services.control.state import control_of
-from services.control.viewers import ViewerStalled, in_time, until_ended
+from services.control.viewers import REFUSED, REFUSED_WHY, ViewerStalled, in_time, until_ended
 from services.jobs.results import FILES
 from services.settings import ResourceName
 
@@ -102,7 +102,7 @@ async def replay_progress(
     with control.viewers.one_more(), suppress(ViewerStalled):
         await socket.accept()
         send, ended = in_time(socket.send_text, socket), False
-        async with until_ended(socket, _left(socket)):
+        async with until_ended(socket, _left(socket), caller) as ending:
             said: ReplayView | None = None
             while not ended:
                 if view != said:
@@ -114,7 +114,10 @@ async def replay_progress(
                     view = await asyncio.to_thread(view_of, jobs, job_id)
         if socket.client_state is WebSocketState.CONNECTED and socket.application_state is WebSocketState.CONNECTED:
             with anyio.move_on_after(CLOSE_S):
-                await socket.close(NORMAL if ended else GOING_AWAY)
+                if ending.refused:
+                    await socket.close(REFUSED, REFUSED_WHY)
+                else:
+                    await socket.close(NORMAL if ended else GOING_AWAY)
 
 
 async def _left(socket: WebSocket) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import threading
 import time
 
 import anyio
@@ -11,6 +12,11 @@ import pytest
 from control_fakes import FakeDisplay, fake_parts
 from starlette.testclient import WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
+
+from services.control import viewers
+from services.control.app import KEYS_FILE
+from services.control.auth.keys import KeyStore
+from services.control.auth.roles import Caller, Role
 
 SOCKET = "/v1/streams/endoscope/display"
 MJPEG = "/v1/streams/endoscope/mjpeg"
@@ -156,3 +162,82 @@ def test_a_viewer_that_takes_nothing_is_dropped(new_plane):
     assert sent == ["http.response.start", "http.response.body"]
     assert display.open == 0
     assert 'intrasplat_viewers_dropped_total{reason="stalled"} 1.0' in plane.ask("GET", "/metrics").text
+
+
+def revoke(plane, how: str) -> None:
+    """End the viewer's key, or the token of a person."""
+    keys = plane.control.keys
+    (key,) = [each for each in keys.all() if each.name == "test-viewer"]
+    if how == "by the API":
+        assert plane.ask("DELETE", f"/v1/keys/{key.id}").status_code == 204
+    else:  # by the command, in another process
+        KeyStore(plane.control.settings.data_dir / KEYS_FILE).revoke(key.id)
+
+
+@pytest.fixture
+def endless(new_plane, monkeypatch):
+    """A display without an end, whose viewers' keys are looked at often."""
+    monkeypatch.setattr(viewers, "LOOK_S", 0.02)
+    plane = new_plane(fake_parts(display=FakeDisplay()))
+    plane.ask("POST", "/v1/streams", json={"name": "endoscope", "source": "synthetic:"})
+    return plane
+
+
+def end_of(socket) -> int:
+    """The code with which the server closes a WebSocket that has pictures."""
+    for _ in range(5000):
+        try:
+            socket.receive_bytes()
+        except WebSocketDisconnect as ended:
+            return ended.code
+    raise AssertionError("it goes on")
+
+
+@pytest.mark.parametrize("how", ["by the API", "by the command"])
+@pytest.mark.parametrize("by_ticket", [True, False])
+def test_a_revoked_key_ends_the_pictures_that_it_had_open(endless, how, by_ticket):
+    headers = {} if by_ticket else endless.headers("viewer")
+    query = f"?ticket={ticket(endless, SOCKET)}" if by_ticket else ""
+    with (
+        endless.client.websocket_connect(SOCKET, headers=endless.headers("operator")) as other,
+        endless.client.websocket_connect(SOCKET + query, headers=headers) as socket,
+    ):
+        assert socket.receive_bytes()
+        revoke(endless, how)
+        assert end_of(socket) == 1008
+        for _ in range(50):
+            other.receive_bytes()
+    assert 'intrasplat_viewers_dropped_total{reason="not admitted"} 1.0' in endless.ask("GET", "/metrics").text
+
+
+def test_a_revoked_key_ends_mjpeg(endless):
+    by = threading.Timer(0.2, revoke, (endless, "by the command"))
+    by.start()
+    assert endless.ask("GET", MJPEG, "viewer").content.startswith(b"--picture")
+    by.join()
+    assert endless.parts.display.open == 0
+
+
+def test_the_token_of_a_person_that_expires_ends_the_pictures(endless):
+    person = Caller("somebody", "oidc-1", Role.VIEWER, federated=True, expires_at=time.time() + 0.5)
+    open_end = Caller("somebody", "oidc-2", Role.VIEWER, federated=True)
+    tickets = [endless.control.tickets.give(each, SOCKET) for each in (person, open_end)]
+    late = endless.control.tickets.give(person, SOCKET)
+    with (
+        endless.client.websocket_connect(f"{SOCKET}?ticket={tickets[1]}") as other,
+        endless.client.websocket_connect(f"{SOCKET}?ticket={tickets[0]}") as socket,
+    ):
+        assert end_of(socket) == 1008
+        assert other.receive_bytes()
+    with pytest.raises(WebSocketDenialResponse), endless.client.websocket_connect(f"{SOCKET}?ticket={late}"):
+        pass
+
+
+def test_keys_that_cannot_be_read_end_no_pictures(endless):
+    path = endless.control.settings.data_dir / KEYS_FILE
+    kept = path.read_bytes()
+    with endless.client.websocket_connect(SOCKET, headers=endless.headers("viewer")) as socket:
+        path.write_bytes(b"{")
+        for _ in range(60):
+            assert socket.receive_bytes()
+        path.write_bytes(kept)
