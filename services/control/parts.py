@@ -168,5 +168,7 @@ class Parts:
     """For /metrics."""
     events: SystemEvents = field(default_factory=SystemEvents)
     """What the parts do by themselves, for the audit log."""
+    trusts_ages: Callable[[], bool] = lambda: True
+    """Whether files of the audit log may be removed now because they are old."""
     errors: Mapping[type[Exception], type[Problem]] = field(default_factory=dict)
     """What the parts' errors mean to a caller; their text is shown."""

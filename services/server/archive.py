@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from prometheus_client import Metric
@@ -45,8 +45,13 @@ class Archive:
     files: StoredFilesWatch
 
 
-def new_archive(settings: ServiceSettings, events: SystemEvents) -> Archive:
-    """As the settings want it; the registry has made the folder of the database. Raises StoreUnavailable."""
+def new_archive(
+    settings: ServiceSettings, events: SystemEvents, trusts_ages: Callable[[], bool] = lambda: True
+) -> Archive:
+    """As the settings want it; the registry has made the folder of the database. Raises StoreUnavailable.
+
+    trusts_ages: whether something may be removed now because it is old.
+    """
     data, wanted, jobs = settings.data_dir, settings.uploaded_recordings, settings.jobs
     database = settings.registry.database
     url = (
@@ -68,9 +73,9 @@ def new_archive(settings: ServiceSettings, events: SystemEvents) -> Archive:
     replays = Replays(store, results)
     return Archive(
         recordings,
-        RecordingRetention(recordings, wanted.keep_days, wanted.keep_bytes, events),
+        RecordingRetention(recordings, wanted.keep_days, wanted.keep_bytes, events, trusts_ages),
         replays,
-        ReplayRetention(replays, jobs.keep_days, jobs.keep_results, events),
+        ReplayRetention(replays, jobs.keep_days, jobs.keep_results, events, trusts_ages),
         PoolKeeper(process, lambda: _open(store.counts())),
         ArchiveMeasures(recordings, store),
         StoredFilesWatch(

@@ -11,6 +11,7 @@ from contextlib import asynccontextmanager
 from services.audit.entries import Outcome
 from services.bus.errors import BusError
 from services.bus.runtime import RuntimeFolder
+from services.clock_guard import ClockGuard
 from services.control.parts import CheckResult, NewStream, Parts
 from services.control.problems import Conflicting, Missing, Problem, Unavailable, Unprocessable
 from services.control.system_events import SystemEvents
@@ -57,7 +58,8 @@ def assembled(settings: ServiceSettings) -> Parts:
     models = registry_of(settings)
     snapshots = SnapshotStore(settings.data_dir / "snapshots")
     exports = ModelExports(models, snapshots, ExportCache(settings.data_dir / "exports"))
-    archive = new_archive(settings, events)
+    clock = ClockGuard(settings.data_dir)
+    archive = new_archive(settings, events, clock.trusts_ages)
     at_start = [
         NewStream(name, stream.source, stream.show, stream.device, stream.options)
         for name, stream in settings.streams.items()
@@ -65,9 +67,13 @@ def assembled(settings: ServiceSettings) -> Parts:
     started = [name for name, stream in settings.streams.items() if stream.start]
 
     async def streams_are_well() -> CheckResult:
-        failed = [stream for stream in streams.now() if stream.state == "failed"]
-        said = "; ".join(f"{stream.name}: {stream.reason}" for stream in failed)
-        return CheckResult(not failed, said or "no stream has failed", needed=False)
+        unwell = [stream for stream in streams.now() if stream.state in ("failed", "source lost")]
+        said = "; ".join(f"{stream.name}: {stream.state}" for stream in unwell)  # asked without a key: no reasons
+        return CheckResult(not unwell, said or "no stream has failed or lost its source", needed=False)
+
+    async def clock_is_right() -> CheckResult:
+        doubt = await asyncio.to_thread(lambda: clock.doubt)
+        return CheckResult(doubt is None, doubt or "it goes on evenly", needed=False)
 
     async def models_are_there() -> CheckResult:
         try:
@@ -95,9 +101,10 @@ def assembled(settings: ServiceSettings) -> Parts:
             archive.replay_retention.running,
             archive.pool.running,
         ],
-        checks={"streams": streams_are_well, "models": models_are_there, "files": archive.files.check},
+        checks={"streams": streams_are_well, "models": models_are_there, "files": archive.files.check, "clock": clock_is_right},
         collectors=[measures, archive.measures, archive.files],
         events=events,
+        trusts_ages=clock.trusts_ages,
         errors=ERRORS,
     )
 
@@ -109,7 +116,10 @@ def told(measures: StreamMeasures, events: SystemEvents) -> Callable[[StreamEven
     def tell(event: StreamEvent) -> None:
         measures.count(event)
         reason = event.reason if OWN_WORDS.fullmatch(event.reason) else "the log has the reason"
-        outcome: Outcome = "failed" if event.kind == "ended" else "done"
+        outcome: Outcome = "failed" if event.kind in ("ended", "lost") else "done"
+        if event.kind in ("lost", "recovered"):
+            events.tell(f"source.{event.kind}", event.stream, outcome, reason=reason)
+            return
         events.tell(f"process.{event.kind}", f"{event.stream}/{event.role}", outcome, pid=event.pid, reason=reason)
 
     return tell

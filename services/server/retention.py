@@ -22,9 +22,16 @@ class RecordingRetention:
     """Looks after a store of recordings while the server runs."""
 
     def __init__(
-        self, store: RecordingStore, keep_days: float | None, keep_bytes: int | None, events: SystemEvents
+        self,
+        store: RecordingStore,
+        keep_days: float | None,
+        keep_bytes: int | None,
+        events: SystemEvents,
+        trusts_ages: Callable[[], bool] = lambda: True,
     ) -> None:
+        """trusts_ages: whether something may be removed now because it is old (`ClockGuard`)."""
         self._store, self._keep_bytes, self._events = store, keep_bytes, events
+        self._trusts_ages = trusts_ages
         self._max_age_s = None if keep_days is None else keep_days * DAY_S
 
     @asynccontextmanager
@@ -47,7 +54,8 @@ class RecordingRetention:
         """Remove what is too old or too much. Raises StoreUnavailable."""
         if self._max_age_s is None and self._keep_bytes is None:
             return
-        for each in await asyncio.to_thread(self._store.expire, self._max_age_s, self._keep_bytes):
+        max_age_s = self._max_age_s if self._trusts_ages() else None
+        for each in await asyncio.to_thread(self._store.expire, max_age_s, self._keep_bytes):
             log.info("a recording was removed: %s", each.why)
             self._events.tell("recording.expire", each.name, why=each.why)
 
@@ -63,9 +71,16 @@ class ReplayRetention:
     """Looks after replays that have ended, and their results, while the server runs."""
 
     def __init__(
-        self, replays: Replays, keep_days: float | None, keep_results: int | None, events: SystemEvents
+        self,
+        replays: Replays,
+        keep_days: float | None,
+        keep_results: int | None,
+        events: SystemEvents,
+        trusts_ages: Callable[[], bool] = lambda: True,
     ) -> None:
+        """trusts_ages: as for `RecordingRetention`."""
         self._replays, self._most, self._events = replays, keep_results, events
+        self._trusts_ages = trusts_ages
         self._max_age_s = None if keep_days is None else keep_days * DAY_S
 
     @asynccontextmanager
@@ -82,7 +97,8 @@ class ReplayRetention:
         """Remove what is too old or too much. Raises StoreUnavailable."""
         if self._max_age_s is None and self._most is None:
             return
-        for each in await asyncio.to_thread(self._replays.expire, self._max_age_s, self._most):
+        max_age_s = self._max_age_s if self._trusts_ages() else None
+        for each in await asyncio.to_thread(self._replays.expire, max_age_s, self._most):
             log.info("the replay %s was removed: %s", each.name, each.why)
             self._events.tell("replay.expire", each.name, why=each.why)
 

@@ -11,10 +11,18 @@ from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidSetting
 from services.control.parts import NewStream
+from services.server.source_options import check_source_options
 from services.supervisor.specs import EngineSpec, SourceSpec, StreamSpec
 
 OF_SOURCE = frozenset(SourceSpec.model_fields) - {"address"}
 OF_ENGINE = frozenset(EngineSpec.model_fields) - {"device", "gpu"}
+KNOWN: Mapping[str, tuple[str, ...]] = {
+    "field": ("auto", "basis", "hexplane"),
+    "renderer": ("alpha",),
+    "tool_mask": ("recorded", "builtin", "onnx", "none"),
+    "depth": ("auto", "recorded", "stereo", "light", "parallax", "onnx", "none"),
+}
+"""Names that the engine's registries have, which load torch. A test holds them against the registries."""
 NVIDIA = Path("/proc/driver/nvidia/gpus")
 
 
@@ -25,6 +33,10 @@ def spec_of(stream: NewStream) -> StreamSpec:
         near = difflib.get_close_matches(name, OF_SOURCE | OF_ENGINE, n=1, cutoff=0.0)[0]
         raise InvalidSetting(f"a stream has no option {name!r:.60}; the nearest is {near!r}")
     device, gpu = _device(stream.device)
+    check_source_options(stream.source)
+    for name, known in KNOWN.items():
+        if name in options and str(options[name]).partition(":")[0] not in known:
+            raise InvalidSetting(f"{name} is {options[name]!r:.60}; choose {', '.join(known)}")
     try:
         return StreamSpec(
             name=stream.name,

@@ -40,7 +40,12 @@ RATE_S = 3.0
 COUNTED: dict[Role, str] = {"capture": "frames", "engine": "pictures"}
 """Figure of the heartbeats whose rate is told."""
 
-Kind = Literal["started", "adopted", "replaced", "ended", "stopped", "left"]
+SOURCE_GONE = ("opening", "stalled", "reconnecting", "lost", "ended")
+"""States of a capture process that has no frames to give."""
+LOST_AFTER_S = 2.0
+"""Time without frames after which the source counts as lost: a short break is in the metrics alone."""
+
+Kind = Literal["started", "adopted", "replaced", "ended", "stopped", "left", "lost", "recovered"]
 
 
 @dataclass(frozen=True)
@@ -120,6 +125,10 @@ class ManagedProcess:
         self._shown: tuple[int, float] = 0, 0.0
         """How much was published, and since when that is so."""
         self._rate = Rate()
+        self._gone_s: float | None = None
+        """Since when the source has given no frames."""
+        self._lost = False
+        """The loss of the source was told, and its return not yet."""
         self._tasks: list[asyncio.Task[None]] = []
 
     @property
@@ -158,6 +167,7 @@ class ManagedProcess:
     def open(self) -> None:
         """Take over the process that runs, or start one, and keep it running."""
         if not self._tasks:
+            self._gone_s, self._lost = None, False
             each = (self._keep, self._listen, self._ping)
             self._tasks = [asyncio.create_task(task(), name=f"{self._spec.name} {self._role}") for task in each]
 
@@ -318,6 +328,22 @@ class ManagedProcess:
             self._well_s = now_s
         if published != self._shown[0]:
             self._shown = published, now_s
+        if self._role == "capture":
+            self._look_at_source(str(said.get("state")), str(said.get("reason")), now_s)
+
+    def _look_at_source(self, state: str, reason: str, now_s: float) -> None:
+        """Tell once when the source is lost, and once when it gives frames again."""
+        if state == "live":
+            self._gone_s = None
+            if self._lost:
+                self._lost = False
+                self._say("recovered", reason, self._identity)
+        elif state in SOURCE_GONE:
+            if self._gone_s is None:
+                self._gone_s = now_s
+            if not self._lost and now_s - self._gone_s >= LOST_AFTER_S:
+                self._lost = True
+                self._say("lost", reason, self._identity)
 
     async def _ping(self) -> None:
         """Tell the process that somebody looks after it."""
@@ -340,5 +366,6 @@ class ManagedProcess:
 
     def _say(self, kind: Kind, reason: str, identity: ProcessIdentity | None) -> None:
         pid = None if identity is None else identity.pid
-        log.info("%s %s %s (%s): %s", self._spec.name, self._role, kind, pid, reason)
+        level = logging.WARNING if kind == "lost" else logging.INFO
+        log.log(level, "%s %s %s (%s): %s", self._spec.name, self._role, kind, pid, reason)
         self._on_event(StreamEvent(self._spec.name, self._role, kind, reason, pid))

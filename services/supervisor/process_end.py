@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from pathlib import Path
 
+from services.settings.addresses import masked_address
 from services.supervisor.exit_codes import NO_USE
 
 _TAIL_BYTES = 4096
+_LOGGED = re.compile(r"[\d-]+ [\d:,]+ (?P<level>[A-Z]+) [\w.]+: ")
+"""What the processes' log puts before a message."""
 
 
 def ended_how(status: int) -> str:
@@ -45,11 +49,16 @@ def cause_of(how: str) -> str:
 
 
 def last_words(log: Path) -> str:
-    """The last line that a process has printed; empty where there is none."""
+    """The sentence of the last error that a process has logged, else its last line; empty where there is none."""
     try:
         with open(log, "rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
-            lines = file.read().decode(errors="replace").split("\n")
+            lines = [line.strip() for line in file.read().decode(errors="replace").split("\n") if line.strip()]
     except FileNotFoundError:
         return ""
-    return next((line.strip()[:500] for line in reversed(lines) if line.strip()), "")
+    errors = [index for index, line in enumerate(lines) if (match := _LOGGED.match(line)) and match["level"] == "ERROR"]
+    if errors:
+        more = lines[errors[-1] + 1 :]
+        ends = next((index for index, line in enumerate(more) if _LOGGED.match(line)), len(more))
+        lines = [" ".join([_LOGGED.sub("", lines[errors[-1]]), *more[:ends]])]
+    return masked_address(_LOGGED.sub("", lines[-1]))[:500] if lines else ""
