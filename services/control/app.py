@@ -83,7 +83,9 @@ def _new_state(settings: ServiceSettings, parts: Parts) -> ControlState:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     keep = settings.audit
     # First: its lock says that no other server uses these folders.
-    audit = AuditLog(data / AUDIT_FILE, Keeping(keep.segment_bytes, keep.keep_segments, keep.keep_days, parts.trusts_ages))
+    audit = AuditLog(
+        data / AUDIT_FILE, Keeping(keep.segment_bytes, keep.keep_segments, keep.keep_days, parts.trusts_ages)
+    )
     _remove_unfinished(uploads)
     keys = KeyStore(data / KEYS_FILE)
     made = first_admin_key(keys, settings.admin_key_file)

@@ -101,7 +101,12 @@ def assembled(settings: ServiceSettings) -> Parts:
             archive.replay_retention.running,
             archive.pool.running,
         ],
-        checks={"streams": streams_are_well, "models": models_are_there, "files": archive.files.check, "clock": clock_is_right},
+        checks={
+            "streams": streams_are_well,
+            "models": models_are_there,
+            "files": archive.files.check,
+            "clock": clock_is_right,
+        },
         collectors=[measures, archive.measures, archive.files],
         events=events,
         trusts_ages=clock.trusts_ages,

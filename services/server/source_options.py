@@ -14,7 +14,7 @@ from operators.sources.registry import split_address
 from operators.sources.url_address import PROTOCOLS, UrlAddress
 
 Check = Callable[[Address, str], object]
-MAX_SEED = 2**31 - 1
+MAX_SEED = 2**63 - 1
 
 
 def _number(least: float, most: float) -> Check:
@@ -101,4 +101,3 @@ def _without_layout(scheme: str, query: str) -> str:
         elif value not in layouts:
             raise InvalidSetting(f"{scheme}: stereo is {value!r:.60}; choose {' or '.join(layouts)}")
     return "&".join(kept)
-

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import tempfile
+
 import pytest
 
 from services.control.system_events import SystemEvents
 from services.server.measures import StreamMeasures
-from services.server.parts import told
+from services.server.parts import assembled, told
+from services.server.streams import StreamFacts, SupervisedStreams
+from services.settings import ServiceSettings
 from services.supervisor.process import StreamEvent
 
 
@@ -25,3 +30,18 @@ def test_reasons_that_could_name_a_file_are_not_in_the_audit_log(reason, kept):
     told(StreamMeasures(), events)(StreamEvent("theatre", "engine", "ended", reason, 7))
     expected = {"pid": 7, "reason": reason if kept else "the log has the reason"}
     assert heard == [(("process.ended", "theatre/engine", "failed"), expected)]
+
+
+@pytest.mark.parametrize(
+    ("state", "ready"), [("live", "ready"), ("stopped", "ready"), ("source lost", "degraded"), ("failed", "degraded")]
+)
+def test_a_lost_camera_is_degraded(tmp_path, monkeypatch, state, ready):
+    """Without the reason: /readyz is asked without a key, and a reason may name a source."""
+    facts = StreamFacts("theatre", "rtsp://10.0.0.5/x", "live", "cpu", {}, state, "rtsp://10.0.0.5/x is gone", {})
+    monkeypatch.setattr(SupervisedStreams, "now", lambda self: [facts])
+    with tempfile.TemporaryDirectory(prefix="isp-") as runtime:
+        settings = ServiceSettings(paths={"data": tmp_path, "runtime": runtime}, streams={})
+        check = assembled(settings).checks["streams"]
+        result = asyncio.run(check())
+    assert (result.ok, result.needed) == (ready == "ready", False)
+    assert "10.0.0.5" not in result.detail and (result.ok or result.detail == f"theatre: {state}")

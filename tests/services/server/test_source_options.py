@@ -1,0 +1,83 @@
+"""Options of a source's address are refused when the stream is made, as the source itself would refuse them."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from importlib import import_module
+
+import pytest
+
+from gsplat_core.deformation.registry import FIELDS
+from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry.registry import DEPTHS
+from gsplat_core.io.recordings.synthetic.synthesize import MAX_SEED
+from gsplat_core.rendering.registry import RENDERERS
+from operators.sources.registry import SOURCES
+from operators.tool_mask import TOOL_MASKS
+from services.control.parts import NewStream
+from services.server import source_options
+from services.server.source_options import OPTIONS, check_source_options
+from services.server.stream_specs import KNOWN, spec_of
+
+MODULES = {
+    "synthetic": "synthetic", "v4l2": "v4l2", "folder": "folder", "pipe": "pipe", "realtime": "realtime",
+    "zmq+tcp": "zeromq", "zmq+ipc": "zeromq",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("address", "option"),
+    [
+        ("synthetic:?fps=nan", "fps"), ("synthetic:?fps=inf", "fps"), ("synthetic:?fps=-1", "fps"), ("synthetic:?fps=", "fps"),
+        ("synthetic:?fps=1e400", "fps"), ("synthetic:?width=0", "width"), ("synthetic:?width=1e3", "width"),
+        ("synthetic:?height=99999999999999999999999", "height"), ("synthetic:?frames=0", "frames"), ("synthetic:?moving=maybe", "moving"),
+        ("synthetic:?eyes=3", "eyes"), ("synthetic:?sead=1", "sead"), ("synthetic:?fps=30&fps=30", "fps"),
+        ("synthetic:?stereo=both", "stereo"), ("v4l2:/dev/video0?size=big", "size"), ("v4l2:/dev/video0?fps=nan", "fps"),
+        ("rtsp://10.0.0.1/x#open_s=nan", "open_s"), ("rtsp://10.0.0.1/x#transport=carrier", "transport"),
+        ("rtsp://10.0.0.1/x#opens=1", "opens"), ("stereo:synthetic:|synthetic:?fps=nan", "fps"),
+        ("realtime:/a?speed=nan", "speed"), ("folder:/a?every=x", "every"), ("zmq+tcp://10.0.0.1:1?open_s=inf", "open_s"),
+    ],
+)  # fmt: skip
+def test_what_a_source_would_refuse_is_refused_with_its_name(address, option):
+    with pytest.raises(InvalidSetting, match=option):
+        spec_of(NewStream("theatre-1", address, "live", "cpu", {}))
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "synthetic:", "synthetic:?width=320&height=256&frames=24&moving=1", "synthetic:?fps=30&seed=3&eyes=2",
+        "rtsp://user:pass@10.0.0.1:554/x?fps=nan#transport=udp&open_s=3", "v4l2:/dev/video0?size=640x480&fps=30",
+        "rtsp://10.0.0.1/x#stereo=side_by_side", "recording:/a/b", "realtime:/a?speed=max&loop=bounce", "folder:/a?every=1&fps=5",
+        "pipe:/a?size=64x48&format=rgb24", "udp://0.0.0.0:5000",
+    ],
+)  # fmt: skip
+def test_what_a_source_takes_is_taken(address):
+    check_source_options(address)
+
+
+@pytest.mark.parametrize("scheme", MODULES)
+def test_the_options_are_those_of_the_source(scheme):
+    asked = set()
+    for node in ast.walk(ast.parse(inspect.getsource(import_module(f"operators.sources.{MODULES[scheme]}")))):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in {
+            f"address.{kind}" for kind in ("text", "choice", "number", "whole", "flag", "size")
+        }:
+            asked.add(ast.literal_eval(node.args[0]) if node.args else "size")
+    assert set(OPTIONS[scheme]) == asked
+
+
+def test_nothing_that_the_engine_knows_is_refused():
+    assert set(KNOWN["field"]) == {"auto", *FIELDS}
+    assert set(KNOWN["renderer"]) == set(RENDERERS)
+    assert set(KNOWN["tool_mask"]) == set(TOOL_MASKS)
+    assert set(KNOWN["depth"]) == {"auto", *DEPTHS}
+    assert set(OPTIONS) <= set(SOURCES) and source_options.MAX_SEED == MAX_SEED
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_names_that_the_engine_does_not_know_are_refused(name):
+    with pytest.raises(InvalidSetting, match=f"{name} is 'nope'"):
+        spec_of(NewStream("theatre-1", "synthetic:", "live", "cpu", {name: "nope"}))
+    spec_of(NewStream("theatre-1", "synthetic:", "live", "cpu", {name: KNOWN[name][0]}))
