@@ -188,7 +188,7 @@ def _fill(places: Places, folder: Path) -> Backup:
         elsewhere.append("the database: take a pg_dump before the backup, and restore it first")
     if not places.blobs_are_ours:
         elsewhere.append("the models' files: back up the object store after the database")
-    files = {path.relative_to(folder).as_posix(): [path.stat().st_size, _sha256(path)] for path in _walk(folder)}
+    files = {path.relative_to(folder).as_posix(): (path.stat().st_size, _sha256(path)) for path in _walk(folder)}
     made = Backup(
         len(files), sum(size for size, _ in files.values()), datetime.now(UTC).isoformat(timespec="seconds"),
         product_version(), tuple(elsewhere), tuple(sorted(missing)), _audit_of(data),

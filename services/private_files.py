@@ -42,7 +42,7 @@ def make_state_private(data: Path, *further: Path | None) -> int:
     Raises FolderNotPrivate for a folder that is open to other users and cannot be closed.
     """
     own = [folder for folder in further if folder is not None]
-    changed = _close(data, lambda: any(_is_ours(name) for name in os.listdir(data)))
+    changed: int = _close(data, lambda: any(_is_ours(name) for name in os.listdir(data)))
     changed += sum(_close(folder, lambda: True) for folder in own)
     kept = [path for path in data.iterdir() if _is_ours(path.name)]
     for path in [*kept, *own]:

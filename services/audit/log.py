@@ -205,7 +205,7 @@ class AuditLog:
         if self._head.seq > kept.seq + 1:
             found["entries_ahead_of_the_head"] = self._head.seq - kept.seq
         if found:
-            self._say("audit.recovered", **found)
+            self._say("audit.recovered", "done", **found)
 
     def _checked_end(self, whole_bytes: int) -> Head:
         """The newest entry, which becomes the head. ValueError where the chain does not lead from the head that was kept to it."""

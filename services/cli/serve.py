@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import typer
 
 from services.cli.exit_codes import OK
 from services.control.app import new_app
-from services.control.logs import log_to_stderr
+from services.control.logs import log_to_stderr, say_start
 from services.control.probe import bind_probe
 from services.control.server import bind, certificate_of, serve
 from services.private_files import keep_files_private, make_state_private
@@ -63,5 +62,4 @@ def _assigned(setting: Sequence[str]) -> dict[str, str]:
 
 
 def _say(address: str, settings: ServiceSettings) -> None:
-    lines = [f"IntraSplat is on {address}/", f"the administrator's key is in {settings.admin_key_file}"]
-    print("\n".join(lines), file=sys.stderr, flush=True)  # noqa: T201
+    say_start(f"IntraSplat is on {address}/", f"the administrator's key is in {settings.admin_key_file}")

@@ -104,7 +104,7 @@ class BoundedListener(socket.socket):
             if key is None:
                 taken.close()
                 continue
-            taken.left = lambda key=key: self.bound.leave(key)  # type: ignore[misc]
+            taken.left = lambda key=key: self.bound.leave(key)
             return taken, address
         raise BlockingIOError("the connections that wait are beyond the bound; the loop comes back for the next")
 

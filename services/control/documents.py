@@ -89,7 +89,7 @@ def _problems_of(path: str, method: str, operation: dict[str, Any]) -> set[int]:
     """Which problems an operation may answer with, from what it is: a check holds this against a running server."""
     found = {400, 413, 421, 429, 431, 500, 503}
     if operation["security"]:
-        found |= {401, 403}
+        found |= {401, 403, 422}
     if "parameters" in operation:
         found |= {422}
     if "{" in path:

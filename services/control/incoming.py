@@ -7,6 +7,7 @@ import hashlib
 import os
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
@@ -35,7 +36,10 @@ async def incoming_file(request: Request, control: ControlState, expected_sha256
     """Write the body to a file as it comes. Raises TooManyRequests, NoSpace, and Unprocessable for another digest or an empty body."""
     if control.uploads.locked():
         raise TooManyRequests("as many uploads as may are running; wait for one to end", 5.0)
-    async with control.uploads:
+    key = request.scope["state"]["caller"].key_id
+    if control.uploads_of[key] >= control.settings.limits.uploads_per_key:
+        raise TooManyRequests("as many uploads of this key as may are running; wait for one to end", 5.0)
+    async with control.uploads, _counted(control.uploads_of, key):
         folder = control.uploads_dir
         _check_space(folder, int(request.headers.get("content-length", 0)))
         descriptor, name = tempfile.mkstemp(prefix="upload-", dir=folder)
@@ -52,6 +56,17 @@ async def incoming_file(request: Request, control: ControlState, expected_sha256
         finally:
             with suppress(FileNotFoundError):
                 path.unlink()
+
+
+@asynccontextmanager
+async def _counted(counts: Counter[str], key: str) -> AsyncIterator[None]:
+    counts[key] += 1
+    try:
+        yield
+    finally:
+        counts[key] -= 1
+        if not counts[key]:
+            del counts[key]
 
 
 async def _write(request: Request, descriptor: int, control: ControlState) -> tuple[int, bytes]:

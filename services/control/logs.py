@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import sys
+import threading
 from contextvars import ContextVar
 from datetime import UTC, datetime
+from types import TracebackType
 
 from services.settings.addresses import masked_address
 from services.settings.sections import LogSettings
@@ -49,10 +52,27 @@ def log_to_stderr(settings: LogSettings) -> None:
     text = settings.format == "text" or (settings.format == "auto" and handler.stream.isatty())
     handler.setFormatter(TextFormatter() if text else JsonFormatter())
     logging.basicConfig(level=settings.level.upper(), handlers=[handler], force=True)
+    logging.captureWarnings(True)
+    sys.excepthook = _log_uncaught
+    threading.excepthook = lambda raised: _log_uncaught(raised.exc_type, raised.exc_value, raised.exc_traceback)
     logging.getLogger("uvicorn.access").disabled = True  # it writes addresses with tickets in them
     logging.getLogger("uvicorn.error").addFilter(_is_no_refused_websocket)
     for chatty in ("websockets", "alembic"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
+
+
+def _log_uncaught(kind: type[BaseException], error: BaseException | None, trace: TracebackType | None) -> None:
+    """Log what nobody has caught, in the format of the log."""
+    if error is not None and not issubclass(kind, SystemExit):
+        logging.getLogger("intrasplat").critical("an error that nothing has caught", exc_info=(kind, error, trace))
+
+
+def say_start(*lines: str) -> None:
+    """Log where the service is, whatever the level: who has started it waits for these lines."""
+    logger = logging.getLogger("intrasplat.start")
+    logger.setLevel(logging.INFO)
+    for line in lines:
+        logger.info("%s", line)
 
 
 def _is_no_refused_websocket(record: logging.LogRecord) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +18,7 @@ from services.control.auth.tickets import Tickets
 from services.control.limits import TokenBuckets
 from services.control.measures import Measures
 from services.control.parts import Parts
-from services.control.problems import NotBuiltIn
+from services.control.problems import Missing, NotBuiltIn, Problem
 from services.control.repeated import Repeated
 from services.control.storage import Storage
 from services.control.viewer_count import ViewerCount
@@ -50,6 +51,8 @@ class ControlState:
     storage: Storage
     persons: Persons | None = None
     """Of an OpenID Connect issuer, where the settings name one."""
+    uploads_of: Counter[str] = field(default_factory=Counter)
+    """Uploads that run, by the key that makes them."""
     draining: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server is asked to end: what has no end of its own then ends."""
     repeated: Repeated = field(default_factory=Repeated)
@@ -72,3 +75,20 @@ def part(connection: HTTPConnection, choose: Callable[[Parts], Part | None], nam
     if found is None:
         raise NotBuiltIn(f"this server was started without {name}")
     return found
+
+
+def known_problem(control: ControlState, error: BaseException) -> type[Problem] | None:
+    """The problem that an error of a part is to a caller; None for a bug."""
+    known = control.parts.errors
+    return next((known[each] for each in type(error).__mro__ if each in known), None)
+
+
+async def is_missing(control: ControlState, look: Callable[[], object]) -> bool:
+    """Whether what `look` asks a part for is not there any more."""
+    try:
+        await asyncio.to_thread(look)
+    except Exception as error:
+        if (kind := known_problem(control, error)) is None:
+            raise
+        return issubclass(kind, Missing)
+    return False

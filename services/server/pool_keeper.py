@@ -14,6 +14,9 @@ from services.registry.errors import StoreUnavailable
 from services.supervisor.restarts import Restarts
 
 log = logging.getLogger(__name__)
+RELAY_S = 1.0
+LEVELS = {"WARNING": logging.WARNING, "ERROR": logging.ERROR, "CRITICAL": logging.ERROR, "Traceback": logging.ERROR}
+"""First words of a line, and how it is logged."""
 LOOK_S = 0.5
 END_S = 10.0
 """How long a pool may take to give its jobs back."""
@@ -30,6 +33,7 @@ class PoolKeeper:
     def __init__(self, pool: PoolProcess, open_jobs: Callable[[], int]) -> None:
         self._pool, self._open_jobs = pool, open_jobs
         self._process: asyncio.subprocess.Process | None = None
+        self._relaying: asyncio.Task[None] | None = None
 
     @property
     def pid(self) -> int | None:
@@ -71,11 +75,19 @@ class PoolKeeper:
         environment = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
         self._process = await asyncio.create_subprocess_exec(
             sys.executable, "-P", "-m", "services.jobs.process",
-            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.DEVNULL, env=environment, start_new_session=True,
+            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.PIPE,
+            env=environment, start_new_session=True,
         )  # fmt: skip
-        assert self._process.stdin is not None
-        self._process.stdin.write(self._pool.line())
-        return await self._process.wait()
+        process = self._process
+        assert process.stdin is not None and process.stderr is not None
+        process.stdin.write(self._pool.line())
+        self._relaying = asyncio.create_task(relayed(process.stderr), name="log of the pool")
+        code = await process.wait()
+        await asyncio.wait(
+            {self._relaying}, timeout=RELAY_S
+        )  # what the pool has started may have the pipe, too, for longer
+        self._relaying.cancel()
+        return code
 
     async def _end(self) -> None:
         process = self._process
@@ -88,3 +100,21 @@ class PoolKeeper:
         except TimeoutError:
             process.kill()
             await process.wait()
+        if self._relaying is not None:
+            await asyncio.wait({self._relaying}, timeout=RELAY_S)
+            self._relaying.cancel()
+
+
+async def relayed(said: asyncio.StreamReader) -> None:
+    """Log each line that a process prints to its standard error, so that this program's log has one format."""
+    while True:
+        try:
+            line = await said.readline()
+        except ValueError:  # longer than the reader takes; the rest of it comes as the next line
+            continue
+        if not line:
+            return
+        text = line.decode(errors="replace").strip()
+        if text:
+            level = LEVELS.get(text.partition(" ")[0], logging.INFO)
+            logging.getLogger("intrasplat.pool").log(level, "%s", text)

@@ -113,7 +113,13 @@ class LimitSettings(Section):
     body_bytes: int = Field(default=MIB, ge=1024, description="Longest body of a request that is not an upload.")
     model_bytes: int = Field(default=2048 * MIB, ge=MIB, description="Longest uploaded model.")
     recording_bytes: int = Field(default=16 * GIB, ge=MIB, description="Longest uploaded recording.")
-    uploads: int = Field(default=2, ge=1, le=64, description="Uploads at one time.")
+    uploads: int = Field(default=8, ge=1, le=64, description="Uploads at one time.")
+    uploads_per_key: int = Field(
+        default=2,
+        ge=1,
+        le=64,
+        description="Uploads of one key at one time: slow ones of one caller leave room for others.",
+    )
     stall_s: float = Field(default=10.0, gt=0, description="Longest wait for the next part of a body.")
     slowest_bytes_per_s: int = Field(
         default=4096, ge=0, description="A body that comes slower than this, after the first seconds, is refused."

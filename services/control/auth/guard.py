@@ -14,7 +14,7 @@ from starlette.responses import Response
 
 from services.control.auth.roles import ANYBODY, Caller, Role
 from services.control.bodies import BoundedBody, refuse_by_length
-from services.control.problems import Forbidden, TooManyRequests, Unauthenticated, WrongContent
+from services.control.problems import Forbidden, TooManyRequests, Unauthenticated, Unprocessable, WrongContent
 from services.control.state import ControlState, control_of
 
 JSON = "application/json"
@@ -83,6 +83,8 @@ class GuardedRoute(APIRoute):
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handle = super().get_route_handler()
         rule = rule_of(self.endpoint)
+        known = _query_names(self.dependant)
+        known |= {"ticket"} if rule.ticket else set()
         takes = rule.takes or (JSON if self.body_field is not None else None)
 
         async def guarded(request: Request) -> Response:
@@ -91,6 +93,8 @@ class GuardedRoute(APIRoute):
             limits = control.settings.limits
             most_bytes: int = getattr(limits, rule.most)
             refuse_by_length(request, most_bytes)
+            if rule.role is not Role.PUBLIC:
+                _refuse_unknown(request, known)
             if takes is not None:
                 _check_content_type(request, takes)
             return await handle(Request(request.scope, BoundedBody(request.scope, request.receive, most_bytes, limits)))
@@ -181,6 +185,20 @@ async def _authenticated(connection: HTTPConnection, rule: Rule, control: Contro
         raise Unauthenticated("the API key is not known here; it may have been revoked")
     control.keys.note_use(key.id)
     return Caller(key.name, key.id, key.role, streams=None if key.streams is None else frozenset(key.streams))
+
+
+def _query_names(dependant: Any) -> set[str]:
+    """Names of the query parameters of a route and of all that it depends on."""
+    own = {param.alias for param in dependant.query_params}
+    return own.union(*(_query_names(each) for each in dependant.dependencies))
+
+
+def _refuse_unknown(request: Request, known: set[str]) -> None:
+    """Raise Unprocessable for a parameter that the route does not have: it would be passed over, and the answer be to another question."""
+    for name in request.query_params:
+        if name not in known:
+            taken = f"it takes {', '.join(sorted(known))}" if known else "it has none"
+            raise Unprocessable(f"this path has no parameter {name!r:.60}; {taken}")
 
 
 def _check_content_type(request: Request, takes: str) -> None:

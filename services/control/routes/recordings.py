@@ -15,7 +15,7 @@ from services.control.digests import stated_sha256
 from services.control.incoming import incoming_file
 from services.control.recorded import recorded
 from services.control.replay_parts import Recordings
-from services.control.state import control_of, part
+from services.control.state import ControlState, control_of, is_missing, known_problem, part
 from services.settings import ResourceName
 
 log = logging.getLogger(__name__)
@@ -108,7 +108,7 @@ async def upload_recording(
             record, is_new = await asyncio.to_thread(kept.add, name, file.path, file.sha256, str(caller))
         said["size_bytes"] = file.size_bytes
     if is_new:
-        checking = asyncio.create_task(_check(kept, name))
+        checking = asyncio.create_task(_check(control, kept, name))
         control.tasks.add(checking)
         checking.add_done_callback(control.tasks.discard)
     else:
@@ -126,11 +126,15 @@ async def delete_recording(request: Request, caller: CallerOf, name: ResourceNam
         await asyncio.to_thread(kept.delete, name)
 
 
-async def _check(kept: Recordings, name: str) -> None:
-    """What a check finds is the recording's state. One that fails by a bug leaves it as it was, which the next start takes up again."""
+async def _check(control: ControlState, kept: Recordings, name: str) -> None:
+    """Set the recording's state to what the check finds. A check that cannot be run leaves it as it was, for the next start."""
     try:
         record = await asyncio.to_thread(kept.check, name)
-    except Exception:  # nobody waits for this task: what it raised would be seen by no one
-        log.exception("the check of a recording failed")
+    except Exception as error:  # nothing waits for this task
+        kind = known_problem(control, error)
+        if kind is not None and await is_missing(control, lambda: kept.get(name)):
+            log.info("a recording was deleted during its check")
+        else:
+            log.error("the check of a recording failed: %s", error, exc_info=None if kind else error)
     else:
         log.info("a recording was checked: %s", record.state)

@@ -14,8 +14,7 @@ from services.control.incoming import incoming_file
 from services.control.parts import Models, VersionRecord
 from services.control.recorded import recorded
 from services.control.routes.models import VersionView, registry_of
-from services.control.state import ControlState, control_of
-from services.control.system_events import SystemEvents
+from services.control.state import ControlState, control_of, is_missing, known_problem
 from services.settings import ResourceName
 
 log = logging.getLogger(__name__)
@@ -65,18 +64,23 @@ async def upload_model(
 
 def check_soon(control: ControlState, registry: Models, record: VersionRecord) -> None:
     """Have a new version checked, after the answer."""
-    checking = asyncio.create_task(_check(registry, record.name, record.version, control.parts.events))
+    checking = asyncio.create_task(_check(control, registry, record.name, record.version))
     control.tasks.add(checking)
     checking.add_done_callback(control.tasks.discard)
 
 
-async def _check(registry: Models, name: str, version: int, events: SystemEvents) -> None:
-    """What a check finds is the version's state. One that fails by a bug leaves it as it was, which the next start takes up again."""
+async def _check(control: ControlState, registry: Models, name: str, version: int) -> None:
+    """Set the version's state to what the check finds. A check that cannot be run leaves the version as it was, for the next start."""
+    events = control.parts.events
     try:
         record = await asyncio.to_thread(registry.check, name, version)
-    except Exception:  # nobody waits for this task: what it raised would be seen by no one
-        log.exception("the check of %s/%d failed", name, version)
-        events.tell("model.check", f"{name}/{version}", "failed")
+    except Exception as error:  # nothing waits for this task
+        kind = known_problem(control, error)
+        if kind is not None and await is_missing(control, lambda: registry.version(name, version)):
+            log.info("%s/%d was deleted during its check", name, version)
+        else:
+            log.error("the check of %s/%d failed: %s", name, version, error, exc_info=None if kind else error)
+            events.tell("model.check", f"{name}/{version}", "failed")
     else:
         events.tell("model.check", f"{name}/{version}", "refused" if record.state == "rejected" else "done")
         log.info("%s/%d was checked: %s", name, version, record.state)
