@@ -8,19 +8,29 @@ from typing import Annotated, Any
 import typer
 
 from gsplat_core.errors import InvalidSetting
-from services.cli import ctl_replays
+from services.cli import ctl_admin, ctl_replays
+from services.cli.ctl_admin import stream_row
 from services.cli.ctl_client import DEFAULT_URL, CaOption, KeyFileOption, UrlOption, print_found, with_client
 from services.cli.exit_codes import OK
 from services.cli.options import JsonOption
+from services.cli.tables import Columns
 
 ctl = typer.Typer(help="Speak to a running service (`intrasplat serve`).", no_args_is_help=True)
 ctl_replays.add_to(ctl)
+ctl_admin.add_to(ctl)
 ModelName = Annotated[str, typer.Argument(metavar="MODEL", show_default=False)]
 StreamName = Annotated[str, typer.Argument(metavar="STREAM", show_default=False)]
 
 
-STREAM = ("name", "state", "show", "source", "reason")
-VERSION = ("name", "version", "state", "size_bytes", "uploaded_by", "reason")
+STREAM: Columns = {
+    "name": "STREAM", "state": "STATE", "show": "SHOWS", "capture_hz": "CAMERA/S", "shown_hz": "SHOWN/S", "age_ms": "AGE MS",
+    "restarts": "RESTARTS", "displays": "DISPLAYS", "source": "SOURCE", "reason": "REASON",
+}  # fmt: skip
+VERSION: Columns = {
+    "name": "MODEL", "version": "VERSION", "state": "STATE", "size_bytes": "SIZE", "uploaded_at": "UPLOADED", "uploaded_by": "BY",
+    "reason": "REASON",
+}  # fmt: skip
+MODEL: Columns = {"name": "MODEL", "active": "ACTIVE VERSION"}
 
 
 @ctl.command("streams")
@@ -28,19 +38,23 @@ def streams(
     url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None, json: JsonOption = False
 ) -> int:
     """List the streams."""
-    return print_found(with_client(url, key_file, ca, lambda client: client.streams()), STREAM, json)
+    return print_found(with_client(url, key_file, ca, lambda client: client.streams()), STREAM, json, stream_row)
 
 
 @ctl.command("start")
 def start(name: StreamName, url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None) -> int:
     """Start a stream."""
-    return print_found([with_client(url, key_file, ca, lambda client: client.start_stream(name))], STREAM, False)
+    return print_found(
+        [with_client(url, key_file, ca, lambda client: client.start_stream(name))], STREAM, False, stream_row
+    )
 
 
 @ctl.command("stop")
 def stop(name: StreamName, url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None) -> int:
     """Stop a stream."""
-    return print_found([with_client(url, key_file, ca, lambda client: client.stop_stream(name))], STREAM, False)
+    return print_found(
+        [with_client(url, key_file, ca, lambda client: client.stop_stream(name))], STREAM, False, stream_row
+    )
 
 
 @ctl.command("create")
@@ -55,7 +69,7 @@ def create(
 ) -> int:
     """Make a stream and start it."""
     made = with_client(url, key_file, ca, lambda client: client.create_stream(name, source, show=show, device=device))
-    return print_found([made], STREAM, False)
+    return print_found([made], STREAM, False, stream_row)
 
 
 @ctl.command("models")
@@ -68,7 +82,7 @@ def models(
 ) -> int:
     """List the models, or the versions of one."""
     if name is None:
-        return print_found(with_client(url, key_file, ca, lambda client: client.models()), ("name", "active"), json)
+        return print_found(with_client(url, key_file, ca, lambda client: client.models()), MODEL, json)
     return print_found(with_client(url, key_file, ca, lambda client: client.versions(name)), VERSION, json)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as json_format
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,16 +13,16 @@ import typer
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.regular_files import read_regular
 from services.cli.exit_codes import OK
-from services.cli.streams import printable
+from services.cli.tables import Columns, table
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-URL, KEY = "INTRASPLAT_URL", "INTRASPLAT_KEY"
+URL, KEY, KEY_FILE = "INTRASPLAT_URL", "INTRASPLAT_KEY", "INTRASPLAT_KEY_FILE"
 UrlOption = Annotated[str, typer.Option(envvar=URL, help="Where the service is.")]
 KeyFileOption = Annotated[
     Path | None,
-    typer.Option(help=f"File with an API key; without it the variable {KEY}.", show_default=False),
+    typer.Option(envvar=KEY_FILE, help=f"File with an API key; without one the variable {KEY}.", show_default=False),
 ]
 CaOption = Annotated[
     Path | None, typer.Option(help="Certificate of the authority that signed the server's.", show_default=False)
@@ -48,7 +48,7 @@ def with_client(url: str, key_file: Path | None, ca: Path | None, act: Callable[
 def _key(file: Path | None) -> str:
     if file is None:
         if not os.environ.get(KEY):
-            raise InvalidSetting(f"there is no API key; give --key-file, or set {KEY}")
+            raise InvalidSetting(f"there is no API key; give --key-file, or set {KEY_FILE} or {KEY}")
         return os.environ[KEY]
     try:
         return read_regular(file, MOST_KEY_BYTES).decode("utf-8")
@@ -59,14 +59,18 @@ def _key(file: Path | None) -> str:
         ) from error
 
 
-def print_found(found: Sequence[BaseModel], names: Sequence[str], as_json: bool) -> int:
+def print_found(
+    found: Sequence[BaseModel],
+    columns: Columns,
+    as_json: bool,
+    row_of: Callable[[Any], Mapping[str, Any]] = lambda one: one.model_dump(mode="json"),
+) -> int:
+    """Print records as a table with headings, or as JSON with all that they have."""
     if as_json:
         typer.echo(json_format.dumps([one.model_dump(mode="json") for one in found], indent=2))
         return OK
-    for one in found:
-        typer.echo(
-            "  ".join(printable(str(value)) for name in names if (value := getattr(one, name)) not in (None, ""))
-        )
+    for line in table(columns, [row_of(one) for one in found]):
+        typer.echo(line)
     return OK
 
 

@@ -22,8 +22,11 @@ from services.cli.ctl_client import (
 )
 from services.cli.exit_codes import OK
 from services.cli.options import ExportedFileArgument, JsonOption
+from services.cli.tables import Columns
 
-SNAPSHOT = ("id", "taken_at", "gaussians", "size_bytes", "pause_ms", "taken_by")
+SNAPSHOT: Columns = {
+    "id": "ID", "taken_at": "TAKEN", "seq": "FRAME", "gaussians": "GAUSSIANS", "size_bytes": "SIZE", "pause_ms": "PAUSE MS", "taken_by": "BY",
+}  # fmt: skip
 FormatOption = Annotated[
     str | None,
     typer.Option(

@@ -24,9 +24,17 @@ from services.cli.ctl_client import (
 )
 from services.cli.exit_codes import OK
 from services.cli.options import JsonOption
+from services.cli.tables import Columns
 
-RECORDING = ("name", "state", "kind", "kept_bytes", "uploaded_by", "reason")
-REPLAY = ("id", "recording", "state", "frames_done", "frames", "psnr_db", "reason")
+RECORDING: Columns = {
+    "name": "RECORDING", "state": "STATE", "kind": "KIND", "description.frames": "FRAMES", "kept_bytes": "SIZE", "uploaded_at": "UPLOADED",
+    "uploaded_by": "BY", "reason": "REASON",
+}  # fmt: skip
+REPLAY: Columns = {
+    "id": "ID", "recording": "RECORDING", "state": "STATE", "frames_done": "DONE", "frames": "FRAMES", "psnr_db": "TRAINING PSNR DB",
+    "created_at": "STARTED", "reason": "REASON",
+}  # fmt: skip
+KEPT: Columns = {"name": "MODEL", "version": "VERSION", "state": "STATE"}
 RecordingName = Annotated[str, typer.Argument(metavar="RECORDING", show_default=False)]
 ReplayId = Annotated[str, typer.Argument(metavar="REPLAY", help="As `ctl replays` shows it.", show_default=False)]
 
@@ -34,7 +42,7 @@ ReplayId = Annotated[str, typer.Argument(metavar="REPLAY", help="As `ctl replays
 def add_to(ctl: typer.Typer) -> None:
     """Give `intrasplat ctl` these commands."""
     for name, command in (
-        ("recordings", recordings), ("add-recording", add_recording), ("remove-recording", remove_recording),
+        ("recordings", recordings), ("add-recording", add_recording), 
         ("replays", replays), ("replay", replay), ("cancel", cancel), ("result", result), ("keep", keep),
     ):  # fmt: skip
         ctl.command(name)(command)
@@ -68,14 +76,6 @@ def add_recording(
     print_found([found], RECORDING, False)
     if found.state == "rejected":
         raise InvalidSetting(f"{name} was rejected: {found.reason}")
-    return OK
-
-
-def remove_recording(
-    name: RecordingName, url: UrlOption = DEFAULT_URL, key_file: KeyFileOption = None, ca: CaOption = None
-) -> int:
-    """Delete a recording that no replay uses."""
-    with_client(url, key_file, ca, lambda client: client.delete_recording(name))
     return OK
 
 
@@ -151,7 +151,7 @@ def keep(
 ) -> int:
     """Keep a replay's model in the registry, as the next version of a model."""
     found = with_client(url, key_file, ca, lambda client: client.keep_model(job_id, model))
-    return print_found([found], ("name", "version", "state"), False)
+    return print_found([found], KEPT, False)
 
 
 @contextmanager

@@ -172,7 +172,7 @@ def test_the_same_from_a_shell(server, tiny, tmp_path, monkeypatch, intrasplat):
     assert job_id in intrasplat("ctl", "replays").out
     refused = intrasplat("ctl", "cancel", job_id)
     assert (refused.code, "cannot be cancelled" in refused.err) == (2, True)
-    assert intrasplat("ctl", "remove-recording", "from-a-folder").code == 0
+    assert intrasplat("ctl", "delete", "recording", "from-a-folder", "--yes").code == 0
     assert "from-a-folder" not in intrasplat("ctl", "recordings").out
 
 
