@@ -2,10 +2,12 @@
 # Runs the steps of docker/Dockerfile's target `cpu`, in their order, where there is no Docker engine: in a root made by debootstrap in place of
 # the base image (Debian bookworm with its own Python 3.11 in place of the image's). Ends with the service as user 10001, and its health check.
 # Needs root, debootstrap, a network, 12 GB and half an hour. Usage: docker/check_in_clean_root.sh FOLDER [MIRROR]
+# TORCH_INDEX_URL and TORCH_SHA256 are those of the image; an empty TORCH_INDEX_URL takes torch of the lock.
 set -euo pipefail
 repository=$(cd "$(dirname "$0")/.." && pwd)
 root=${1:?give a folder that is not there yet}
 mirror=${2:-http://deb.debian.org/debian}
+torch_index=${TORCH_INDEX_URL-$(sed -n 's/^ARG TORCH_INDEX_URL=//p' "$repository/docker/Dockerfile")}
 [ ! -e "$root" ] || { echo "$root is there already; give another folder" >&2; exit 2; }
 
 step() { echo "== $*" >&2; }
@@ -24,8 +26,9 @@ trap 'umount "$root/proc" "$root/dev"' EXIT
 
 step "packages: a virtual environment with the locked packages"
 cp "$repository/requirements-service.lock" "$root/tmp/requirements.lock"
+cp "$repository/docker/install_packages.py" "$root/tmp/install_packages.py"
 inside python -m venv /opt/intrasplat
-inside pip install --quiet --require-hashes -r /tmp/requirements.lock
+inside python /tmp/install_packages.py /tmp/requirements.lock --torch-index-url "$torch_index" --torch-sha256 "${TORCH_SHA256:-}"
 
 step "source and wheel-cpu: compiled as the image does, with what .dockerignore lets through"
 inside apt-get update -qq

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from pathlib import Path, PurePosixPath
 
@@ -62,7 +63,9 @@ def copied_from_the_repository() -> list[str]:
 
 def test_what_is_copied_is_there_and_reaches_the_build():
     sources = copied_from_the_repository()
-    assert {"services", "requirements-service.lock", "docker/healthcheck.py"} <= set(sources)
+    assert {"services", "requirements-service.lock", "docker/healthcheck.py", "docker/install_packages.py"} <= set(
+        sources
+    )
     for source in sources:
         assert (ROOT / source).exists(), source
         assert let_through(source), source
@@ -82,7 +85,7 @@ def test_images_have_no_compiler_and_do_not_run_as_root(stage):
     assert [rest for name, rest in steps if name == "USER"][-1] == "10001:10001"
     assert [name for name, _ in steps if name == "HEALTHCHECK"] == ["HEALTHCHECK"]
     copied = [rest for name, rest in steps if name == "COPY" and "/opt/intrasplat " in rest]
-    assert copied == ["--from=trimmed /opt/intrasplat /opt/intrasplat"]
+    assert copied == [f"--from=trimmed-{stage} /opt/intrasplat /opt/intrasplat"]
 
 
 def test_the_health_check_asks_the_probe_listener():
@@ -94,13 +97,13 @@ def test_build_tools_are_taken_out_again():
     import tomllib
 
     tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]["build"]
-    (removed,) = [rest for _, rest in stages()["trimmed"][1]]
+    (removed,) = {rest for stage in ("trimmed-cpu", "trimmed-cuda") for _, rest in stages()[stage][1]}
     assert set(re.sub(r"pip uninstall --yes", "", removed).split()) == {re.split(r"[<>=]", tool)[0] for tool in tools}
 
 
 def test_stages_that_are_copied_from_exist():
     named = re.findall(r"(?:--from=|from=)([\w-]+)", DOCKERFILE.read_text())
-    assert set(named) == {"trimmed", "wheel-cpu", "wheel-cuda"}
+    assert set(named) == {f"{each}-{kind}" for each in ("packages", "trimmed", "wheel") for kind in ("cpu", "cuda")}
     assert set(named) <= set(stages())
 
 
@@ -111,6 +114,71 @@ def test_the_cuda_wheel_is_built_as_make_cuda_does():
         assert option in built and option in makefile
     assert "build/cuda-toolkit" in built and "CUDA_TOOLKIT := build/cuda-toolkit" in makefile
     assert ("ARG", "CUDA_ARCHITECTURES=portable") in stages()["wheel-cuda"][1]
+
+
+@pytest.fixture(scope="module")
+def installing():
+    """The program that installs the images' packages."""
+    spec = importlib.util.spec_from_file_location("install_packages", ROOT / "docker" / "install_packages.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_cpu_image_leaves_out_what_is_for_cuda_alone(installing):
+    lock = (ROOT / "requirements-service.lock").read_text()
+    every = list(installing.requirements(lock))  # some packages are there once for each Python
+    assert len(every) == len(re.findall(r"(?m)^[a-z0-9][^=\s]*==", lock)) > 50
+    kept, version = installing.without_cuda(lock)
+    left = list(installing.requirements(kept))
+    assert left == [each for each in every if each in left] and len(left) > 50
+    assert all("--hash=sha256:" in text for _, _, text in left)
+    gone = {name: (number, text) for name, number, text in every if (name, number, text) not in left}
+    assert {"torch", "triton", "nvidia-cublas", "nvidia-cudnn-cu13"} <= gone.keys() and version == gone["torch"][0]
+    assert not gone.keys() & {name for name, _, _ in left}
+    for name in gone.keys() - {"torch"}:  # nothing that stays asks for them
+        asking = set(re.findall(r"(?m)^    #(?: via |   )([a-z0-9][a-z0-9._-]*)$", gone[name][1]))
+        assert asking and asking <= gone.keys(), (name, asking)
+    with pytest.raises(ValueError, match="no torch"):
+        installing.without_cuda("numpy==2.0 \\\n    --hash=sha256:00\n")
+
+
+def test_what_pip_is_asked_for(installing, monkeypatch, tmp_path):
+    lock = tmp_path / "requirements.lock"
+    lock.write_text(
+        "numpy==2.0 \\\n    --hash=sha256:00\ntorch==2.15.0 \\\n    --hash=sha256:11\ntriton==3.9.0 \\\n    --hash=sha256:22\n"
+    )
+    asked: list[tuple[str, ...]] = []
+    written: list[str] = []
+
+    def pip(*arguments: str) -> int:
+        asked.append(arguments)
+        if "-r" in arguments:
+            written.append(Path(arguments[-1]).read_text())
+        return 0
+
+    monkeypatch.setattr(installing, "pip", pip)
+    assert installing.main([str(lock), "--torch-index-url", ""]) == 0
+    assert asked == [("install", "--require-hashes", "-r", str(lock))], "without an index: the lock as it is"
+    asked.clear(), written.clear()
+    assert installing.main([str(lock), "--torch-index-url", "https://mirror.example/cpu", "--torch-sha256", "ab"]) == 0
+    (rest, torch, check) = asked
+    assert rest[:3] == ("install", "--require-hashes", "--no-deps") and "--index-url" not in rest
+    assert torch[:4] == ("install", "--no-deps", "--index-url", "https://mirror.example/cpu") and check == ("check",)
+    assert written == ["numpy==2.0 \\\n    --hash=sha256:00\n", "torch==2.15.0+cpu --hash=sha256:ab\n"]
+    monkeypatch.setattr(installing, "pip", lambda *arguments: 1)
+    assert installing.main([str(lock), "--torch-index-url", "https://mirror.example/cpu"]) == 1, (
+        "what fails fails the build"
+    )
+
+
+def test_the_index_of_cpu_torch_is_an_argument_of_the_build():
+    steps = stages()["packages-cpu"][1]
+    assert [rest.partition("=")[0] for name, rest in steps if name == "ARG"] == ["TORCH_INDEX_URL", "TORCH_SHA256"]
+    (run,) = [rest for name, rest in steps if name == "RUN"]
+    assert '--torch-index-url "${TORCH_INDEX_URL}"' in run and '--torch-sha256 "${TORCH_SHA256}"' in run
+    assert not any(name == "ARG" for name, _ in stages()["packages-cuda"][1])
 
 
 def test_hadolint_finds_nothing(tool):

@@ -1,0 +1,77 @@
+"""Installs the packages of a lock file into the environment of the Python that runs this; with CPU-only torch where an index for it is given.
+
+    python install_packages.py requirements.lock
+    python install_packages.py requirements.lock --torch-index-url URL [--torch-sha256 HEX]
+
+Without an index everything comes from the lock, checked by its hashes: torch from PyPI, with CUDA's libraries. With one, torch, Triton and
+NVIDIA's libraries are left out, and the same version of torch comes from that index as `VERSION+cpu`. The lock has no hash of it: give the
+wheel's SHA-256 to have it checked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+ONLY_FOR_CUDA = re.compile(r"torch|triton|(cuda|nvidia)-[a-z0-9-]+")
+NAME = re.compile(r"([a-z0-9][a-z0-9._-]*)==([^\s;\\]+)")
+
+
+def requirements(lock: str) -> Iterator[tuple[str, str, str]]:
+    """Yield name, version and text of each requirement of a lock file, with its hashes."""
+    for part in re.split(r"\n(?=[A-Za-z0-9])", "\n" + lock):
+        text = part.strip("\n")
+        if found := NAME.match(text):
+            yield found[1], found[2], text
+
+
+def without_cuda(lock: str) -> tuple[str, str]:
+    """Return a lock file without torch, Triton and NVIDIA's libraries, and the version of torch that it had. Raises ValueError without torch."""
+    kept, version = [], None
+    for name, number, text in requirements(lock):
+        if name == "torch":
+            version = number
+        if not ONLY_FOR_CUDA.fullmatch(name):
+            kept.append(text)
+    if version is None:
+        raise ValueError("the lock file has no torch==VERSION")
+    return "\n".join(kept) + "\n", version
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Install; returns pip's exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("lock", type=Path)
+    parser.add_argument(
+        "--torch-index-url", default="", help="index with CPU builds of torch; empty: torch of the lock"
+    )
+    parser.add_argument("--torch-sha256", default="", help="digest that torch's wheel must have; empty: not checked")
+    given = parser.parse_args(arguments)
+    if not given.torch_index_url:
+        return pip("install", "--require-hashes", "-r", str(given.lock))
+    kept, version = without_cuda(given.lock.read_text(encoding="utf-8"))
+    wanted = f"torch=={version}+cpu"
+    with tempfile.TemporaryDirectory() as folder:
+        rest, torch = Path(folder, "rest.txt"), Path(folder, "torch.txt")
+        rest.write_text(kept, encoding="utf-8")
+        torch.write_text(wanted + (f" --hash=sha256:{given.torch_sha256}" if given.torch_sha256 else "") + "\n")
+        # The lock is complete: nothing is resolved, so that nothing brings the CUDA build back. `check` says if that leaves anything out.
+        return (
+            pip("install", "--require-hashes", "--no-deps", "-r", str(rest))
+            or pip("install", "--no-deps", "--index-url", given.torch_index_url, "-r", str(torch))
+            or pip("check")
+        )
+
+
+def pip(*arguments: str) -> int:
+    """Run pip of this environment; returns its exit code."""
+    return subprocess.run([sys.executable, "-m", "pip", *arguments], check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())
