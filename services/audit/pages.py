@@ -139,8 +139,9 @@ def _opened(log: Path, opened: ExitStack) -> list[BinaryIO]:
         closed = closed_segments(log)
         with ExitStack() as trying:
             try:
-                files = [trying.enter_context(each.path.open("rb")) for each in closed]
-                files.append(trying.enter_context(log.open("rb")))
+                files: list[BinaryIO] = [
+                    trying.enter_context(path.open("rb")) for path in (*(each.path for each in closed), log)
+                ]
             except FileNotFoundError:
                 continue
             if closed == closed_segments(log):

@@ -229,7 +229,7 @@ def audit(
     ca: CaOption = None,
 ) -> int:
     """Show the audit log, the oldest of the entries first."""
-    wanted = {
+    wanted: dict[str, Any] = {
         "event": event, "actor": actor, "subject": subject, "outcome": outcome, "since": moment(since), "until": moment(until),
     }  # fmt: skip
     if format not in ("table", "csv", "jsonl"):

@@ -53,7 +53,7 @@ class ServerCertificate(Collector):
             connection.context = self._context
 
         # Called for each handshake, with a server name or without one.
-        context.sni_callback = choose  # type: ignore[assignment]
+        context.sni_callback = choose
 
     def look(self) -> bool:
         """Load the files again if they have changed. Returns True where a new pair is in use."""

@@ -64,7 +64,7 @@ class Stream:
         now = self.supervisor.state()
         state, reason = overall(now.capture, now.engine)
         processes = {"capture": asdict(now.capture), "engine": asdict(now.engine)}
-        viewers = {} if self.hub is None else {kind: self.hub.viewers(kind) for kind in KINDS}
+        viewers: dict[str, int] = {} if self.hub is None else {str(kind): self.hub.viewers(kind) for kind in KINDS}
         return StreamFacts(*about, state, reason, processes, viewers)
 
 
