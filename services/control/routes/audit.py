@@ -8,13 +8,14 @@ from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from fastapi import Depends, Query
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
 from services.audit import ExportFormat, Wanted
 from services.audit.entries import Outcome
 from services.control.auth.guard import CallerOf, new_router, requires
+from services.control.moments import Moment
 from services.control.recorded import recorded
 from services.control.state import control_of
 
@@ -56,8 +57,8 @@ def wanted_of(
     actor: Annotated[Text | None, Query(description="Part of the actor: the name or the number of a key.")] = None,
     subject: Annotated[Text | None, Query(description="Part of the subject.")] = None,
     outcome: Annotated[Outcome | None, Query()] = None,
-    since: Annotated[AwareDatetime | None, Query(description="From this moment on, with a time zone.")] = None,
-    until: Annotated[AwareDatetime | None, Query(description="Before this moment, with a time zone.")] = None,
+    since: Annotated[Moment | None, Query(description="From this moment on, with a time zone.")] = None,
+    until: Annotated[Moment | None, Query(description="Before this moment, with a time zone.")] = None,
 ) -> Wanted:
     """Return the entries to look for."""
     return Wanted(event, actor, subject, outcome, since, until)

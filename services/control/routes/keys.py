@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import asyncio
 from datetime import UTC, datetime
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, Strict, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 from starlette.requests import Request
 
 from services.control.auth.guard import CallerOf, new_router, requires
 from services.control.auth.key_changes import limits_of
 from services.control.auth.keys import MOST_STREAMS, ApiKey, KeyConflict
 from services.control.auth.roles import Role
+from services.control.moments import Moment
 from services.control.problems import Conflicting, Missing
 from services.control.recorded import recorded
 from services.control.state import ControlState, control_of
@@ -27,7 +28,7 @@ class NewKey(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
     name: ResourceName
     role: Literal["viewer", "operator", "admin"] = Field(examples=["viewer"])
-    expires_at: Annotated[AwareDatetime, Strict(False)] | None = Field(
+    expires_at: Moment | None = Field(
         None, description="Refused from then on, with a time zone; null: never.", examples=["2099-01-01T00:00:00Z"]
     )
     streams: list[ResourceName] | None = Field(

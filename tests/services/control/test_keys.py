@@ -332,6 +332,8 @@ def test_expiry_and_last_use_over_the_api(plane, clock):
         {"expires_at": "2020-01-01T00:00:00Z"},
         {"expires_at": "2999-01-01T00:00:00"},
         {"expires_at": "never"},
+        {"expires_at": 9_999_999_999},
+        {"expires_at": "9999999999"},
         {"streams": []},
         {"streams": ["A/B"]},
         {"streams": "theatre-1"},
