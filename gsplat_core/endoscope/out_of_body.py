@@ -191,7 +191,7 @@ def _gradient(
 
 def _smooth(grey: NDArray[np.uint8], judged: NDArray[np.bool_]) -> float:
     """Share of the judged area, without a border of two pixels, in which brightness hardly changes from pixel to pixel."""
-    inner = cv2.erode(judged.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
+    inner = np.asarray(cv2.erode(judged.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0)) > 0
     *_, steepness = _gradient(grey, 1 / 8)
     return float(np.count_nonzero((steepness < FLAT * grey) & inner) / max(1, np.count_nonzero(inner)))
 
@@ -206,8 +206,8 @@ def _straight(image: NDArray[np.uint8], lit: NDArray[np.bool_]) -> float:
     around = cv2.resize(lit.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     around = cv2.copyMakeBorder(around, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=0)
     kernel = np.ones((margin, margin), np.uint8)
-    inner = cv2.erode(cv2.morphologyEx(around, cv2.MORPH_CLOSE, kernel), kernel)
-    inner = inner[margin : margin + height, margin : margin + width] > 0
+    eroded = np.asarray(cv2.erode(cv2.morphologyEx(around, cv2.MORPH_CLOSE, kernel), kernel))
+    inner = eroded[margin : margin + height, margin : margin + width] > 0
     area = np.count_nonzero(inner)
     if area < 100:
         return 0.0
