@@ -193,7 +193,8 @@ def _smooth(grey: NDArray[np.uint8], judged: NDArray[np.bool_]) -> float:
     """Share of the judged area, without a border of two pixels, in which brightness hardly changes from pixel to pixel."""
     inner = np.asarray(cv2.erode(judged.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0)) > 0
     *_, steepness = _gradient(grey, 1 / 8)
-    return float(np.count_nonzero((steepness < FLAT * grey) & inner) / max(1, np.count_nonzero(inner)))
+    area = int(np.count_nonzero(inner))
+    return int(np.count_nonzero((steepness < FLAT * grey) & inner)) / area if area else 0.0
 
 
 def _straight(image: NDArray[np.uint8], lit: NDArray[np.bool_]) -> float:
