@@ -6,7 +6,8 @@ import sys
 
 def main() -> None:
     """Entry point of the console script; exits with 0, 1 (a bug), 2 (bad input), 130 (interrupted) or 141 (nobody reads the output)."""
-    import _signal  # built in: until the handler below is set, an import that Ctrl-C cuts short would show a traceback
+    # Until the handler below is set, an import that Ctrl-C cuts short would show a traceback. This module is built in: it is there at once.
+    import _signal  # type: ignore[import-not-found]
 
     _signal.signal(_signal.SIGINT, lambda number, frame: os._exit(130))
     from services.cli.interrupt import end_on_interrupt

@@ -213,5 +213,7 @@ def refused_by(answer: httpx2.Response, url: str) -> Refused:
 
 def _digest_of(content: BinaryIO) -> tuple[str, int]:
     """SHA-256 in base64, and the size."""
-    digest = hashlib.file_digest(content, "sha256").digest()
-    return base64.b64encode(digest).decode(), content.tell()
+    digest = hashlib.sha256()
+    while piece := content.read(CHUNK_BYTES):
+        digest.update(piece)
+    return base64.b64encode(digest.digest()).decode(), content.tell()
