@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsplat_core.geometry.depth_agreement import UNCONFIRMED, Look, agree
 from gsplat_core.geometry.depth_map import DepthMap, doubted
 from gsplat_core.geometry.multiview import DEFORMS, depth_of_view, view_of
 from gsplat_core.geometry.plane_sweep import View
@@ -23,17 +24,21 @@ EVERY_S = 0.2
 class ParallaxDepth:
     """Finds depth every `EVERY_S`, and none for the frames between. Memory and time do not grow with the stream.
 
+    Depth is given once a look agrees with the one before (`depth_agreement`).
+
     Frames without a pose, or of another projection than a pinhole, have nothing to find depth from.
     """
 
     def __init__(self) -> None:
         self._kept: list[tuple[float, View]] = []
         self._found_s: float | None = None
+        self._look: Look | None = None
+        """The one at `_found_s`."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """See `Estimator`."""
         if frame.new_scene is not None:
-            self._kept, self._found_s = [], None
+            self._kept, self._found_s, self._look = [], None, None
         if frame.pose is None or camera.model != "pinhole":
             return None
         now_s = frame.time_s
@@ -49,10 +54,19 @@ class ParallaxDepth:
             if found.doubt is None and not np.any(found.believed):
                 found = doubted(found.depth.shape, found.origin, DEFORMS)
             if found.doubt is None:
-                self._found_s = now_s
+                found = self._confirmed(found, camera, now_s)
         if self._is_elsewhere(camera):
             self._keep(now_s, view)
         return found
+
+    def _confirmed(self, found: DepthMap, camera: Camera, now_s: float) -> DepthMap | None:
+        """Return the depth if it agrees with the look before, else a doubted one; None for a first look."""
+        is_first = self._found_s is None or not 0 <= now_s - self._found_s <= LONGEST_S
+        before, self._look = self._look, Look.of(found.depth, found.confidence, camera)
+        self._found_s = now_s
+        if is_first or before is None:
+            return None
+        return found if agree(before, self._look) else doubted(found.depth.shape, found.origin, UNCONFIRMED)
 
     def _is_elsewhere(self, camera: Camera) -> bool:
         """Whether the scope is farther from every key frame than most of them from their neighbours, or there are few."""

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
+from gsplat_core.geometry.depth_agreement import UNCONFIRMED, Look, agree
 from gsplat_core.geometry.depth_map import DepthMap
 from gsplat_core.geometry.light_of_recording import frames_with_light
 from gsplat_core.geometry.matched_surface import with_matched_surface
@@ -53,7 +55,7 @@ def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> 
     given, doubts = _compared(frames, cameras)
     contradicted = sum(doubts[each] for each in (DEFORMS, CONTRADICTED))
     if contradicted < MOVES * min(MOST_KEY_FRAMES, len(frames)):
-        return WithParallax(given, doubts, at_rest=True)
+        return _confirmed(given, cameras, doubts)
     tissue = MovingTissue(frames, cameras)
     count = min(len(frames), max(1, MOST_PIXELS // frames[0].image[..., 0].size))
     breathing, uncertain = list(frames), Counter[str]()
@@ -63,10 +65,28 @@ def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> 
             uncertain[found.doubt] += 1
         else:
             breathing[number] = _with(frames[number], found)
-    # Where no motion is found, a rough depth is better to start from than none.
+    # Where no motion is found, a rough depth on which frames agree is better to start from than none.
     if uncertain.total() == count:
-        return WithParallax(given, doubts, at_rest=True)
+        return _confirmed(given, cameras, doubts)
     return WithParallax(breathing, uncertain)
+
+
+def _confirmed(frames: list[Frame], cameras: Sequence[Camera], doubts: Counter[str]) -> WithParallax:
+    """Return the frames with the depth that a neighbour with depth confirms (`depth_agreement`), as that of tissue at rest; `doubts` are added to."""
+    numbers = [number for number, frame in enumerate(frames) if frame.depth is not None]
+    looks = [
+        Look.of(depth, frames[number].depth_confidence, cameras[number])
+        for number in numbers
+        if (depth := frames[number].depth) is not None
+    ]
+    confirmed: set[int] = set()
+    for (one, first), (other, second) in pairwise(zip(numbers, looks, strict=True)):
+        if agree(first, second):
+            confirmed |= {one, other}
+    for number in set(numbers) - confirmed:
+        frames[number] = frames[number].with_fields(depth=None, depth_confidence=None, depth_origin=None)
+        doubts[UNCONFIRMED] += 1
+    return WithParallax(frames, doubts, at_rest=True)
 
 
 def _compared(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[Frame], Counter[str]]:

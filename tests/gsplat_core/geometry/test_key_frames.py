@@ -39,11 +39,11 @@ def test_it_is_found_by_name() -> None:
     assert isinstance(DEPTHS["parallax"](), ParallaxDepth)
 
 
-def test_depth_comes_as_soon_as_there_is_parallax_and_then_from_time_to_time() -> None:
-    found = answers(ParallaxDepth(), stream(14))
+def test_depth_comes_as_soon_as_a_second_look_confirms_the_first_and_then_from_time_to_time() -> None:
+    found = answers(ParallaxDepth(), stream(20))
     known = [number for number, each in enumerate(found) if each is not None and each.doubt is None]
     assert found[0] is None
-    assert known[0] <= 3
+    assert 6 <= known[0] <= 9
     assert all(later - earlier >= 6 for earlier, later in pairwise(known))
     assert len(known) >= 2
     assert all(1.5 < median_depth(found[number]) < 2.1 for number in known)

@@ -1,0 +1,125 @@
+"""Depth by parallax is used where two looks agree on the relief, and not where tissue that moves feigns it."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gsplat_core.geometry.depth_agreement import MOST_DISAGREEMENT, UNCONFIRMED, Look, agree, disagreement
+from gsplat_core.geometry.key_frames import ParallaxDepth
+from gsplat_core.io.recordings.synthetic.rendered import Asked, render_recording
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import DepthOrigin, Frame
+from gsplat_core.training.parallax import _confirmed
+from tests.gsplat_core.geometry.test_key_frames import answers, stream
+
+WIDTH, HEIGHT, FOCAL = 120, 90, 100.0
+CAMERA = Camera.from_focal(FOCAL, WIDTH, HEIGHT)
+
+
+def moved_by(x: float, y: float, z: float) -> Camera:
+    pose = np.eye(4)
+    pose[:3, 3] = -x, -y, -z
+    return CAMERA.with_pose(pose)
+
+
+def relief(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """z of the tissue at (x, y) mm."""
+    return 60 + 6 * np.sin(x / 9) + 5 * np.cos(y / 8)
+
+
+def true_depth(camera: Camera) -> NDArray[np.float32]:
+    """z of `relief` before a camera that looks straight ahead, by fixed-point iteration of each ray."""
+    centre = camera.position
+    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    slope_x, slope_y = (column - WIDTH / 2) / FOCAL, (row - HEIGHT / 2) / FOCAL
+    z = np.full((HEIGHT, WIDTH), 60.0)
+    for _ in range(200):
+        z = 0.5 * z + 0.5 * (relief(centre[0] + z * slope_x, centre[1] + z * slope_y) - centre[2])
+    return z.astype(np.float32)
+
+
+def look(camera: Camera, depth: NDArray[np.float32] | None = None) -> Look:
+    return Look.of(true_depth(camera) if depth is None else depth, None, camera)
+
+
+def test_looks_at_the_truth_agree_from_wherever_they_are() -> None:
+    for place in ((0.0, 0.0, 0.0), (5.0, -3.0, 4.0), (-8.0, 6.0, -5.0)):
+        assert disagreement(look(CAMERA), look(moved_by(*place))) < 0.06
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_looks_at_other_distances_do_not_agree(factor: float) -> None:
+    other = moved_by(4.0, 0.0, 0.0)
+    assert not agree(look(CAMERA), look(other, factor * true_depth(other)))
+
+
+def test_a_look_at_a_relief_that_is_not_there_does_not_agree() -> None:
+    other = moved_by(4.0, 2.0, 0.0)
+    assert not agree(look(CAMERA), look(other, np.flip(true_depth(other), axis=1).copy()))
+    flat = np.full((HEIGHT, WIDTH), 60, np.float32)
+    assert disagreement(look(CAMERA), look(other, flat)) == np.inf
+
+
+def test_noise_counts_as_much_as_it_is_beside_the_relief() -> None:
+    other, random = moved_by(4.0, 0.0, 0.0), np.random.default_rng(2)
+    noise = lambda share: np.exp(share * random.standard_normal((HEIGHT, WIDTH))).astype(np.float32)
+    found = [disagreement(look(CAMERA), look(other, true_depth(other) * noise(share))) for share in (0.005, 0.02, 0.08)]
+    assert found[0] < MOST_DISAGREEMENT < found[2] and found == sorted(found)
+
+
+def test_looks_that_share_no_tissue_say_nothing() -> None:
+    assert disagreement(look(CAMERA), look(moved_by(200.0, 0.0, 0.0))) == np.inf
+    nothing = Look.of(np.zeros((HEIGHT, WIDTH), np.float32), None, CAMERA)
+    assert disagreement(nothing, look(CAMERA)) == disagreement(look(CAMERA), nothing) == np.inf
+    unsure = Look.of(true_depth(CAMERA), np.full((HEIGHT, WIDTH), 0.2, np.float32), CAMERA)
+    assert disagreement(unsure, look(CAMERA)) == np.inf
+
+
+def test_in_a_stream_a_first_look_gives_nothing_and_a_second_one_confirms_it() -> None:
+    found = answers(ParallaxDepth(), stream(20))
+    assert [each.doubt for each in found if each is not None] == [None, None]
+
+
+def test_a_look_long_ago_confirms_nothing() -> None:
+    estimator, frames = ParallaxDepth(), stream(20)
+    late = [frame.with_fields(pts_ns=frame.pts_ns + 10_000_000_000) for frame in frames[8:]]
+    found = answers(estimator, frames[:5]) + answers(estimator, late)
+    assert all(each is None for each in found[:10])
+
+
+@pytest.fixture(scope="module")
+def breathing():
+    """Tissue that breathes before a moving scope: for a while it looks as if it stood still at another distance."""
+    return render_recording(Asked(18, 160, 128, seed=0, camera="moving"))
+
+
+def test_breathing_tissue_gets_no_depth_by_parallax_in_a_stream(breathing) -> None:
+    estimator, found = ParallaxDepth(), []
+    for frame in breathing:
+        bare = frame.with_fields(depth=None, depth_origin=None)
+        found.append(estimator.estimate(bare, breathing.camera_at(frame.seq)))
+    assert all(each is None or each.doubt is not None for each in found)
+    assert UNCONFIRMED in {each.doubt for each in found if each is not None}
+
+
+def test_offline_depth_that_no_neighbour_confirms_is_left_out() -> None:
+    """Of five looks the second one is at another distance."""
+    cameras = [moved_by(2.0 * number, 0.0, 0.0) for number in range(5)]
+    factors = (1.0, 1.3, 1.0, 1.0, 1.0)
+    frames = [
+        Frame(
+            number,
+            number,
+            np.zeros((HEIGHT, WIDTH, 3), np.uint8),
+            depth=factor * true_depth(camera),
+            depth_origin=DepthOrigin.PARALLAX,
+        )
+        for number, (camera, factor) in enumerate(zip(cameras, factors, strict=True))
+    ]
+    given = _confirmed(frames, cameras, Counter())
+    assert [frame.seq for frame in given.frames if frame.depth is not None] == [2, 3, 4]
+    assert given.doubts == {UNCONFIRMED: 2} and given.at_rest
