@@ -4,7 +4,7 @@ BACKUP/
   backup.json                          what is in it: size and SHA-256 of each file, and what is not in it
   data/registry/registry.sqlite        by SQLite's own backup, so that it is of one moment
   data/registry/blobs/  data/recordings/  data/replays/  data/snapshots/
-  data/audit.*  data/keys.json  data/admin.key
+  data/audit.*  data/keys.json  data/keys.used.json  data/admin.key
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def _fill(places: Places, folder: Path) -> Backup:
             break
         known = missing
     _copy_audit(places.data, data)
-    for name in (KEYS_FILE, "admin.key"):
+    for name in (KEYS_FILE, "keys.used.json", "admin.key"):
         if (places.data / name).is_file():
             _copy(places.data / name, data / name)
     elsewhere = []
