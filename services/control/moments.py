@@ -1,0 +1,19 @@
+"""A moment in a request: text in ISO 8601 with a time zone, and not the number of seconds that pydantic would take, too."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated
+
+from pydantic import AwareDatetime, BeforeValidator, Strict
+
+_DATE_AND_TIME = re.compile(r"\d{4}-\d\d-\d\d[Tt ]\d\d:\d\d.*")
+
+
+def _text(value: object) -> object:
+    if not isinstance(value, str) or not _DATE_AND_TIME.fullmatch(value):
+        raise ValueError("it is no date and time with a zone, such as 2026-11-23T20:30:00+01:00")
+    return value
+
+
+Moment = Annotated[AwareDatetime, Strict(False), BeforeValidator(_text)]
