@@ -13,14 +13,15 @@ from gsplat_core.io.recordings import open_recording
 
 Image = NDArray[np.uint8]
 PLACES = {"cutting": "cutting", "heart": "heart/left.mp4", "sinus": "sinus", "colon": "colon/video.mp4"}
-PLACES |= {name: f"others/{name}" for name in ("resting_bowel", "laparoscopy", "stereomis_like")}
+OTHERS = {name: f"others/{name}" for name in ("resting_bowel", "laparoscopy", "stereomis_like")}
+"""Recordings that are no ordinary ones throughout: with cuts, blur and many tools."""
 FRAME_NS = 33_333_333
 
 
 @lru_cache(maxsize=4)
 def clip(recordings_dir: Path, name: str) -> tuple[Image, ...]:
     """The pictures of a recording, at their own size; not to be written to."""
-    return tuple(frame.image for frame in open_recording(recordings_dir / PLACES[name]))
+    return tuple(frame.image for frame in open_recording(recordings_dir / (PLACES | OTHERS)[name]))
 
 
 @lru_cache(maxsize=8)
