@@ -33,7 +33,7 @@ def main() -> None:
             model = reconstructor.snapshot()  # immutable: a later step never changes it
             camera = recording.camera_at(frame.seq)
             live_db = psnr_tissue_db(model.render(frame.time_s, camera).image, frame.image, frame.mask)
-            line = f"frame {frame.seq}: {report.steps} steps, model {model.version}, live {live_db:.1f} dB"
+            line = f"frame {frame.seq}: {report.steps} steps, model {model.version}, training error {live_db:.1f} dB"
             if previous is not None:
                 line += (
                     f", previous frame shown instead {psnr_tissue_db(previous.image, frame.image, frame.mask):.1f} dB"

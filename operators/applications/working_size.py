@@ -98,29 +98,20 @@ def choose_working_size(
 
 
 def _largest_that_fits(measured: dict[int, float], allowed_s: float) -> int:
-    """Estimate the largest step whose frames take `allowed_s`: a frame takes a fixed time and a time for each of its pixels.
-
-    Between two measured sizes the estimate lies between them, so that a choice that was measured too long is not measured again.
-    """
-    fits = max((step for step, took_s in measured.items() if took_s <= allowed_s), default=None)
-    too_large = min((step for step, took_s in measured.items() if took_s > allowed_s), default=None)
+    """Estimate the largest step whose frames take `allowed_s`: a frame takes a fixed time and a time for each of its pixels."""
     near = sorted(measured, key=lambda step: abs(measured[step] - allowed_s))[:2]
     if len(near) == 1:
-        squared = near[0] ** 2 * allowed_s / measured[near[0]]
-        if fits is not None:
+        (only,) = near
+        squared = only**2 * allowed_s / measured[only]
+        if measured[only] <= allowed_s:
             # Where most of the time is fixed, this is far too small; a second size a quarter larger shows what a pixel costs.
-            squared = max(squared, (fits + max(1, fits // 4)) ** 2)
+            squared = max(squared, (only + max(1, only // 4)) ** 2)
     else:
         (a, b), (s, t) = near, (measured[near[0]], measured[near[1]])
         per_pixel = (t - s) / (b**2 - a**2)
         # Without a slope, as beside other load, the time is taken to be proportional.
         squared = a**2 + (allowed_s - s) / per_pixel if per_pixel > 0 else a**2 * allowed_s / s
-    step = math.floor(math.sqrt(max(0.0, squared)))
-    if too_large is not None:
-        step = min(step, too_large - 1)
-    if fits is not None:
-        step = max(step, fits)
-    return step
+    return math.floor(math.sqrt(max(0.0, squared)))
 
 
 class PacedTissue(ThreadedSource):

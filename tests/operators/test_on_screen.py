@@ -280,3 +280,11 @@ def test_the_digest_is_over_every_new_picture_and_all_of_its_bytes(stream, rende
     other = [all_of_them[0], shown(changed, PERIOD + MS), all_of_them[2]]
     assert len({digest(all_of_them), digest(other), digest(all_of_them[:2])}) == 3
     assert digest(all_of_them) == digest(in_time(pictures))
+
+
+def test_the_first_second_begins_with_the_stream_and_not_at_zero(frame, rendered, compute_queued):
+    start_ns = 3_600_000_000_000
+    frames = [frame(k, pts_ns=start_ns + k * PERIOD, arrived_ns=k * PERIOD) for k in range(30)]
+    pictures = [rendered(k, frame=frames[k], offset=9 if k < 25 else 3) for k in range(30)]
+    _, result, _ = score(OnScreenMetricsOp(None), compute_queued, frames, in_time(pictures))
+    assert result.settled_db == pytest.approx(decibels(3), abs=0.05)
