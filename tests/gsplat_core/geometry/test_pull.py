@@ -60,3 +60,14 @@ def test_motion_along_the_line_of_sight_has_the_sign_of_the_motion() -> None:
         # What comes nearer moves away from the middle of the picture.
         assert along[0] == pytest.approx(-0.1, rel=0.1)
         assert unexplained[0] < 0.002
+
+
+def test_points_that_were_followed_wrongly_do_not_decide_the_direction() -> None:
+    """Some points seem to move in another direction altogether, and farther than the tissue does."""
+    rays, off, _ = pulled(6.0, 3)
+    random = np.random.default_rng(8)
+    wrong = random.choice(len(rays), 12, replace=False)
+    off[wrong] = random.normal([-3, 8], 3, (len(wrong), 2)) / FOCAL_PX
+    pull = pull_of([rays], [off], [np.eye(3)], FOCAL_PX)
+    assert pull is not None
+    assert abs(pull.direction @ DIRECTION) > 0.99

@@ -7,7 +7,7 @@ import pytest
 
 from gsplat_core.geometry.light_change import Change
 from gsplat_core.geometry.relief import Grid, Places, appearance
-from gsplat_core.geometry.relief_fit import find_change, find_reliefs
+from gsplat_core.geometry.relief_fit import Equations, find_change, find_reliefs
 from gsplat_core.geometry.shading import LEAST_DETAIL, Shading
 from gsplat_core.scene.cameras import Camera
 
@@ -84,3 +84,64 @@ def test_glints_everywhere_alike_make_no_relief():
 def test_a_light_that_becomes_brighter_is_no_relief():
     changed = Change(0.3 * ONES, ONES, np.zeros((32, 40, 2)), 1.0)
     assert np.std(PLACES.value @ find_change(GRID, relief(0), changed)) < 0.005
+
+
+def analytic_view(seed):
+    """Log brightness and log depth [32, 40] of a bumpy surface z(X, Y), by intersecting rays and the surface's own normals; nothing of `relief` is used."""
+    random = np.random.default_rng(seed)
+    angles = random.uniform(0, 2 * np.pi, 4)
+    lengths = random.uniform(0.1, 0.16, 4)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    waves = [(k, random.uniform(0, 6.3), random.uniform(1.0, 2.0)) for k in lengths]
+    column, row = np.meshgrid(np.arange(40) * 4 + 2.0, np.arange(32) * 4 + 2.0)
+    slope = np.stack([(column - 80) / 140.0, (row - 64) / 140.0])
+    z = np.full(column.shape, 60.0)
+    for _ in range(100):
+        here = z * slope
+        z = 60 + sum(size * np.sin(k[0] * here[0] + k[1] * here[1] + phase) for k, phase, size in waves)
+    here = z * slope
+    bends = [size * np.cos(k[0] * here[0] + k[1] * here[1] + phase) for k, phase, size in waves]
+    by_x, by_y = (sum(k[axis] * bend for (k, _, _), bend in zip(waves, bends, strict=True)) for axis in (0, 1))
+    point = np.stack([*here, z])
+    normal = np.stack([by_x, by_y, -np.ones_like(z)]) / np.sqrt(1 + by_x**2 + by_y**2)
+    distance = np.sqrt((point**2).sum(0))
+    cosine = -(normal * point).sum(0) / distance
+    forward = np.log(z / distance)  # fall-off of the beam to the side, as the lamp of an endoscope has it
+    return np.log((cosine + 0.25) / 1.25) - 2 * np.log(distance) + forward, np.log(z)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_relief_of_an_analytic_surface_is_found(seed):
+    lit, true = analytic_view(seed)
+    found = PLACES.value @ find_reliefs(GRID, [Shading(lit, ONES, LEAST_DETAIL, NOTHING, NOTHING)], [None]).key
+    true = true.ravel() - true.mean()
+    found = found - found.mean()
+    assert np.std(found - true) < 0.55 * np.std(true)
+    assert np.corrcoef(found, true)[0, 1] > 0.85
+
+
+def test_a_step_is_that_of_all_unknowns_together():
+    """The elimination of the own unknowns, against one dense least-squares problem with the priors as rows."""
+    random = np.random.default_rng(6)
+    own, relief_by, off = random.normal(size=(30, 3)), random.normal(size=(30, 4)), random.normal(size=30)
+    weight, prior, away = random.uniform(0.5, 2, 30), random.uniform(1, 9, 3), random.normal(0, 2, 3)
+    key, key_prior = random.normal(size=4), random.uniform(1, 5, 4)
+    equations = Equations(own, relief_by, off, weight, prior, away)
+    step = np.linalg.solve(equations.information + np.diag(key_prior), equations.pull - key_prior * key)
+    rows = np.vstack(
+        [
+            np.sqrt(weight)[:, None] * np.hstack([own, relief_by]),
+            np.hstack([np.diag(np.sqrt(prior)), np.zeros((3, 4))]),
+            np.hstack([np.zeros((4, 3)), np.diag(np.sqrt(key_prior))]),
+        ]
+    )
+    right = np.concatenate([np.sqrt(weight) * off, -np.sqrt(prior) * away, -np.sqrt(key_prior) * key])
+    together = np.linalg.lstsq(rows, right, rcond=None)[0]
+    np.testing.assert_allclose(step, together[3:], rtol=1e-8)
+    np.testing.assert_allclose(equations.own_step(step), together[:3], rtol=1e-8)
+
+
+def test_weak_evidence_leaves_the_relief_small():
+    """Noise far above the brightness of any relief: the prior keeps the relief near the plane."""
+    noise = np.random.default_rng(9).normal(0, 1.0, (32, 40))
+    found = find_reliefs(GRID, [Shading(noise, ONES, 1.0, NOTHING, NOTHING)], [None]).key
+    assert np.std(PLACES.value @ found) < 0.25

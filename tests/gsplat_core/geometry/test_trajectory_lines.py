@@ -64,3 +64,10 @@ def test_other_frequencies_stay_where_they_are():
     way, lines = sways(0.22), [(0.33, 0.03, 0), (1.1, 0.02, 1)]
     told, _ = is_told(both := poses(*way, *lines), refined(both, (0.33, 1.1)), TIMES_S, (0.33, 1.1))
     assert told
+
+
+def test_a_way_that_swings_nearly_as_fast_shows_on_both_sides():
+    """A slower way alone raises the side below the breathing's frequency: breathing is still told."""
+    way, breathing = sways(0.27), (0.33, 0.03, 0)
+    told, mistaken = is_told(both := poses(*way, breathing), refined(both, (0.33,)), TIMES_S, (0.33,))
+    assert told and mistaken < 0.005
