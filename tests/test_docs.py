@@ -78,7 +78,10 @@ def commands() -> dict[str, set[str]]:
     group = typer.main.get_command(app)
     options = {name: {"--help"} for name in ["", *group.commands]}
     for name, command in [("", group), *group.commands.items()]:
-        for each in [command, *getattr(command, "commands", {}).values()] if name else [command]:
+        waiting = [command]
+        while waiting:
+            each = waiting.pop()
+            waiting += getattr(each, "commands", {}).values() if name else ()
             for parameter in each.params:
                 options[name] |= {*parameter.opts, *parameter.secondary_opts}
     return options

@@ -80,7 +80,7 @@ def load_bundle(folder: str | Path) -> Model:
     """
     folder = Path(folder)
     path = folder / TENSORS
-    if folder.exists() and not folder.is_dir():
+    if os.path.isfile(folder):  # False for a name that no file can have; opening it below says what is wrong
         raise BundleError(
             f"{folder} is a file, and a model is a folder with {TENSORS} and {MANIFEST}; give that folder"
         )

@@ -15,8 +15,8 @@ from services.client.pictures import Picture, pictures
 from services.client.replays import ReplayMethods
 from services.client.requests import refused_by, waited_for
 from services.client.snapshots import SnapshotMethods
-from services.control.routes.audit import AuditPage
 from services.control.health import Readiness
+from services.control.routes.audit import AuditPage
 from services.control.routes.keys import KeyView, MadeKey, Myself
 from services.control.routes.models import ModelView, VersionView
 from services.control.routes.streams import StreamView

@@ -162,13 +162,13 @@ def test_what_pip_is_asked_for(installing, monkeypatch, tmp_path):
     assert installing.main([str(lock), "--torch-index-url", ""]) == 0
     assert asked == [("install", "--require-hashes", "-r", str(lock))], "without an index: the lock as it is"
     asked.clear(), written.clear()
-    assert installing.main([str(lock), "--torch-index-url", "https://mirror.example/cpu", "--torch-sha256", "ab"]) == 0
+    assert installing.main([str(lock), "--torch-index-url", "https://index.example/cpu", "--torch-sha256", "ab"]) == 0
     (rest, torch, check) = asked
     assert rest[:3] == ("install", "--require-hashes", "--no-deps") and "--index-url" not in rest
-    assert torch[:4] == ("install", "--no-deps", "--index-url", "https://mirror.example/cpu") and check == ("check",)
+    assert torch[:4] == ("install", "--no-deps", "--index-url", "https://index.example/cpu") and check == ("check",)
     assert written == ["numpy==2.0 \\\n    --hash=sha256:00\n", "torch==2.15.0+cpu --hash=sha256:ab\n"]
     monkeypatch.setattr(installing, "pip", lambda *arguments: 1)
-    assert installing.main([str(lock), "--torch-index-url", "https://mirror.example/cpu"]) == 1, (
+    assert installing.main([str(lock), "--torch-index-url", "https://index.example/cpu"]) == 1, (
         "what fails fails the build"
     )
 

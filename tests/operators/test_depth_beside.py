@@ -183,7 +183,7 @@ def test_depth_rests_three_times_as_long_as_it_works_where_cores_are_few(
 ):
     bound, rested, clock = [], [], iter(range(1000))
     monkeypatch.setattr("operators.depth_beside.usable_cores", lambda: cores)
-    monkeypatch.setattr("operators.depth_beside.use_one_core", lambda: bound.append(True))
+    monkeypatch.setattr("operators.depth_beside.use_one_thread", lambda: bound.append(True))
     beside = DepthBeside("gated", CAMERA)
     monkeypatch.setattr(beside, "_rest", rested.append)
     monkeypatch.setattr("operators.depth_beside.time", SimpleNamespace(thread_time=lambda: 0.2 * next(clock)))

@@ -93,7 +93,11 @@ def test_it_runs_through_a_replay(points, tiny, tmp_path, device):
     settings = {"recording": tiny, "device": device.type, "steps_per_frame": 1}
     outcome = replay(ReplaySettings(out=tmp_path / "points", renderer="points", **settings))
     quality = outcome.find(QualityResult)
-    assert quality.frames == 3 and points.prepared == [1, 2, 3]
+    assert quality.frames == 3 and sorted(set(points.prepared)) == [
+        1,
+        2,
+        3,
+    ]  # and again for what is predicted of the next frame
     assert (tmp_path / "points" / "reconstruction.mp4").exists()
     blended = replay(ReplaySettings(out=tmp_path / "alpha", **settings))
     assert quality.frames_sha256 != blended.find(QualityResult).frames_sha256

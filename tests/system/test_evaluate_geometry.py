@@ -54,7 +54,7 @@ def test_it_is_printed_and_written_with_units_and_marks(intrasplat, known, made,
     assert done.code == 0, done.err
     for said in (
         "Depth after one scale",
-        "best flat plane",
+        "best-fit plane",
         "View of the third camera",
         "left picture",
         "no motion",

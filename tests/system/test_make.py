@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -67,6 +68,6 @@ def test_ci_runs_all_tests():
 
 def test_the_two_groups_of_tests_are_all_of_them():
     lines = [line for group in ("test-of-programs", "test-of-parts") for line in dry_run(group).splitlines()]
-    programs, parts = (line.partition("-m pytest ")[2].split() for line in lines if "-m pytest " in line)
+    programs, parts = (shlex.split(line.partition("-m pytest ")[2]) for line in lines if "-m pytest " in line)
     assert programs and all((ROOT / path).exists() for path in programs)
     assert parts == [f"--ignore={path}" for path in programs]

@@ -17,7 +17,7 @@ FRAME_NS = 33_333_333
 @pytest.fixture(scope="module")
 def stream() -> list[Frame]:
     """A moving scope with poses and without depth."""
-    frames, cameras = video(8, SIDEWAYS)
+    frames, cameras = video(16, SIDEWAYS)
     return [
         frame.with_fields(seq=number, pts_ns=number * FRAME_NS, pose=camera.world_to_camera)
         for number, (frame, camera) in enumerate(zip(frames, cameras, strict=True))

@@ -151,7 +151,7 @@ def test_what_is_no_folder_or_stays_empty_is_a_sentence(images, tmp_path):
         open_source(f"folder:{tmp_path}/nothing")
     with pytest.raises(SourceUnavailable, match=r"no whole image came into .*/images within 0\.1 s"):
         open_source(f"folder:{images}?open_s=0.1")
-    with pytest.raises(InvalidSetting, match="say which"):
+    with pytest.raises(InvalidSetting, match="the path is empty"):
         open_source("folder:")
 
 

@@ -162,7 +162,7 @@ def test_every_format_gives_the_same_picture(name, width, height):
 @pytest.mark.parametrize(
     ("address", "what"),
     [
-        ("pipe:", "say which"),
+        ("pipe:", "the path is empty"),
         ("pipe:-?size=6x4", "need their format"),
         ("pipe:-?format=rgb24", "need their size"),
         ("pipe:-?size=6x4&format=pink", "format is 'pink'; known are rgb24"),

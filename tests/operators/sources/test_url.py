@@ -315,7 +315,7 @@ def test_a_malformed_address_is_refused_before_anything_is_started(monkeypatch, 
     "address",
     [
         "udp://:5000", "udp://@:5000", "udp://@239.0.0.1:1234", "rtp://127.0.0.1:5004", "tcp://localhost:65535",
-        "rtsp://user:p%40ss@camera-3.theatre_2.local./h264", "rtsp://[fe80::1%25eth0]:554/x", "http://10.0.0.7/stream",
+        "rtsp://user:p%40ss@camera-3.theatre_2.local./h264", "rtsp://[fe80::1%25eth0]:554/x", "http://127.0.0.7/stream",
         "https://caméra.example:8443/x?y=z", "srt://[::1]:9000", "rtmp://host/app/key",
     ],
 )  # fmt: skip

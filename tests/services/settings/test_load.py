@@ -35,7 +35,7 @@ def test_flags_win_over_the_environment_over_the_file_over_defaults(file, monkey
     settings = load_settings(path, {"server.port": "3"})
     server = settings.server
     assert (server.port, server.host, server.drain_s) == (3, "127.0.0.3", 3.0)
-    assert (settings.log.level, settings.limits.uploads) == ("debug", 2)
+    assert (settings.log.level, settings.limits.uploads) == ("debug", 8)
     assert type(settings) is ServiceSettings
     assert "endoscope" in settings.streams
 

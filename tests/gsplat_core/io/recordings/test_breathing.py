@@ -89,7 +89,7 @@ def test_a_description_states_what_was_asked_for_alone(tmp_path: Path) -> None:
     )
     description = json.loads((folder / "recording.json").read_text())
     assert set(description["made_with"]) == {
-        "scene", "third", "flow", "tracks", "smoke", "depth_noise_mm", "exposure_changes"
+        "scene", "third", "behind", "flow", "tracks", "smoke", "depth_noise_mm", "exposure_changes"
     }  # fmt: skip
     other = synthesize(tmp_path / "b", frames=2, width_px=48, height_px=40, seed=4, extras=Extras(rate_wander=0.1))
     assert json.loads((other / "recording.json").read_text())["made_with"]["rate_wander"] == 0.1
