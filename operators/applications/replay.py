@@ -83,7 +83,7 @@ class ReplaySettings:
     depth: str = "auto"
     """Where depth comes from: a name in `gsplat_core.geometry.registry.DEPTHS`, or `auto`."""
     eyes: Eyes | None = None
-    """Pictures of a stereo scope that are trained on; None: frame by frame the left ones, which are shown, offline those of both eyes."""
+    """Pictures of a stereo scope that are trained on; None: the left ones, which are displayed."""
     poses: Poses = "given"
     """Where the scope was: as the recording says, or as is estimated from the pictures, frame by frame (`operators.pose`)."""
     heldout: bool = False
@@ -110,7 +110,7 @@ class ReplaySettings:
     def reconstructor_config(self, pixels: int | None = None, *, offline: bool = False) -> ReconstructorConfig:
         """The reconstructor's settings for frames of so many pixels. offline: for `Reconstructor.fit`. Raises InvalidSetting."""
         config = ReconstructorConfig.offline(self.field) if offline else ReconstructorConfig(field=self.field)
-        config = replace(config, eyes=self.eyes or ("both" if offline else "left"))
+        config = replace(config, eyes=self.eyes or "left")
         if offline:
             config = replace(config, depth_from_motion=self.depth in ("auto", "parallax"))
         if pixels is not None:

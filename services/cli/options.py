@@ -106,7 +106,7 @@ PosesFromOption = Annotated[
 ]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same bytes.")]
 EYES = "Pictures of a stereo scope that are trained on: left or both."
-EyesOption = Annotated[str | None, typer.Option(help=EYES, show_default="left; of reconstruct both")]
+EyesOption = Annotated[str | None, typer.Option(help=EYES, show_default="left")]
 ScaleOption = Annotated[float, typer.Option(help="Resize the frames by this factor.")]
 MaxFramesOption = Annotated[int | None, typer.Option(help="Stop after this many frames.", show_default=False)]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout, and nothing else.")]
