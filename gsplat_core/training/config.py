@@ -94,7 +94,7 @@ class ReconstructorConfig:
     matched."""
     default_depth_mm: float = 60.0
     """Distance of the plane on which a recording without depth starts."""
-    eyes: Eyes = "both"
+    eyes: Eyes = "left"
     """Whether the right eye's pictures are trained on, too, where frames have one and its camera is known."""
     motion_prior: str = "bumps"
     """What is assumed about motion after the newest frame: a name in `MOTION_PRIORS`."""
