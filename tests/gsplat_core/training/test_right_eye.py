@@ -17,7 +17,7 @@ from gsplat_core.training.right_eye import BothEyes, right_tissue
 from tests.gsplat_core.training.two_eyes import HEIGHT, LEFT, RIGHT, THIRD, WIDTH, seen, stereo_frame
 
 CONFIG = ReconstructorConfig(
-    gaussians=700, max_gaussians=1400, default_depth_mm=56.0, first_frame_steps=80, steps_per_frame=20
+    eyes="both", gaussians=700, max_gaussians=1400, default_depth_mm=56.0, first_frame_steps=80, steps_per_frame=20
 )
 DISPARITY_PX = 60 * 5 / 56
 
