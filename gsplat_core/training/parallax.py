@@ -72,7 +72,11 @@ def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> 
 
 
 def _confirmed(frames: list[Frame], cameras: Sequence[Camera], doubts: Counter[str]) -> WithParallax:
-    """Return the frames with the depth that a neighbour with depth confirms (`depth_agreement`), as that of tissue at rest; `doubts` are added to."""
+    """Return the frames with their depth where most looks are confirmed by a neighbour, and without any depth elsewhere.
+
+    The decision is one for the recording: frames that keep depth next to frames that lose it start at different distances. `depth_agreement`
+    says when two looks confirm each other. `doubts` are added to.
+    """
     numbers = [number for number, frame in enumerate(frames) if frame.depth is not None]
     looks = [
         Look.of(depth, frames[number].depth_confidence, cameras[number])
@@ -83,9 +87,10 @@ def _confirmed(frames: list[Frame], cameras: Sequence[Camera], doubts: Counter[s
     for (one, first), (other, second) in pairwise(zip(numbers, looks, strict=True)):
         if agree(first, second):
             confirmed |= {one, other}
-    for number in set(numbers) - confirmed:
-        frames[number] = frames[number].with_fields(depth=None, depth_confidence=None, depth_origin=None)
-        doubts[UNCONFIRMED] += 1
+    if 2 * len(confirmed) < len(numbers):
+        for number in numbers:
+            frames[number] = frames[number].with_fields(depth=None, depth_confidence=None, depth_origin=None)
+            doubts[UNCONFIRMED] += 1
     return WithParallax(frames, doubts, at_rest=True)
 
 
