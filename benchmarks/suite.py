@@ -103,6 +103,15 @@ BENCHMARKS = (
     Benchmark("training", "benchmarks/training_cpu.py", "cpu", runs=1),
     Benchmark("deformation", "benchmarks/deformation_cpu.py", "cpu", runs=1),
     Benchmark("tool_mask", "benchmarks/tool_mask.py {recordings}/cutting", "cpu", runs=1),
+    *(
+        Benchmark(f"breathing_{name}", f"benchmarks/geometry_moving.py --seeds 0 1 {options}".rstrip(), "cpu", runs=1)
+        for name, options in {
+            "steady": "",
+            "ratio": "--breathing-ratio 2",
+            "wander": "--rate-wander 0.15",
+            "path": "--scope-path seeded --breathing-ratio 2 --rate-wander 0.15",
+        }.items()
+    ),
     Benchmark("stereo", "benchmarks/geometry_stereo.py --recordings {recordings} --without heart", "cpu", runs=1),
 )
 
