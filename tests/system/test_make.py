@@ -15,10 +15,14 @@ from tests.missing import missing
 ROOT = Path(__file__).resolve().parents[2]
 
 
+OF_MAKE = ("CUDACXX", "MAKEFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "MARKED")
+"""Variables that a make above these tests sets."""
+
+
 def dry_run(*arguments: str, **environment: str) -> str:
     if shutil.which("make") is None:
         missing("there is no make")
-    clean = {name: value for name, value in os.environ.items() if name not in ("CUDACXX", "MAKEFLAGS", "MAKELEVEL")}
+    clean = {name: value for name, value in os.environ.items() if name not in OF_MAKE}
     done = subprocess.run(
         ["make", "--dry-run", "--always-make", *arguments],
         cwd=ROOT, env=clean | environment, capture_output=True, text=True, check=True,
