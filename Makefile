@@ -23,7 +23,7 @@ demo: native
 
 # The fast tests (`test`), or all of them (`test-all`: also those that are marked as slow), in two groups beside each other that take about equally
 # long. What a group says is printed when it is over.
-PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py tests/gsplat_core/geometry tests/operators
+PROGRAM_TESTS := tests/system tests/attacks tests/test_examples.py tests/gsplat_core/geometry tests/operators tests/recipes tests/deploy
 BESIDE := --no-print-directory --jobs=2 --output-sync=target --keep-going
 test: native .venv/.development
 	@$(MAKE) $(BESIDE) MARKED='not slow' test-of-programs test-of-parts
