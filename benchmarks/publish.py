@@ -26,7 +26,7 @@ RESULTS = ROOT / "benchmarks" / "RESULTS.md"
 README = ROOT / "README.md"
 BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 ENVELOPE = ("benchmark", "run", "commit", "date", "machine", "command", "seconds")
-"""What every log line states besides its result."""
+"""Fields that every log line has besides its result."""
 
 
 @dataclass(frozen=True)

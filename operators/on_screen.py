@@ -47,7 +47,7 @@ class OnScreenResult:
     previous_frame_db: float | None
     """Mean tissue PSNR of the previous raw frame, shown instead, after the first second."""
     previous_frame_throughout_db: float | None
-    """The same mean over all frames that were scored."""
+    """Mean tissue PSNR of the previous raw frame, over all frames that were scored."""
     frames: int
     """Frames that were scored."""
     not_on_screen: int

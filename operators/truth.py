@@ -33,7 +33,7 @@ class BehindTools:
     """Mean PSNR over pixels behind a tool whose place was seen before, against the picture through the tool."""
 
     psnr_db: float
-    """Of the reconstruction."""
+    """PSNR of the reconstruction behind tools."""
     last_seen_db: float
     """Trivial baseline: each pixel as it was when no tool hid it last."""
     inpainted_db: float
@@ -50,13 +50,13 @@ class TruthResult:
     depth: DepthShare | None
     """Depth of tissue that the camera shows, with the best level and the best tilted plane of each frame as trivial baselines."""
     depth_behind_tools: DepthShare | None
-    """The same of tissue behind tools."""
+    """Depth of tissue behind tools, with the same baselines."""
 
 
 class TruthOp(Operator):
     """Compares what is rendered with a recording's tissue behind its tools.
 
-    Nothing of the truth reaches training. Pixels that no earlier frame has shown are left out: nobody can know what is there.
+    Nothing of the truth reaches training. Pixels that no earlier frame has shown are left out, since no method can know them.
 
     Inputs:
         rendered: `RenderedFrame`.

@@ -88,9 +88,9 @@ class Backup:
     size_bytes: int
     made_at: str
     version: str
-    """Of the program that made it."""
+    """Version of the program that made the backup."""
     elsewhere: tuple[str, ...]
-    """What is not in it, and has to be backed up by its own means."""
+    """Data that the backup does not hold and that has to be backed up by other means."""
     missing: tuple[str, ...]
     """Rows of the database whose files were missing already when it was made."""
     audit: str

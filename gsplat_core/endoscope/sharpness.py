@@ -106,7 +106,7 @@ class SharpnessGate:
         self._clear_count = 0
         self._fault: str | None = None
         self._smoke_s = self._unseen_s = 0.0
-        """How long smoke has lasted, and how long frames could not be measured, which keep the fault of the one before."""
+        """Duration of the smoke so far, and of frames that could not be measured. Such frames keep the fault of the frame before."""
 
     def fault(self, image: NDArray[np.uint8], pts_ns: int, kept: NDArray[np.generic] | None = None) -> str | None:
         """Judge the stream's next frame: "blur", "smoke", or None for a good one.

@@ -24,9 +24,9 @@ class DepthShare:
     scaled_rmse_share: float
     """The same after the model's depth was multiplied by `scale`: of the shape alone."""
     plane_rmse_share: float
-    """The same of each frame's best-fit plane (`FlatDepths.plane`), which knows the truth."""
+    """Error of each frame's best-fit plane (`FlatDepths.plane`), which is fitted to the truth."""
     level_rmse_share: float
-    """The same of each frame's level plane (`FlatDepths.level`)."""
+    """Error of each frame's level plane (`FlatDepths.level`), which is fitted to the truth."""
     median_share: float
     """Median of the absolute error after `scale`, divided by the true depth."""
     rmse: float

@@ -27,9 +27,9 @@ class NormalErrors:
     mean_deg: float
     median_deg: float
     plane_mean_deg: float
-    """Of the normal of each frame's best-fit plane (`best_plane`), which knows the truth."""
+    """Error of the normal of each frame's best-fit plane (`best_plane`), which is fitted to the truth."""
     level_mean_deg: float
-    """Of the normal of a level plane: along the optical axis, towards the camera."""
+    """Error of the normal of a level plane: along the optical axis, towards the camera."""
     frames: int
 
 

@@ -74,9 +74,9 @@ class SparseDepthErrors:
     scale: float
     """The factor that was taken out: median of true over rendered depth."""
     plane_median: float
-    """As `median`, for each frame's best-fit plane (`FlatDepths.plane`); NaN where no frame has three sightings."""
+    """Median error of each frame's best-fit plane (`FlatDepths.plane`); NaN where no frame has three sightings."""
     level_median: float
-    """As `median`, for each frame's level plane (`FlatDepths.level`)."""
+    """Median error of each frame's level plane (`FlatDepths.level`)."""
     covered: float
     """Share of the sightings at which there is a depth; the others are in no error."""
     sightings: int
@@ -90,7 +90,7 @@ class SparseDepthSums:
         self._rendered: list[Array] = []
         self._true: list[Array] = []
         self._flat: list[Array] = []
-        """Of each frame the depths [2, n] of the best-fit and of the level plane."""
+        """Depths [2, n] of each frame's best-fit and level plane."""
 
     def add(self, number: int, depth: NDArray[np.float32], camera: Camera) -> None:
         """Compare depth z [H, W], 0 = unknown, of frame `number` with its points; `camera` has the frame's pose and this size."""

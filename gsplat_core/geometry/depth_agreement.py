@@ -36,7 +36,7 @@ class Look:
     believed: NDArray[np.float32]
     """[h, w]; 1 where it is believed, 0 elsewhere."""
     camera: Camera
-    """Of this size, with the pose."""
+    """Camera scaled to the size of the map, with its pose."""
 
     @classmethod
     def of(cls, depth: NDArray[np.float32], confidence: NDArray[np.float32] | None, camera: Camera) -> Look:

@@ -21,7 +21,7 @@ from gsplat_core.scene.model import Model
 
 WIDTH_PX, HEIGHT_PX = 640, 512
 FIELD_OF_VIEW = 0.9
-"""Of the camera that looks at a scene from a file: its width over its distance."""
+"""Width over distance of the camera that looks at a scene from a file."""
 SHOWN_SHARE = 0.9
 """Share of the Gaussians within the sphere that the camera shows whole."""
 WINDOW_S = (0.0, 4.0)

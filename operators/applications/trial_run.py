@@ -67,7 +67,7 @@ def trial_run(
 
 
 def run_on_trial(settings: LiveSettings, new_graph: Callable[[LiveSettings], Application]) -> None:
-    """Run a live graph of which nothing is recorded and nothing stays on the disk. Raises as a run does."""
+    """Run a live graph without recording, and keep no file of it. Raises the errors of a run."""
     with TemporaryDirectory(prefix="intrasplat-trial-") as folder:
         inside = replace(settings, out=Path(folder), record=None, out_of_body="off", seconds=None, max_frames=None)
         with seeded(settings.seed, settings.device):

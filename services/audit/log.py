@@ -162,7 +162,7 @@ class AuditLog:
         self._descriptor = descriptor
 
     def _is_current(self) -> bool:
-        """Whether the file that is open is still the one at the log's path, and not a closed segment."""
+        """Return True if the open file is still the one at the log's path, and not a closed segment."""
         try:
             return os.path.samestat(os.stat(self.path, follow_symlinks=False), os.fstat(self._descriptor))
         except FileNotFoundError:

@@ -30,7 +30,7 @@ class Keeping:
     segments: int | None = None
     days: float | None = None
     trusts_ages: Callable[[], bool] = lambda: True
-    """Whether the clock is believed; while it is not, no file is removed by its age."""
+    """Return True if the clock is trusted. While it is not, no file is removed by its age."""
 
 
 @dataclass(frozen=True)

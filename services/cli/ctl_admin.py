@@ -50,7 +50,7 @@ def add_to(ctl: typer.Typer) -> None:
 
 
 def check_sure(what: str, yes: bool) -> None:
-    """Ask whether something is to be deleted. Raises InvalidSetting for a no, and where nobody can be asked and `--yes` is missing."""
+    """Ask for confirmation of a deletion. Raises InvalidSetting if it is refused, or without a terminal and `--yes`."""
     if yes:
         return
     if not sys.stdin.isatty():

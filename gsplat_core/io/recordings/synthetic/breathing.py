@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 PERIOD_S = 3.4
-"""Of a breath, in the mean."""
+"""Mean period of a breath, in seconds."""
 WANDER_PERIODS_S = (6.1, 9.7)
 """The rate is off by two waves of these periods, of two and of three breaths."""
 

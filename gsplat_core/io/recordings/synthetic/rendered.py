@@ -31,7 +31,7 @@ class Asked:
     camera: Literal["fixed", "moving"] = "fixed"
     stereo: bool = False
     extras: Extras = CLEAR
-    """Of these the breathing and the scope's path count."""
+    """Options of the generator; only breathing and scope path are used."""
 
 
 class RenderedRecording:
