@@ -1,12 +1,40 @@
 #!/usr/bin/env bash
 # Runs the numeric tests with each instruction set of this processor: that of torch's kernels (ATEN_CPU_CAPABILITY), of torch's BLAS
 # (MKL_ENABLE_INSTRUCTIONS; MKL ignores it on processors that are not Intel's), of numpy's BLAS (OPENBLAS_CORETYPE) and of our kernels
-# (INTRASPLAT_ISA). Arguments are passed to pytest in place of the numeric tests.
+# (INTRASPLAT_ISA). Usage: tests/instruction_sets.sh [TEST FILES OR FOLDERS]; without arguments the fast tests of the core and the operators.
+# The environment may set PROCESSES (default 2, the files are split over them) and PYTHON. Logs go to out/instruction_sets.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 export OMP_WAIT_POLICY=PASSIVE OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}" OPENBLAS_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1
-tests=("$@")
-[ $# -gt 0 ] || tests=(-m "not slow" tests/gsplat_core tests/operators)
+python=${PYTHON:-.venv/bin/python}
+processes=${PROCESSES:-2}
+logs=out/instruction_sets
+mkdir -p "$logs"
+mapfile -t files < <(find "${@:-tests/gsplat_core}" $([ $# -gt 0 ] || echo tests/operators) -name 'test_*.py' | sort)
+
+run_tests() {  # NAME VARIABLE=VALUE...: the tests with these settings; false where one fails
+  local name=$1 pids=() part index failed=0
+  shift
+  for ((part = 0; part < processes; part++)); do
+    local chosen=()
+    for ((index = part; index < ${#files[@]}; index += processes)); do chosen+=("${files[index]}"); done
+    [ ${#chosen[@]} -gt 0 ] || continue
+    env "$@" TORCHINDUCTOR_CACHE_DIR="$(mktemp -d)" TORCH_EXTENSIONS_DIR="$(mktemp -d)" \
+      "$python" -m pytest -p no:cacheprovider -m "not slow" "${chosen[@]}" > "$logs/$name.$part.log" 2>&1 &
+    pids+=($!)
+  done
+  for ((part = 0; part < ${#pids[@]}; part++)); do
+    wait "${pids[part]}"
+    local code=$?
+    tail -n 1 "$logs/$name.$part.log"
+    if [ "$code" -ne 0 ] && [ "$code" -ne 5 ]; then  # 5: all of its tests are slow
+      failed=1
+      grep -E "^(FAILED|ERROR) " "$logs/$name.$part.log"
+    fi
+  done
+  return $failed
+}
+
 failed=()
 for set in baseline avx2 avx512 widest; do
   case $set in
@@ -17,7 +45,7 @@ for set in baseline avx2 avx512 widest; do
       settings=(ATEN_CPU_CAPABILITY=avx512 MKL_ENABLE_INSTRUCTIONS=AVX512 OPENBLAS_CORETYPE=SkylakeX INTRASPLAT_ISA=avx512) ;;
     widest) settings=(OPENBLAS_CORETYPE=Zen) ;;  # torch and our kernels as they choose
   esac
-  echo "== ${settings[*]}"
-  env "${settings[@]}" .venv/bin/python -m pytest "${tests[@]}" || failed+=("$set")
+  echo "== $set: ${settings[*]}"
+  run_tests "$set" "${settings[@]}" || failed+=("$set")
 done
 [ ${#failed[@]} -eq 0 ] || { echo "failed with: ${failed[*]}"; exit 1; }
