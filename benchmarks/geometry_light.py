@@ -1,7 +1,7 @@
 """Errors of depth by the scope's own light, beside those of planes, and its cost: python benchmarks/geometry_light.py [--pictures DIR]
 
 A line of JSON for each recording. `error` is the root mean square after one factor per frame, in shares of the median depth. `level` and `plane` are those of the level
-plane and of the best-fit plane (`gsplat_core.evaluation.plane`). `believed` is the share of the pixels with a confidence of at least 0.5. `doubted` is the share of the
+plane and of the best-fit plane (`gsplat_core.evaluation.depth`). `believed` is the share of the pixels with a confidence of at least 0.5. `doubted` is the share of the
 frames without an answer, which count as a level plane. `whole` is the error where all frames are looked at together, as `reconstruct` does it.
 """
 
@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.evaluation.depth_share import MOST_PIXELS
-from gsplat_core.evaluation.plane import flat_depths, pixels_to_compare
+from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_to_compare
 from gsplat_core.geometry.depth_map import BELIEVED
 from gsplat_core.geometry.light import LightDepth
 from gsplat_core.geometry.light_of_recording import frames_with_light
@@ -77,7 +76,7 @@ def measure(name: str, frames: Sequence[Frame], camera: Camera, pictures: Path |
         if frame.depth is not None:
             kept = known_tissue(frame)
             errors.append(error(depth, frame.depth, kept))
-            rays, true = pixels_to_compare(camera, kept, MOST_PIXELS, frame.depth)
+            rays, true = pixels_to_compare(camera, kept, MOST_DEPTH_PIXELS, frame.depth)
             flat = flat_depths(rays, true)
             assert flat is not None
             for found_errors, plane in ((levels, flat.level), (planes, flat.plane)):

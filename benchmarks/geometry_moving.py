@@ -6,7 +6,7 @@ truth, without a model in between.
 
 One JSON line a seed: the frequencies that were found (of each window), doubts, relative errors (root mean square over all tissue of all frames, the
 same where depth is believed, the share that is believed, the median of the absolute value, after one scale for all frames), the root mean square relative errors of the
-level plane and of the best-fit plane of each frame (`gsplat_core.evaluation.plane`), and processor seconds. The last three options are those of `intrasplat synthesize`.
+level plane and of the best-fit plane of each frame (`gsplat_core.evaluation.depth`), and processor seconds. The last three options are those of `intrasplat synthesize`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from run_facts import run_facts
 
-from gsplat_core.evaluation.depth_share import MOST_PIXELS
-from gsplat_core.evaluation.plane import flat_depths, pixels_to_compare
+from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_to_compare
 from gsplat_core.geometry.depth_map import BELIEVED
 from gsplat_core.geometry.moving_tissue import MovingTissue
 from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
@@ -42,7 +41,7 @@ def measured(asked: Asked) -> dict[str, Any]:
         if found.doubt is None:
             relative.append((found.depth / frame.depth)[frame.mask != 0])
             believed.append(found.confidence[frame.mask != 0] >= BELIEVED)
-            rays, true = pixels_to_compare(recording.camera, frame.mask != 0, MOST_PIXELS, frame.depth)
+            rays, true = pixels_to_compare(recording.camera, frame.mask != 0, MOST_DEPTH_PIXELS, frame.depth)
             planes = flat_depths(rays, true)
             assert planes is not None
             flat.append(np.stack([planes.level, planes.plane]) / true - 1)

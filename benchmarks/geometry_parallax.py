@@ -15,7 +15,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gsplat_core.evaluation.sparse_points import SparseDepthErrors, SparseDepthSums, SparsePoints
+from sparse_points import SparseDepthErrors, SparseDepthSums, SparsePoints
+
 from gsplat_core.geometry.registry import DepthFinder
 from gsplat_core.io.recordings import FileRecording, open_recording
 from gsplat_core.rendering.rasterization import render

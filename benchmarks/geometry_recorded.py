@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gsplat_core.evaluation.depth_share import DepthShareSums
+from gsplat_core.evaluation.depth import DepthShareSums
 from gsplat_core.geometry.measured_depth import measured_confidence
 from gsplat_core.geometry.registry import DepthFinder
 from gsplat_core.io.recordings import open_recording

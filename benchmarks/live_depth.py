@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sparse_points import SparseDepthSums, SparsePoints
 
-from gsplat_core.evaluation.sparse_points import SparseDepthSums, SparsePoints
 from gsplat_core.geometry.registry import DepthFinder
 from gsplat_core.io.recordings import FileRecording, open_recording
 from gsplat_core.rendering.rasterization import render

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.evaluation.depth_share import DepthShare, DepthShareSums
+from gsplat_core.evaluation.depth import DepthShare, DepthShareSums
 from gsplat_core.io.recordings.truth import TissueBehindTools
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus

@@ -1,12 +1,11 @@
-"""How good a reconstruction is, by the protocols that its figures are compared under; one module a protocol.
+"""Measures of a reconstruction, each next to the trivial baselines that it has to beat. `docs/evaluation.md` defines them.
 
-* `baselines`: what doing nothing scores; stands beside every other figure.
-* `heldout`: the field's split, rendered from a finished model.
-* `causal`: predict the next frame, then learn from it.
-* `live`: what was on the screen when the next frame arrived.
-* `geometry`: how true a model is in three dimensions: `depth_share`, `normals`, `novel_view`, `tracking`, `trajectory`, `parts`.
-* `second_eye`: the right eye's view beside what the right eye saw.
-* `retention`: what a model still knows of earlier frames and of places that it saw before.
+* `baselines`: copies and means of frames, and optical flow.
+* `protocols`: the held-out, causal and retention protocols on rendered pictures.
+* `live`: the picture on the screen when the next frame arrived.
+* `geometry`: accuracy in three dimensions, from `depth`, `motion`, `views` and `trajectory`.
+* `views`: further cameras and the right eye.
+* `scores`: sums of fixed size that the protocols share.
 
-Each takes frames one at a time, keeps sums of fixed size and hands every frame's figures to a callback. `docs/evaluation.md` defines them.
+Each protocol takes frames one at a time, keeps sums of fixed size and passes every frame's figures to a callback.
 """

@@ -1,16 +1,113 @@
-"""Errors of rendered depth, where a recording has measured depth."""
+"""Errors of rendered depth and normals against true depth, next to the best-fit plane and the level plane of each frame.
+
+`DepthSums` gives absolute errors for the held-out protocol. `DepthShareSums` and `NormalSums` compare whole sequences with flat planes.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.geometry.depth_map import BELIEVED
+from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.projection import pixel_rays, points_of
 from gsplat_core.training.metrics import ScoredMean
+
+Array = NDArray[np.float64]
+
+
+MOST_STEPS = 100
+"""Steps of Levenberg and Marquardt's method from each start; it converges in about ten."""
+
+
+CONVERGED = 1e-10
+"""Relative decrease of the squared error that ends the iteration."""
+
+
+STEEPEST_RATIO = 1e-6
+"""Least inverse depth of a plane at a fitted pixel, as a share of the mean: a plane has to lie in front of the camera there."""
+
+
+class FlatDepths(NamedTuple):
+    """Depth z [N] of the baselines at the pixels that were given."""
+
+    level: Array
+    """The median true depth, at every pixel: a plane across the optical axis."""
+    plane: Array
+    """The plane with the least squared error in z, tilted as it may be."""
+
+
+def flat_depths(rays: Array, z: Array) -> FlatDepths | None:
+    """Return both baselines for one frame; None for fewer than three pixels.
+
+    Args:
+        rays: (x/z, y/z, 1) of the pixels [N, 3].
+        z: true depth of the pixels [N], positive and finite.
+    """
+    plane = best_plane(rays, z)
+    return None if plane is None else FlatDepths(np.full(len(z), np.median(z)), 1 / (rays @ plane))
+
+
+def best_plane(rays: Array, z: Array) -> Array | None:
+    """Return the plane n [3] with n · (x, y, z) = 1 that minimises the sum of (1 / (n · ray) - z)², in front of the camera at every pixel given.
+
+    The problem is not linear in n. Levenberg and Marquardt's method starts from the best level plane and from two linear fits of 1/z; the best end counts.
+    No step that increases the error is taken, so that the result is never worse than a level plane. None for fewer than three pixels.
+
+    Args:
+        rays: (x/z, y/z, 1) of the pixels [N, 3].
+        z: true depth of the pixels [N], positive and finite.
+    """
+    if len(z) < 3:
+        return None
+    unit = float(z.mean())
+    heights = z / unit
+    starts = [np.array([0.0, 0.0, 1.0])]
+    for power in (1, 2):  # squared differences of 1/z, and of z to first order
+        weight = heights**power
+        found, *_ = np.linalg.lstsq(rays * weight[:, None], weight / heights, rcond=None)
+        if (rays @ found).min() > STEEPEST_RATIO:
+            starts.append(found)
+    ends = [_descended(start, rays, heights) for start in starts]
+    best, _ = min(ends, key=lambda end: end[1])
+    return best / unit
+
+
+def _descended(plane: Array, rays: Array, z: Array) -> tuple[Array, float]:
+    """Return the plane at the end of the descent from `plane`, and its squared error."""
+    found = 1 / (rays @ plane)
+    error, damping = float(np.square(found - z).sum()), 1e-3
+    for _ in range(MOST_STEPS):
+        slopes = -rays * np.square(found)[:, None]
+        normal, gradient = slopes.T @ slopes, slopes.T @ (found - z)
+        scale = np.diag(np.diag(normal) + 1e-12 * np.trace(normal))
+        before = error
+        while damping < 1e12:
+            step = np.linalg.solve(normal + damping * scale, gradient)
+            inverse = rays @ (plane - step)
+            if inverse.min() > STEEPEST_RATIO:
+                tried = float(np.square(1 / inverse - z).sum())
+                if tried <= error:
+                    plane, found, error, damping = plane - step, 1 / inverse, tried, damping / 10
+                    break
+            damping *= 10
+        if before - error <= CONVERGED * before:
+            break
+    return plane, error
+
+
+def pixels_to_compare(camera: Camera, where: NDArray[np.bool_], most: int, *planes: NDArray[Any]) -> tuple[Array, ...]:
+    """Return rays [N, 3] and the values [N] of each of `planes` [H, W] at no more than about `most` pixels of `where` [H, W], spread evenly."""
+    chosen = np.flatnonzero(where)
+    chosen = chosen[:: max(1, len(chosen) // most)]
+    rays = pixel_rays(camera).reshape(-1, 3)[chosen]
+    return rays, *(plane.ravel()[chosen].astype(np.float64) for plane in planes)
 
 
 @dataclass(frozen=True)
@@ -70,3 +167,141 @@ class DepthSums:
         means = {name: mean.mean for name, mean in self._means.items()}
         found = {name: value for name, value in means.items() if value is not None}
         return DepthErrors(**found, frames=self._frames) if len(found) == len(means) else None
+
+
+MOST_DEPTH_PIXELS = 8192
+"""Pixels of a frame that are compared, spread evenly: what is kept does not grow with the pictures."""
+
+
+@dataclass(frozen=True)
+class DepthShare:
+    """Errors over all compared pixels of all compared frames: tissue, with known depth, at which the model has depth."""
+
+    rmse_share: float
+    """Root of the mean squared error, divided by the median true depth."""
+    scaled_rmse_share: float
+    """The same after the model's depth was multiplied by `scale`: of the shape alone."""
+    plane_rmse_share: float
+    """Error of each frame's best-fit plane (`FlatDepths.plane`), which is fitted to the truth."""
+    level_rmse_share: float
+    """Error of each frame's level plane (`FlatDepths.level`), which is fitted to the truth."""
+    median_share: float
+    """Median of the absolute error after `scale`, divided by the true depth."""
+    rmse: float
+    """`rmse_share` in the unit of the recording's depth."""
+    scale: float
+    """One factor for the whole sequence: the median of true depth over the model's."""
+    median_depth: float
+    covered: float
+    """Share of the pixels of tissue with known depth at which the model has depth."""
+    frames: int
+
+
+class DepthShareSums:
+    """Takes frames one at a time; keeps at most `MOST_DEPTH_PIXELS` of each."""
+
+    def __init__(self) -> None:
+        self._kept: list[NDArray[np.float64]] = []
+        self._known = self._both = 0
+
+    def add(self, camera: Camera, true: NDArray[Any], shown: NDArray[Any], known: NDArray[np.bool_]) -> None:
+        """Compare depth z [H, W] that a model shows, 0 = nothing there, with the true one where that is known."""
+        both = known & np.isfinite(shown) & (shown > 0)
+        self._known += int(known.sum())
+        self._both += int(both.sum())
+        rays, *values = pixels_to_compare(camera, both, MOST_DEPTH_PIXELS, true, shown)
+        flat = flat_depths(rays, values[0])
+        if flat is not None:
+            self._kept.append(np.stack([*values, flat.plane, flat.level]))
+
+    @property
+    def errors(self) -> DepthShare | None:
+        """What they come to; None where nothing could be compared."""
+        if not self._kept:
+            return None
+        true, shown, plane, level = np.concatenate(self._kept, axis=1)
+        scale, median = float(np.median(true / shown)), float(np.median(true))
+        rmse = lambda found: float(np.sqrt(np.mean(np.square(found - true))))
+        return DepthShare(
+            rmse_share=rmse(shown) / median,
+            scaled_rmse_share=rmse(scale * shown) / median,
+            plane_rmse_share=rmse(plane) / median,
+            level_rmse_share=rmse(level) / median,
+            median_share=float(np.median(np.abs(scale * shown - true) / true)),
+            rmse=rmse(shown),
+            scale=scale,
+            median_depth=median,
+            covered=self._both / self._known,
+            frames=len(self._kept),
+        )
+
+
+MOST_PLANE_PIXELS = 8192
+"""Pixels of a frame that its plane is fitted to, spread evenly."""
+
+
+SMOOTH_PX = 5
+"""Points are averaged over so many pixels across before they are differentiated: stored depth has steps."""
+
+
+@dataclass(frozen=True)
+class NormalErrors:
+    """Angles between true and shown normals, means over frames; degrees."""
+
+    mean_deg: float
+    median_deg: float
+    plane_mean_deg: float
+    """Error of the normal of each frame's best-fit plane (`best_plane`), which is fitted to the truth."""
+    level_mean_deg: float
+    """Error of the normal of a level plane: along the optical axis, towards the camera."""
+    frames: int
+
+
+def normals_of(
+    camera: Camera, depth: NDArray[Any], known: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Unit normals [H, W, 3] of a depth map z [H, W], towards the camera, and where they are known: where all depth around is."""
+    points = points_of(camera, np.where(known, depth, 0))
+    smooth = cv2.blur(points, (SMOOTH_PX, SMOOTH_PX), borderType=cv2.BORDER_REPLICATE)
+    normal = np.cross(np.gradient(smooth, axis=0), np.gradient(smooth, axis=1))
+    length = np.linalg.norm(normal, axis=-1)
+    reach = np.ones((SMOOTH_PX + 2, SMOOTH_PX + 2), np.uint8)
+    inside = cv2.erode(known.astype(np.uint8), reach, borderType=cv2.BORDER_CONSTANT, borderValue=0) != 0
+    there = np.asarray(inside & (length > 0))
+    normal /= np.where(length > 0, length, 1)[..., None]
+    return normal, there
+
+
+class NormalSums:
+    """Takes frames one at a time; the normals of both depths are found in the same way."""
+
+    def __init__(self) -> None:
+        self._mean, self._median, self._plane, self._level = (ScoredMean() for _ in range(4))
+
+    def add(self, camera: Camera, true: NDArray[Any], shown: NDArray[Any], known: NDArray[np.bool_]) -> None:
+        """Compare the surface that a model shows, depth z [H, W], 0 = nothing there, with the true one where that is known."""
+        compared = known & np.isfinite(shown) & (shown > 0)
+        right, both = normals_of(camera, true, compared)
+        found, _ = normals_of(camera, shown, compared)
+        if not both.any():
+            return
+        plane = best_plane(*pixels_to_compare(camera, compared, MOST_PLANE_PIXELS, true))
+        if plane is None:
+            return
+        angles = _degrees(np.einsum("ni,ni->n", right[both], found[both]))
+        self._mean.add(float(angles.mean()))
+        self._median.add(float(np.median(angles)))
+        self._plane.add(float(_degrees(right[both] @ (-plane / np.linalg.norm(plane))).mean()))
+        self._level.add(float(_degrees(-right[both][:, 2]).mean()))
+
+    @property
+    def errors(self) -> NormalErrors | None:
+        """The means so far; None where nothing could be compared."""
+        mean, median, plane, level = (each.mean for each in (self._mean, self._median, self._plane, self._level))
+        if mean is None or median is None or plane is None or level is None:
+            return None
+        return NormalErrors(mean, median, plane, level, self._mean.count)
+
+
+def _degrees(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))

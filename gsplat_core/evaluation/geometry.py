@@ -1,35 +1,36 @@
-"""How true a finished model is in three dimensions, over a whole sequence; each measure is a module of its own, beside its trivial baseline.
+"""Geometric accuracy of a finished model over a whole sequence; each measure is reported next to its trivial baseline.
 
-* `depth_share` and `normals`, where the recording has depth: beside the best flat plane.
-* `novel_view`, where it has further cameras or a right eye: beside the left picture.
-* `tracking`, where it has points of the tissue that are followed, and `flow`, where it has the motion of each pixel to the next frame: beside no motion.
-* `trajectory`, where it has poses and the model was made with others: beside a scope that stands still.
-* `parts`: how much of the pictures' change motion, colour, and size and opacity explain.
+* depth and normals, where the recording has depth: next to the best flat plane;
+* novel views, where it has further cameras or a right eye: next to the left picture;
+* followed points and flow, where it has them: next to no motion;
+* the trajectory, where it has poses and the model was made with others: next to a scope at rest;
+* parts of the deformation: shares of the pictures' change that motion, colour, and size and opacity explain.
 
-Everything is compared in the left camera's coordinates, frame by frame, so that it does not matter where a model has its origin. Where a
-model has no scale of its own, the figures that are called `scaled` count: all of its lengths times one factor for the whole sequence.
+Lengths are compared in the left camera's coordinates, frame by frame, so the origin of a model does not matter. For a model without a scale of its own,
+the `scaled` figures multiply all of its lengths by one factor for the whole sequence.
+
+A model that repaints tissue instead of moving it shows the right pictures with the wrong motion. `PartSums` therefore renders frames with parts of the
+deformation frozen at a reference time. A part's share is its Shapley value: the mean reduction of the squared difference over all orders of thawing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import combinations
+from math import factorial
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from gsplat_core.evaluation.depth_share import DepthShare, DepthShareSums
-from gsplat_core.evaluation.followed import FollowedPoints
-from gsplat_core.evaluation.normals import NormalErrors, NormalSums
-from gsplat_core.evaluation.novel_view import NovelView
-from gsplat_core.evaluation.parts import MOST_FRAMES as PART_FRAMES
-from gsplat_core.evaluation.parts import PartShares, PartSums
-from gsplat_core.evaluation.scene_flow import FlowErrors, FlowSums
+from gsplat_core.evaluation.depth import DepthShare, DepthShareSums, NormalErrors, NormalSums
+from gsplat_core.evaluation.motion import FlowErrors, FlowSums, FollowedPoints, Tracking
 from gsplat_core.evaluation.scores import why_left_out
-from gsplat_core.evaluation.tracking import Tracking
 from gsplat_core.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
-from gsplat_core.evaluation.views import Pose, Shown, ViewSums
+from gsplat_core.evaluation.views import NovelView, Pose, Shown, ViewSums
 from gsplat_core.geometry.depth_map import BELIEVED
 from gsplat_core.geometry.measured_depth import measured_confidence
 from gsplat_core.io.recordings.truth import GroundTruth
@@ -39,8 +40,88 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 
+MOTION, COLOUR, SIZE = "motion", "colour", "size"
+
+
+PARTS: dict[str, tuple[str, ...]] = {
+    MOTION: ("means", "quats"),
+    COLOUR: ("sh",),
+    SIZE: ("log_scales", "logit_opacities"),
+}
+"""The tensors of `Gaussians` that each part changes."""
+
+
+PART_FRAMES = 8
+"""Frames that are looked at: each is rendered eight times."""
+
+
+@dataclass(frozen=True)
+class PartShares:
+    """Shares of the squared change of the recorded pictures against the model frozen at `reference_s`, over tissue."""
+
+    motion: float
+    """Positions and orientations of Gaussians."""
+    colour: float
+    size: float
+    """Sizes and opacities."""
+    explained: float
+    """The sum: of the whole deformation. The rest is what no part explains."""
+    reference_s: float
+    frames: int
+
+
+class PartSums:
+    """Takes frames one at a time."""
+
+    def __init__(self, gaussians_at: Callable[[float], Gaussians], reference_s: float) -> None:
+        """gaussians_at: the deformed Gaussians of a model. reference_s: when the frozen parts are taken from."""
+        self._at, self._reference_s = gaussians_at, reference_s
+        self._errors: dict[frozenset[str], float] = {thawed: 0.0 for thawed in _subsets(tuple(PARTS))}
+        self._frames = 0
+
+    def add(self, frame: Frame, picture_of: Callable[[Gaussians], NDArray[Any]]) -> None:
+        """Render a frame with each choice of parts thawed. picture_of: its picture of Gaussians, [H, W, 3] in 0..1, from its own pose."""
+        moved, frozen = self._at(frame.time_s).tensors(), self._at(self._reference_s).tensors()
+        tissue = np.ones(frame.image.shape[:2], bool) if frame.mask is None else frame.mask != 0
+        wanted = frame.image[tissue].astype(np.float64) / 255
+        for thawed in self._errors:
+            names = {name for part in thawed for name in PARTS[part]}
+            mixed: dict[str, Tensor] = {name: (moved if name in names else frozen)[name] for name in moved}
+            shown = picture_of(Gaussians(**mixed))[tissue].astype(np.float64)
+            self._errors[thawed] += float(np.square(shown - wanted).sum())
+        self._frames += 1
+
+    @property
+    def shares(self) -> PartShares | None:
+        """What they come to; None where nothing changes."""
+        whole = self._errors[frozenset()]
+        if not self._frames or whole <= 0:
+            return None
+        shares = {part: self._shapley(part) / whole for part in PARTS}
+        return PartShares(
+            shares[MOTION], shares[COLOUR], shares[SIZE], sum(shares.values()), self._reference_s, self._frames
+        )
+
+    def _shapley(self, part: str) -> float:
+        others = tuple(name for name in PARTS if name != part)
+        count = len(PARTS)
+        return sum(
+            factorial(len(before))
+            * factorial(count - len(before) - 1)
+            / factorial(count)
+            * (self._errors[before] - self._errors[before | {part}])
+            for before in _subsets(others)
+        )
+
+
+def _subsets(names: tuple[str, ...]) -> list[frozenset[str]]:
+    return [frozenset(chosen) for size in range(len(names) + 1) for chosen in combinations(names, size)]
+
+
 MOST_FRAMES = 48
 """Frames that are compared, spread evenly over the recording."""
+
+
 NO_SCALING = 0.005
 """A factor so near to 1 is taken for 1: the scaled pictures are the others."""
 

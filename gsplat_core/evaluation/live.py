@@ -1,8 +1,7 @@
-"""The live protocol: what was on the screen when frame i+1 arrived, against frame i.
+"""Scores of a live run: the picture on the screen when frame i+1 arrives, against frame i.
 
-The picture of frame i has the time until the next frame comes. What is on the screen at that moment is the last picture that was shown before
-it: of frame i when it was in time, an older one when it was late or was never made. Pictures that were shown and replaced before then are not
-scored, and a viewer of a source that stopped sees what was shown last: nothing is scored until another frame comes.
+The picture on the screen is the last one that was shown before that moment. It belongs to frame i if it was in time, and to an older frame otherwise.
+Pictures that were replaced earlier are not scored. Nothing is scored while a stopped source sends no frames.
 """
 
 from __future__ import annotations
@@ -17,18 +16,77 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.evaluation.ages import AgeHistogram, Ages
 from gsplat_core.evaluation.baselines import BaselineScore
 from gsplat_core.evaluation.scores import Record, Score, ScoreSums, finite, measures, why_left_out
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import FrameQuality, ScoredMean, frame_quality, psnrs_db
 
+_FINEST_MS = 1e-3
+
+
+_RATIO = 1.01
+
+
+_BUCKETS = 2600
+"""From a microsecond to two days."""
+
+
+@dataclass(frozen=True)
+class Ages:
+    """How old what was shown was, in milliseconds; percentiles are at most 1 % too high, `max_ms` is exact."""
+
+    count: int
+    p50_ms: float
+    p95_ms: float
+    p99_ms: float
+    max_ms: float
+
+
+class AgeHistogram:
+    """Takes ages one at a time, into buckets of 1 %."""
+
+    def __init__(self) -> None:
+        self._counts = [0] * _BUCKETS
+        self._max_ms = 0.0
+
+    def add(self, age_ms: float) -> None:
+        """Take one age in milliseconds; below a microsecond counts as one."""
+        self._max_ms = max(self._max_ms, age_ms)
+        place = math.ceil(math.log(max(age_ms, _FINEST_MS) / _FINEST_MS) / math.log(_RATIO) - 1e-9)
+        self._counts[min(place, _BUCKETS - 1)] += 1
+
+    def ages(self) -> Ages | None:
+        """The distribution so far; None without any age."""
+        count = sum(self._counts)
+        if not count:
+            return None
+        p50_ms, p95_ms, p99_ms = (self._quantile(share, count) for share in (0.50, 0.95, 0.99))
+        return Ages(count, p50_ms, p95_ms, p99_ms, self._max_ms)
+
+    def _quantile(self, share: float, count: int) -> float:
+        """The age that this share of all does not exceed."""
+        reached = 0
+        for place, here in enumerate(self._counts):
+            reached += here
+            if reached >= share * count - 1e-9 * count:
+                return min(_FINEST_MS * _RATIO**place, self._max_ms)
+        return self._max_ms
+
+
 MOST_BEHIND = 8
 """Lateness is counted up to so many frames; what is later counts as this many."""
+
+
 SETTLING_S = 1.0
 """The first second, in which a model begins, is in `score` and not in `settled`."""
+
+
 NOTHING_SHOWN, NOT_KEPT, OTHER_SIZE = "nothing shown yet", "picture not kept", "picture of another size"
+
+
 _MAX_STATES = 16
+
+
 _NS_PER_MS = 1e6
 
 

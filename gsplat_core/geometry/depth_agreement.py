@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.evaluation.projection import moved, pixel_rays, pixels_of
 from gsplat_core.geometry.depth_map import BELIEVED
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.projection import moved, pixel_rays, pixels_of
 
 LONGEST_PX = 160
 """Longest side of the maps that are compared."""

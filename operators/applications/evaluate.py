@@ -12,14 +12,21 @@ from time import perf_counter
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.baselines import AGES, measure_baselines
-from gsplat_core.evaluation.causal import evaluate_causal
 from gsplat_core.evaluation.geometry import Geometry
-from gsplat_core.evaluation.heldout import HeldOut, evaluate_heldout
 from gsplat_core.evaluation.live import Live
-from gsplat_core.evaluation.pictures import PictureMaker
-from gsplat_core.evaluation.retention import Retention, Return, evaluate_retention, find_places, returns
+from gsplat_core.evaluation.protocols import (
+    HeldOut,
+    PictureMaker,
+    Retention,
+    Return,
+    evaluate_causal,
+    evaluate_heldout,
+    evaluate_retention,
+    find_places,
+    returns,
+)
 from gsplat_core.evaluation.scores import Record
-from gsplat_core.evaluation.second_eye import SecondEye, evaluate_second_eye
+from gsplat_core.evaluation.views import SecondEye, evaluate_second_eye
 from gsplat_core.io.recordings.truth import open_truth
 from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.scene.model import Model

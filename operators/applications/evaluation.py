@@ -10,12 +10,10 @@ from pathlib import Path
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.evaluation.geometry import Geometry
-from gsplat_core.evaluation.heldout import HeldOut
 from gsplat_core.evaluation.live import Live
-from gsplat_core.evaluation.places import Visits
-from gsplat_core.evaluation.retention import LAST_S, Retention, Return
+from gsplat_core.evaluation.protocols import LAST_S, HeldOut, Retention, Return, Visits
 from gsplat_core.evaluation.scores import Score
-from gsplat_core.evaluation.second_eye import SecondEye
+from gsplat_core.evaluation.views import SecondEye
 from gsplat_core.training.motion_priors import MOTION_PRIORS
 from operators.applications.limits import check_max_frames, check_scale, check_steps
 from operators.sources.source import SourceDescription

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gsplat_core.evaluation.geometry import Geometry, evaluate_geometry
-from gsplat_core.evaluation.pictures import Picture, PictureMaker
+from gsplat_core.evaluation.protocols import Picture, PictureMaker
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.poses_file import read_poses
 from gsplat_core.io.recordings.truth import GroundTruth

@@ -9,7 +9,7 @@ from pathlib import Path
 import typer
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.evaluation.places import Visits
+from gsplat_core.evaluation.protocols import Visits
 from operators.applications.evaluate import evaluate
 from operators.applications.evaluation import EvaluationSettings
 from operators.output_folder import OutputFolder

@@ -8,7 +8,7 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.baselines import Baselines
-from gsplat_core.evaluation.depth_share import DepthShare
+from gsplat_core.evaluation.depth import DepthShare
 from gsplat_core.training.metrics import QualityTracker
 from operators.applications.result import RunOutcome
 from operators.display import LiveDisplayResult

@@ -16,8 +16,8 @@ from gsplat_core.evaluation.baselines import (
     BaselineScore,
 )
 from gsplat_core.evaluation.live import Live
-from gsplat_core.evaluation.retention import PlaceScore
-from gsplat_core.evaluation.second_eye import MATCHED, RIGHT_BEFORE, SHIFTED, SecondEye
+from gsplat_core.evaluation.protocols import PlaceScore
+from gsplat_core.evaluation.views import MATCHED, RIGHT_BEFORE, SHIFTED, SecondEye
 from gsplat_core.scene.model import Model
 from operators.applications.evaluated import EvaluatedRun
 from operators.applications.evaluation import Evaluation, EvaluationSettings

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsplat_core.evaluation.pictures import Picture
+from gsplat_core.evaluation.protocols import Picture
 from gsplat_core.scene.frames import Frame
 
 HEIGHT, WIDTH = 16, 20

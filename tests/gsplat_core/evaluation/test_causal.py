@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.evaluation.causal import evaluate_causal
+from gsplat_core.evaluation.protocols import evaluate_causal
 from gsplat_core.scene.frames import FrameStatus
 
 

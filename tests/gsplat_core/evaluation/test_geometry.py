@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.evaluation.geometry import Geometry, evaluate_geometry
-from gsplat_core.evaluation.pictures import PictureMaker
+from gsplat_core.evaluation.protocols import PictureMaker
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene

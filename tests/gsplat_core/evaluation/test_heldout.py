@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.evaluation.heldout import OUTSIDE, evaluate_heldout
+from gsplat_core.evaluation.protocols import OUTSIDE, evaluate_heldout
 from gsplat_core.scene.frames import FrameStatus
 from gsplat_core.training.metrics import PSNR_CAP_DB
 

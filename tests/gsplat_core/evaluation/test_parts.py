@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.evaluation.parts import PARTS, PartShares, PartSums
+from gsplat_core.evaluation.geometry import PARTS, PartShares, PartSums
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame

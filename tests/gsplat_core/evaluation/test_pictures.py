@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.evaluation.pictures import PictureMaker
+from gsplat_core.evaluation.protocols import PictureMaker
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.model import Model

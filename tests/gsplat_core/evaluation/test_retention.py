@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.evaluation.places import MAX_POSES, PlaceFinder, Visits
-from gsplat_core.evaluation.retention import evaluate_retention, find_places, returns
+from gsplat_core.evaluation.protocols import MAX_POSES, PlaceFinder, Visits, evaluate_retention, find_places, returns
 from gsplat_core.scene.frames import FrameStatus
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsplat_core.evaluation.second_eye import (
+from gsplat_core.evaluation.views import (
     BEYOND_TYPICAL,
     EVERY,
     MATCHED,
@@ -12,7 +12,7 @@ from gsplat_core.evaluation.second_eye import (
     evaluate_second_eye,
     line_psnr_db,
     matched_disparity,
-    moved,
+    warped_by_disparity,
 )
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
@@ -129,4 +129,4 @@ def test_a_match_finds_disparity_to_either_side():
 
 def test_a_disparity_of_nothing_moves_nothing():
     picture = wide(3)[:, :WIDTH]
-    assert np.array_equal(moved(picture, np.zeros(picture.shape[:2], np.float32)), picture)
+    assert np.array_equal(warped_by_disparity(picture, np.zeros(picture.shape[:2], np.float32)), picture)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.sparse_points import SparseDepthSums, SparsePoints
 from gsplat_core.errors import InvalidInput
-from gsplat_core.evaluation.sparse_points import SparseDepthSums, SparsePoints
 from gsplat_core.scene.cameras import Camera
 
 CAMERA = Camera.from_focal(50.0, 60, 40)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.evaluation.novel_view import seen_by_both
+from gsplat_core.evaluation.views import seen_by_both
 from gsplat_core.io.bundle import load_bundle, save_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.synthetic.extras import Extras

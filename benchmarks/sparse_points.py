@@ -1,7 +1,7 @@
-"""Errors of rendered depth at the points of a structure from motion: a check for recordings of which no dense depth is known.
+"""Errors of rendered depth at the points of a structure from motion, for recordings without dense depth.
 
-The points were triangulated from the same pictures, apart from the model, and each is compared only in frames in which it was found. Their unit is that of
-the poses; a model's may be another one, so that one factor for the whole recording, the median of true over rendered depth, is taken out.
+The points were triangulated from the same pictures, apart from the model. Each is compared only in frames in which it was found. Lengths are in the unit
+of the poses; one factor for the whole recording, the median of true over rendered depth, is taken out.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.evaluation.plane import flat_depths
+from gsplat_core.evaluation.depth import flat_depths
 from gsplat_core.scene.cameras import Camera
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""From depth to points and back, for the cameras whose views are compared; pinhole, in a camera's own coordinates."""
+"""Projection of depth maps and points between the pixels of pinhole cameras."""
 
 from __future__ import annotations
 

@@ -1,0 +1,321 @@
+"""Errors of a model's motion: points followed through a sequence, and optical and scene flow from frame to frame.
+
+A point is given by its pixel in the first frame that sees it. A model lifts it by its own depth and moves it with the nearest Gaussians. Errors are
+Euclidean, over every later frame that sees the point: in pixels, and in the recording's unit in the coordinates of the left camera. Schmidt et al.,
+"STIR: Surgical Tattoos in Infrared" (2023), and the STIR challenge of 2024.
+
+Flow compares each pixel with its place in the next frame. A pixel moves by the mean motion of the Gaussians on its ray, weighted as their colours are
+blended.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsplat_core.io.recordings.true_motion import MotionFiles, TrueMotion
+from gsplat_core.io.recordings.truth import Tracks
+from gsplat_core.rendering.rasterization import rasterization
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.projection import Points, at_pixels, inverse, moved, pixel_rays, pixels_of, points_of
+
+WITHIN_PX = (4, 8, 16, 32, 64)
+
+
+WITHIN_MM = (2, 4, 8, 16, 32)
+"""The challenge's thresholds; its figure is the mean share of points within each of them."""
+
+
+NEIGHBOURS = 8
+
+
+LEAST_OPACITY = 0.1
+"""Gaussians that show less than this carry nothing."""
+
+
+class CarriedPoints:
+    """Points of the world at one time, and how a model carries them to others: by the mean motion of the Gaussians nearest to them."""
+
+    def __init__(self, model: Model, points: Points, time_s: float) -> None:
+        self._model, self._points = model, points
+        start = model.at(time_s)
+        self._index, self._weights = _neighbours(start, torch.as_tensor(points, dtype=torch.float32).to(model.device))
+        self._start = start.means[self._index].double()
+
+    def at(self, time_s: float) -> Points:
+        """Where the points [P, 3] are at a time."""
+        now = self._model.at(time_s).means[self._index].double()
+        motion = ((now - self._start) * self._weights[..., None]).sum(dim=1)
+        return np.asarray(self._points + motion.cpu().numpy())
+
+
+def _neighbours(gaussians: Gaussians, points: Tensor) -> tuple[Tensor, Tensor]:
+    """For each of P points the nearest Gaussians [P, K], and their weights, of sum 1: what they show, less where they are farther away."""
+    shows = gaussians.opacities.detach()
+    candidates = torch.nonzero(shows > LEAST_OPACITY).flatten()
+    if not len(candidates):
+        candidates = torch.arange(gaussians.count, device=points.device)
+    means = gaussians.means.detach()[candidates]
+    distances, nearest = [], []
+    for chunk in points.split(64):
+        distance, index = torch.cdist(chunk, means).topk(min(NEIGHBOURS, len(candidates)), largest=False)
+        distances.append(distance)
+        nearest.append(index)
+    distance, index = torch.cat(distances).double(), candidates[torch.cat(nearest)]
+    width = distance.median(dim=1, keepdim=True).values.clamp_min(1e-9)
+    weights = shows[index].double() * torch.exp(-0.5 * (distance / width).square())
+    return index, weights / weights.sum(dim=1, keepdim=True).clamp_min(1e-12)
+
+
+@dataclass(frozen=True)
+class TrackErrors:
+    """Errors over every point and later frame that sees it."""
+
+    median_mm: float
+    mean_mm: float
+    median_px: float
+    mean_px: float
+    within_mm: float
+    """Mean share of points nearer than 2, 4, 8, 16 and 32 mm."""
+    within_px: float
+    """Mean share of points nearer than 4, 8, 16, 32 and 64 pixels."""
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Points of the tissue, followed."""
+
+    model: TrackErrors
+    scaled: TrackErrors
+    """After all of the model's lengths were multiplied by the one factor of the sequence's depth."""
+    still: TrackErrors
+    """No motion: each point stays at its first pixel and at its first true depth."""
+    points: int
+    compared: int
+    """Positions that were compared."""
+
+
+class TrackSums:
+    """Takes positions in the left camera's coordinates [P, 3] and pixels [P, 2]."""
+
+    def __init__(self) -> None:
+        self._mm: list[Points] = []
+        self._px: list[Points] = []
+
+    def add(self, found: Points, true: Points, found_px: Points, true_px: Points) -> None:
+        """Compare where points are said to be with where they are."""
+        self._mm.append(np.linalg.norm(found - true, axis=1))
+        # Behind the camera there is no pixel: as far away as the challenge's last threshold, and no nearer.
+        self._px.append(np.nan_to_num(np.linalg.norm(found_px - true_px, axis=1), nan=2.0 * WITHIN_PX[-1]))
+
+    @property
+    def count(self) -> int:
+        """How many positions were compared."""
+        return sum(len(each) for each in self._mm)
+
+    @property
+    def errors(self) -> TrackErrors | None:
+        """None where nothing was compared."""
+        if not self.count:
+            return None
+        mm, px = np.concatenate(self._mm), np.concatenate(self._px)
+        share = lambda errors, limits: float(np.mean([np.mean(errors < limit) for limit in limits]))
+        return TrackErrors(
+            median_mm=float(np.median(mm)),
+            mean_mm=float(mm.mean()),
+            median_px=float(np.median(px)),
+            mean_px=float(px.mean()),
+            within_mm=share(mm, WITHIN_MM),
+            within_px=share(px, WITHIN_PX),
+        )
+
+
+class FollowedPoints:
+    """Takes frames in order. Each point starts in the first of them that sees it and at whose pixel the model has depth."""
+
+    def __init__(self, model: Model, camera: Camera, tracks: Tracks) -> None:
+        self._model, self._camera, self._tracks = model, camera, tracks
+        count = tracks.points.shape[1]
+        self._started = np.zeros(count, bool)
+        self._start_px, self._start_true = np.zeros((count, 2)), np.zeros((count, 3))
+        self._groups: list[tuple[NDArray[np.int64], CarriedPoints]] = []
+        self._found: list[tuple[Points, Points]] = []
+        """Of each compared frame: where the model has the points, and where they are, in the left camera's coordinates."""
+        self._pixels, self._still = TrackSums(), TrackSums()
+
+    def add(self, frame: Frame, own: Camera, shown: NDArray[Any]) -> None:
+        """The next frame. own: the model's camera. shown: the model's depth z [H, W]."""
+        pose = np.eye(4) if frame.pose is None else frame.pose
+        true = moved(pose, self._tracks.points[frame.seq])
+        true_px = pixels_of(self._camera, true)
+        seen = self._tracks.seen[frame.seq]
+        for index, carried in self._groups:
+            now = seen[index]
+            if not now.any():
+                continue
+            found = moved(own.world_to_camera, carried.at(frame.time_s))[now]
+            there = index[now]
+            self._found.append((found, true[there]))
+            self._pixels.add(found, true[there], pixels_of(self._camera, found), true_px[there])
+            self._still.add(self._start_true[there], true[there], self._start_px[there], true_px[there])
+        self._begin(frame, own, shown, seen, true, true_px)
+
+    def _begin(
+        self,
+        frame: Frame,
+        own: Camera,
+        shown: NDArray[Any],
+        seen: NDArray[np.bool_],
+        true: Points,
+        true_px: Points,
+    ) -> None:
+        """Start the points that are seen for the first time: each at its pixel, at the model's depth there."""
+        z = at_pixels(shown, true_px)
+        new = np.flatnonzero(seen & ~self._started & (z > 0))
+        if not len(new):
+            return
+        K = self._camera.K
+        slopes = (true_px[new] - K[:2, 2]) / K[[0, 1], [0, 1]]
+        local = np.concatenate([slopes, np.ones((len(new), 1))], axis=1) * z[new, None]
+        world = moved(inverse(own.world_to_camera), local)
+        self._groups.append((new, CarriedPoints(self._model, world, frame.time_s)))
+        self._started[new] = True
+        self._start_px[new], self._start_true[new] = true_px[new], true[new]
+
+    def tracking(self, scale: float) -> Tracking | None:
+        """What the errors come to; `scale`: the factor that a model's lengths lack. None where nothing was compared."""
+        scaled = TrackSums()
+        for found, true in self._found:
+            scaled.add(scale * found, true, pixels_of(self._camera, found), pixels_of(self._camera, true))
+        model, one_scale, still = self._pixels.errors, scaled.errors, self._still.errors
+        if model is None or one_scale is None or still is None:
+            return None
+        return Tracking(model, one_scale, still, int(self._started.sum()), self._pixels.count)
+
+
+MOST_PIXELS = 8192
+"""Pixels of a frame that are compared, spread evenly: what is kept does not grow with the pictures."""
+
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EndPointErrors:
+    """Distances between where the pixels' tissue is said to go and where it goes, until the next frame, over all compared pixels."""
+
+    median_px: float
+    mean_px: float
+    median_mm: float | None
+    """None where the recording knows no scene flow, as `mean_mm`. In the recording's unit."""
+    mean_mm: float | None
+
+
+@dataclass(frozen=True)
+class FlowErrors:
+    """Motion from frame to frame, at the pixels of tissue whose true motion is known."""
+
+    model: EndPointErrors
+    scaled: EndPointErrors
+    """After all of the model's lengths were multiplied by the one factor of the sequence's depth."""
+    still: EndPointErrors
+    """No motion: how far the tissue goes."""
+    frames: int
+
+
+@dataclass(frozen=True)
+class _Started:
+    """Some pixels of a frame whose next one has not come yet."""
+
+    seq: int
+    time_s: float
+    points: Values
+    """Where the model has them in the world [P, 3]."""
+    pixels: Values
+    here: NDArray[np.bool_]
+    """[H, W]: which pixels they are."""
+    own: Camera
+    true: TrueMotion
+    true_pose: Values
+
+
+class FlowSums:
+    """Takes frames in order, all of them: `arrive` ends what `begin` began with the frame before."""
+
+    def __init__(self, model: Model, camera: Camera, files: MotionFiles) -> None:
+        self._model, self._camera, self._files = model, camera, files
+        self._started: _Started | None = None
+        self._px: list[Values] = []
+        """Of each compared frame [2, P]: errors of the model and of no motion."""
+        self._mm: list[tuple[Values, Values]] = []
+        """The model's motion and the true one [P, 3], in the axes of the left camera."""
+
+    def begin(self, frame: Frame, own: Camera, shown: NDArray[Any], tissue: NDArray[np.bool_]) -> None:
+        """A frame to be compared with the next one. own: the model's camera; shown: the model's depth z [H, W]."""
+        true = self._files.of(frame)
+        if true is None:
+            return
+        known = tissue & np.isfinite(true.flow).all(axis=2) & np.isfinite(shown) & (shown > 0)
+        if true.scene_flow is not None:
+            known &= np.isfinite(true.scene_flow).all(axis=2)
+        here = np.zeros(known.shape, bool)
+        chosen = np.flatnonzero(known)
+        here.flat[chosen[:: -(-len(chosen) // MOST_PIXELS)] if len(chosen) else chosen] = True
+        if not here.any():
+            return
+        points = moved(inverse(own.world_to_camera), points_of(own, shown)[here])
+        pixels = pixel_rays(own)[here][:, :2] * own.K[[0, 1], [0, 1]] + own.K[:2, 2]
+        pose = np.eye(4) if frame.pose is None else frame.pose
+        self._started = _Started(frame.seq, frame.time_s, points, pixels, here, own, true, pose)
+
+    def arrive(self, frame: Frame, own: Camera) -> None:
+        """The next frame, whether it is itself compared or not; own: where the model has its camera."""
+        started, self._started = self._started, None
+        if started is None or frame.seq != started.seq + 1:
+            return
+        motion = self._motion(started, frame.time_s)[started.here]
+        there = pixels_of(own, moved(own.world_to_camera, started.points + motion))
+        true = started.true.flow[started.here]
+        off = np.linalg.norm(there - started.pixels - true, axis=1)
+        seen = np.isfinite(off)  # not what is said to go behind the camera, which is no place in the picture
+        self._px.append(np.stack([off[seen], np.linalg.norm(true, axis=1)[seen]]))
+        if started.true.scene_flow is not None:
+            found = motion @ started.own.world_to_camera[:3, :3].T
+            self._mm.append((found, started.true.scene_flow[started.here] @ started.true_pose[:3, :3].T))
+
+    def _motion(self, started: _Started, next_s: float) -> Values:
+        """The motion of what each pixel shows [H, W, 3], in the model's world."""
+        now, then = self._model.at(started.time_s), self._model.at(next_s)
+        viewmat, intrinsics = started.own.matrices(now.device, now.dtype)
+        with torch.inference_mode():
+            blended, alpha, _ = rasterization(
+                now.means, now.quats, now.scales, now.opacities, then.means - now.means, viewmat[None],
+                intrinsics[None], started.own.width_px, started.own.height_px, camera_model=started.own.model,
+            )  # fmt: skip
+        return np.asarray((blended / alpha.clamp(min=1e-6))[0].double().cpu().numpy())
+
+    def errors(self, scale: float) -> FlowErrors | None:
+        """What they come to; `scale`: the factor that a model's lengths lack. None where nothing was compared."""
+        if not self._px:
+            return None
+        px, still_px = np.concatenate(self._px, axis=1)
+        if not len(px):
+            return None
+        found, true = (np.concatenate(each) for each in zip(*self._mm, strict=True)) if self._mm else (None, None)
+        off = lambda factor: None if found is None else np.linalg.norm(factor * found - true, axis=1)
+        return FlowErrors(
+            _errors(px, off(1.0)), _errors(px, off(scale)), _errors(still_px, off(0.0)), frames=len(self._px)
+        )
+
+
+def _errors(px: Values, mm: Values | None) -> EndPointErrors:
+    lengths = (None, None) if mm is None else (float(np.median(mm)), float(mm.mean()))
+    return EndPointErrors(float(np.median(px)), float(px.mean()), *lengths)

@@ -1,0 +1,439 @@
+"""Offline protocols that render a model for the frames of a recording and score the pictures.
+
+* `evaluate_heldout`: the frames that training never saw, rendered from a finished model;
+* `evaluate_causal`: each frame is predicted before it is learned from. Only its time and pose are known, and its exposure is taken from the frame before;
+* `evaluate_retention`: earlier frames and revisited places, rendered from the final model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.evaluation.baselines import BaselineScore
+from gsplat_core.evaluation.depth import DepthErrors, DepthSums
+from gsplat_core.evaluation.scores import Entry, Record, Score, ScoreSums, finite, measures, number, why_left_out
+from gsplat_core.io.recordings.split import is_heldout
+from gsplat_core.rendering.registry import RENDERERS, new_renderer
+from gsplat_core.rendering.renderer import Renderer
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.model import Model
+from gsplat_core.scene.snapshots import Snapshot
+from gsplat_core.training.metrics import ScoredMean, psnr_tissue_db, psnrs_db
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A rendered picture, in memory of its own."""
+
+    image: NDArray[np.uint8]
+    """RGB [H, W, 3] as it is displayed, and as a PNG file would hold it: clipped and rounded to 8 bits."""
+    unrounded: NDArray[np.float32]
+    """RGB [H, W, 3] in 0..1 before the rounding, clipped."""
+    depth: NDArray[np.float32]
+    """z [H, W] in the model's unit of length; 0 = nothing there."""
+    model_version: int
+
+
+class PictureMaker:
+    """Renders published models for frames: at the frame's time, from its pose, with its exposure. One renderer for all of them."""
+
+    def __init__(self, camera: Camera, device: torch.device | str = "cpu", renderer: str = "alpha") -> None:
+        """camera: of the pictures; a frame with a pose of its own is seen from there."""
+        self.camera = camera
+        self._reads_snapshots = RENDERERS[renderer].capabilities.reads_snapshots
+        self._renderer: Renderer = new_renderer(renderer, camera, device)
+        self._prepared: Model | Snapshot | None = None
+
+    def __call__(self, model: Model | Snapshot, frame: Frame, camera: Camera | None = None) -> Picture:
+        """The model as it would be shown for the frame; with a `camera` of the same size, as that one sees it. Its time is clamped to the
+        model's window."""
+        if camera is None:
+            camera = self.camera if frame.pose is None else self.camera.with_pose(frame.pose)
+        with torch.inference_mode():
+            if model is not self._prepared:
+                self._renderer.prepare(model if self._reads_snapshots else model.as_model())
+                # A snapshot's slot is free for training only when nobody holds it.
+                self._prepared = model if isinstance(model, Model) else None
+            output = self._renderer.render(camera, frame.time_s).result()
+            picture = output.image
+            if frame.exposure != (1.0, 1.0, 1.0):
+                picture = picture * picture.new_tensor(frame.exposure)
+            picture = picture.clamp(0, 1)
+            rounded = (picture * 255).round().to(torch.uint8)
+            return Picture(
+                image=np.array(rounded.cpu().numpy()),
+                unrounded=np.array(picture.cpu().numpy()),
+                depth=np.array(output.depth.cpu().numpy()),
+                model_version=model.version,
+            )
+
+
+OUTSIDE = "outside of the model's time"
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """What a model scores on the held-out frames."""
+
+    score: Score
+    """Of the pictures as displayed, rounded to 8 bits: what EndoGaussian measures after it has written PNG files."""
+    unrounded_db: float | None
+    """Mean tissue PSNR of the pictures before they are rounded."""
+    depth: DepthErrors | None
+    """None where the recording has no depth."""
+
+
+def evaluate_heldout(
+    frames: Iterable[Frame],
+    picture_of: Callable[[Frame], Picture],
+    *,
+    window_s: tuple[float, float],
+    record: Record | None = None,
+) -> HeldOut:
+    """Score the frames with (i - 1) mod 8 = 0, counted from 0 by `Frame.seq`; the others are not rendered.
+
+    Args:
+        frames: of the recording, in order.
+        picture_of: what the model shows for a frame.
+        window_s: the times that the model has seen, with what is tolerated around them; frames outside are left out and counted.
+        record: given each scored frame's figures.
+    """
+    sums, unrounded, depth = ScoreSums(), ScoredMean(), DepthSums()
+    for frame in frames:
+        if not is_heldout(frame.seq):
+            continue
+        reason = why_left_out(frame)
+        if reason is None and not window_s[0] <= frame.time_s <= window_s[1]:
+            reason = OUTSIDE
+        if reason is not None:
+            sums.leave_out(reason)
+            continue
+        picture = picture_of(frame)
+        quality = sums.add(frame, picture.image)
+        unrounded_db = psnr_tissue_db(picture.unrounded, frame.image, frame.mask)
+        unrounded.add(unrounded_db)
+        depth_mae_mm = depth.add(frame, picture.depth)
+        if record is not None:
+            record(
+                {
+                    "seq": frame.seq,
+                    "time_s": frame.time_s,
+                    "trained": False,
+                    "model_version": picture.model_version,
+                    **measures(quality),
+                    "psnr_unrounded_db": unrounded_db,
+                    "depth_mae_mm": finite(depth_mae_mm),
+                }
+            )
+    return HeldOut(sums.score, unrounded.mean, depth.errors)
+
+
+class Learner(Protocol):
+    """What learns from frames as they come: a `Reconstructor`."""
+
+    def observe(self, frame: Frame, *, train: bool = True) -> object:
+        """Take the next frame and train on it; with `train=False` only move on to its time."""
+
+    def publish(self) -> Model | Snapshot:
+        """The model as it is now."""
+
+
+def published(learner: Learner, frame: Frame) -> Model | Snapshot:
+    """The model as it is before `frame` was seen; it is rendered at that frame's time, where its motion goes on as the model has it."""
+    return learner.publish()
+
+
+def _hidden(frame: Frame, exposure: tuple[float, float, float]) -> Frame:
+    """A frame with this one's number, time and pose and a black picture, so that nothing else of it can reach a prediction."""
+    return Frame(frame.seq, frame.pts_ns, np.zeros_like(frame.image), pose=frame.pose, exposure=exposure)
+
+
+def evaluate_causal(
+    frames: Iterable[Frame],
+    learner: Learner,
+    picture_of: Callable[[Model | Snapshot, Frame], Picture],
+    *,
+    predict: Callable[[Learner, Frame], Model | Snapshot] = published,
+    record: Record | None = None,
+) -> Score:
+    """Run the learner over the frames; each is predicted and scored before it is learned from. The first one has no prediction.
+
+    A damaged or withheld frame is neither scored nor learned from; a frame without tissue is learned from and not scored.
+
+    Args:
+        frames: in order; the first ones are skipped until there is one that may be trained on.
+        learner: has seen nothing yet.
+        picture_of: what a model shows for a frame.
+        predict: what is to show a frame that was not seen; the frame that it gets has a black picture.
+        record: given each scored frame's figures.
+    """
+    sums = ScoreSums()
+    started = False
+    exposure = (1.0, 1.0, 1.0)
+    for frame in frames:
+        reason = why_left_out(frame)
+        trains = reason in (None, "no tissue")
+        if not started:
+            sums.leave_out(reason if reason is not None and not trains else "before the first prediction")
+            if trains:
+                learner.observe(frame)
+                started, exposure = True, frame.exposure
+            continue
+        if reason is None:
+            unseen = _hidden(frame, exposure)
+            _score(frame, picture_of(predict(learner, unseen), unseen), sums, record)
+        else:
+            sums.leave_out(reason)
+        learner.observe(frame, train=trains)
+        exposure = frame.exposure
+    return sums.score
+
+
+def _score(frame: Frame, picture: Picture, sums: ScoreSums, record: Record | None) -> None:
+    quality = sums.add(frame, picture.image)
+    if record is not None:
+        own = {"seq": frame.seq, "time_s": frame.time_s, "trained": False, "model_version": picture.model_version}
+        record({**own, **measures(quality)})
+
+
+NEAR_SHARE = 0.05
+"""Two positions are one place when they are nearer than this share of the greatest distance between any two; a scale need not be known."""
+
+
+NEAR_DEGREES = 10.0
+
+
+AWAY = 3.0
+"""In between, the scope must have been this many times as far away, or turned as much."""
+
+
+MAX_POSES = 2048
+"""Poses that are kept; of a longer stream every second, fourth, ... one is."""
+
+
+Range = tuple[float, float]
+"""First and last time, in seconds."""
+
+
+@dataclass(frozen=True)
+class Visits:
+    """Two stays at one place."""
+
+    first: Range
+    again: Range
+
+    def __post_init__(self) -> None:
+        if not self.first[0] <= self.first[1] < self.again[0] <= self.again[1]:
+            raise InvalidInput(f"visits {self.first} and {self.again} must be two ranges of time, one after the other")
+
+
+class PlaceFinder:
+    """Takes the pose of each frame; `visits` are the returns. Memory of fixed size."""
+
+    def __init__(self) -> None:
+        self._poses: list[tuple[float, NDArray[np.float64]]] = []
+        self._every = 1
+        self._seen = 0
+
+    def add(self, time_s: float, world_to_camera: NDArray[np.float64]) -> None:
+        """The next frame's pose [4, 4]."""
+        if self._seen % self._every == 0:
+            self._poses.append((time_s, np.asarray(world_to_camera, np.float64)))
+            if len(self._poses) == MAX_POSES:
+                self._poses = self._poses[::2]
+                self._every *= 2
+        self._seen += 1
+
+    def visits(self) -> list[Visits]:
+        """Each return to a place that the scope had left, with the last stay there before it."""
+        if len(self._poses) < 3:
+            return []
+        times = [time_s for time_s, _ in self._poses]
+        apart = _distances(np.stack([pose for _, pose in self._poses]))
+        found: list[Visits] = []
+        k = 0
+        while k < len(times):
+            j = _last_stay(apart[k, :k])
+            if j is None:
+                k += 1
+                continue
+            begin = j
+            while begin > 0 and apart[k, begin - 1] <= 1:
+                begin -= 1
+            end = k
+            while end + 1 < len(times) and apart[j, end + 1] <= 1:
+                end += 1
+            found.append(Visits((times[begin], times[j]), (times[k], times[end])))
+            k = end + 1
+        return found
+
+
+def _last_stay(apart: NDArray[np.float64]) -> int | None:
+    """The newest earlier moment at the same place from which the scope has been away since; None where there is none."""
+    away = np.flatnonzero(apart >= AWAY)
+    if not len(away):
+        return None
+    near = np.flatnonzero(apart[: away[-1]] <= 1)
+    return int(near[-1]) if len(near) else None
+
+
+def _distances(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far apart each two poses [K, 4, 4] are [K, K], where 1 is the edge of "the same place": the larger of position and direction."""
+    rotations, translations = poses[:, :3, :3], poses[:, :3, 3]
+    centres = -np.einsum("kij,ki->kj", rotations, translations)
+    between = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    largest = float(between.max())
+    axes = rotations[:, 2]  # the third row is the viewing direction in the world
+    degrees = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
+    position = between / (NEAR_SHARE * largest) if largest > 0 else np.zeros_like(between)
+    return np.maximum(position, degrees / NEAR_DEGREES)
+
+
+LAST_S = 5.0
+
+
+FOUND_DB = 33.0
+"""From this tissue PSNR on a place that was left counts as found again."""
+
+
+FIRST_FRAMES = 3
+
+
+@dataclass(frozen=True)
+class PlaceScore:
+    """A place that was seen twice, rendered by the final model at the times and poses of each stay."""
+
+    visits: Visits
+    first: Score
+    again: Score
+
+
+@dataclass(frozen=True)
+class Retention:
+    """What the final model scores on frames that it saw long ago."""
+
+    last: Score
+    """On the last seconds of the stream."""
+    last_range_s: Range
+    frozen: BaselineScore
+    """The stream's last frame shown for all of these seconds."""
+    places: tuple[PlaceScore, ...]
+
+
+def evaluate_retention(
+    frames: Iterable[Frame],
+    picture_of: Callable[[Frame], Picture],
+    *,
+    window_s: tuple[float, float],
+    last_s: float = LAST_S,
+    places: Sequence[Visits] = (),
+    record: Record | None = None,
+) -> Retention:
+    """Render frames again with the final model and compare; reads the frames twice.
+
+    Args:
+        frames: of the recording, in order, each time they are iterated.
+        picture_of: what the final model shows for a frame.
+        window_s: first and last time that the model has seen; the last seconds are the end of it.
+        last_s: how many seconds.
+        places: stays at places, as `PlaceFinder` finds them.
+        record: given the figures of each scored frame of the last seconds.
+
+    Raises InvalidInput when `frames` can be read only once.
+    """
+    if isinstance(frames, Iterator):
+        raise InvalidInput("evaluate_retention reads the frames twice: pass the recording itself, not an iterator")
+    tail = max(window_s[0], window_s[1] - last_s), window_s[1]
+    last = ScoreSums()
+    visits = [(place, ScoreSums(), ScoreSums()) for place in places]
+    newest: Frame | None = None
+    for frame in frames:
+        wanted = [last] if _within(frame, tail) else []
+        for place, first, again in visits:
+            wanted += [sums for stay, sums in ((place.first, first), (place.again, again)) if _within(frame, stay)]
+        reason = why_left_out(frame)
+        if not wanted or reason is not None:
+            for sums in wanted:
+                sums.leave_out(str(reason))
+            continue
+        if last in wanted:
+            newest = frame
+        picture = picture_of(frame)
+        for sums in wanted:
+            quality = sums.add(frame, picture.image)
+            if sums is last and record is not None:
+                own = {
+                    "seq": frame.seq,
+                    "time_s": frame.time_s,
+                    "trained": True,
+                    "model_version": picture.model_version,
+                }
+                record({**own, **measures(quality)})
+    return Retention(
+        last=last.score,
+        last_range_s=tail,
+        frozen=_frozen(frames, newest, tail),
+        places=tuple(PlaceScore(place, first.score, again.score) for place, first, again in visits),
+    )
+
+
+def find_places(frames: Iterable[Frame]) -> list[Visits]:
+    """The places that the scope of a recording came back to, by the poses of its frames; none where they have no poses."""
+    finder = PlaceFinder()
+    for frame in frames:
+        if frame.pose is not None:
+            finder.add(frame.time_s, frame.pose)
+    return finder.visits()
+
+
+@dataclass(frozen=True)
+class Return:
+    """How soon a place was found again when the scope came back, in another protocol's figures."""
+
+    visits: Visits
+    first_db: tuple[float | None, ...]
+    """Tissue PSNR of the first frames of the second stay."""
+    frames_until_found: int | None
+    """The number, from 1, of the first of its frames that scored `FOUND_DB` or more; None where none did."""
+
+
+def returns(entries: Iterable[Entry], places: Sequence[Visits]) -> list[Return]:
+    """Read from the log of a live or causal evaluation how good the first frames of each return were."""
+    first: list[list[float | None]] = [[] for _ in places]
+    count, found = [0] * len(places), [None] * len(places)  # type: list[int], list[int | None]
+    for entry in entries:
+        value, time_s = number(entry, "psnr_tissue_db"), number(entry, "time_s")
+        for k, place in enumerate(places):
+            if time_s is None or not place.again[0] <= time_s <= place.again[1]:
+                continue
+            count[k] += 1
+            if len(first[k]) < FIRST_FRAMES:
+                first[k].append(value)
+            if found[k] is None and value is not None and value >= FOUND_DB:
+                found[k] = count[k]
+    return [Return(place, tuple(first[k]), found[k]) for k, place in enumerate(places)]
+
+
+def _within(frame: Frame, times: Range) -> bool:
+    # Seconds are made of nanoseconds by a product that rounds.
+    return times[0] - 1e-6 <= frame.time_s <= times[1] + 1e-6
+
+
+def _frozen(frames: Iterable[Frame], shown: Frame | None, tail: Range) -> BaselineScore:
+    """What one picture scores on every frame of a range of time but itself."""
+    tissue, whole = ScoredMean(), ScoredMean()
+    for frame in frames if shown is not None else ():
+        assert shown is not None
+        if _within(frame, tail) and frame.seq != shown.seq and why_left_out(frame) is None:
+            tissue_db, frame_db = psnrs_db(shown.image, frame.image, frame.mask)
+            tissue.add(tissue_db)
+            whole.add(frame_db)
+    return BaselineScore(tissue.mean, whole.mean, tissue.count)
