@@ -1,34 +1,120 @@
 """Per-Gaussian basis functions in time: bumps that move, turn, scale and colour each Gaussian, local in time.
 
-The idea is Deform3DGS's (Yang et al. 2024), with one timing per bump shared by all channels, colour added, and truncated
-bumps, so that one time touches few of them: reading, training and storing a stretch of time costs the same however long
-the stream is.
+The idea is Deform3DGS's (Yang et al. 2024), with one timing per bump shared by all channels, colour added, and truncated bumps. One time touches few of
+them, so reading, training and storing a stretch of time cost the same for any length of the stream.
 
-Inside the field time is counted in bump spacings from the first column, tau = (time_s - origin_s) / spacing_s, so column b
-starts with centre b and width 1.
+Inside the field, time is counted in bump spacings from the first column, tau = (time_s - origin_s) / spacing_s. Column b starts with centre b and width 1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.basis_adam import BasisRates
-from gsplat_core.deformation.basis_bumps import BUMPS_PER_SPACING, BumpTensors
-from gsplat_core.deformation.continuation import Continuation
-from gsplat_core.deformation.displacement import displaced
-from gsplat_core.deformation.field import ops_for
-from gsplat_core.deformation.field_slots import BasisSlot
-from gsplat_core.deformation.smoothing import least_squares_weights, towards_neighbours_, towards_others_
+from gsplat_core.deformation.basis_bumps import (
+    BUMPS_PER_SPACING,
+    COLUMNS_AHEAD,
+    INERT,
+    INERT_CENTER,
+    BasisRates,
+    BumpTensors,
+    bump_capacity,
+)
+from gsplat_core.deformation.field import (
+    Continuation,
+    DeformationField,
+    FieldKind,
+    FieldRates,
+    NewField,
+    copy_each,
+    displaced,
+    ops_for,
+)
+from gsplat_core.deformation.regularisers import least_squares_weights, towards_neighbours_, towards_others_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field import basis_field as compiled
 from gsplat_core.ops.basis_field import plain_torch
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.layout import BASIS_CHANNELS, POSITION, ROTATION
+from gsplat_core.value_ranges import IntegerIn, NumberIn
+
+
+class BasisSlot:
+    """A basis field with capacity for more Gaussians and more bumps than it has; those that are not in use are inert."""
+
+    def __init__(self, source: BasisField, rows: int) -> None:
+        # A ring has its places from the start, and the copy has the same ones.
+        places = source.columns.places if source.columns.is_ring else bump_capacity(source.bumps)
+        with torch.device(source.weights.device):
+            self.field = type(source)(rows, source.time_window_s, bumps=places)
+        self.field.requires_grad_(False)
+        self.field.centers.data.fill_(INERT_CENTER)
+        if source.continuation is not None:
+            self.field.continuation = Continuation(rows, source.weights.device)
+        self._used = 0, 0
+        self._in_use: list[Tensor] = [tensor.data[:0, :0] for tensor in self.field.parameters()]
+
+    @property
+    def parameter_count(self) -> int:
+        """Of the rows and bumps in use."""
+        count, bumps = self._used
+        return count * bumps * (2 + int(self.field.weights.shape[2]))
+
+    def overwrite(self, source: DeformationField) -> bool:
+        """Copy the bumps and the layout of the columns, and make inert what an earlier state had used beyond them."""
+        if not isinstance(source, type(self.field)):
+            return False
+        if source.continuation is not None and self.field.continuation is None:
+            return False
+        count, columns = source.count, source.columns
+        places = int(self.field.weights.shape[1])
+        if count > self.field.count or columns.count > places or (columns.is_ring and columns.places != places):
+            return False
+        if self._used != (count, columns.count):
+            self._use(count, columns.count)
+        theirs = (source.centers.data, source.log_widths.data, source.weights.data)
+        # Bumps lie at the first places, or in a ring at all of them.
+        copy_each(self._in_use, [values[:count, : columns.count] for values in theirs])
+        self.field._time_window_s = source.time_window_s
+        self.field._columns = replace(columns, places=places)
+        self._continue(source.continuation, count)
+        return True
+
+    def _continue(self, source: Continuation | None, count: int) -> None:
+        """Continue as `source` does, or not at all."""
+        mine = self.field.continuation
+        if mine is None:
+            return
+        if source is None:
+            mine.stop()
+            return
+        mine.write(source.velocity[:count], source.from_s, source.horizon_s)
+        mine.set_clock(self.field.tau, self.field.spacing_s)
+
+    def _use(self, count: int, bumps: int) -> None:
+        """Choose the part of every tensor that is written, and make inert what an earlier state had used beyond it."""
+        mine = (self.field.centers.data, self.field.log_widths.data, self.field.weights.data)
+        rows, columns = self._used
+        for to, inert in zip(mine, INERT, strict=True):
+            if rows > count:
+                to[count:rows].fill_(inert)
+            if columns > bumps:
+                to[:, bumps:columns].fill_(inert)
+        self._used = count, bumps
+        self._in_use = [to[:count, :bumps] for to in mine]
+
+    def exact_copy(self) -> DeformationField:
+        """A field of as many Gaussians and bumps as are in use."""
+        copied = self.field._copy_of(self._used[0])
+        if self.field.continuation is not None:
+            copied.continuation = self.field.continuation.of_first(self._used[0])
+        return copied
+
 
 OVERSHOOT = 0.25
 """Bound on a course between the offsets that it follows and beyond the first and last: this share of their range outside of it. Least squares alone put a
@@ -219,3 +305,113 @@ class BasisField(BumpTensors):
         """Centres, log-widths and weights of the first `count` Gaussians."""
         whole = self._whole_parameters()
         return whole if count == self.weights.shape[0] else tuple(parameter[:count] for parameter in whole)
+
+
+FADING_S = 1.0
+"""Time constant with which the deformation of Gaussians that are in view fades beside what training asks for, where a stream has no end.
+Without it deformations that cancel each other add up: Gaussians become needles, and quality falls as the stream goes on."""
+
+
+@dataclass(frozen=True)
+class BasisLearningRates(FieldRates):
+    """Rates of the bumps' weights by what they move, and of the bumps' centres and widths (`timing`, in bump spacings)."""
+
+    means_px: float = 0.1
+    quats: float = 5e-3
+    log_scales: float = 5e-3
+    sh: float = 1e-2
+    timing: float = 1e-3
+
+
+def basis_rates(rates: Mapping[str, float]) -> BasisRates:
+    """Scaled `BasisLearningRates` in the units of the parameters."""
+    return BasisRates(
+        position=rates["means_px"],
+        rotation=rates["quats"],
+        log_scale=rates["log_scales"],
+        colour=rates["sh"],
+        centers=rates["timing"],
+        widths=rates["timing"],
+    )
+
+
+class BasisTraining:
+    """Lazy Adam over the bumps that are active at a step's time.
+
+    What the field adds to a raw parameter has that parameter's gradient, so the picture's gradient serves both, and no autograd graph is
+    built.
+    """
+
+    def __init__(self, field: BasisField) -> None:
+        self._field = field
+        self._time_s = 0.0
+
+    def deform(self, gaussians: Gaussians, time_s: float) -> Gaussians:
+        self._time_s = time_s
+        with torch.no_grad():
+            deformed: Gaussians = self._field(gaussians, time_s)
+        return deformed
+
+    def update(self, gradients: Mapping[str, Tensor], rates: Mapping[str, float]) -> Mapping[str, Tensor | None]:
+        deltas = torch.cat(
+            [gradients["means"], gradients["quats"], gradients["log_scales"], gradients["sh"][:, 0]], dim=1
+        )
+        self._field.adam_step(self._time_s, deltas, basis_rates(rates))
+        return gradients
+
+
+class CapturedBasisTraining:
+    """The same in a CUDA graph."""
+
+    rates = 6
+    reads_positions = False
+
+    def __init__(self, field: BasisField) -> None:
+        self._field = field
+        self._tensors: Sequence[Tensor] = ()
+        self._tensors_of: object = None
+
+    def rate_values(self, rates: Mapping[str, float]) -> Sequence[float]:
+        return list(vars(basis_rates(rates)).values())
+
+    def tensors(self) -> Sequence[Tensor]:
+        # Asked for at every step; a field that is extended or appended to gets other parameters.
+        if self._tensors_of is not self._field.weights:
+            self._tensors, self._tensors_of = self._field.training_tensors(), self._field.weights
+        return self._tensors
+
+    def deltas(self, gaussians: Gaussians, time: Tensor) -> Tensor:
+        return self._field.frame_deltas(gaussians)(time)
+
+    def update(self, gradient: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor) -> None:
+        # A frame whose splats did not fit has a gradient of zero, and bumps of Gaussians without gradient are left alone.
+        self._field.adam_step_at(time, gradient, rates)
+
+    def add_colours(self, change: Tensor, time: Tensor) -> None:
+        self._field.add_colours_at(time, change)
+
+
+def new_basis_field(wanted: NewField) -> BasisField:
+    """Columns `spacing_s` apart over the window; online over what `BasisField.cover` keeps ahead, as a ring where only so much is kept."""
+    spacing_s = wanted.spacing_s
+    span_s = COLUMNS_AHEAD * spacing_s if wanted.end_s is None else max(wanted.end_s - wanted.start_s, spacing_s)
+    bumps = max(4, round(span_s / spacing_s) + 3)
+    field = BasisField(wanted.gaussians.count, (wanted.start_s, wanted.start_s + span_s), bumps=bumps)
+    if wanted.end_s is None and wanted.history_s is not None:
+        field.keep_last(wanted.history_s, FADING_S)
+    return field
+
+
+KIND = FieldKind(
+    field=BasisField,
+    new=new_basis_field,
+    config={
+        "bumps": IntegerIn(4, 1 << 20),
+        "channels": IntegerIn(BASIS_CHANNELS, BASIS_CHANNELS),
+        "origin_s": NumberIn(-2e10, 2e10),
+        "spacing_s": NumberIn(1e-6, 1e6),
+    },
+    rates=BasisLearningRates(),
+    training=BasisTraining,
+    captured_training=CapturedBasisTraining,
+)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from gsplat_core.deformation.field import DeformationField
-from gsplat_core.deformation.kind import FieldKind
+from gsplat_core.deformation.field import DeformationField, FieldKind
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.registry import Registry
 from gsplat_core.scene.gaussians import Gaussians
@@ -14,9 +13,9 @@ from gsplat_core.scene.gaussians import Gaussians
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",
     {
-        "auto": "gsplat_core.deformation.basis_kind:KIND",  # the better one in benchmarks/notes/replay.md
-        "basis": "gsplat_core.deformation.basis_kind:KIND",
-        "hexplane": "gsplat_core.deformation.hexplane_kind:KIND",
+        "auto": "gsplat_core.deformation.basis:KIND",  # the better one in benchmarks/notes/replay.md
+        "basis": "gsplat_core.deformation.basis:KIND",
+        "hexplane": "gsplat_core.deformation.hexplane:KIND",
     },
 )
 """Kinds by the names that a user can choose; `auto` stands for one of the others."""

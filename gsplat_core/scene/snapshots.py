@@ -16,8 +16,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import DeformationField, continued_window
-from gsplat_core.deformation.field_slots import FieldSlot, copy_each
+from gsplat_core.deformation.field import DeformationField, FieldSlot, continued_window, copy_each
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from gsplat_core.deformation.rates import FieldRates, check_rates
+from gsplat_core.deformation.field import FieldRates, check_rates
 from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import DepthOrigin, Frame

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import DeformationField
-from gsplat_core.deformation.rates import FieldRates
+from gsplat_core.deformation.field import DeformationField, FieldRates
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.optimiser import FusedAdam
 

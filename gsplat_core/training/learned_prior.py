@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.displacement import displaced
+from gsplat_core.deformation.field import displaced
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.layout import COLOUR, POSITION, RAW_COLUMNS
 from gsplat_core.training.colour_fit import colour_change

@@ -16,10 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.deformation.continuation import Continuation
-from gsplat_core.deformation.displacement import displaced
-from gsplat_core.deformation.field import DeformationField
-from gsplat_core.deformation.newest_state import NewestState
+from gsplat_core.deformation.field import Continuation, DeformationField, NewestState, displaced
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.kind import NewField
+from gsplat_core.deformation.field import NewField
 from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera

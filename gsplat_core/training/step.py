@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import DeformationField
-from gsplat_core.deformation.kind import FieldTraining
+from gsplat_core.deformation.field import DeformationField, FieldTraining
 from gsplat_core.deformation.registry import kind_of
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gsplat_core.deformation.field_slots import copy_each
+from gsplat_core.deformation.field import copy_each
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.colour_correction import ResidualTarget
 from gsplat_core.training.observations import Observation

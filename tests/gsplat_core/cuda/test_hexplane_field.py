@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from gsplat_core.deformation import HexPlaneField
-from gsplat_core.deformation.hexplane import PLANE_NAMES
-from gsplat_core.deformation.hexplane_training import HexPlaneTraining
+from gsplat_core.deformation.hexplane import PLANE_NAMES, HexPlaneTraining
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.optimiser import FusedAdam

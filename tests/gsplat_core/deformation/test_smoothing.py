@@ -6,7 +6,12 @@ import pytest
 import torch
 
 from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
-from gsplat_core.deformation.smoothing import ROWS_AT_ONCE, least_squares_weights, towards_neighbours_, towards_others_
+from gsplat_core.deformation.regularisers import (
+    ROWS_AT_ONCE,
+    least_squares_weights,
+    towards_neighbours_,
+    towards_others_,
+)
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field.plain_torch import basis_field
 

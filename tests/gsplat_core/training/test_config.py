@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gsplat_core.deformation.basis_kind import BasisLearningRates
-from gsplat_core.deformation.hexplane_kind import HexPlaneLearningRates
+from gsplat_core.deformation.basis import BasisLearningRates
+from gsplat_core.deformation.hexplane import HexPlaneLearningRates
 from gsplat_core.errors import InvalidSetting, UserError
 from gsplat_core.scene.frames import DepthOrigin
 from gsplat_core.training.config import (

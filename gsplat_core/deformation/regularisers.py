@@ -1,4 +1,4 @@
-"""Smoothing of what a field has learned, along its axis of time and among its Gaussians."""
+"""Smoothing of learned motion along time and between neighbouring Gaussians."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from gsplat_core.threads import one_thread
 
 ROWS_AT_ONCE = 1 << 14
 """Bounds the memory for differences."""
+
 
 BEND = 0.05
 """How much a course that bends from bump to bump costs, beside being off by as much at one time: what is measured at each frame is noisy."""
