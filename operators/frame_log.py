@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.io.regular_files import open_regular
+from gsplat_core.io.files import open_regular
 from operators.storage import StorageReserve, storage_errors
 
 FRAMES_FILE = "frames.jsonl"

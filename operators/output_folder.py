@@ -27,8 +27,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from gsplat_core.io.atomic_files import replace_durably, sync_folder, unfinished
-from gsplat_core.io.regular_files import open_regular, read_regular
+from gsplat_core.io.files import open_regular, read_regular, replace_durably, sync_folder, unfinished
 from operators.errors import OutputFolderInUse
 from operators.folder_lock import LOCK, FolderLock
 from operators.output_paths import MARKER, check_folder_path

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsplat_core.io.atomic_files import PartialFile
+from gsplat_core.io.files import PartialFile
 from operators.errors import OutputError, StorageFull
 
 STAGING_PREFIX = ".run-"

@@ -25,7 +25,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from gsplat_core.errors import UserError
-from gsplat_core.io.atomic_files import PartialFolder, sync_folder
+from gsplat_core.io.files import PartialFolder, sync_folder
 from services.audit import verify
 from services.audit.entries import MOST_LINE_BYTES, parse_line
 from services.audit.head import read_head

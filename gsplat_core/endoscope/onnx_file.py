@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.regular_files import read_regular
+from gsplat_core.io.files import read_regular
 
 MOST_BYTES = 512 * 2**20
 MOST_NESTING = 64

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.regular_files import read_regular
+from gsplat_core.io.files import read_regular
 
 METADATA_KEY = "intrasplat"
 """Of the model's metadata: its value is a JSON object with the fields of the settings."""

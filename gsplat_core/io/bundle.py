@@ -1,21 +1,19 @@
-"""A model on disk: a folder with `model.safetensors` (every tensor) and `manifest.json` (everything else).
+"""Model bundles: a folder with `model.safetensors` (every tensor) and `manifest.json` (everything else).
 
-Nothing in a bundle is executed when it is read: no pickle. A bundle may come from anyone, so each value is checked against
-the architecture that the manifest states before memory is taken for it.
-
-Saving is atomic. Both files are first written in full beside the old ones (a full disk is noticed here), then renamed,
-tensors before manifest. Should the machine stop between the two renames, the new manifest still lies there as
-`manifest.next.json`, and loading takes it because its digest is the tensors'.
+The tensor file is written in pieces that share the tensors' memory, since `safetensors.torch.save` copies all of it twice. Loading checks names, shapes,
+sizes and finiteness before a model is built, and follows no link out of the folder.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
 import safetensors
 import safetensors.torch
 import torch
@@ -23,15 +21,43 @@ from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
-from gsplat_core.io.atomic_files import replace_durably, write_durably
+from gsplat_core.io.files import replace_durably, write_durably
 from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, Manifest, manifest_bytes, parse_manifest
 from gsplat_core.io.model_files import check_memory, open_model_file
-from gsplat_core.io.safetensors_pieces import safetensors_pieces
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 
+PIECE_BYTES = 1 << 22
+"""Who hashes or writes one piece lets other threads run meanwhile, and again after it."""
+
+
+ALIGNMENT = 8
+
+
+def safetensors_pieces(tensors: Mapping[str, Tensor]) -> Iterator[bytes | memoryview]:
+    """The bytes of a file with these float32 tensors of the host, contiguous; the same as `safetensors.torch.save` gives."""
+    names = sorted(tensors)
+    entries, start = {}, 0
+    for name in names:
+        assert tensors[name].dtype == torch.float32 and tensors[name].is_contiguous()
+        end = start + 4 * tensors[name].numel()
+        entries[name] = {"dtype": "F32", "shape": list(tensors[name].shape), "data_offsets": [start, end]}
+        start = end
+    header = json.dumps(entries, separators=(",", ":"), ensure_ascii=False).encode()
+    header += b" " * (-len(header) % ALIGNMENT)
+    yield struct.pack("<Q", len(header)) + header
+    for name in names:
+        values = tensors[name].numpy().reshape(-1).view(np.uint8).data
+        for first in range(0, len(values), PIECE_BYTES):
+            yield values[first : first + PIECE_BYTES]
+
+
 TENSORS, NEXT_TENSORS = "model.safetensors", "model.next.safetensors"
+
+
 MANIFEST, NEXT_MANIFEST = "manifest.json", "manifest.next.json"
+
+
 MAX_HEADER_BYTES = 1 << 20
 
 

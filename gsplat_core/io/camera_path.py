@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting
+from gsplat_core.io.files import read_regular
 from gsplat_core.io.json_object import JsonObject
-from gsplat_core.io.regular_files import read_regular
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.value_ranges import NumberIn
 

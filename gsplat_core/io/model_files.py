@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsplat_core.errors import BundleError
-from gsplat_core.io.regular_files import open_regular
+from gsplat_core.io.files import open_regular
 from gsplat_core.memory import available_bytes, in_gib
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import BundleCorrupt, BundleError
 from gsplat_core.io.bundle import load_bundle
-from gsplat_core.io.exports.splat import ROW
+from gsplat_core.io.exports.files import ROW
 from gsplat_core.io.model_files import check_memory, open_model_file
 from gsplat_core.io.ply import load_ply
 from gsplat_core.scene.cameras import Camera

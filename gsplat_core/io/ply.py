@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import BundleCorrupt
-from gsplat_core.io.atomic_files import replace_durably, write_durably
+from gsplat_core.io.files import replace_durably, write_durably
 from gsplat_core.io.model_files import check_memory, open_model_file
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 

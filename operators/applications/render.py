@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import RecordingError, UserError
-from gsplat_core.io.atomic_files import PartialFile
+from gsplat_core.io.files import PartialFile
 from gsplat_core.io.model_sources import is_scene_file, load_model
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.rendering.registry import check_renderer, new_renderer

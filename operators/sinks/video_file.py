@@ -17,7 +17,7 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
-from gsplat_core.io.atomic_files import PartialFile
+from gsplat_core.io.files import PartialFile
 from operators.errors import OutputError
 from operators.storage import StorageReserve, storage_errors
 

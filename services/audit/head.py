@@ -9,7 +9,7 @@ import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from gsplat_core.io.regular_files import read_regular
+from gsplat_core.io.files import read_regular
 from services.audit.entries import FIRST
 
 MOST_BYTES = 4096

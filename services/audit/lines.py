@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from gsplat_core.io.regular_files import open_regular
+from gsplat_core.io.files import open_regular
 
 BLOCK_BYTES = 1 << 16
 

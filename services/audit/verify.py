@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsplat_core.io.regular_files import open_regular
+from gsplat_core.io.files import open_regular
 from services.audit.entries import MOST_LINE_BYTES, Entry, digest_of_entry, parse_line
 from services.audit.head import Head, read_anchor, read_head
 from services.audit.segments import closed_segments

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.regular_files import read_regular
+from gsplat_core.io.files import read_regular
 from services.cli.exit_codes import OK
 from services.cli.tables import Columns, table
 

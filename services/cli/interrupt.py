@@ -29,7 +29,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 def _end_now() -> None:
-    files = sys.modules.get("gsplat_core.io.atomic_files")
+    files = sys.modules.get("gsplat_core.io.files")
     if files is not None:
         files.remove_unfinished()
     os._exit(INTERRUPTED)

@@ -13,7 +13,7 @@ from urllib.parse import urlencode, urlsplit
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import connect
 
-from gsplat_core.io.regular_files import read_regular
+from gsplat_core.io.files import read_regular
 from services.client.errors import ClientError, Unreachable
 
 MOST_CERTIFICATE_BYTES = 1 << 20

@@ -13,8 +13,7 @@ from urllib.parse import urlsplit
 
 import httpx2
 
-from gsplat_core.io.atomic_files import PartialFile
-from gsplat_core.io.regular_files import open_regular
+from gsplat_core.io.files import PartialFile, open_regular
 from services.client.errors import ClientError, Refused, Unreachable
 from services.client.pictures import tls_context
 

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from gsplat_core.io.atomic_files import sync_folder
+from gsplat_core.io.files import sync_folder
 from services.exports.errors import ExportFailed, NoSnapshot
 
 NUMBER = re.compile(r"[0-9a-f]{16}")

@@ -13,7 +13,7 @@ import os
 import shutil
 from pathlib import Path
 
-from gsplat_core.io.atomic_files import sync_folder
+from gsplat_core.io.files import sync_folder
 from services.registry.errors import StoreUnavailable
 
 RUNNING, LOCK = ".running", "lock"

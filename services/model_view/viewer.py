@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.exports.rows import rows_of
+from gsplat_core.io.exports.files import rows_of
 from gsplat_core.scene.gaussians import SH_C0
 from gsplat_core.scene.model import Model
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from gsplat_core.io.atomic_files import sync_folder
+from gsplat_core.io.files import sync_folder
 from services.recordings.kinds import ARCHIVE, kind_of
 from services.recordings.limits import RecordingLimits
 from services.recordings.records import Expired, RecordingRecord, State, recording_record

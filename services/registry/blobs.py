@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import fsspec
 
-from gsplat_core.io.atomic_files import beside, sync_folder
+from gsplat_core.io.files import beside, sync_folder
 from services.registry.errors import StoreUnavailable
 
 PART_SUFFIX = ".part"

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from gsplat_core.io.atomic_files import PartialFile, write_durably
+from gsplat_core.io.files import PartialFile, write_durably
 from services.registry.errors import Rejected
 
 SUFFIX = ".isplat"

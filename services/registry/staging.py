@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsplat_core.errors import BundleError
-from gsplat_core.io.atomic_files import beside, write_durably
+from gsplat_core.io.files import beside, write_durably
 from gsplat_core.io.model_files import open_model_file
 from services.registry.blobs import PART_SUFFIX
 from services.registry.bundle_file import PIECE_BYTES, digest_of, members_of

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gsplat_core.io.atomic_files import PartialFolder
+from gsplat_core.io.files import PartialFolder
 from services.registry.blobs import BlobStore
 from services.registry.bundle_file import MANIFEST, PIECE_BYTES, TENSORS, unpack
 from services.registry.errors import BlobDamaged, Rejected, StoreUnavailable

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from gsplat_core.io.regular_files import read_regular
+from gsplat_core.io.files import read_regular
 from services.settings.errors import SettingsInvalid
 
 MOST_BYTES = 2**20

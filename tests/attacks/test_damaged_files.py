@@ -13,8 +13,8 @@ from gsplat_core.endoscope.onnx_file import read_model
 from gsplat_core.errors import UserError
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.camera_path import read_camera_path
+from gsplat_core.io.files import open_regular, read_regular
 from gsplat_core.io.ply import load_ply
-from gsplat_core.io.regular_files import open_regular, read_regular
 from gsplat_core.io.surface_files import read_surface
 from operators.frame_log import read_frames
 from services.audit import verify

@@ -14,12 +14,16 @@ import torch
 
 from gsplat_core.errors import ExportError
 from gsplat_core.geometry.mesh import mesh_of
-from gsplat_core.io.atomic_files import PartialFile
+from gsplat_core.io.exports.files import (
+    glb_pieces,
+    mesh_glb_pieces,
+    mesh_ply_pieces,
+    rows_of,
+    splat_bytes,
+    unit_rotations,
+)
 from gsplat_core.io.exports.formats import ExportWish
-from gsplat_core.io.exports.glb import glb_pieces
-from gsplat_core.io.exports.mesh_files import mesh_glb_pieces, mesh_ply_pieces
-from gsplat_core.io.exports.rows import rows_of, unit_rotations
-from gsplat_core.io.exports.splat import splat_bytes
+from gsplat_core.io.files import PartialFile
 from gsplat_core.io.ply import ply_pieces
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model

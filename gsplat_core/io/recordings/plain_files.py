@@ -7,8 +7,8 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
+from gsplat_core.io.files import open_regular
 from gsplat_core.io.recordings.findings import Findings
-from gsplat_core.io.regular_files import open_regular
 
 
 class UnreadableFile(Exception):

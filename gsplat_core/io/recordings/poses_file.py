@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.io.atomic_files import PartialFile
+from gsplat_core.io.files import PartialFile
 from gsplat_core.io.recordings.arrays import ArrayHeader, read_array
 from gsplat_core.io.recordings.calibration import invert_poses
 from gsplat_core.io.recordings.findings import Findings

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, ValidationError
 
 from gsplat_core.errors import InvalidInput, RecordingInvalid
-from gsplat_core.io.atomic_files import PartialFile
+from gsplat_core.io.files import PartialFile
 from gsplat_core.io.recordings.findings import printable
 from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
 from gsplat_core.io.sessions.records import CameraRecord, Count, Record, Text

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_core.errors import UserError
-from gsplat_core.io.regular_files import read_regular
+from gsplat_core.io.files import read_regular
 from services.control.auth.roles import Role
 
 log = logging.getLogger(__name__)

@@ -7,8 +7,8 @@ import os
 
 import pytest
 
-from gsplat_core.io import atomic_files
-from gsplat_core.io.atomic_files import PartialFile, PartialFolder, remove_unfinished, write_durably
+from gsplat_core.io import files
+from gsplat_core.io.files import PartialFile, PartialFolder, remove_unfinished, write_durably
 
 
 def test_a_file_appears_when_it_is_complete(tmp_path):
@@ -58,7 +58,7 @@ def test_a_planted_link_is_replaced_and_never_written_through(tmp_path):
 
 
 def test_a_name_that_was_guessed_is_an_error_and_not_overwritten(tmp_path, monkeypatch):
-    monkeypatch.setattr(atomic_files.secrets, "token_hex", lambda count: "guessed")
+    monkeypatch.setattr(files.secrets, "token_hex", lambda count: "guessed")
     (tmp_path / "diary").write_bytes(b"mine")
     (tmp_path / ".intrasplat-guessed.part.mp4").symlink_to(tmp_path / "diary")
     with pytest.raises(FileExistsError):
@@ -80,7 +80,7 @@ def test_names_of_the_greatest_length_and_the_umask(tmp_path):
 @pytest.mark.parametrize("exchange", [True, False])
 def test_a_folder_takes_the_place_of_an_earlier_one(tmp_path, monkeypatch, exchange):
     if not exchange:
-        monkeypatch.setattr(atomic_files, "_exchanged", lambda first, second: False)
+        monkeypatch.setattr(files, "_exchanged", lambda first, second: False)
     target = tmp_path / "take"
     target.mkdir()
     (target / "old").touch()

@@ -11,7 +11,7 @@ import torch
 
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
-from gsplat_core.io import atomic_files, bundle
+from gsplat_core.io import bundle, files
 from gsplat_core.io.bundle import load_bundle, save_bundle
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
@@ -163,7 +163,7 @@ def test_a_full_disk_leaves_the_previous_bundle(fails_at, make_gaussians, tmp_pa
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         real_fsync(descriptor)
 
-    monkeypatch.setattr(atomic_files.os, "fsync", full_disk)
+    monkeypatch.setattr(files.os, "fsync", full_disk)
     with pytest.raises(BundleError, match=r"No space left on device") as raised:
         save_bundle(make_model(make_gaussians(9)), tmp_path)
     assert str(tmp_path) in str(raised.value)
@@ -183,7 +183,7 @@ def test_a_crash_between_the_renames_leaves_a_whole_bundle(renames, make_gaussia
         if len(done) == renames:
             raise KeyboardInterrupt
         done.append(target)
-        atomic_files.replace_durably(source, target)
+        files.replace_durably(source, target)
 
     monkeypatch.setattr(bundle, "replace_durably", stop_after)
     with pytest.raises(KeyboardInterrupt):

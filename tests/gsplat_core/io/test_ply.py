@@ -114,7 +114,7 @@ def test_a_malformed_file_is_refused_with_its_reason(change, reason, tmp_path):
 
 
 def test_a_failed_save_leaves_the_old_file(make_gaussians, tmp_path, monkeypatch):
-    from gsplat_core.io import atomic_files
+    from gsplat_core.io import files
 
     path = tmp_path / "a.ply"
     save_ply(make_gaussians(3), path)
@@ -123,7 +123,7 @@ def test_a_failed_save_leaves_the_old_file(make_gaussians, tmp_path, monkeypatch
     def full_disk(descriptor):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(atomic_files.os, "fsync", full_disk)
+    monkeypatch.setattr(files.os, "fsync", full_disk)
     with pytest.raises(OSError, match="No space"):
         save_ply(make_gaussians(5), path)
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["a.ply"]

@@ -6,8 +6,8 @@ import pytest
 import safetensors.torch
 import torch
 
-from gsplat_core.io import safetensors_pieces
-from gsplat_core.io.safetensors_pieces import PIECE_BYTES
+from gsplat_core.io import bundle
+from gsplat_core.io.bundle import PIECE_BYTES
 
 
 @pytest.mark.parametrize(
@@ -23,18 +23,18 @@ from gsplat_core.io.safetensors_pieces import PIECE_BYTES
 )
 def test_the_bytes_are_those_of_the_library(shapes, generator):
     tensors = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
-    pieces = [bytes(piece) for piece in safetensors_pieces.safetensors_pieces(tensors)]
+    pieces = [bytes(piece) for piece in bundle.safetensors_pieces(tensors)]
     assert b"".join(pieces) == safetensors.torch.save(tensors)
     assert all(len(piece) <= PIECE_BYTES for piece in pieces[1:])
 
 
 def test_the_tensors_are_not_copied():
     values = torch.zeros(PIECE_BYTES // 2)
-    _, first, second = safetensors_pieces.safetensors_pieces({"a": values})
+    _, first, second = bundle.safetensors_pieces({"a": values})
     values.fill_(1.0)
     assert bytes(first[:4]) == bytes(second[:4]) == b"\x00\x00\x80\x3f"
 
 
 def test_a_piece_ends_with_the_tensor_and_not_in_the_next():
     tensors = {"a": torch.zeros(3), "b": torch.zeros(2)}
-    assert [len(piece) for piece in safetensors_pieces.safetensors_pieces(tensors)][1:] == [12, 8]
+    assert [len(piece) for piece in bundle.safetensors_pieces(tensors)][1:] == [12, 8]

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Literal
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.atomic_files import PartialFolder
+from gsplat_core.io.files import PartialFolder
 from gsplat_core.io.recordings.synthetic.description import describe
 from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
 from gsplat_core.io.recordings.synthetic.files import FrameFiles

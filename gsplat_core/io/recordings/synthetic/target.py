@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.regular_files import read_regular
+from gsplat_core.io.files import read_regular
 
 GENERATOR = "intrasplat synthesize"
 _FRAME = r"frame-\d{6}\."
