@@ -6,10 +6,10 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from gsplat_core.io.sessions.records import LostLine
-from gsplat_core.io.sessions.schedule import (
+from gsplat_core.io.sessions.records import (
     DepthTaken,
     Grown,
+    LostLine,
     Observed,
     ReconstructorMade,
     Rehearsed,

@@ -56,19 +56,11 @@ class Moments:
 
 INERT_CENTER = 1e9
 """Centre of a column that is no bump yet, in bump spacings: too far from any time to contribute or to be trained."""
-
-
 INERT = (INERT_CENTER, 0.0, 0.0)
 """Centre, log-width and weights of such a column."""
-
-
 CAPACITY_STEP = 16
 """The capacity for bumps is a multiple of this."""
-
-
 HEADROOM = 1.25
-
-
 COLUMNS_AHEAD = 1
 """Columns that the window keeps ahead of the newest frame online."""
 

@@ -44,11 +44,7 @@ from gsplat_core.scene.layout import HEAD_COLUMNS, HEAD_GROUPS, width_of
 from gsplat_core.value_ranges import IntegerIn, ListOf
 
 PLANE_NAMES = ("xy", "xz", "yz", "xt", "yt", "zt")
-
-
 SPACE_PLANES, TIME_PLANES = PLANE_NAMES[:3], PLANE_NAMES[3:]
-
-
 BOX_MARGIN = 0.05
 """Share of the box's longest side added on every side, so that Gaussians can move a little and stay inside."""
 
@@ -412,8 +408,6 @@ class HexPlaneLearningRates(FieldRates):
 
 ROWS_PER_SPACING = 1
 """Time rows of the planes, where the recording's end is known, for each of `NewField.spacing_s`: between rows they are linear."""
-
-
 MOST_ROWS = 1 << 10
 
 

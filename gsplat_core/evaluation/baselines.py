@@ -27,8 +27,6 @@ from gsplat_core.training.metrics import ImageLike, ScoredMean, psnr_tissue_db, 
 
 SMALLEST_SIDE_PX = 12
 """The shortest side that the flow is found for."""
-
-
 _per_thread = threading.local()
 
 
@@ -76,18 +74,10 @@ def _moved(image: NDArray[np.uint8], flow: NDArray[np.float32], share: float) ->
 
 AGES = (1, 2, 3, 5, 8)
 """How many frames old the copies of the frame-hold curve are."""
-
-
 PREVIOUS_FRAME, NEIGHBOUR_MEAN, TRAIN_MEAN = "previous_frame", "neighbour_mean", "train_mean"
-
-
 HALF_VELOCITY, HALF_WAY = "half_velocity_flow", "half_way_flow"
-
-
 SEES_THE_FUTURE = frozenset({NEIGHBOUR_MEAN, HALF_WAY})
 """Baselines that need the frame after the one that they are scored on, which a live system does not have."""
-
-
 _MAX_THREADS = 4
 
 

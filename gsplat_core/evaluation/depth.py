@@ -20,16 +20,10 @@ from gsplat_core.scene.projection import pixel_rays, points_of
 from gsplat_core.training.metrics import ScoredMean
 
 Array = NDArray[np.float64]
-
-
 MOST_STEPS = 100
 """Steps of Levenberg and Marquardt's method from each start; it converges in about ten."""
-
-
 CONVERGED = 1e-10
 """Relative decrease of the squared error that ends the iteration."""
-
-
 STEEPEST_RATIO = 1e-6
 """Least inverse depth of a plane at a fitted pixel, as a share of the mean: a plane has to lie in front of the camera there."""
 
@@ -238,8 +232,6 @@ class DepthShareSums:
 
 MOST_PLANE_PIXELS = 8192
 """Pixels of a frame that its plane is fitted to, spread evenly."""
-
-
 SMOOTH_PX = 5
 """Points are averaged over so many pixels across before they are differentiated: stored depth has steps."""
 

@@ -41,16 +41,12 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.model import Model
 
 MOTION, COLOUR, SIZE = "motion", "colour", "size"
-
-
 PARTS: dict[str, tuple[str, ...]] = {
     MOTION: ("means", "quats"),
     COLOUR: ("sh",),
     SIZE: ("log_scales", "logit_opacities"),
 }
 """The tensors of `Gaussians` that each part changes."""
-
-
 PART_FRAMES = 8
 """Frames that are looked at: each is rendered eight times."""
 
@@ -120,8 +116,6 @@ def _subsets(names: tuple[str, ...]) -> list[frozenset[str]]:
 
 MOST_FRAMES = 48
 """Frames that are compared, spread evenly over the recording."""
-
-
 NO_SCALING = 0.005
 """A factor so near to 1 is taken for 1: the scaled pictures are the others."""
 

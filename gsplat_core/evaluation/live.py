@@ -22,11 +22,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import FrameQuality, ScoredMean, frame_quality, psnrs_db
 
 _FINEST_MS = 1e-3
-
-
 _RATIO = 1.01
-
-
 _BUCKETS = 2600
 """From a microsecond to two days."""
 
@@ -75,18 +71,10 @@ class AgeHistogram:
 
 MOST_BEHIND = 8
 """Lateness is counted up to so many frames; what is later counts as this many."""
-
-
 SETTLING_S = 1.0
 """The first second, in which a model begins, is in `score` and not in `settled`."""
-
-
 NOTHING_SHOWN, NOT_KEPT, OTHER_SIZE = "nothing shown yet", "picture not kept", "picture of another size"
-
-
 _MAX_STATES = 16
-
-
 _NS_PER_MS = 1e6
 
 

@@ -28,15 +28,9 @@ from gsplat_core.scene.model import Model
 from gsplat_core.scene.projection import Points, at_pixels, inverse, moved, pixel_rays, pixels_of, points_of
 
 WITHIN_PX = (4, 8, 16, 32, 64)
-
-
 WITHIN_MM = (2, 4, 8, 16, 32)
 """The challenge's thresholds; its figure is the mean share of points within each of them."""
-
-
 NEIGHBOURS = 8
-
-
 LEAST_OPACITY = 0.1
 """Gaussians that show less than this carry nothing."""
 
@@ -203,8 +197,6 @@ class FollowedPoints:
 
 MOST_PIXELS = 8192
 """Pixels of a frame that are compared, spread evenly: what is kept does not grow with the pictures."""
-
-
 Values = NDArray[np.float64]
 
 

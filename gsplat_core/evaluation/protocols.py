@@ -206,19 +206,11 @@ def _score(frame: Frame, picture: Picture, sums: ScoreSums, record: Record | Non
 
 NEAR_SHARE = 0.05
 """Two positions are one place when they are nearer than this share of the greatest distance between any two; a scale need not be known."""
-
-
 NEAR_DEGREES = 10.0
-
-
 AWAY = 3.0
 """In between, the scope must have been this many times as far away, or turned as much."""
-
-
 MAX_POSES = 2048
 """Poses that are kept; of a longer stream every second, fourth, ... one is."""
-
-
 Range = tuple[float, float]
 """First and last time, in seconds."""
 
@@ -298,12 +290,8 @@ def _distances(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 LAST_S = 5.0
-
-
 FOUND_DB = 33.0
 """From this tissue PSNR on a place that was left counts as found again."""
-
-
 FIRST_FRAMES = 3
 
 

@@ -31,8 +31,6 @@ from gsplat_core.training.right_eye import right_tissue
 
 SAME_DEPTH = 0.02
 """Two cameras see the same point where its depth agrees by this share."""
-
-
 LEAST_SEEN = 0.05
 """A frame of which a view and training have less than this share in common is left out."""
 
@@ -124,8 +122,6 @@ def moved_picture(left_camera: Camera, image: NDArray[np.uint8], camera: Camera,
 
 
 Pose = NDArray[np.float64]
-
-
 Shown = Callable[[Camera, Frame], Picture]
 """What a model shows of a frame's time and exposure from a camera in its own world."""
 
@@ -177,26 +173,14 @@ def _views_of(frame: Frame, truth: GroundTruth) -> Iterator[tuple[str, Camera, F
 
 EVERY = 10
 """One frame of so many is scored."""
-
-
 BORDER_PX = 10
 """Left out all around, in a picture of `BORDER_OF_PX` columns or more; in proportion in a smaller one."""
-
-
 BORDER_OF_PX = 360
-
-
 BEYOND_TYPICAL = 1.3
 """The columns that only one eye sees, where nobody says how many: so many times the typical disparity."""
-
-
 SEARCHED = 0.07
 """Semi-global matching looks so far, as a share of the width, to both sides of the typical disparity."""
-
-
 MODEL = "model"
-
-
 SHIFTED, MATCHED, RIGHT_BEFORE = "left_shifted", "semi_global_matching", "previous_right"
 
 

@@ -29,8 +29,6 @@ from gsplat_core.scene.model import Model
 
 PIECE_BYTES = 1 << 22
 """Who hashes or writes one piece lets other threads run meanwhile, and again after it."""
-
-
 ALIGNMENT = 8
 
 
@@ -53,11 +51,7 @@ def safetensors_pieces(tensors: Mapping[str, Tensor]) -> Iterator[bytes | memory
 
 
 TENSORS, NEXT_TENSORS = "model.safetensors", "model.next.safetensors"
-
-
 MANIFEST, NEXT_MANIFEST = "manifest.json", "manifest.next.json"
-
-
 MAX_HEADER_BYTES = 1 << 20
 
 

@@ -63,14 +63,8 @@ def _not_regular(mode: int, path: str | Path) -> OSError:
 
 
 _RENAME_EXCHANGE = 2
-
-
 _AT_FDCWD = -100
-
-
 _NO_HARD_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
-
-
 _unfinished: set[Path] = set()
 """Files and folders of this process that have not got their name yet."""
 

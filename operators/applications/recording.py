@@ -11,8 +11,15 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter
 
 from gsplat_core.io.sessions import SessionInfo
-from gsplat_core.io.sessions.schedule import Grown, Observed, ReconstructorMade, Rehearsed, SceneBegun, ScheduleLine
-from gsplat_core.io.sessions.session_file import camera_record
+from gsplat_core.io.sessions.records import (
+    Grown,
+    Observed,
+    ReconstructorMade,
+    Rehearsed,
+    SceneBegun,
+    ScheduleLine,
+    camera_record,
+)
 from gsplat_core.training.live import LiveReconstructor
 from operators.graph import Application, Operator
 from operators.output_folder import RECORDINGS

@@ -11,8 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.sessions import SessionReader, is_session
-from gsplat_core.io.sessions.schedule import ReconstructorMade
-from gsplat_core.io.sessions.session_file import camera_of
+from gsplat_core.io.sessions.records import ReconstructorMade, camera_of
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.live import LiveReconstructor
 from gsplat_core.training.live_training import LiveTraining

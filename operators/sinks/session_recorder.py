@@ -17,9 +17,7 @@ from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.sessions import SessionInfo, SessionWriter, WriterOptions
-from gsplat_core.io.sessions.records import MOST_NS, LostLine
-from gsplat_core.io.sessions.schedule import ScheduleLine
-from gsplat_core.io.sessions.session_file import SESSION_FILE
+from gsplat_core.io.sessions.records import MOST_NS, SESSION_FILE, LostLine, ScheduleLine
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
 from operators.errors import OutputError

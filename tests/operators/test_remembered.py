@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.io.sessions.track_writer import TrackWriter
+from gsplat_core.io.sessions.tracks import TrackWriter
 from gsplat_core.training.metrics import psnr_tissue_db
 from operators.endoscope.stage import tissue_of
 from operators.remembered import COVERED, RememberedTissue, marked

@@ -82,27 +82,13 @@ def _byte(values: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 EXTENSION = "KHR_gaussian_splatting"
-
-
 MOST_SH_DEGREE = 3
-
-
 FLOAT, UNSIGNED_SHORT = 5126, 5123
-
-
 ARRAY_BUFFER = 34962
-
-
 POINTS = 0
-
-
 TURN_X = [1.0, 0.0, 0.0, 0.0]
 """Half a turn round x, as x, y, z, w."""
-
-
 METRES_PER_UNIT = 0.001
-
-
 MOST_BYTES = 2**32 - 1
 
 
@@ -200,20 +186,10 @@ def _document(
 
 
 UNLIT = "KHR_materials_unlit"
-
-
 ELEMENT_ARRAY_BUFFER = 34963
-
-
 UNSIGNED_INT = 5125
-
-
 TRIANGLES = 4
-
-
 VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
-
-
 FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 
 

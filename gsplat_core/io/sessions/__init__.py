@@ -1,7 +1,7 @@
 """Recordings of live sessions: what came in, what was done with it, what was shown. docs/session-recordings.md describes the files."""
 
 from gsplat_core.io.sessions.reader import SessionReader, is_session
-from gsplat_core.io.sessions.session_file import SessionInfo
+from gsplat_core.io.sessions.records import SessionInfo
 from gsplat_core.io.sessions.writer import SessionWriter, WriterOptions
 
 __all__ = ["SessionInfo", "SessionReader", "SessionWriter", "WriterOptions", "is_session"]

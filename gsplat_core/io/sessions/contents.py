@@ -16,8 +16,7 @@ from gsplat_core.io.recordings.contents import digest_of
 from gsplat_core.io.recordings.decoder import NO_PICTURE
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.sessions.reader import SessionReader
-from gsplat_core.io.sessions.records import FrameLine
-from gsplat_core.io.sessions.session_file import SESSION_FILE, camera_of
+from gsplat_core.io.sessions.records import SESSION_FILE, FrameLine, camera_of
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 _ADVICE = "What can be read is played"

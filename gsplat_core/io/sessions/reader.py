@@ -13,11 +13,22 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.io.recordings.findings import printable
-from gsplat_core.io.sessions.log import Line
-from gsplat_core.io.sessions.records import FrameLine, LostLine, PreparedLine, ShownLine
-from gsplat_core.io.sessions.schedule import SCHEDULE_LINES, DepthTaken, ReconstructorMade, ScheduleLine
-from gsplat_core.io.sessions.segment_reader import FIELDS, SegmentPictures, SegmentReader, mask_of_nothing
-from gsplat_core.io.sessions.session_file import SEGMENTS_FOLDER, SESSION_FILE, camera_of, read_session_file
+from gsplat_core.io.sessions.records import (
+    SCHEDULE_LINES,
+    SEGMENTS_FOLDER,
+    SESSION_FILE,
+    DepthTaken,
+    FrameLine,
+    Line,
+    LostLine,
+    PreparedLine,
+    ReconstructorMade,
+    ScheduleLine,
+    ShownLine,
+    camera_of,
+    read_session_file,
+)
+from gsplat_core.io.sessions.segments import FIELDS, SegmentPictures, SegmentReader, mask_of_nothing
 from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 
 MOST_ARRIVED = 64

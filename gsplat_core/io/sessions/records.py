@@ -1,24 +1,28 @@
-"""The lines of a session's log: one JSON object each, with its kind under `event`.
+"""Records of a session's recording: the lines of its log, the schedule of training calls, and `session.json`.
 
-    segment      a segment begins                    frame      a frame came in
-    prepared     what training was given of it       shown      a picture was shown
-    lost         something could not be recorded     deleted    an older segment was removed
-    note         a sentence                          end        the segment is complete
-
-The lines that say what was trained, `reconstructor`, `observe`, `take_depth`, `grow`, `rehearse` and `begin_scene`, are in `schedule`. A reader leaves out
-lines whose `event` it does not know.
+A log is JSON lines, one object each with its kind under `event`. Each line is written by one system call, so only the last one can be cut. The schedule
+lists the training calls of a live session so that replay can repeat them.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from gsplat_core.errors import InvalidInput, RecordingInvalid
+from gsplat_core.io.files import PartialFile
+from gsplat_core.io.recordings.findings import printable
+from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
+from gsplat_core.scene.cameras import Camera
 
 MOST_NS = 2**62
 MAX_SIDE_PX = 65_536
 MAX_TEXT = 1_000
-
 Count = Annotated[int, Field(ge=0, le=MOST_NS)]
 Nanoseconds = Annotated[int, Field(ge=-MOST_NS, le=MOST_NS)]
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]
@@ -36,12 +40,9 @@ def _is_pose(rows: tuple[float, ...]) -> tuple[float, ...]:
 Pose = Annotated[tuple[Number, ...], Field(min_length=16, max_length=16), AfterValidator(_is_pose)]
 """[4, 4] row by row, OpenCV axes."""
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-
 TrackName = Literal["image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth", "depth_confidence", "shown"]
 Tracks = dict[TrackName, Count]
 """For each track that has a picture for this line, the time in milliseconds at which it lies in the track's file."""
-
-
 Origin = Literal["measured", "stereo", "parallax", "light"]
 """See `gsplat_core.scene.frames.DepthOrigin`."""
 
@@ -168,3 +169,199 @@ class SegmentEnds(Record):
     """"bytes" and "seconds": the next segment goes on; anything else: why the recording ends."""
     frames: Count
     """How many `frame` lines the segment has."""
+
+
+Steps = Annotated[int, Field(ge=0, le=10_000_000)]
+
+
+class ReconstructorMade(Record):
+    """A new reconstructor: at the beginning, and after an operator was restarted."""
+
+    event: Literal["reconstructor"] = "reconstructor"
+    device: Text
+    seed: Count
+    renderer: Text
+    config: dict[str, Any]
+    """The fields of `ReconstructorConfig`."""
+    training: dict[str, Any]
+    """The fields of `LiveTraining`."""
+    camera: CameraRecord
+    stereo: bool = False
+    """Whether it was prepared for frames of two eyes."""
+
+
+class SceneBegun(Record):
+    """`LiveReconstructor.begin_scene` was called."""
+
+    event: Literal["begin_scene"] = "begin_scene"
+    seq: Count
+
+
+class Observed(Record):
+    """`LiveReconstructor.observe` and then `publish` were called."""
+
+    event: Literal["observe"] = "observe"
+    seq: Count
+    steps: Steps
+    train: bool
+
+
+class DepthTaken(Record):
+    """`LiveReconstructor.take_depth` was called with a frame that was observed before, and with depth that was found since."""
+
+    event: Literal["take_depth"] = "take_depth"
+    seq: Count
+    origin: Origin
+    width_px: Side
+    height_px: Side
+    tracks: Tracks
+    """`depth`, and `depth_confidence` where there is any."""
+
+
+class Grown(Record):
+    """`LiveReconstructor.grow` was called with the frame that was observed last."""
+
+    event: Literal["grow"] = "grow"
+    seq: Count
+
+
+class Rehearsed(Record):
+    """`LiveReconstructor.rehearse` was called."""
+
+    event: Literal["rehearse"] = "rehearse"
+    steps: Steps
+
+
+ScheduleLine = ReconstructorMade | SceneBegun | Observed | DepthTaken | Grown | Rehearsed
+SCHEDULE_LINES = (ReconstructorMade, SceneBegun, Observed, DepthTaken, Grown, Rehearsed)
+LOG_FILE = "log.jsonl"
+MAX_LINE_BYTES = 1 << 20
+Line = (
+    SegmentBegins | FrameLine | PreparedLine | ShownLine | LostLine | DeletedLine | NoteLine | SegmentEnds
+    | ReconstructorMade | SceneBegun | Observed | DepthTaken | Grown | Rehearsed
+)  # fmt: skip
+_LINES: TypeAdapter[Line] = TypeAdapter(Annotated[Line, Field(discriminator="event")])
+_UNKNOWN_EVENT = "union_tag_invalid"
+
+
+class LogWriter:
+    """Appends lines to a new file. Raises OSError."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("xb", buffering=0)
+        self.bytes = 0
+
+    def write(self, line: Record) -> None:
+        """Append one line."""
+        data = line.line()
+        written = self._file.write(data)
+        self.bytes += written
+        if written != len(data):  # a disk that fills up takes the beginning; the next write says why
+            self.bytes += self._file.write(data[written:])
+
+    def sync(self) -> None:
+        """Force what was written to the disk."""
+        os.fdatasync(self._file.fileno())
+
+    def close(self) -> None:
+        """Closing twice is allowed."""
+        self._file.close()
+
+
+def read_log(path: Path) -> Iterator[Line]:
+    """The lines in order, up to the first one that is cut off or is not what a log holds. Lines of an unknown kind are left out.
+
+    Raises UnreadableFile, OSError.
+    """
+    with open_plain(path) as file:
+        while True:
+            data = file.readline(MAX_LINE_BYTES)
+            if not data.endswith(b"\n"):
+                return  # the end, or a line that was cut off, or one that is too long
+            try:
+                yield _LINES.validate_json(data)
+            except ValidationError as error:
+                if [each["type"] for each in error.errors(include_input=False)] != [_UNKNOWN_EVENT]:
+                    return
+
+
+SESSION_FILE = "session.json"
+SEGMENTS_FOLDER = "segments"
+FORMAT = "intrasplat-session"
+VERSION = 1
+MAX_BYTES = 1 << 20
+
+
+class SessionInfo(Record):
+    """The whole of `session.json`."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", strict=True, allow_inf_nan=False)
+
+    format: Literal["intrasplat-session"] = "intrasplat-session"
+    version: Literal[1] = 1
+    source: Text
+    """Where the frames came from, in words."""
+    utc: Text
+    """When the recording began: ISO 8601."""
+    fps: float = Field(gt=0, le=10_000)
+    """Nominal frames per second."""
+    camera: CameraRecord
+    """The camera of the first frame."""
+    fields: tuple[Literal["mask", "depth", "right_image", "pose"], ...] = ()
+    """What every frame of the source has."""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    """The settings of the run, for people and programs that know them."""
+    keeps_bytes: Count | None = None
+    """Segments beyond so many bytes are deleted, the oldest first; absent: none."""
+    keeps_s: float | None = Field(default=None, ge=0)
+    """Segments that ended longer ago are deleted; absent: none."""
+
+
+def camera_record(camera: Camera) -> CameraRecord:
+    """A camera as it is written."""
+    return CameraRecord(
+        model=camera.model,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        fx=float(camera.K[0, 0]),
+        fy=float(camera.K[1, 1]),
+        cx=float(camera.K[0, 2]),
+        cy=float(camera.K[1, 2]),
+        world_to_camera=tuple(camera.world_to_camera.ravel().tolist()),
+    )
+
+
+def camera_of(record: CameraRecord) -> Camera:
+    """The camera that was written. Raises InvalidInput for one that cannot be."""
+    K = np.array([[record.fx, 0, record.cx], [0, record.fy, record.cy], [0, 0, 1]])
+    pose = np.array(record.world_to_camera).reshape(4, 4)
+    return Camera(K, record.width_px, record.height_px, pose, record.model)
+
+
+def write_session_file(folder: Path, info: SessionInfo) -> None:
+    """Write it whole, in a folder where there is none yet. Raises FileExistsError, OSError."""
+    with PartialFile(folder / SESSION_FILE, overwrite=False) as partial:
+        partial.file.write(info.model_dump_json(indent=1, exclude_none=True).encode() + b"\n")
+
+
+def read_session_file(folder: Path) -> SessionInfo:
+    """Raises RecordingInvalid for what is no such file."""
+    path = folder / SESSION_FILE
+    try:
+        if os.path.islink(path):
+            raise UnreadableFile("it is a link")
+        with open_plain(path) as file:
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise UnreadableFile(f"it has more bytes than the bound of {MAX_BYTES}")
+        info = SessionInfo.model_validate_json(data)
+        camera_of(info.camera)
+    except (UnreadableFile, OSError, InvalidInput) as error:
+        raise RecordingInvalid(f"{printable(path)}: {error}. Copy the session again from its source.") from error
+    except ValidationError as error:
+        first = error.errors(include_input=False, include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise RecordingInvalid(
+            f"{printable(path)}: {where}: {first['msg']:.200}. This version reads {FORMAT} {VERSION}; copy the session again from its source."
+        ) from error
+    return info

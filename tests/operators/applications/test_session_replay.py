@@ -14,7 +14,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.sessions import SessionReader, WriterOptions
-from gsplat_core.io.sessions.schedule import DepthTaken, Observed, Rehearsed, SceneBegun
+from gsplat_core.io.sessions.records import DepthTaken, Observed, Rehearsed, SceneBegun
 from gsplat_core.scene.frames import Frame
 from operators.applications.live import LiveApplication
 from operators.applications.live_settings import LiveSettings

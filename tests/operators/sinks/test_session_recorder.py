@@ -16,8 +16,7 @@ import pytest
 
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.sessions import SessionReader, SessionWriter
-from gsplat_core.io.sessions.records import LostLine
-from gsplat_core.io.sessions.schedule import Observed
+from gsplat_core.io.sessions.records import LostLine, Observed
 from gsplat_core.io.sessions.writer import Shown
 from operators.errors import OutputError, StorageFull
 from operators.sinks import session_recorder

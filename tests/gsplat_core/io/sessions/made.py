@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsplat_core.io.sessions import SessionInfo, SessionWriter
-from gsplat_core.io.sessions.schedule import Observed, Rehearsed
-from gsplat_core.io.sessions.session_file import camera_record
+from gsplat_core.io.sessions.records import Observed, Rehearsed, camera_record
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus

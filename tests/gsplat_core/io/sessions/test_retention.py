@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from gsplat_core.io.sessions import SessionReader, SessionWriter, WriterOptions
-from gsplat_core.io.sessions import retention as retention_module
+from gsplat_core.io.sessions import writer as retention_module
 from gsplat_core.io.sessions.records import NoteLine
-from gsplat_core.io.sessions.retention import DELETING, finish_removals, remove_whole
+from gsplat_core.io.sessions.writer import DELETING, finish_removals, remove_whole
 from tests.gsplat_core.io.sessions.made import Clock, new_frame, session_info
 
 HOUR_S = 3600

@@ -13,8 +13,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.sessions import SessionReader, SessionWriter, WriterOptions
 from gsplat_core.io.sessions.reader import prepared_of
-from gsplat_core.io.sessions.records import DeletedLine, PreparedLine, ShownLine
-from gsplat_core.io.sessions.schedule import Observed
+from gsplat_core.io.sessions.records import DeletedLine, Observed, PreparedLine, ShownLine
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 from tests.gsplat_core.io.sessions.made import Clock, new_frame, same_frame, session_info

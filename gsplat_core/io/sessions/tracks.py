@@ -1,0 +1,339 @@
+"""Tracks of a session segment: pictures of one size in a Matroska file, each in a cluster of its own with a checksum.
+
+Pictures are coded without loss by FFV1 (RFC 9043), or for viewing by VP9. The reader first finds the pictures that are complete, then decodes the
+requested ones in order.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from array import array
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from fractions import Fraction
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import av
+import cv2
+import numpy as np
+from av.video.reformatter import ColorRange, Colorspace
+from numpy.typing import NDArray
+
+from gsplat_core.errors import InvalidInput
+from gsplat_core.io.recordings.containers import Container
+from gsplat_core.io.recordings.decoder import PictureDecoder, captured_log
+from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.io.recordings.matroska import whole_clusters
+from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
+from gsplat_core.io.recordings.video_index import open_container
+
+Coding = Literal["colour", "grey", "float", "vp9"]
+CODINGS: Mapping[str, Coding] = {
+    "image": "colour",
+    "right_image": "colour",
+    "mask": "grey",
+    "loss_mask": "grey",
+    "rehearsal_mask": "grey",
+    "depth": "float",
+    "depth_confidence": "float",
+    "shown": "colour",
+}
+"""How each track is coded; `shown` may be vp9."""
+PIXEL_FORMATS: Mapping[Coding, str] = {"colour": "bgr0", "grey": "gray", "float": "gray", "vp9": "yuv420p"}
+ENCODERS: Mapping[Coding, str] = {"colour": "ffv1", "grey": "ffv1", "float": "ffv1", "vp9": "libvpx-vp9"}
+_VP9 = {
+    "deadline": "realtime",
+    "cpu-used": "8",
+    "lag-in-frames": "0",
+    "row-mt": "1",
+    "tile-columns": "2",
+    "crf": "24",
+    "b": "0",
+}
+_FLOAT_BYTES = 4
+
+
+def encoder_options(coding: Coding, height_px: int, width_px: int) -> dict[str, str]:
+    """The encoder's options for pictures that are coded with these sides."""
+    if coding == "vp9":
+        return _VP9
+    # Four slices limit what a flipped bit destroys; a picture smaller than that has no room for them.
+    slices = "4" if min(height_px, width_px) >= 8 else "1"
+    return {"level": "3", "slices": slices, "slicecrc": "1", "g": "1"}
+
+
+def coded_size(coding: Coding, height_px: int, width_px: int) -> tuple[int, int]:
+    """Height and width of the pictures in the file."""
+    if coding == "vp9":
+        return height_px + height_px % 2, width_px + width_px % 2
+    return (_FLOAT_BYTES * height_px if coding == "float" else height_px), width_px
+
+
+def encoded(coding: Coding, picture: NDArray[Any]) -> av.VideoFrame:
+    """A picture as the encoder takes it. Raises InvalidInput for an array that the coding is not for."""
+    if coding == "colour":
+        _require(picture, np.uint8, 3)
+        frame = av.VideoFrame(picture.shape[1], picture.shape[0], "bgr0")
+        cv2.cvtColor(picture, cv2.COLOR_RGB2BGRA, dst=_pixels(frame, 4))
+        return frame
+    if coding == "vp9":
+        _require(picture, np.uint8, 3)
+        height, width = coded_size(coding, *picture.shape[:2])
+        padding = ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0))
+        even = np.pad(picture, padding, mode="edge") if any(map(any, padding)) else picture
+        planes = np.asarray(cv2.cvtColor(even, cv2.COLOR_RGB2YUV_I420), np.uint8)
+        return av.VideoFrame.from_ndarray(planes, format="yuv420p")
+    _require(picture, np.uint8 if coding == "grey" else np.float32, 2)
+    if coding == "float":
+        height, width = picture.shape
+        parts = np.ascontiguousarray(picture, "<f4").view(np.uint8).reshape(height, width, _FLOAT_BYTES)
+        picture = parts.transpose(2, 0, 1).reshape(_FLOAT_BYTES * height, width)
+    frame = av.VideoFrame(picture.shape[1], picture.shape[0], "gray")
+    np.copyto(_pixels(frame, 1)[..., 0], picture)
+    return frame
+
+
+def decoded(coding: Coding, frame: av.VideoFrame, height_px: int, width_px: int) -> NDArray[Any] | None:
+    """The picture [height_px, width_px]; None where the frame is not what this coding makes of such a picture."""
+    if frame.format.name != PIXEL_FORMATS[coding] or (frame.height, frame.width) != coded_size(
+        coding, height_px, width_px
+    ):
+        return None
+    if coding == "colour":
+        return np.asarray(cv2.cvtColor(_pixels(frame, 4), cv2.COLOR_BGRA2RGB), np.uint8)
+    if coding == "vp9":
+        planes = frame.to_ndarray(format="yuv420p")
+        picture = np.asarray(cv2.cvtColor(planes, cv2.COLOR_YUV2RGB_I420), np.uint8)
+        return np.ascontiguousarray(picture[:height_px, :width_px])
+    grey = _pixels(frame, 1)[..., 0]
+    if coding == "grey":
+        return grey.copy()
+    parts = grey.reshape(_FLOAT_BYTES, height_px, width_px).transpose(1, 2, 0)
+    return np.ascontiguousarray(parts).view("<f4").reshape(height_px, width_px).astype(np.float32, copy=False)
+
+
+def _require(picture: NDArray[Any], dtype: type, dimensions: int) -> None:
+    fits = picture.ndim == dimensions and picture.dtype == dtype and (dimensions == 2 or picture.shape[2] == 3)
+    if not fits or 0 in picture.shape:
+        raise InvalidInput(f"cannot record a picture {list(picture.shape)} of {picture.dtype}")
+
+
+def _pixels(frame: av.VideoFrame, channels: int) -> NDArray[np.uint8]:
+    """The first plane [H, W, channels], as it lies in the frame's memory."""
+    plane = frame.planes[0]
+    rows = np.frombuffer(memoryview(plane), np.uint8)[: plane.line_size * frame.height].reshape(
+        frame.height, plane.line_size
+    )
+    return rows[:, : channels * frame.width].reshape(frame.height, frame.width, channels)
+
+
+MOST_MS_AHEAD = 3_600_000
+"""A clock that jumps further ahead is followed so far: the log has the true times, the file's are for players."""
+_MS = Fraction(1, 1000)
+_MUXER = {
+    # Every packet leaves the process when it is muxed, as a cluster of its own with its CRC-32: a file that is cut loses only what
+    # comes after the cut. FFmpeg writes a cluster when the next one begins, so that one picture is always on its way.
+    "flush_packets": "1",
+    "cluster_time_limit": "0",
+}
+
+
+class TrackWriter:
+    """Codes pictures into a new file. Raises OSError and av.FFmpegError, after which only `abandon` may be called."""
+
+    def __init__(self, path: Path, coding: Coding, height_px: int, width_px: int, fps: float) -> None:
+        self.path, self.coding = path, coding
+        self.bytes = 0
+        """How much was written; the index that closing adds is not counted."""
+        self._last_ms = -1
+        self._file = path.open("xb", buffering=0)
+        self._container = av.open(self._file, mode="w", format="matroska", options=_MUXER)
+        height, width = coded_size(coding, height_px, width_px)
+        options = encoder_options(coding, height, width)
+        rate = Fraction(fps).limit_denominator(1001) or Fraction(30)
+        self._stream = cast(av.VideoStream, self._container.add_stream(ENCODERS[coding], rate=rate, options=options))
+        self._stream.height, self._stream.width = height, width
+        self._stream.pix_fmt = PIXEL_FORMATS[coding]
+        context = self._stream.codec_context
+        context.time_base = _MS
+        # One thread: coding goes on beside the graph and must not take more than its share.
+        context.thread_count = 1
+        if coding == "vp9":
+            context.gop_size = max(1, round(2 * fps))
+            context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.SMPTE170M
+        context.open()
+
+    def write(self, picture: NDArray[Any], wanted_ms: int) -> int:
+        """Add a picture; returns the time in milliseconds at which it lies in the file: `wanted_ms`, but always after the one before it."""
+        frame = encoded(self.coding, np.ascontiguousarray(picture))
+        self._last_ms += min(max(1, wanted_ms - self._last_ms), MOST_MS_AHEAD)
+        frame.pts, frame.time_base = self._last_ms, _MS
+        self._mux(frame)
+        return self._last_ms
+
+    def sync(self) -> None:
+        """Force what was written to the disk."""
+        os.fdatasync(self._file.fileno())
+
+    def close(self) -> None:
+        """Write the last picture, the index and the length, and force them to the disk."""
+        self._mux(None)
+        self._container.close()
+        self.sync()
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Let go of the file as it is."""
+        with suppress(OSError, av.FFmpegError):  # it could not be written before either
+            self._container.close()
+        self._file.close()
+
+    def _mux(self, frame: av.VideoFrame | None) -> None:
+        for packet in self._stream.encode(frame):
+            self.bytes += packet.size
+            self._container.mux(packet)
+
+
+_CODECS = ("ffv1", "vp9")
+_MOST_MS = 2**62
+MOST_PICTURES = 1_000_000
+"""In one file: nine hours at 30 pictures/s, where segments last minutes."""
+
+
+class TrackIndex:
+    """Which pictures of a track's file can be decoded: those in clusters that are whole, up to the first one that is not."""
+
+    def __init__(self, path: Path, *, check_sums: bool) -> None:
+        """check_sums: whether it ends before the first cluster whose checksum is wrong, too; that reads the whole file. Without it, such
+        clusters are noticed when they are decoded. Raises UnreadableFile, OSError."""
+        self.path, self.checked = path, check_sums
+        self.end = 0
+        self._times = array("q")
+        if path.is_symlink():
+            raise UnreadableFile("it is a link")
+        with open_plain(path) as file:
+            size = file.seek(0, io.SEEK_END)
+            for cluster in islice(whole_clusters(file, size, check_sums=check_sums), MOST_PICTURES):
+                rising = cluster.time < _MOST_MS and (not self._times or cluster.time > self._times[-1])
+                if not cluster.intact or not rising:  # our writer's times rise
+                    break
+                self._times.append(cluster.time)
+                self.end = cluster.end
+
+    def __contains__(self, time_ms: object) -> bool:
+        """Whether there is a picture at a time."""
+        assert isinstance(time_ms, int)
+        at = bisect_left(self._times, time_ms)
+        return at < len(self._times) and self._times[at] == time_ms
+
+    def damaged(self) -> frozenset[int]:
+        """The times of pictures whose checksum is wrong. Raises UnreadableFile, OSError."""
+        if self.checked:
+            return frozenset()
+        with open_plain(self.path) as file:
+            clusters = islice(whole_clusters(file, self.end, check_sums=True), MOST_PICTURES)
+            return frozenset(cluster.time for cluster in clusters if not cluster.intact)
+
+
+class TrackReader:
+    """Decodes pictures of one track; ask for them in the order of their times."""
+
+    def __init__(self, index: TrackIndex, track: str, height_px: int, width_px: int) -> None:
+        self._index, self._size = index, (height_px, width_px)
+        self._coding: Coding = CODINGS[track]
+        self._pictures: Iterator[tuple[int, NDArray[Any] | None, str | None]] | None = None
+        self._next: tuple[int, NDArray[Any] | None, str | None] | None = None
+
+    def picture(self, time_ms: int) -> tuple[NDArray[Any] | None, str | None]:
+        """The picture at a time, or None; and what is wrong with it. Raises UnreadableFile, OSError, av.FFmpegError."""
+        if self._pictures is None:
+            self._pictures = self._decode()
+            self._next = next(self._pictures, None)
+        while self._next is not None and self._next[0] < time_ms:
+            self._next = next(self._pictures, None)
+        if self._next is None or self._next[0] != time_ms:
+            return None, "its picture is missing"
+        return self._next[1:]
+
+    def close(self) -> None:
+        """Close the file."""
+        pictures, self._pictures, self._next = self._pictures, None, None
+        if pictures is not None:
+            pictures.close()  # type: ignore[attr-defined]
+
+    def _decode(self) -> Iterator[tuple[int, NDArray[Any] | None, str | None]]:
+        """Time, picture and damage of all pictures."""
+        with (
+            open_plain(self._index.path) as file,
+            open_container(_Beginning(file, self._index.end), Container("matroska")) as container,  # type: ignore[arg-type]
+        ):
+            if len(container.streams) != 1 or len(container.streams.video) != 1:
+                raise UnreadableFile(f"it holds {len(container.streams)} streams in place of one video")
+            stream = container.streams.video[0]
+            context = stream.codec_context
+            if context is None or context.codec.canonical_name not in _CODECS:
+                raise UnreadableFile("its video is neither FFV1 nor VP9")
+            if context.width * context.height > 4 * MAX_PIXELS:
+                raise UnreadableFile(f"frames of {context.width}x{context.height} exceed the bound of pixels")
+            coding: Coding = "vp9" if context.codec.canonical_name == "vp9" else self._coding
+            decoder, wrong = PictureDecoder(stream), self._index.damaged()
+            times: dict[int, int] = {}
+            for number, packet in enumerate(_packets(container, stream)):
+                if packet is not None:
+                    if packet.pts is None or packet.time_base is None:
+                        continue
+                    times[number] = round(packet.pts * packet.time_base * 1000)
+                for own, frame in decoder.decode(packet, number, True):
+                    picture = decoded(coding, frame, *self._size)
+                    damage = decoder.doubts.pop(own, None) if picture is not None else "it has another size or format"
+                    time = times.pop(own)
+                    yield time, picture, "the checksum of its part of the file is wrong" if time in wrong else damage
+                decoder.doubts.clear()
+
+
+def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.Packet | None]:
+    """The packets that hold data, and None at the end. What cannot be read ends them."""
+    packets = iter(container.demux(stream))
+    while True:
+        with captured_log():
+            try:
+                packet = next(packets, None)
+            except av.FFmpegError:
+                packet = None
+        if packet is None:
+            break
+        if packet.size:
+            yield packet
+    yield None
+
+
+class _Beginning(io.RawIOBase):
+    """The first bytes of a file, as if it ended there."""
+
+    def __init__(self, file: io.BufferedIOBase | Any, end: int) -> None:
+        self._file, self._end, self._at = file, end, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def read(self, size: int = -1) -> bytes:
+        left = max(0, self._end - self._at)
+        self._file.seek(self._at)
+        data: bytes = self._file.read(left if size < 0 else min(size, left))
+        self._at += len(data)
+        return data
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._end}[whence]
+        self._at = max(0, base + offset)
+        return self._at
