@@ -38,7 +38,7 @@ from gsplat_core.evaluation.geometry import Geometry
 from gsplat_core.geometry.odometry import trajectory_of
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
-from gsplat_core.io.recordings.poses_file import POSES_FILE, write_poses
+from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.io.recordings.truth import open_truth
 from operators.applications.geometry import SeenFromAnywhere, measure_geometry

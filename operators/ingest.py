@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.io.recordings.decoded import DamagedFrames
+from gsplat_core.io.recordings.plain_files import DamagedFrames
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder

@@ -20,7 +20,7 @@ from gsplat_core.io.exports.export import TIMES_FILE
 from gsplat_core.io.exports.files import ROW
 from gsplat_core.io.files import open_regular
 from gsplat_core.io.ply import MARK_LINE
-from gsplat_core.io.recordings.poses_file import TRAILER
+from gsplat_core.io.recordings.calibration import TRAILER
 
 _MOST_JSON_BYTES = 64 << 20
 

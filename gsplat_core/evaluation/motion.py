@@ -18,8 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.io.recordings.true_motion import MotionFiles, TrueMotion
-from gsplat_core.io.recordings.truth import Tracks
+from gsplat_core.io.recordings.truth import MotionFiles, Tracks, TrueMotion
 from gsplat_core.rendering.rasterization import rasterization
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame

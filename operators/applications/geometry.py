@@ -9,8 +9,8 @@ import numpy as np
 
 from gsplat_core.evaluation.geometry import Geometry, evaluate_geometry
 from gsplat_core.evaluation.protocols import Picture, PictureMaker
+from gsplat_core.io.recordings.calibration import read_poses
 from gsplat_core.io.recordings.findings import Findings
-from gsplat_core.io.recordings.poses_file import read_poses
 from gsplat_core.io.recordings.truth import GroundTruth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame

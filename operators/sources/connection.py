@@ -9,9 +9,8 @@ from fractions import Fraction
 
 import av
 
-from gsplat_core.io.recordings.decoded import DEPENDS
 from gsplat_core.io.recordings.decoder import PictureConverter, PictureDecoder, captured_log, frame_rate
-from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.io.recordings.plain_files import DEPENDS, MAX_PIXELS
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 KEPT_PACKETS = 256

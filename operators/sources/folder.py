@@ -8,9 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.recordings.decoded import Picture
-from gsplat_core.io.recordings.image_files import decode_picture
-from gsplat_core.io.recordings.plain_files import UnreadableFile
+from gsplat_core.io.recordings.plain_files import Picture, UnreadableFile, decode_picture
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.errors import SourceUnavailable
 from operators.sources.address import Address

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from pathlib import Path
 
-from gsplat_core.io.recordings.image_files import IMAGE_SUFFIXES, natural_key
+from gsplat_core.io.recordings.plain_files import IMAGE_SUFFIXES, natural_key
 
 SHARE = 10
 """Looking through a large folder takes long: it is done so many times as seldom as it takes."""

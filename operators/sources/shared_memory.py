@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.io.recordings.plain_files import MAX_PIXELS
 
 SLOTS = 4
 """Frames that may be under way at once."""

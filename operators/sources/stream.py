@@ -11,7 +11,7 @@ import numpy as np
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
 from gsplat_core.io.recordings.frame_files import resized_frame
-from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.io.recordings.plain_files import MAX_PIXELS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.sources.live import STALLED_AFTER_S, LiveSource

@@ -13,8 +13,8 @@ from typing import Any
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.files import PartialFile, open_regular, read_regular
-from gsplat_core.io.recordings.eyes import split_eyes
-from gsplat_core.io.recordings.poses_file import POSES_FILE
+from gsplat_core.io.recordings.calibration import POSES_FILE
+from gsplat_core.io.recordings.layouts import split_eyes
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES
 from operators.output_folder import is_whole_output
 from operators.output_paths import DESCRIPTIONS

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsplat_core.io.recordings.poses_file import write_poses
+from gsplat_core.io.recordings.calibration import write_poses
 from operators.errors import OutputError, OutputFolderInUse
 from operators.output_folder import OutputFolder
 from operators.output_paths import check_file_path

@@ -16,7 +16,7 @@ import pytest
 
 from gsplat_core.errors import RecordingError, RecordingInvalid, RecordingMissing
 from gsplat_core.io.recordings import open_recording, validate_recording
-from gsplat_core.io.recordings.image_files import MAX_PIXELS
+from gsplat_core.io.recordings.plain_files import MAX_PIXELS
 
 SIZE = 32
 

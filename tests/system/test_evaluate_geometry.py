@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.io.recordings import open_recording, synthesize
-from gsplat_core.io.recordings.poses_file import write_poses
+from gsplat_core.io.recordings.calibration import write_poses
 from gsplat_core.io.recordings.synthetic.extras import Extras
 from services.cli.app import run
 from services.reports.evaluation_schema import EvaluationReport

@@ -19,10 +19,9 @@ from gsplat_core.errors import RecordingInvalid
 from gsplat_core.geometry.rectification import Rectification
 from gsplat_core.io.recordings.ahead import read_ahead
 from gsplat_core.io.recordings.calibration import Calibration
-from gsplat_core.io.recordings.decoded import Picture
 from gsplat_core.io.recordings.findings import Findings, printable
 from gsplat_core.io.recordings.frame_files import DepthFiles, MaskFiles
-from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
+from gsplat_core.io.recordings.plain_files import Picture, UnreadableFile, open_plain
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 

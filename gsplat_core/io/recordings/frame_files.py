@@ -10,18 +10,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.io.recordings.arrays import ArrayHeader, read_array, read_header
-from gsplat_core.io.recordings.decoded import Picture
 from gsplat_core.io.recordings.findings import Findings
-from gsplat_core.io.recordings.image_files import (
+from gsplat_core.io.recordings.plain_files import (
     MAX_PIXELS,
+    ArrayHeader,
+    Picture,
+    UnreadableFile,
     UnreadableImage,
     decode_picture,
     decode_plane,
     frame_number,
     image_size,
+    read_array,
+    read_header,
 )
-from gsplat_core.io.recordings.plain_files import UnreadableFile
 from gsplat_core.scene.frames import Frame
 
 POLARITY_SAMPLES = 16

@@ -1,42 +1,206 @@
-"""Recognising a recording by what lies in its folder.
+"""Recognition of a recording's layout by the files in its folder.
 
-| what is there                                     | layout     | read as                                               |
+| files                                             | layout     | read as                                               |
 |---------------------------------------------------|------------|-------------------------------------------------------|
-| a video, alone or in a folder                     | `video`    | beside it `masks/`, `depth/`, `poses_bounds.npy`, …   |
+| a video, alone or in a folder                     | `video`    | with `masks/`, `depth/`, `poses_bounds.npy`, …        |
 | `cameras.json`                                    | `cameras`  | the images it names, K, camera_to_world, `valid_mask` |
 | `images/`                                         | `endonerf` | `masks/ depth/ images_right/ poses_bounds.npy`        |
 | image files                                       | `images`   | a stated default camera                               |
 | images or videos named for the left and right eye | `images`, `video` | a stereo pair                                  |
-| `session.json`                                    | `session`  | what came in during a live session, with its own times |
+| `session.json`                                    | `session`  | the frames of a live session, with their own times    |
 
-The sidecars mean the same in every layout and each is optional. `recording.json`, which `synthesize` writes, adds what
-the layouts cannot say: frame rate, camera, unit of depth, stereo baseline.
+The sidecars mean the same in every layout and each is optional. `recording.json`, which `synthesize` writes, adds frame rate, camera, unit of depth and
+stereo baseline.
 """
 
 from __future__ import annotations
 
+import os
+import re
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from gsplat_core.geometry.rectification import Rectification
-from gsplat_core.io.recordings.calibration import Calibration, default_calibration
-from gsplat_core.io.recordings.cameras_json import read_cameras_json
+from gsplat_core.io.recordings.calibration import (
+    POSES_FILE,
+    Calibration,
+    default_calibration,
+    invert_poses,
+    number,
+    read_json,
+    read_pinhole,
+    rectified_by_file,
+)
 from gsplat_core.io.recordings.contents import Contents, FrameImages
-from gsplat_core.io.recordings.eyes import split_eyes
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.frame_files import ImageFiles, check_sizes
-from gsplat_core.io.recordings.image_files import list_images
-from gsplat_core.io.recordings.numbering import frame_times
-from gsplat_core.io.recordings.plain_files import all_stay_inside, stays_inside
-from gsplat_core.io.recordings.poses_file import POSES_FILE
+from gsplat_core.io.recordings.plain_files import (
+    UnreadableFile,
+    all_stay_inside,
+    check_plain,
+    frame_number,
+    list_images,
+    stays_inside,
+)
 from gsplat_core.io.recordings.sidecars import DESCRIPTION_FILE, Beside
-from gsplat_core.io.recordings.stereo_calibration import rectified_by_file
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES, open_video
 
 if TYPE_CHECKING:
     from gsplat_core.io.sessions.contents import SessionContents
+
+
+_LEFT = re.compile(r"(?<![a-z])(left|l)(?![a-z])", re.IGNORECASE)
+_RIGHT = re.compile(r"(?<![a-z])(right|r)(?![a-z])", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Eyes:
+    """Files by the eye that their names say."""
+
+    left: tuple[Path, ...]
+    right: tuple[Path, ...]
+    """As many, each the one of the left file at its place."""
+    others: tuple[Path, ...]
+    """Of neither eye."""
+
+
+def split_eyes(files: Sequence[Path]) -> Eyes | None:
+    """The files of either eye, in their order; None where there are no pairs, or a file of one eye lacks that of the other."""
+    lefts = {_key(_LEFT, path): path for path in files if _LEFT.search(path.stem)}
+    rights = {_key(_RIGHT, path): path for path in files if _RIGHT.search(path.stem) and not _LEFT.search(path.stem)}
+    if not lefts or lefts.keys() != rights.keys():
+        return None
+    named = {*lefts.values(), *rights.values()}
+    if len(named) != 2 * len(lefts) or len(named) < sum(
+        bool(_LEFT.search(p.stem) or _RIGHT.search(p.stem)) for p in files
+    ):
+        return None
+    others = tuple(path for path in files if path not in named)
+    return Eyes(tuple(lefts.values()), tuple(rights[key] for key in lefts), others)
+
+
+def _key(eye: re.Pattern[str], path: Path) -> str:
+    return eye.sub("*", path.stem, count=1) + path.suffix
+
+
+def frame_times(files: Sequence[Path], findings: Findings) -> tuple[float, ...] | None:
+    """When each image was taken, in frame durations from the first one on; None: one after the other.
+
+    The most common step between two numbers is one frame's duration, so that every tenth frame of a longer recording is evenly
+    spaced. A gap is kept as a gap in time, with a note. Two images with one number are a problem.
+    """
+    numbers = [number for path in files if (number := frame_number(path)) is not None]
+    if len(numbers) < len(files) or len(set(numbers)) < 2:
+        return None  # names without numbers, or one number that is part of every name
+    for earlier, later, first, second in zip(numbers, numbers[1:], files, files[1:], strict=False):
+        if later <= earlier:
+            findings.problem(
+                second,
+                f"its number {later} does not follow the number {earlier} of {first.name}",
+                "Keep one image for each number, in one sequence",
+            )
+            return None
+    steps = [later - earlier for earlier, later in pairwise(numbers)]
+    step = Counter(steps).most_common(1)[0][0]
+    gaps = [index for index, wide in enumerate(steps) if wide != step]
+    if not gaps:
+        return None
+    first, second = files[gaps[0]], files[gaps[0] + 1]
+    findings.warn(
+        files[0].parent,
+        f"image numbers skip {len(gaps)} time{'s' * (len(gaps) > 1)}, first from {first.name} to {second.name}",
+        "The frames that are not there are left out as a gap in time",
+    )
+    return tuple((number - numbers[0]) / step for number in numbers)
+
+
+MAX_NAME = 512
+"""Longest file name, folders included."""
+
+
+def read_cameras_json(root: Path, findings: Findings) -> tuple[ImageFiles, Calibration] | None:
+    """The images that `cameras.json` names, in its order, and their cameras."""
+    path = root / "cameras.json"
+    content = read_json(path, findings)
+    if content is None:
+        return None
+    camera = read_pinhole(path, content, findings)
+    entries = content.get("frames")
+    if not isinstance(entries, list) or not entries:
+        findings.problem(path, f"frames is {entries!r:.40}", 'Give a list of {"file": …, "camera_to_world": 4x4}')
+        return None
+    if camera is None:
+        return None
+    files: list[Path] = []
+    poses: list[Any] = []
+    for index, entry in enumerate(entries):
+        entry = entry if isinstance(entry, dict) else {}
+        file = _inside(root, entry.get("file"), path, index, findings)
+        pose = _pose(entry.get("camera_to_world"), path, index, findings)
+        if file is None or pose is None:
+            return None
+        files.append(file)
+        poses.append(pose)
+    size = (camera.width_px, camera.height_px)
+    world_to_camera = invert_poses(np.stack(poses)[:, :3], path, findings)
+    if world_to_camera is None or check_sizes(files, size, "image", findings) is None:
+        return None
+    fps = stated = content.get("fps", content.get("fps_assumed"))
+    if stated is not None:
+        fps = number(stated)
+        if fps is None or not 0.1 <= fps <= 1000:
+            findings.problem(path, f"the frame rate is {stated!r:.40}", "Give frames per second from 0.1 to 1000")
+            return None
+    calibration = Calibration(camera.with_pose(world_to_camera[0]), world_to_camera, path.name)
+    return ImageFiles(files, *size, fps), calibration
+
+
+def _pose(value: object, path: Path, index: int, findings: Findings) -> np.ndarray | None:
+    try:
+        pose = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pose = np.empty(0)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all() or pose[3].tolist() != [0, 0, 0, 1]:
+        findings.problem(
+            path,
+            f"camera_to_world of frame {index} is {value!r:.60}",
+            "Give 4 rows of 4 finite numbers, the last of them 0 0 0 1",
+        )
+        return None
+    return pose
+
+
+def _inside(root: Path, name: object, path: Path, index: int, findings: Findings) -> Path | None:
+    """The file that a document names, held inside the folder: no absolute path, no `..`, no link that leads out."""
+    relative = isinstance(name, str) and 0 < len(name) <= MAX_NAME and "\0" not in name
+    if relative:
+        posix, windows = PurePosixPath(str(name)), PureWindowsPath(str(name))
+        relative = not posix.is_absolute() and not windows.anchor and ".." not in (*posix.parts, *windows.parts)
+    if not relative:
+        findings.problem(
+            path, f"the file of frame {index} is {name!r:.80}", "Give a path inside the recording's folder"
+        )
+        return None
+    file = root / str(name)
+    try:
+        missing = not os.path.lexists(file)
+        check_plain(file)
+    except (UnreadableFile, ValueError) as error:
+        findings.problem(
+            file,
+            f"frame {index} cannot be read: {error}",
+            "Export it again, or drop it from cameras.json",
+            missing=missing,
+        )
+        return None
+    return file if stays_inside(root, file, findings) else None
+
 
 DEFAULT_FPS = 30.0
 _LAYOUTS = "a video, a folder with video.mp4, with images/ (EndoNeRF), with images and cameras.json, or with images"

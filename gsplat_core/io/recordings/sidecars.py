@@ -14,13 +14,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.io.recordings.calibration import Calibration, number, read_json, read_pinhole, read_poses_bounds
+from gsplat_core.io.recordings.calibration import (
+    POSES_FILE,
+    Calibration,
+    number,
+    read_json,
+    read_pinhole,
+    read_poses,
+    read_poses_bounds,
+)
 from gsplat_core.io.recordings.contents import FrameImages
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.frame_files import DepthFiles, ImageFiles, MaskFiles, check_pairing, check_sizes
-from gsplat_core.io.recordings.image_files import decode_plane, list_images
-from gsplat_core.io.recordings.plain_files import UnreadableFile, all_stay_inside, stays_inside
-from gsplat_core.io.recordings.poses_file import POSES_FILE, read_poses
+from gsplat_core.io.recordings.plain_files import (
+    UnreadableFile,
+    all_stay_inside,
+    decode_plane,
+    list_images,
+    stays_inside,
+)
 
 RECORDING_FORMAT = "intrasplat-recording"
 RECORDING_VERSION = 1

@@ -15,8 +15,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.io.recordings.image_files import MAX_PIXELS
-from gsplat_core.io.recordings.plain_files import UnreadableFile
+from gsplat_core.io.recordings.plain_files import MAX_PIXELS, UnreadableFile
 from gsplat_core.io.sessions.records import (
     LOG_FILE,
     DepthTaken,

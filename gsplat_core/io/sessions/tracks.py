@@ -24,12 +24,10 @@ from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.io.recordings.containers import Container
 from gsplat_core.io.recordings.decoder import PictureDecoder, captured_log
-from gsplat_core.io.recordings.image_files import MAX_PIXELS
-from gsplat_core.io.recordings.matroska import whole_clusters
-from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
-from gsplat_core.io.recordings.video_index import open_container
+from gsplat_core.io.recordings.packets import Container, whole_clusters
+from gsplat_core.io.recordings.plain_files import MAX_PIXELS, UnreadableFile, open_plain
+from gsplat_core.io.recordings.video import open_container
 
 Coding = Literal["colour", "grey", "float", "vp9"]
 CODINGS: Mapping[str, Coding] = {

@@ -12,7 +12,7 @@ import pytest
 from gsplat_core.geometry import registry
 from gsplat_core.geometry.key_frames import ParallaxDepth
 from gsplat_core.io.recordings import is_heldout
-from gsplat_core.io.recordings.poses_file import write_poses
+from gsplat_core.io.recordings.calibration import write_poses
 from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.result import RunOutcome

@@ -11,7 +11,7 @@ from gsplat_core.io.recordings.synthetic.extras import CLEAR
 from gsplat_core.io.recordings.synthetic.files import DEPTH_UNIT_MM, FrameFiles
 from gsplat_core.io.recordings.synthetic.scene import BASELINE_MM
 from gsplat_core.io.recordings.synthetic.target import GENERATOR
-from gsplat_core.io.recordings.views import VIEWS_FILE, VIEWS_FORMAT, VIEWS_VERSION
+from gsplat_core.io.recordings.truth import VIEWS_FILE, VIEWS_FORMAT, VIEWS_VERSION
 from gsplat_core.scene.cameras import Camera
 
 _ALWAYS = {

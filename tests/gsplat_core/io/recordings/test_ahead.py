@@ -11,7 +11,7 @@ import pytest
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.ahead import read_ahead
-from gsplat_core.io.recordings.image_files import quiet_decoder
+from gsplat_core.io.recordings.plain_files import quiet_decoder
 
 NAME = "read ahead in a test"
 

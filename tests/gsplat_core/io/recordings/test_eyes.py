@@ -10,7 +10,7 @@ import pytest
 
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.io.recordings.eyes import split_eyes
+from gsplat_core.io.recordings.layouts import split_eyes
 from tests.gsplat_core.io.recordings.test_stereo_calibration import scared_json
 
 

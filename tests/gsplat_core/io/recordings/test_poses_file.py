@@ -9,7 +9,7 @@ import pytest
 
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings import open_recording, synthesize
-from gsplat_core.io.recordings.poses_file import write_poses
+from gsplat_core.io.recordings.calibration import write_poses
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import RecordingInvalid
-from gsplat_core.io.recordings.true_motion import open_motion
+from gsplat_core.io.recordings.truth import open_motion
 from gsplat_core.scene.frames import Frame
 
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import RecordingError
-from gsplat_core.io.recordings.truth import open_truth
-from gsplat_core.io.recordings.views import open_views
+from gsplat_core.io.recordings.truth import open_truth, open_views
 from tests.gsplat_core.io.recordings.conftest import HEIGHT, WIDTH, write_images
 
 CAMERA = {"width": WIDTH, "height": HEIGHT, "fx": 50.0, "fy": 50.0, "cx": WIDTH / 2, "cy": HEIGHT / 2}
