@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,8 @@ KNOWN: Mapping[str, tuple[str, ...]] = {
     "depth": ("auto", "recorded", "stereo", "light", "parallax", "onnx", "none"),
 }
 """Names that the engine's registries have, which load torch. A test holds them against the registries."""
+WITH_FILE = frozenset({"onnx"})
+"""Names of `KNOWN` that a file follows, as in `onnx:/models/depth.onnx`."""
 NVIDIA = Path("/proc/driver/nvidia/gpus")
 
 
@@ -35,8 +37,8 @@ def spec_of(stream: NewStream) -> StreamSpec:
     device, gpu = _device(stream.device)
     check_source_options(stream.source)
     for name, known in KNOWN.items():
-        if name in options and str(options[name]).partition(":")[0] not in known:
-            raise InvalidSetting(f"{name} is {options[name]!r:.60}; choose {', '.join(known)}")
+        if name in options:
+            _check_choice(name, options[name], known)
     try:
         return StreamSpec(
             name=stream.name,
@@ -46,6 +48,21 @@ def spec_of(stream: NewStream) -> StreamSpec:
     except ValidationError as error:
         first = error.errors(include_input=False)[0]
         raise InvalidSetting(f"{first['loc'][-1]}: {first['msg']}") from None
+
+
+def _check_choice(option: str, given: Any, known: Sequence[str]) -> None:
+    """Raise InvalidSetting for a name that is not known, a name without the file that it needs, and a file after a name that takes none."""
+    name, colon, file = str(given).partition(":")
+    if name not in known or not isinstance(given, str):
+        raise InvalidSetting(f"{option} is {given!r:.60}; choose {', '.join(known)}")
+    if name not in WITH_FILE and colon:
+        raise InvalidSetting(f"{option} is {given!r:.60}; nothing follows {name}, write {name!r}")
+    if name in WITH_FILE and not Path(file).is_absolute():
+        raise InvalidSetting(
+            f"{option} is {given!r:.60}; give the absolute path of a file, as {name}:/models/{option}.onnx"
+        )
+    if name in WITH_FILE and not (Path(file).suffix == ".onnx" and Path(file).is_file()):
+        raise InvalidSetting(f"{option}: {file!r:.200} is no file of the server that ends in .onnx; check the path")
 
 
 def gpus() -> int:

@@ -47,6 +47,33 @@ def test_options_that_cannot_be_are_refused_with_what_is_wrong(options, said):
         spec_of(wanted(**options))
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [(name, value) for name in ("scale", "fps", "engine_scale", "seed", "budget_ms") for value in (True, False, "1", "nan", float("nan"), float("inf"), 1e400, -1, 10**30)]
+    + [("loop", value) for value in (0, 1, "yes", "true", 1.0)]
+    + [(name, value) for name in ("eyes", "poses", "out_of_body", "field", "renderer") for value in (True, 1, "", "x")],
+)  # fmt: skip
+def test_a_value_of_another_type_or_range_is_refused_and_not_converted(option, value):
+    with pytest.raises(InvalidSetting, match=option):
+        spec_of(wanted(**{option: value}))
+
+
+@pytest.mark.parametrize("option", ["tool_mask", "depth"])
+@pytest.mark.parametrize(
+    "value",
+    ["onnx", "onnx:", "onnx:a.onnx", "onnx:../a.onnx", "onnx:/etc/passwd", "onnx:/none.onnx", "recorded:1", "none:"],
+)
+def test_only_networks_are_followed_by_a_file_and_it_must_be_there(option, value):
+    with pytest.raises(InvalidSetting, match=option):
+        spec_of(wanted(**{option: value}))
+
+
+def test_a_network_of_the_server_is_taken(tmp_path):
+    network = tmp_path / "tools.onnx"
+    network.write_bytes(b"")
+    assert spec_of(wanted(tool_mask=f"onnx:{network}")).engine.tool_mask == f"onnx:{network}"
+
+
 def process(state, reason="", **figures):
     return ProcessState(state, reason, 1, 0, figures, 0.1)
 
