@@ -26,12 +26,11 @@ class HeadLength:
         if scope["type"] == "lifespan" or length_of(scope) <= MOST_HEAD_BYTES:
             return await self._app(scope, receive, send)
         self._measures.refused.labels("head").inc()
-        if scope["type"] == "websocket":
-            await receive()  # websocket.connect
-            return await send({"type": "websocket.close", "code": 1009})  # before it is accepted: 403 to the client
         problem = HeadTooLarge(
             f"the head of the request has {length_of(scope)} bytes; at most {MOST_HEAD_BYTES} are taken"
         )
+        if scope["type"] == "websocket":
+            await receive()  # websocket.connect
         await response_of(problem, scope)(scope, receive, send)
 
 

@@ -18,6 +18,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from services.control.certificate import ServerCertificate
 from services.control.connections import AddressBound, BoundedListener
 from services.control.errors import CannotServe
+from services.control.handshakes import AnsweredHandshakes
 from services.control.heads import MOST_HEAD_BYTES
 from services.control.probe import ProbeListener
 from services.control.state import ControlState
@@ -91,7 +92,7 @@ def config_of(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
         app,
         http=with_head_limits(settings.limits.head_s),
         loop="asyncio",  # it accepts by the listener's own method, which counts
-        ws="websockets-sansio",
+        ws=AnsweredHandshakes,
         ws_max_size=MOST_MESSAGE_BYTES,
         ws_per_message_deflate=False,  # the pictures are compressed
         log_config=None,

@@ -255,6 +255,40 @@ def test_a_head_in_one_piece_is_bounded(served):
     assert b"HTTP/1.1 431" in answer(tcp(port), twice)
 
 
+HANDSHAKE = (
+    b"GET /v1/streams/x/display HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+)
+
+
+def test_a_handshake_that_cannot_be_taken_is_answered_and_closed(served):
+    """Whether the HTTP parser, the WebSocket parser or the application refuses it, no connection stays open without an answer."""
+    _, bound, port, _ = served()
+    line = b"X-Long: " + 20_000 * b"a" + b"\r\n"
+    lines = b"".join(b"X-%d: a\r\n" % number for number in range(300))
+    total = b"".join(b"X-%d: " % number + 7000 * b"a" + b"\r\n" for number in range(6))
+    for extra, status in (
+        (b"", b"401"),
+        (line, b"431"),
+        (lines, b"431"),
+        (total, b"431"),
+        (4 * line, b"431"),
+        (10 * line, b"431"),
+        (b"Content-Length: 5\r\n", b"400"),
+        (b"Transfer-Encoding: chunked\r\n", b"400"),
+        (b"Host: localhost\r\n", b"400"),
+    ):
+        found = answer(tcp(port), HANDSHAKE.replace(b"Host", extra + b"Host", 1))
+        assert found.startswith(b"HTTP/1.1 " + status), (extra[:40], found[:80])
+    long = HANDSHAKE.replace(b"/display", b"/display?" + 9000 * b"a")
+    assert answer(tcp(port), long).startswith(b"HTTP/1.1 431")
+    for _ in range(100):
+        if not bound.open("127.0.0.1"):
+            break
+        time.sleep(0.02)
+    assert bound.open("127.0.0.1") == 0
+
+
 def test_a_refused_upload_gets_its_answer_though_it_sends_everything_first(served):
     _, _, port, _ = served(model_bytes=2**20)
     size = 24 * 2**20
