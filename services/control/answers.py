@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import anyio
 from fastapi import FastAPI
-from fastapi.exceptions import RequestValidationError
+from fastapi.exceptions import RequestValidationError, WebSocketRequestValidationError
 from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
@@ -85,7 +85,7 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
         return await _answer(connection, BadRequest("the connection was closed before the whole body had come"))
 
     async def on_invalid(connection: HTTPConnection, error: Exception) -> Response | None:
-        assert isinstance(error, RequestValidationError)
+        assert isinstance(error, RequestValidationError | WebSocketRequestValidationError)
         return await _answer(connection, _of_validation(error))
 
     async def on_known(connection: HTTPConnection, error: Exception) -> Response | None:
@@ -100,7 +100,8 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
     app.add_exception_handler(ClientDisconnect, on_left)  # type: ignore[arg-type]
     app.add_exception_handler(Problem, on_problem)  # type: ignore[arg-type]
     app.add_exception_handler(HTTPException, on_http)  # type: ignore[arg-type]
-    app.add_exception_handler(RequestValidationError, on_invalid)  # type: ignore[arg-type]
+    for invalid in (RequestValidationError, WebSocketRequestValidationError):
+        app.add_exception_handler(invalid, on_invalid)  # type: ignore[arg-type]
 
 
 def _methods_of(app: FastAPI, connection: HTTPConnection) -> str:
@@ -110,7 +111,7 @@ def _methods_of(app: FastAPI, connection: HTTPConnection) -> str:
     return ", ".join(sorted({method for each in routes for method in getattr(each, "methods", None) or ()}))
 
 
-def _of_validation(error: RequestValidationError) -> Problem:
+def _of_validation(error: RequestValidationError | WebSocketRequestValidationError) -> Problem:
     """Where and what, without the values: they may be secrets, and the caller has them."""
     errors = [{"at": ".".join(str(part) for part in each["loc"]), "what": each["msg"]} for each in error.errors()]
     said = "; ".join(f"{each['at']}: {each['what']}" for each in errors[:3])

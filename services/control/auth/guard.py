@@ -83,8 +83,7 @@ class GuardedRoute(APIRoute):
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handle = super().get_route_handler()
         rule = rule_of(self.endpoint)
-        known = _query_names(self.dependant)
-        known |= {"ticket"} if rule.ticket else set()
+        known = _known_parameters(self.dependant, rule)
         takes = rule.takes or (JSON if self.body_field is not None else None)
 
         async def guarded(request: Request) -> Response:
@@ -108,9 +107,12 @@ def new_router(tag: str, prefix: str = "/v1") -> APIRouter:
 
 
 async def _caller_of(connection: HTTPConnection) -> Caller:
-    """Who makes this request. A WebSocket is guarded here: it has no body, and its route no handler to wrap."""
+    """Return the caller of this request. A WebSocket is guarded here: it has no body, and its route has no handler to wrap."""
     if connection.scope["type"] == "websocket":
-        return await _admit(connection, rule_of(connection.scope["endpoint"]), control_of(connection))
+        rule = rule_of(connection.scope["endpoint"])
+        admitted = await _admit(connection, rule, control_of(connection))
+        _refuse_unknown(connection, _known_parameters(connection.scope["route"].dependant, rule))
+        return admitted
     caller: Caller = connection.scope["state"]["caller"]
     return caller
 
@@ -193,12 +195,22 @@ def _query_names(dependant: Any) -> set[str]:
     return own.union(*(_query_names(each) for each in dependant.dependencies))
 
 
-def _refuse_unknown(request: Request, known: set[str]) -> None:
-    """Raise Unprocessable for a parameter that the route does not have: it would be passed over, and the answer be to another question."""
-    for name in request.query_params:
+def _known_parameters(dependant: Any, rule: Rule) -> set[str]:
+    return _query_names(dependant) | ({"ticket"} if rule.ticket else set())
+
+
+def _refuse_unknown(connection: HTTPConnection, known: set[str]) -> None:
+    """Raise Unprocessable for a query parameter that the route does not have, and for one that is given twice.
+
+    Either would be ignored, and the answer would be to another question.
+    """
+    given = [name for name, _ in connection.query_params.multi_items()]
+    for name in given:
         if name not in known:
             taken = f"it takes {', '.join(sorted(known))}" if known else "it has none"
             raise Unprocessable(f"this path has no parameter {name!r:.60}; {taken}")
+        if given.count(name) > 1:
+            raise Unprocessable(f"the parameter {name} is given {given.count(name)} times; give it once")
 
 
 def _check_content_type(request: Request, takes: str) -> None:

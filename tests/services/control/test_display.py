@@ -76,6 +76,30 @@ def test_no_pictures_without_a_ticket(watched, display, query):
     assert display.asked == []
 
 
+@pytest.mark.parametrize(
+    ("query", "said"),
+    [
+        ("?x=1", "no parameter 'x'"),
+        ("?Kind=raw", "no parameter 'Kind'"),
+        ("?kind=raw&kind=depth", "kind is given 2 times"),
+        ("?quality=50&quality=50", "quality is given 2 times"),
+        ("?quality=nan", "quality"),
+        ("?quality=96", "quality"),
+        ("?quality=-1", "quality"),
+        ("?kind=", "kind"),
+        ("?kind=everything", "kind"),
+    ],
+)
+def test_parameters_are_checked_on_both_ways_to_watch(watched, display, query, said):
+    over_http = watched.ask("GET", MJPEG + query)
+    refused_socket = pytest.raises(WebSocketDenialResponse)
+    with refused_socket as refused, watched.client.websocket_connect(SOCKET + query, headers=watched.headers()):
+        pass
+    for answer in (over_http, refused.value):
+        assert answer.status_code == 422 and said in answer.json()["detail"]
+    assert display.asked == []
+
+
 def test_a_ticket_is_for_one_use_and_one_path(watched):
     used = ticket(watched, MJPEG)
     assert watched.client.get(f"{MJPEG}?ticket={used}").status_code == 200

@@ -29,6 +29,8 @@ OCTETS = "application/octet-stream"
         ("/v1/streams?x=1", "it has none"),
         ("/v1/replays?ticket=x", "it takes"),
         ("/metrics?name[]=up", "it has none"),
+        ("/v1/audit?count=1&count=2", "count is given 2 times"),
+        ("/v1/models/a/versions/1/exports/ply?time_s=0&time_s=1", "time_s is given 2 times"),
     ],
 )
 def test_a_parameter_that_there_is_not_is_refused(plane, path, near):
