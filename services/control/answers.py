@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections.abc import Mapping
 
@@ -16,12 +17,18 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from services.audit import AuditUnwritable
-from services.control.problems import OF_STATUS, PROBLEM_JSON, BadRequest, Problem, Unavailable, Unprocessable
+from services.control.problems import OF_STATUS, PROBLEM_JSON, BadRequest, NoSpace, Problem, Unavailable, Unprocessable
 
 log = logging.getLogger(__name__)
 
 KNOWN: dict[type[Exception], type[Problem]] = {AuditUnwritable: Unavailable}
 """Errors of other packages, and what they are here. `Parts.errors` adds those of the parts."""
+
+OF_ERRNO: dict[int, type[Problem]] = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), NoSpace),
+    **dict.fromkeys((errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE), Unavailable),
+}
+"""Errors of the server's disk that any store may raise, and their problems."""
 
 PHRASES = {
     404: "there is nothing at this path; /docs lists what there is",
@@ -94,9 +101,19 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
             log.error("%s", error)
         return await _answer(connection, kind(str(error)))
 
+    async def on_disk(connection: HTTPConnection, error: Exception) -> Response | None:
+        assert isinstance(error, OSError)
+        kind = OF_ERRNO.get(error.errno or 0)
+        if kind is None:
+            raise error
+        log.error("the disk refuses what a request needs: %s", error)
+        what = f"{error.strerror}; {'free space on the disk of the server' if kind is NoSpace else 'check the disk of the server'}"
+        return await _answer(connection, kind(what))
+
     known: dict[type, type[Problem]] = {**KNOWN, **errors}
     for each in known:
         app.add_exception_handler(each, on_known)  # type: ignore[arg-type]
+    app.add_exception_handler(OSError, on_disk)
     app.add_exception_handler(ClientDisconnect, on_left)  # type: ignore[arg-type]
     app.add_exception_handler(Problem, on_problem)  # type: ignore[arg-type]
     app.add_exception_handler(HTTPException, on_http)  # type: ignore[arg-type]

@@ -88,3 +88,27 @@ def test_a_folder_of_its_own_is_looked_at(new_plane, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", usage)
     ready = plane.client.get("/readyz?verbose").json()
     assert ready["status"] == "degraded" and "recordings: 0 MiB free" in ready["checks"]["disk"]["detail"]
+
+
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(errno.ENOSPC, 507), (errno.EDQUOT, 507), (errno.EROFS, 503), (errno.EIO, 503), (errno.EMFILE, 503)],
+)
+@pytest.mark.parametrize("store", ["keys", "registry", "streams"])
+def test_a_store_whose_disk_refuses_is_no_bug(plane, monkeypatch, caplog, store, number, status):
+    """An error of the disk in any store is an answer that names it, and not a traceback."""
+
+    def refuse(*_, **__):
+        raise OSError(number, os.strerror(number), "/secret/path")
+
+    if store == "keys":
+        monkeypatch.setattr(plane.control.keys, "create", refuse)
+        answer = plane.ask("POST", "/v1/keys", json={"name": "new", "role": "viewer"})
+    elif store == "registry":
+        monkeypatch.setattr(plane.parts.models, "rollback", refuse)
+        answer = plane.ask("POST", "/v1/models/liver/rollback")
+    else:
+        monkeypatch.setattr(plane.parts.streams, "create", refuse)
+        answer = plane.ask("POST", "/v1/streams", json={"name": "x", "source": "synthetic:"})
+    assert answer.status_code == status and os.strerror(number) in answer.json()["detail"]
+    assert "/secret" not in answer.text and "Traceback" not in caplog.text
