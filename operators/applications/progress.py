@@ -19,6 +19,8 @@ class Progress:
     """Tissue PSNR of the newest displayed frame; its training error where `trained`."""
     previous_frame_db: float | None = None
     """Tissue PSNR of the raw frame before it, shown instead."""
+    next_frame_db: float | None = None
+    """Tissue PSNR of the next frame, predicted before it was trained on: no training error."""
     trained: bool = True
     """The newest displayed frame was trained on before it was shown."""
 

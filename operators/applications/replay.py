@@ -239,7 +239,7 @@ class ReplayApplication(Application):
         if scored is None:
             self._progress(Progress(self.stage, done, total))
             return
-        measured, previous_db = scored.quality.psnr_tissue_db, scored.previous_frame_db
+        measured, previous_db, next_db = scored.quality.psnr_tissue_db, scored.previous_frame_db, scored.next_frame_db
         self._progress(
             Progress(
                 self.stage,
@@ -247,6 +247,7 @@ class ReplayApplication(Application):
                 total,
                 psnr_tissue_db=measured,
                 previous_frame_db=previous_db if math.isfinite(previous_db) else None,
+                next_frame_db=next_db if math.isfinite(next_db) else None,
                 trained=scored.rendered.trained,
             )
         )

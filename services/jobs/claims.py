@@ -76,7 +76,8 @@ class Claims:
             for job_id, reached in progress.items():
                 values = {
                     "lease_until_ms": until_ms, "frames_done": reached.frames_done, "frames": reached.frames,
-                    "psnr_db": reached.psnr_db,
+                    "psnr_db": reached.psnr_db, "previous_frame_db": reached.previous_frame_db,
+                    "next_frame_db": reached.next_frame_db,
                 }  # fmt: skip
                 connection.execute(sa.update(JOBS).where(*self._mine(job_id)).values(values))
                 row = connection.execute(sa.select(JOBS.c.cancelled_by).where(*self._mine(job_id))).first()

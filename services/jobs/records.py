@@ -41,6 +41,11 @@ class JobRecord:
     frames_done: int
     frames: int | None
     psnr_db: float | None
+    """Tissue PSNR of the newest displayed frame: its training error."""
+    previous_frame_db: float | None
+    """Tissue PSNR of the raw frame before it, shown instead."""
+    next_frame_db: float | None
+    """Tissue PSNR of the newest frame that was predicted before it was trained on."""
     created_by: str
     created_at: str
     started_at: str | None
@@ -91,6 +96,8 @@ class JobProgress:
     frames_done: int
     frames: int | None
     psnr_db: float | None
+    previous_frame_db: float | None = None
+    next_frame_db: float | None = None
 
 
 def job_record(row: sa.RowMapping) -> JobRecord:
@@ -98,6 +105,7 @@ def job_record(row: sa.RowMapping) -> JobRecord:
     return JobRecord(
         id=row["id"], number=row["number"], batch=row["batch"], recording=row["recording"], folder=row["folder"],
         options=dict(row["options"]), state=JobState(row["state"]), reason=row["reason"], attempts=row["attempts"],
-        frames_done=row["frames_done"], frames=row["frames"], psnr_db=row["psnr_db"], created_by=row["created_by"],
+        frames_done=row["frames_done"], frames=row["frames"], psnr_db=row["psnr_db"],
+        previous_frame_db=row["previous_frame_db"], next_frame_db=row["next_frame_db"], created_by=row["created_by"],
         created_at=row["created_at"], started_at=row["started_at"], ended_at=row["ended_at"],
     )  # fmt: skip

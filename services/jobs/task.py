@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +41,7 @@ class Task:
 
     def say_progress(self, reached: JobProgress) -> None:
         """Say how far it has come."""
-        reached_values = {"frames_done": reached.frames_done, "frames": reached.frames, "psnr_db": reached.psnr_db}
-        _write(Path(self.folder) / PROGRESS, reached_values)
+        _write(Path(self.folder) / PROGRESS, asdict(reached))
 
     def say_outcome(self, state: JobState, reason: str | None = None) -> None:
         """Say how it ended, once everything is written."""

@@ -48,12 +48,19 @@ class _Teller:
 
     def __init__(self, task: Task) -> None:
         self._task, self._said_s = task, 0.0
+        self._next_db: float | None = None
 
     def __call__(self, progress: Progress) -> None:
         now_s = time.monotonic()
         if now_s - self._said_s >= SAY_S or progress.done == progress.total:
             self._said_s = now_s
-            self._task.say_progress(JobProgress(progress.done, progress.total, progress.psnr_tissue_db))
+            next_db = progress.next_frame_db
+            self._next_db = self._next_db if next_db is None else next_db  # the last frame has no next one
+            self._task.say_progress(
+                JobProgress(
+                    progress.done, progress.total, progress.psnr_tissue_db, progress.previous_frame_db, self._next_db
+                )
+            )
 
 
 def _write_reports(outcome: RunOutcome, folder: Path) -> None:

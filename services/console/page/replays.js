@@ -80,9 +80,10 @@ export function replaysPage(report) {
     }
     const options = Object.entries(replay.options).map(([name, value]) => `${name.replaceAll("_", " ")} ${value}`).join(", ");
     const state = replay.reason ? `${replay.state}: ${replay.reason}` : replay.state;
-    const quality = Number.isFinite(replay.psnr_db) ? `${replay.psnr_db.toFixed(1)} dB` : "";
+    const decibels = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
+    const figures = [replay.psnr_db, replay.previous_frame_db, replay.next_frame_db].map(decibels);
     const started = [when(replay.created_at), `, ${replay.created_by}`];
-    return row(replay.recording, replay.id, state, progress(replay), quality, options, started, actions);
+    return row(replay.recording, replay.id, state, progress(replay), ...figures, options, started, actions);
   }
 
   /** In a page of its own, which may do nothing but show itself. */

@@ -73,6 +73,14 @@ class ReplayView(BaseModel):
     psnr_db: float | None = Field(
         None, examples=[36.5], description="Over tissue, of the newest displayed frame: its training error."
     )
+    previous_frame_db: float | None = Field(
+        None, examples=[35.9], description="Over tissue, of the raw frame before it, shown instead."
+    )
+    next_frame_db: float | None = Field(
+        None,
+        examples=[34.8],
+        description="Over tissue, of the newest frame that was predicted before the model was trained on it.",
+    )
     created_by: str
     created_at: str
     started_at: str | None = None

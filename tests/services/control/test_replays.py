@@ -191,11 +191,12 @@ def test_progress_is_said_until_the_end(plane, worker):
     with plane.client.websocket_connect(f"{path}?ticket={ticket}") as socket:
         assert socket.receive_json()["state"] == "queued"
         assert worker.claims.take().id == job_id
-        worker.claims.renew({job_id: JobProgress(4, 9, 30.5)})
+        worker.claims.renew({job_id: JobProgress(4, 9, 30.5, 29.5, 28.5)})
         told = [socket.receive_json()]
         if told[-1]["frames_done"] == 0:  # it was seen between the two
             told.append(socket.receive_json())
         assert (told[-1]["state"], told[-1]["frames_done"], told[-1]["psnr_db"]) == ("running", 4, 30.5)
+        assert (told[-1]["previous_frame_db"], told[-1]["next_frame_db"]) == (29.5, 28.5)
         worker.claims.end(job_id, JobState.FAILED, "its recording is empty")
         assert socket.receive_json()["reason"] == "its recording is empty"
         with pytest.raises(WebSocketDisconnect) as ended:
