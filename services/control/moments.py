@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+from datetime import UTC, datetime
 from typing import Annotated
 
-from pydantic import AwareDatetime, BeforeValidator, Strict
+from pydantic import AfterValidator, AwareDatetime, BeforeValidator, Strict
 
 _DATE_AND_TIME = re.compile(r"\d{4}-\d\d-\d\d[Tt ]\d\d:\d\d.*")
 
@@ -16,4 +17,12 @@ def _text(value: object) -> object:
     return value
 
 
-Moment = Annotated[AwareDatetime, Strict(False), BeforeValidator(_text)]
+def _in_utc(moment: datetime) -> datetime:
+    """Return the moment in UTC. Raises ValueError for one that is not in the years 1 to 9999 there."""
+    try:
+        return moment.astimezone(UTC)
+    except OverflowError as error:
+        raise ValueError("it is before the year 1 or after the year 9999 in UTC") from error
+
+
+Moment = Annotated[AwareDatetime, Strict(False), BeforeValidator(_text), AfterValidator(_in_utc)]

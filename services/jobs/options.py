@@ -14,7 +14,7 @@ DEPTH_CHOICES = ("auto", *(WITH_ADDRESS.get(name, name) for name in DEPTHS))
 class ReplayOptions(BaseModel):
     """How a recording is replayed; what is left out is as `intrasplat replay` has it."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     device: Literal["cpu", "cuda"] = Field(default="cpu", description="Where it is computed.")
     field: Literal["auto", "basis", "hexplane"] = Field(default="auto", description="Deformation field.")

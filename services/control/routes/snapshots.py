@@ -28,7 +28,7 @@ SnapshotId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["1f0c9a3b5
 class SnapshotWanted(BaseModel):
     """What becomes of a snapshot."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
     model: ResourceName | None = Field(
         None,
         description="Make it the next version of this model; without it, it is kept as a file.",

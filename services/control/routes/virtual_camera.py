@@ -16,7 +16,7 @@ class VirtualCamera(BaseModel):
     """Where the virtual camera is, beside the endoscope's: round the point in the middle of its picture."""
 
     model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"examples": [{"azimuth_deg": 20, "elevation_deg": 10}]}
+        extra="forbid", strict=True, json_schema_extra={"examples": [{"azimuth_deg": 20, "elevation_deg": 10}]}
     )
     azimuth_deg: float = Field(0.0, ge=-75, le=75, description="To the right.")
     elevation_deg: float = Field(0.0, ge=-75, le=75, description="Upwards.")

@@ -166,3 +166,31 @@ def test_what_the_pool_prints_is_in_the_log(caplog):
     levels = [(record.levelname, record.getMessage()[:12]) for record in caplog.records]
     assert levels[:2] == [("INFO", "INFO service"), ("ERROR", "ERROR x: no")] and levels[-1] == ("INFO", "\ufffd end")
     assert ("ERROR", "Traceback (m") in levels
+
+
+@pytest.mark.parametrize(
+    "moment", ["9999-12-31T23:59:59-14:00", "9999-12-31T23:59:59-00:01", "0001-01-01T00:00:00+14:00", "0001-01-01T00:00:00+00:01"]
+)  # fmt: skip
+def test_a_moment_that_utc_does_not_have_is_refused(plane, moment):
+    quoted = moment.replace("+", "%2B")
+    for path in (f"/v1/audit?since={quoted}", f"/v1/audit?until={quoted}", f"/v1/audit/export?since={quoted}"):
+        assert plane.ask("GET", path).status_code == 422, path
+    wanted = {"name": "key", "role": "viewer", "expires_at": moment}
+    assert plane.ask("POST", "/v1/keys", json=wanted).status_code == 422
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{name: value} for name in ("steps_per_frame", "seed", "max_frames", "scale") for value in (True, "1", "nan")]
+    + [{"heldout": value} for value in (0, 1, "yes", "true")]
+    + [{"steps_per_frame": 1.0}, {"seed": 2.0}],
+)
+def test_options_of_replays_are_not_converted(plane, options):
+    answer = plane.ask("POST", "/v1/replays", json={"recording": "case-7", "options": options})
+    assert answer.status_code == 422
+
+
+@pytest.mark.parametrize("name", ["azimuth_deg", "elevation_deg", "zoom"])
+@pytest.mark.parametrize("value", [True, "1", None, [], 1e9])
+def test_the_virtual_camera_takes_numbers_alone(plane, name, value):
+    assert plane.ask("PUT", "/v1/streams/endoscope/camera", json={name: value}).status_code == 422
