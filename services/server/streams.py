@@ -73,7 +73,7 @@ def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | Non
     for process in (capture, engine):
         if process.state == "failed":
             return "failed", process.reason
-    if capture.state in ("stalled", "reconnecting", "lost", "ended"):
+    if capture.lost or capture.state in ("stalled", "reconnecting", "lost", "ended"):
         return "source lost", capture.reason
     if capture.state != "live":
         return "starting", capture.reason

@@ -73,6 +73,8 @@ class ProcessState:
     """Seconds since its last heartbeat."""
     rate_hz: float | None = None
     """Frames captured, or new pictures shown, a second over the last `RATE_S`."""
+    lost: bool = False
+    """A capture process whose source has given no frames for `LOST_AFTER_S`."""
 
 
 class Rate:
@@ -150,6 +152,7 @@ class ManagedProcess:
             figures if isinstance(figures, dict) else {},
             round(silent_s, 3),
             self._rate.hz,
+            self._lost,
         )
 
     @property

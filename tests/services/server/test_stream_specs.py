@@ -74,6 +74,12 @@ def test_a_network_of_the_server_is_taken(tmp_path):
     assert spec_of(wanted(tool_mask=f"onnx:{network}")).engine.tool_mask == f"onnx:{network}"
 
 
+def test_a_source_that_never_opened_counts_as_lost():
+    """A camera that is not there stays in the state `opening`: after a while that is a lost source, as the audit log says."""
+    absent = ProcessState("opening", "there is no camera", 1, 0, {}, 0.1, lost=True)
+    assert overall(absent, process("running")) == ("source lost", "there is no camera")
+
+
 def process(state, reason="", **figures):
     return ProcessState(state, reason, 1, 0, figures, 0.1)
 
