@@ -81,7 +81,7 @@ class Screen:
             if header["new"]:
                 self.pictures += 1
                 self.ages.add(header["age_ms"] * 1e-3)
-            self._last = {name: header[name] for name in ("state", "age_ms", "model_version", "psnr_db")}
+            self._last = {name: header.get(name) for name in ("state", "age_ms", "model_version", *SCORES)}
             self._last |= {"show": shows, "shown_ns": time.monotonic_ns()}
             return True
 
