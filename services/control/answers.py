@@ -113,7 +113,7 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
     known: dict[type, type[Problem]] = {**KNOWN, **errors}
     for each in known:
         app.add_exception_handler(each, on_known)  # type: ignore[arg-type]
-    app.add_exception_handler(OSError, on_disk)
+    app.add_exception_handler(OSError, on_disk)  # type: ignore[arg-type]
     app.add_exception_handler(ClientDisconnect, on_left)  # type: ignore[arg-type]
     app.add_exception_handler(Problem, on_problem)  # type: ignore[arg-type]
     app.add_exception_handler(HTTPException, on_http)  # type: ignore[arg-type]
