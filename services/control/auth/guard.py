@@ -121,13 +121,15 @@ CallerOf = Annotated[Caller, Depends(_caller_of)]
 
 
 def still_valid(control: ControlState, caller: Caller) -> bool:
-    """Return False once the caller's key was revoked or has expired, or the person's token has expired.
+    """Return False once the caller's key was revoked, has expired or has another role or other streams, or the person's token has expired.
 
     For connections that outlast their admission, such as displays.
     """
     if caller.federated:
         return caller.expires_at is None or time.time() < caller.expires_at
-    return not control.keys.is_revoked(caller.key_id)
+    key = control.keys.get(caller.key_id)
+    streams = None if key is None or key.streams is None else frozenset(key.streams)
+    return key is not None and (key.role, streams) == (caller.role, caller.streams)
 
 
 async def _admit(connection: HTTPConnection, rule: Rule, control: ControlState) -> Caller:

@@ -97,10 +97,10 @@ class KeyStore:
         key = self._match(token)
         return key if key is not None and key.has_expired() else None
 
-    def is_revoked(self, key_id: str) -> bool:
-        """Return True if a key was revoked or has expired. Cheap: for looking again while a connection lasts."""
+    def get(self, key_id: str) -> ApiKey | None:
+        """Return a valid key; None if it was revoked or has expired. Cheap: for looking again while a connection lasts."""
         key = self._current().get(key_id)
-        return key is None or key.has_expired()
+        return None if key is None or key.has_expired() else key
 
     def all(self) -> list[ApiKey]:
         """Return every key, expired ones too, the oldest first."""

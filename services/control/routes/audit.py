@@ -74,7 +74,7 @@ async def audit_entries(
     caller: CallerOf,
     wanted: WantedOf,
     count: int = Query(100, ge=1, le=500),
-    before: int | None = Query(None, ge=0),
+    before: int | None = Query(None, ge=0, le=2**63 - 1),
 ) -> AuditPage:
     """What was done, the newest first. That it was read is an entry, too: one a minute for the same key and the same filter, so that a page that
     follows the log does not fill it."""

@@ -15,6 +15,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from services.control import viewers
 from services.control.app import KEYS_FILE
+from services.control.auth.guard import still_valid
 from services.control.auth.keys import KeyStore
 from services.control.auth.roles import Caller, Role
 
@@ -265,3 +266,21 @@ def test_keys_that_cannot_be_read_end_no_pictures(endless):
         for _ in range(60):
             assert socket.receive_bytes()
         path.write_bytes(kept)
+
+
+@pytest.mark.parametrize(
+    "change", [{"streams": ["another"]}, {"streams": ["endoscope", "another"]}, {"role": "viewer"}, {"expires_at": "2020-01-01T00:00:00+00:00"}]
+)  # fmt: skip
+def test_a_key_that_was_changed_admits_an_open_connection_no_more(plane, change):
+    """A key whose role, streams or expiry are changed in the file of the keys must be presented again."""
+    keys = plane.control.keys
+    key = next(key for key in keys.all() if key.role is Role.OPERATOR)
+    caller = Caller(key.name, key.id, key.role)
+    assert still_valid(plane.control, caller)
+    file = plane.control.settings.data_dir / KEYS_FILE
+    text = json.loads(file.read_text())
+    entries = text["keys"] if isinstance(text, dict) and "keys" in text else text
+    entry = entries[key.id] if isinstance(entries, dict) else next(each for each in entries if each["id"] == key.id)
+    entry.update(change)
+    file.write_text(json.dumps(text))
+    assert not still_valid(plane.control, caller)
