@@ -9,7 +9,7 @@ exceeds its own threshold, by recording, and how many frames of each recording a
 alone, half-way between their extreme value and the pictures from outside.
 
 Usage: python benchmarks/gates.py FOLDER_OF_RECORDINGS [--frames 60] [--only NAME] [--margins]
-FOLDER_OF_RECORDINGS is laid out as docs/tool-masks.md says.
+FOLDER_OF_RECORDINGS is laid out as benchmarks/README.md says.
 """
 
 from __future__ import annotations

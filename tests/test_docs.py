@@ -219,9 +219,9 @@ def test_the_calibration_files_in_the_guide_are_read_as_it_says(tmp_path):
 
 
 def test_the_manifest_in_the_guide_is_one():
-    (example,) = json_examples("bundle.md")
+    (example,) = json_examples("design/bundle.md")
     example["training_digest"] = example["tensors"]["sha256"] = 64 * "0"
-    manifest = parse_manifest(json.dumps(example).encode(), "docs/bundle.md")
+    manifest = parse_manifest(json.dumps(example).encode(), "docs/design/bundle.md")
     gaussians, field = manifest.skeleton()
     assert field is not None
     tensors = [*gaussians.tensors().values(), *field.state_dict().values()]
@@ -238,7 +238,7 @@ def test_the_manifest_in_the_guide_is_one():
 
 
 def test_the_operator_in_the_guide_works():
-    text = (ROOT / "docs" / "operators.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "design" / "operators.md").read_text(encoding="utf-8")
     (source,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     names: dict[str, Any] = {"Operator": Operator, "OperatorSpec": OperatorSpec, "Frame": Frame, "Any": Any}
     exec(source, names)

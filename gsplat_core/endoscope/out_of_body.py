@@ -7,7 +7,7 @@ narrow bands, and none of that is evidence. Rooms differ from it in two ways tog
 - The light or the shapes are those of a room. A scope is its own lamp, so that brightness falls off with distance; walls, cloth and paper
   under room light are evenly lit and have no relief. Furniture, screens and print have straight edges at right angles.
 
-Nothing here recognises people or objects. docs/tool-masks.md says what is found and what is not.
+Nothing here recognises people or objects. docs/checks.md lists what is found and what is not.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Measures of a reconstruction, each next to the trivial baselines that it has to beat. `docs/evaluation.md` defines them.
+"""Measures of a reconstruction, each next to the trivial baselines that it has to beat. `docs/offline.md` defines them.
 
 * `baselines`: copies and means of frames, and optical flow.
 * `protocols`: the held-out, causal and retention protocols on rendered pictures.

@@ -59,7 +59,7 @@ def save_bundle(model: Model, folder: str | Path, *, to_host: Callable[[Tensor],
     """Write `model` into `folder` (made when missing), replacing the bundle there in one step. It is written in pieces, between which other threads
     run. to_host: how a tensor of a GPU comes into host memory.
 
-    Raises BundleCorrupt when a tensor holds NaN or infinity, BundleError when the model is beyond the ranges of `docs/bundle.md` or the
+    Raises BundleCorrupt when a tensor holds NaN or infinity, BundleError when the model is beyond the ranges of `docs/design/bundle.md` or the
     files cannot be written (a full disk, a missing right); the bundle that was there before is then still whole.
     """
     folder = Path(folder)

@@ -25,7 +25,7 @@ class Picture:
     """A picture as a viewer gets it."""
 
     header: dict[str, Any]
-    """Its number, times, age and state (docs/processes.md)."""
+    """Its number, times, age and state (docs/design/processes.md)."""
     jpeg: bytes
 
 

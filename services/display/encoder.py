@@ -26,7 +26,7 @@ class EncodedPicture:
 
     header: dict[str, object]
     """JSON: `seq`, `pts_ns`, `arrived_ns`, `age_ms`, `state`, and of reconstructions `model_version`, `steps`, `psnr_db`, `previous_frame_db` and
-    `next_frame_db` (docs/processes.md)."""
+    `next_frame_db` (docs/design/processes.md)."""
     jpeg: bytes
 
     @cached_property

@@ -1,1 +1,1 @@
-"""A stream's pictures for 3D Slicer, PLUS and others over OpenIGTLink; see docs/openigtlink.md."""
+"""A stream's pictures for 3D Slicer, PLUS and others over OpenIGTLink; see docs/exports.md."""

@@ -92,7 +92,7 @@ class Screen:
 
 
 def header_of(shown: ShownPicture) -> dict[str, Any]:
-    """What is said of a picture of the live reconstruction (docs/processes.md)."""
+    """What is said of a picture of the live reconstruction (docs/design/processes.md)."""
     rendered = shown.rendered
     content = rendered.content or rendered.frame
     pose = rendered.frame.pose

@@ -86,7 +86,7 @@ class StreamSupervisor:
     async def command(
         self, role: Role, command: str, *, timeout_s: float = ANSWER_S, **arguments: Any
     ) -> dict[str, Any]:
-        """Send a command to a process (docs/processes.md lists them). Raises NoAnswer and CommandRefused."""
+        """Send a command to a process (docs/design/processes.md lists them). Raises NoAnswer and CommandRefused."""
         return await self._process(role).command(command, timeout_s, arguments)
 
     def _process(self, role: Role) -> ManagedProcess:

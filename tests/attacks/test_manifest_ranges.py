@@ -270,7 +270,7 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path):
 
 
 def test_the_documentation_states_the_ranges():
-    text = (Path(__file__).parents[2] / "docs" / "bundle.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "design" / "bundle.md").read_text(encoding="utf-8")
     ranges = (VERSION, COUNT, SH_DEGREE, SIDE_PX, FOCAL_PX, INTRINSICS_PX, POSE)
     for low, high in [(each.low, each.high) for each in ranges]:
         assert f"{low:g} to {high:g}" in text or f"{low} to {high}" in text, (low, high)
