@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import json
+import pkgutil
 import re
+import shlex
 import subprocess
 from functools import cache
 from pathlib import Path
@@ -14,6 +18,8 @@ import numpy as np
 import pytest
 import torch
 import typer
+import yaml
+from fastapi import APIRouter
 
 from gsplat_core import Camera, Frame, Gaussians
 from gsplat_core.io.manifest import manifest_bytes, parse_manifest
@@ -26,6 +32,8 @@ from operators.sinks.callback import CallbackSinkOp
 from operators.sources.source import SourceDescription
 from operators.sources.threaded import ThreadedSource
 from services.cli.app import app
+from services.control import routes as service_routes
+from services.settings import ServiceSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
@@ -75,7 +83,7 @@ def test_relative_links_resolve(document):
 
 def commands() -> dict[str, set[str]]:
     """The options of each command, those of a group's commands under its name; those of the program itself under the empty name."""
-    group = typer.main.get_command(app)
+    group = program()
     options = {name: {"--help"} for name in ["", *group.commands]}
     for name, command in [("", group), *group.commands.items()]:
         waiting = [command]
@@ -103,6 +111,152 @@ def test_commands_and_flags_exist(document):
         assert command in known, f"intrasplat {line}: there is no command {command}"
         unknown = set(re.findall(r"--[a-z-]+", line)) - known[command]
         assert not unknown, f"intrasplat {line}: {command} has no {unknown}"
+
+
+@cache
+def program() -> Any:
+    """The command line's definition."""
+    return typer.main.get_command(app)
+
+
+def misuse(line: str) -> str | None:
+    """The reason for which a command line does not parse; None where it does. Values are not converted: RECORDING stands for a path."""
+    command = program()
+    words = shlex.split(line.partition(" #")[0].partition(" > ")[0].partition(" | ")[0])
+    while getattr(command, "commands", None):
+        if not words or words[0] not in command.commands:
+            return f"there is no command {words[:1]}"
+        command = command.commands[words.pop(0)]
+    arguments = [each for each in command.params if each.param_type_name == "argument"]
+    options = {
+        name: each for each in command.params if each not in arguments for name in (*each.opts, *each.secondary_opts)
+    }
+    given = 0
+    while words:
+        word = words.pop(0)
+        if not word.startswith("--"):
+            given += 1
+        elif word == "--help":
+            return None
+        elif word.partition("=")[0] not in options:
+            return f"there is no option {word}"
+        elif not options[word.partition("=")[0]].is_flag and "=" not in word:
+            if not words or words[0].startswith("--"):
+                return f"{word} has no value"
+            words.pop(0)
+    least = sum(each.required for each in arguments)
+    most = 1000 if any(each.nargs == -1 for each in arguments) else len(arguments)
+    missing = [name for name, each in options.items() if each.required and name not in line]
+    if missing:
+        return f"{missing[0]} is missing"
+    return None if least <= given <= most else f"{given} arguments where {least} to {most} are taken"
+
+
+GUIDES = [
+    path for path in DOCUMENTS if path.name != "CHANGELOG.md" and "benchmarks" not in path.relative_to(ROOT).parts
+]
+
+
+@pytest.mark.parametrize("document", GUIDES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_command_lines_in_code_blocks_parse(document):
+    blocks = "\n".join(CODE_BLOCK.findall(document.read_text(encoding="utf-8")))
+    lines = re.findall(r"^(?:\S*/)?intrasplat +(\S.*)$", blocks, re.MULTILINE)
+    assert [(line, misuse(line)) for line in lines if misuse(line)] == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "replays RECORDING --out DIR",
+        "replay RECORDING --outt DIR",
+        "replay RECORDING",
+        "replay --out DIR",
+        "replay RECORDING OTHER --out DIR",
+        "replay RECORDING --out",
+        "ctl streams --stream x",
+        "ctl delete",
+    ],
+)
+def test_command_lines_that_do_not_parse_are_noticed(line):
+    assert misuse(line)
+
+
+@cache
+def routes() -> tuple[tuple[str, str], ...]:
+    """Method and path of each route of the service; WebSockets begin as GET."""
+    routers: list[Any] = []
+    for module in pkgutil.iter_modules(service_routes.__path__):
+        found = importlib.import_module(f"{service_routes.__name__}.{module.name}")
+        routers += [route for each in vars(found).values() if isinstance(each, APIRouter) for route in each.routes]
+    return tuple((method, route.path) for route in routers for method in (getattr(route, "methods", None) or {"GET"}))
+
+
+def test_rest_paths_that_documents_name_exist():
+    unknown = []
+    for document in GUIDES:
+        code = document.read_text(encoding="utf-8")
+        for method, path in re.findall(
+            r"(?:\b(GET|PUT|POST|PATCH|DELETE) )?(?:\$URL)?(/v1/[A-Za-z0-9{}_/-]*[A-Za-z0-9}])", code
+        ):
+            pattern = re.sub(r"\{[^}]*\}", "x", path)
+            fits = [
+                each
+                for each, route in routes()
+                if re.fullmatch(re.sub(r"\{[^}]*\}", "[^/]+", f"/v1{route.removeprefix('/v1')}"), pattern)
+            ]
+            if not fits or (method and method not in fits):
+                unknown.append(f"{document.name}: {method} {path}")
+    assert unknown == []
+
+
+def test_settings_that_documents_name_exist():
+    schema = ServiceSettings.model_json_schema()
+    unknown = []
+    for document in GUIDES:
+        text = document.read_text(encoding="utf-8")
+        for name in re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)(?:: [^`]*)?`", text):
+            section, *keys = name.split(".")
+            here = schema["properties"].get(section)
+            for key in keys if here is not None and section not in {"streams", "version"} else ():
+                reference = next((each["$ref"] for each in (here, *here.get("anyOf", ())) if "$ref" in each), None)
+                here = schema["$defs"][reference.rpartition("/")[2]] if reference else here
+                here = here.get("properties", {}).get(key)
+                if here is None:
+                    unknown.append(f"{document.name}: {name}")
+                    break
+    assert [
+        each for each in unknown if not each.endswith((".head", ".anchor", ".jsonl", ".sqlite", ".crt", ".key"))
+    ] == []  # files
+
+
+def test_the_settings_in_the_guide_are_accepted():
+    text = (ROOT / "docs" / "service.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 2
+    for block in blocks:
+        ServiceSettings(**yaml.safe_load(block))
+
+
+def test_python_in_documents_imports_what_exists():
+    for document in GUIDES:
+        for block in re.findall(
+            r"^```python\n(.*?)^```", document.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+        ):
+            for node in ast.walk(ast.parse(block)):
+                if isinstance(node, ast.ImportFrom) and node.module is not None:
+                    if node.module.split(".")[0] in {"gsplat_core", "operators", "services"}:
+                        module = importlib.import_module(node.module)
+                        for each in node.names:
+                            assert hasattr(module, each.name), f"{document.name}: {node.module}.{each.name}"
+
+
+def test_the_index_names_every_page():
+    index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    pages = [path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")]
+    unlisted = [
+        page for page in pages if page != "README.md" and not page.startswith("adr/") and f"({page})" not in index
+    ]
+    assert unlisted == []
 
 
 def test_command_lines_are_found():

@@ -128,3 +128,12 @@ def test_every_measure_of_the_service_is_in_a_panel():
 def test_the_docs_have_what_to_do_about_each_alert():
     text = (DEPLOY.parent / "docs" / "operations.md").read_text()
     assert [name for name, _ in rules() if f"`{name}`" not in text] == []
+
+
+def test_the_docs_name_metrics_that_exist():
+    text = (DEPLOY.parent / "docs" / "service.md").read_text()
+    named = set(re.findall(r"`(intrasplat_[a-z_]+)[`{]", text))
+    code = "".join(path.read_text() for path in (DEPLOY.parent / "services").rglob("*.py"))
+    made = set(re.findall(r'"(intrasplat_[a-z_]+)"', code))
+    assert len(named) > 20
+    assert [name for name in named if name not in served() and re.sub(r"_(total|info)$", "", name) not in made] == []
