@@ -262,6 +262,17 @@ def test_the_training_program_in_the_guide_works(tmp_path):
     assert names["frame"].seq == 1 and names["picture"].image.shape == (24, 32, 3)
 
 
+def test_guides_state_no_measured_quality():
+    """Measured figures belong into RESULTS.md, which is generated from logs, or into benchmarks/notes with their commit."""
+    found = []
+    for document in GUIDES:
+        if "docs" in document.relative_to(ROOT).parts and "adr" not in document.parts:
+            for figure in re.findall(r"\d+(?:\.\d+)? dB\b", document.read_text(encoding="utf-8")):
+                if figure != "100 dB":  # the score of equal pictures
+                    found.append(f"{document.name}: {figure}")
+    assert found == []
+
+
 def test_the_index_names_every_page():
     index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
     pages = [path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")]
