@@ -1,6 +1,8 @@
-"""Depth that is known up to a factor and a summand, as a network says it: both found by other depth of the same picture, or assumed.
+"""Affine alignment of relative depth: scale and offset between a network's output and a reference
+depth of the same picture.
 
-All of it works on values that are the depth itself or its inverse; the answer is of the same kind.
+All functions work on values that are either depth or inverse depth. The result is of the same kind
+as the input.
 """
 
 from __future__ import annotations
@@ -13,46 +15,63 @@ from numpy.typing import NDArray
 Plane = NDArray[np.float64]
 
 MOST_SPAN = 5.0
-"""Where nothing says what zero means, the far end of a picture is taken to be at most so many times as far away as its near end."""
+"""Largest assumed ratio of the far end of a picture to its near end, when no reference depth fixes
+the offset.
+"""
 ENDS = (2.0, 98.0)
-"""Percentiles that count as the ends of a picture; what is beyond may be anything."""
+"""Percentiles used as the near and far ends of a picture; values beyond them may be outliers."""
 ROUNDS = 10
 LEAST_VALUES = 64
 CONSTANT = 1e-4
-"""Spread over size below which values say nothing but one distance."""
+"""Ratio of spread to magnitude below which values count as constant."""
 
 
 class Affine(NamedTuple):
-    """`factor` · values + `summand`."""
+    """Affine map `factor` · values + `summand`."""
 
     factor: float
     summand: float
     alike: float
-    """-1 to 1: correlation of both sides where they agree best; with a negative one the factor is negative, too."""
+    """Weighted correlation of the two aligned sides, -1 to 1; negative exactly when the factor is
+    negative.
+    """
 
     def of(self, values: Plane) -> Plane:
-        """The values, brought to the other side."""
+        """Apply the map to values of any shape."""
         return self.factor * values + self.summand
 
 
 def is_constant(values: Plane) -> bool:
-    """Whether [N] say no more than one distance."""
+    """Return True if values [N] are effectively constant."""
     low, high = np.percentile(values, ENDS)
     return bool(high - low <= CONSTANT * max(abs(low), abs(high), 1e-30))
 
 
 def with_assumed_zero(values: Plane) -> Affine:
-    """What to add to [N], of which no other is known, so that they span no more than `MOST_SPAN`; nothing where they do not."""
+    """Return the offset that limits the span of values [N] to `MOST_SPAN`; zero if the span is
+    already smaller.
+
+    Used when no reference depth is available.
+    """
     low, high = np.percentile(values, ENDS)
     missing = (high - MOST_SPAN * low) / (MOST_SPAN - 1)
     return Affine(1.0, max(0.0, float(missing)), 1.0)
 
 
 def fitted(values: Plane, known: Plane) -> Affine | None:
-    """What brings [N] to `known` [N], by most of them; None where they are too few or say one distance.
+    """Fit the affine map from `values` [N] to `known` [N] robustly.
 
-    Both sides have errors, so their spreads are made equal (reduced major axis). Least squares would lose a little of the relief each time, and
-    depth that is fitted to the depth before it, frame after frame, would end flat. Iteratively reweighted by Cauchy's weights.
+    Both sides have errors, so their spreads are made equal (reduced major axis regression). Least
+    squares would flatten the relief a little at each fit, and depth that is fitted to the previous
+    frame's depth would become flat over time. Outliers are suppressed by iteratively reweighted
+    estimates with Cauchy weights.
+
+    Args:
+        values: float64 [N], the network's output.
+        known: float64 [N], reference values at the same pixels.
+
+    Returns:
+        The map, or None for fewer than `LEAST_VALUES` values or when either side is constant.
     """
     if len(values) < LEAST_VALUES or is_constant(values) or is_constant(known):
         return None
@@ -72,14 +91,16 @@ def fitted(values: Plane, known: Plane) -> Affine | None:
 
 
 def _by_medians(values: Plane, known: Plane, sign: float) -> Affine:
-    """Where to start from; values that do not belong there hardly move it."""
+    """Return a start value from medians, which outliers hardly influence."""
     (x, dx), (y, dy) = _middle(values), _middle(known)
     factor = sign * dy / dx
     return Affine(factor, y - factor * x, 0.0)
 
 
 def _middle(values: Plane) -> tuple[float, float]:
-    """The median, and how far values typically are from it."""
+    """Return the median and the median absolute deviation, or the standard deviation if the latter
+    is zero.
+    """
     median = float(np.median(values))
     return median, float(np.median(np.abs(values - median))) or float(values.std())
 

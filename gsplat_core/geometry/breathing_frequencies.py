@@ -1,4 +1,6 @@
-"""At which frequencies tissue breathes and its heart beats, before a scope whose trajectory is not known either."""
+"""Search for the breathing and heart frequencies of tissue when the scope's trajectory is unknown
+as well.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +17,31 @@ from gsplat_core.threads import one_thread
 
 BREATHING_HZ, HEART_HZ = (0.1, 0.8), (0.8, 3.0)
 LEAST_CYCLES, FEWEST_TRIED = 1.5, 0.5
-"""Of breathing: with less of it, a smooth trajectory of the scope does as well. Less is looked for all the same, or its double would be found in its place."""
+"""Breathing cycles that the recording must contain for a frequency to be accepted, and to be tried.
+A smooth scope trajectory explains less than `LEAST_CYCLES` equally well. Slower frequencies are
+still tried, because otherwise their double would win.
+"""
 STEP_CYCLES = 0.25
-"""From one frequency that is tried to the next, in cycles over the recording; twice that for the heart."""
+"""Spacing of the tried breathing frequencies, in cycles over the recording; twice that for the
+heart.
+"""
 SPREAD = 0.007
-"""Rays (x / z) that are off by well more than this decide little."""
+"""Cauchy scale of ray errors (x / z)."""
 ROUNDS = 2
 UNEXPLAINED = 1.0
-"""Cost of an observation from which on there is something to explain: errors as they are expected cost one half to one."""
+"""Mean robust cost per observation below which the static model is sufficient. Observations with
+only the expected noise cost 0.5 to 1.
+"""
 BREATHES, BEATS = 0.75, 0.94
-"""What is left of the cost with a frequency from which on the tissue is taken to move with it: of breathing relative to tissue at rest, of the heart to
-the median of all frequencies that are tried, since any explains a little."""
+"""Largest accepted ratio of the cost with a frequency to the reference cost. The reference of
+breathing is the static model. The reference of the heart is the median over all tried heart
+frequencies, because any extra frequency lowers the cost a little.
+"""
 
 
 @dataclass(frozen=True)
 class _Try:
-    """What was found with some frequencies."""
+    """Result of adjusting the bundle with one set of frequencies."""
 
     hz: tuple[float, ...]
     bundle: MovingBundle
@@ -38,17 +49,23 @@ class _Try:
 
 
 def waves(times_s: Tensor, frequencies_hz: Sequence[float]) -> Tensor:
-    """Cosine and sine of each frequency [T, 2 F]."""
+    """Return cosine and sine of each frequency at each time, [T, 2 F]."""
     angles = 2 * torch.pi * times_s[:, None] * torch.tensor(frequencies_hz, dtype=times_s.dtype)
     return torch.stack([angles.cos(), angles.sin()], 2).flatten(1)
 
 
 @one_thread()
 def frequencies_of(start: MovingBundle, times_s: Tensor, fastest_hz: float = HEART_HZ[1]) -> tuple[float, ...]:
-    """Of breathing, or of breathing and the heart, those that explain best where points were seen; none where they explain little more than tissue
-    at rest does.
+    """Find the frequencies that best explain the observations.
 
-    fastest_hz: what swings faster is seen too seldom to be told from what is slower.
+    Args:
+        start: static bundle (no motion amplitudes).
+        times_s: float64 [T], time of each camera in seconds.
+        fastest_hz: upper limit of the search in Hz, set by the frame rate.
+
+    Returns:
+        The breathing frequency, the breathing and heart frequencies, or an empty tuple if static
+            tissue explains the observations nearly as well.
     """
     length_s = float(times_s[-1] - times_s[0])
     step = STEP_CYCLES / length_s
@@ -61,7 +78,7 @@ def frequencies_of(start: MovingBundle, times_s: Tensor, fastest_hz: float = HEA
         return ()
     if best.hz[0] * length_s < LEAST_CYCLES:
         return ()
-    # From here on one step each is enough: all but the new frequency's part is there.
+    # One step per heart frequency is enough, since the bundle is already adjusted for breathing.
     beats = [
         _tried(best.bundle, times_s, (*best.hz, hz), 1)
         for hz in _between(HEART_HZ[0], min(HEART_HZ[1], fastest_hz), 2 * step)
@@ -83,7 +100,19 @@ def sharpened(
     spread: float,
     prior: TrajectoryPrior | None = None,
 ) -> tuple[MovingBundle, tuple[float, ...]]:
-    """The bundle after a step for each frequency, with those that are right to about so many cycles over the recording."""
+    """Refine each frequency in turn by comparing it with its neighbours at ± `cycles`.
+
+    Args:
+        bundle: bundle adjusted with the frequencies `hz`.
+        times_s: float64 [T], time of each camera in seconds.
+        hz: frequencies to refine, in Hz.
+        cycles: distance of the neighbours, in cycles over the recording.
+        spread: Cauchy scale of ray errors.
+        prior: prior of the scope's trajectory.
+
+    Returns:
+        The bundle after one adjustment step per frequency, and the refined frequencies in Hz.
+    """
     part = cycles / float(times_s[-1] - times_s[0])
     for which in range(len(hz)):
         around = [_changed(hz, which, change) for change in (-part, 0.0, part)]
@@ -100,7 +129,9 @@ def _tried(
     spread: float = SPREAD,
     prior: TrajectoryPrior | None = None,
 ) -> _Try:
-    """From a start with all of these frequencies, or with those before the last one."""
+    """Adjust a start bundle that already contains all of these frequencies, or all but the last
+    one.
+    """
     return _Try(hz, *adjust(with_waves(start, waves(times_s, hz)), spread, rounds, prior))
 
 
@@ -109,7 +140,9 @@ def _best(tries: Sequence[_Try]) -> _Try:
 
 
 def _local_minima(tries: Sequence[_Try]) -> list[_Try]:
-    """Those that are better than both neighbours: the best one at an end of the band is the flank of something outside."""
+    """Return the tries with a lower cost than both neighbours. A minimum at the end of the band
+    belongs to a frequency outside it.
+    """
     inner = zip(tries, tries[1:], tries[2:], strict=False)
     return [each for before, each, after in inner if each.cost <= min(before.cost, after.cost)]
 

@@ -1,9 +1,14 @@
-"""The scope's trajectory before tissue that breathes: cameras refined against points that repeat their motion.
+"""Scope trajectory in front of breathing tissue, estimated together with the periodic motion of the
+points.
 
-Poses that take tissue to be at rest have its breathing in them. Here the frequencies of breathing and heart beat are looked for that explain better where
-points were seen (`breathing_frequencies`), and cameras, points and their motion are found together (`moving_bundle`), with what may be expected of a
-scope's trajectory (`trajectory_prior`), learned anew as the trajectory gets better. Nothing is said where no frequency explains clearly more, less than one and a half
-breaths are seen, or the scope itself swings nearly as fast (`trajectory_lines`).
+Poses estimated for static tissue contain its breathing. This module searches for breathing and
+heart frequencies that explain the observations better (`breathing_frequencies`). It then optimises
+cameras, points and periodic motion together (`moving_bundle`). A prior of the scope's trajectory
+(`trajectory_prior`) is re-estimated as the trajectory improves.
+
+There is no result if no frequency explains the observations clearly better, if the recording shows
+less than one and a half breaths, or if the scope itself moves nearly as fast as the tissue
+(`trajectory_lines`).
 """
 
 from __future__ import annotations
@@ -25,14 +30,17 @@ from gsplat_core.geometry.trajectory_prior import TrajectoryPrior, learned_from
 from gsplat_core.threads import one_thread
 
 EVERY_S = 0.4
-"""Between the frames that are looked at, on average."""
+"""Average time between the frames that are used, in seconds."""
 FEWEST_FRAMES, MOST_FRAMES = 40, 150
 LONGEST_S = MOST_FRAMES * EVERY_S
 POINTS, LEAST_SEEN = 600, 5
-"""How many points are looked at, those most often seen, and how often at least."""
+"""Number of points used, most often observed first, and the least number of observations of each.
+"""
 FEWEST_POINTS = 60
 NEAREST, FARTHEST = 0.5, 2.0
-"""Of the median depth: points that are nearer or farther at first start there."""
+"""Accepted initial depths relative to the median; points outside this range start at the median
+depth.
+"""
 FINEST = 0.0017
 STAGES = (
     (0.014, 3, 0.0),
@@ -43,56 +51,71 @@ STAGES = (
     (FINEST, 3, 0.015),
     *((FINEST, 4, 0.0),) * 9,
 )
-"""Rays (x / z) that are off by well more than the first number decide little; after so many steps frequencies are sharpened to so many cycles over the
-recording, and the trajectory's prior is learned anew."""
+"""Optimisation stages: Cauchy scale of ray errors (x / z), number of steps, and the frequency
+spacing in cycles over the recording for the refinement that follows (0 = none). The trajectory
+prior is re-estimated before each stage.
+"""
 FEW_POINTS, FEW_FRAMES, FEW_NODES = 200, 40, 16
-"""With which frequencies are looked for."""
+"""Size of the reduced problem on which frequencies are searched."""
 SAMPLED = 0.4
-"""Of the frame rate: what swings faster is not looked for."""
+"""Highest frequency searched, as a share of the frame rate."""
 LEAST_SHARED, PLACE_ROUNDS = 24, 10
-"""Points that a frame between those looked at has to share with them, to be placed by them."""
+"""Observations of moving points that an intermediate frame needs to be placed by them, and the
+number of adjustment steps for it.
+"""
 GOLDEN = 0.5 * (5**0.5 - 1)
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """Where points were seen, and what follows when they are taken to be at rest; the unit of length is about their distance."""
+    """Point observations of all frames with a static reconstruction. The unit of length is about
+    the points' distance.
+    """
 
     frame: Tensor
-    """int64 [K], ascending: in which frame ..."""
+    """Frame index of each observation, int64 [K], ascending."""
     point: Tensor
-    """int64 [K]: ... which point was seen ..."""
+    """Point index of each observation, int64 [K]."""
     rays: Tensor
-    """[K, 2]: ... where, as x / z and y / z."""
+    """Observed rays as x / z and y / z, [K, 2]."""
     times_s: Tensor
-    """[N]: of all frames."""
+    """Time of every frame in seconds, [N]."""
     poses: Tensor
-    """[N, 4, 4]: world to camera."""
+    """World-to-camera poses of the static reconstruction, [N, 4, 4]."""
     points: Tensor
-    """[P, 3]."""
+    """Point positions of the static reconstruction, [P, 3]."""
 
 
 @dataclass(frozen=True)
 class BreathingTrajectory:
-    """What was found."""
+    """Trajectory and periodic motion found for a recording."""
 
     poses: Tensor
-    """[N, 4, 4]: of all frames; the first one is the identity and the unit the median depth of the points."""
+    """World-to-camera poses of all frames, [N, 4, 4]. The first one is the identity. The unit of
+    length is the median depth of the points.
+    """
     points: Tensor
-    """[P, 3]: places at rest of the points that were looked at."""
+    """Rest positions of the points used, [P, 3]."""
     frequencies_hz: tuple[float, ...]
-    """Of breathing, or of breathing and the heart."""
+    """Breathing frequency, or breathing and heart frequencies."""
     uncertain: float
-    """How much of the trajectory, root mean square, may be the tissue's own."""
+    """Root mean square share of the trajectory that may be tissue motion instead of scope motion,
+    in units of the median depth.
+    """
     error: float
-    """Median of how far rays are off."""
+    """Median ray error (x / z)."""
 
 
 @one_thread()
 def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTrajectory | None:
-    """The trajectory before breathing tissue, or None where there is none to be told.
+    """Estimate the scope's trajectory in front of breathing tissue.
 
-    placed: bool [N]: frames whose pose is known.
+    Args:
+        sightings: observations and the static reconstruction.
+        placed: bool [N], frames with a known pose.
+
+    Returns:
+        The trajectory, or None if the recording is unsuitable or no periodic motion is found.
     """
     length_s = float(sightings.times_s[-1] - sightings.times_s[0])
     known = torch.nonzero(placed)[:, 0]
@@ -121,8 +144,17 @@ def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTraje
 def refined(
     start: MovingBundle, times_s: Tensor, frequencies_hz: tuple[float, ...]
 ) -> tuple[MovingBundle, tuple[float, ...], TrajectoryPrior]:
-    """Cameras, tissue and its motion with about these frequencies, from cameras and tissue that know no motion; the frequencies, and the prior of trajectories
-    like the one that was found."""
+    """Optimise cameras, tissue and periodic motion from a static start.
+
+    Args:
+        start: static bundle.
+        times_s: float64 [T], time of each camera in seconds.
+        frequencies_hz: start values of the frequencies.
+
+    Returns:
+        The adjusted bundle, the refined frequencies in Hz, and the trajectory prior learned from
+            the result.
+    """
     bundle, hz = with_waves(start, waves(times_s, frequencies_hz)), frequencies_hz
     for spread, rounds, cycles in STAGES:
         prior = learned_from(bundle.poses, times_s, bundle.waves)
@@ -134,8 +166,9 @@ def refined(
 
 
 def _some(frames: Tensor, most: int) -> Tensor:
-    """At most so many of the frames, the first and the last among them, spread over all but not evenly: evenly spread ones show a fast motion as a slow
-    one."""
+    """Select at most `most` frames, including the first and the last. The spacing is irregular to
+    avoid aliasing of fast motion.
+    """
     if len(frames) <= most:
         return frames
     shift = (torch.arange(most, dtype=torch.float64) * GOLDEN) % 1 - 0.5
@@ -145,7 +178,11 @@ def _some(frames: Tensor, most: int) -> Tensor:
 
 
 def _bundle(sightings: Sightings, frames: Tensor, most: int, nodes: int) -> tuple[MovingBundle, Tensor] | None:
-    """What the given frames show of the points that they show most often, at rest, and the points' numbers; None where these are too few."""
+    """Build a static bundle from the given frames and their most observed points.
+
+    Returns:
+        The bundle and the point numbers, or None with fewer than `FEWEST_POINTS` points.
+    """
     chosen = torch.isin(sightings.frame, frames)
     times = torch.bincount(sightings.point[chosen], minlength=len(sightings.points))
     often = torch.argsort(times, descending=True, stable=True)[:most]
@@ -170,7 +207,9 @@ def _bundle(sightings: Sightings, frames: Tensor, most: int, nodes: int) -> tupl
 
 
 def _limited(poses: Tensor, rest: Tensor, camera: Tensor, point: Tensor, rays: Tensor) -> Tensor:
-    """The points where they were first seen, none much nearer or farther than most."""
+    """Return the points on their first observed rays, with depths outside `NEAREST` to `FARTHEST`
+    replaced by the median.
+    """
     number = torch.arange(len(point))
     first = torch.zeros(len(rest), dtype=torch.int64).scatter_reduce(0, point, number, "amin", include_self=False)
     pose = poses[camera[first]]
@@ -182,7 +221,7 @@ def _limited(poses: Tensor, rest: Tensor, camera: Tensor, point: Tensor, rays: T
 
 
 def _with_new_nodes(bundle: MovingBundle) -> MovingBundle:
-    """The same motion, with nodes among the points where they are now."""
+    """Resample the motion field on nodes placed among the points' current rest positions."""
     field = SurfaceField.over(bundle.rest, len(bundle.field.nodes))
     amplitudes = torch.einsum("nm,mjb->njb", bundle.field.influence(field.nodes), bundle.amplitudes)
     return replace(bundle, field=field, amplitudes=amplitudes, influence=field.influence(bundle.rest))
@@ -191,7 +230,9 @@ def _with_new_nodes(bundle: MovingBundle) -> MovingBundle:
 def _all_placed(
     sightings: Sightings, frames: Tensor, found: MovingBundle, numbers: Tensor, frequencies_hz: Sequence[float]
 ) -> Tensor:
-    """Poses of all frames: of those between the ones looked at, where the moving points fit."""
+    """Return poses of all frames. Frames between the adjusted ones are interpolated and then
+    aligned to the moving points.
+    """
     poses = _between(frames, found.poses, len(sightings.times_s))
     chosen = torch.isin(sightings.point, numbers) & ~torch.isin(sightings.frame, frames)
     shared = torch.bincount(sightings.frame[chosen], minlength=len(poses))
@@ -211,7 +252,9 @@ def _all_placed(
 
 
 def _between(frames: Tensor, poses: Tensor, count: int) -> Tensor:
-    """Poses of all frames [count, 4, 4] from those of some, along screw motions; before the first and after the last one it stands."""
+    """Interpolate poses of all frames [count, 4, 4] along screw motions. Poses are constant before
+    the first and after the last given frame.
+    """
     number = torch.arange(count)
     after = torch.searchsorted(frames, number).clamp(1, len(frames) - 1)
     first, second = frames[after - 1], frames[after]

@@ -1,7 +1,8 @@
-"""Bundle adjustment: poses and points that explain best where the points were seen.
+"""Bundle adjustment of camera poses and static points by minimising the reprojection error.
 
-Levenberg-Marquardt on the reprojection errors with Cauchy's robust weights; the points are eliminated (Schur complement), so that the system to
-solve has six unknowns a camera. Triggs et al., "Bundle Adjustment: a Modern Synthesis", 2000, sections 4.3 and 6.1.
+Levenberg-Marquardt with Cauchy's robust weights. The points are eliminated by the Schur complement,
+so the linear system has six unknowns per camera. Triggs et al., "Bundle Adjustment: a Modern
+Synthesis", 2000, sections 4.3 and 6.1.
 """
 
 from __future__ import annotations
@@ -16,29 +17,31 @@ from gsplat_core.geometry.pose import exp
 from gsplat_core.threads import one_thread
 
 NEAREST = 1e-3
-"""Of the median depth: what is nearer, or behind the camera, is taken to be there."""
+"""Smallest depth used in projections, as a share of the median depth. Points nearer than this or
+behind the camera are clamped to it.
+"""
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """Cameras, points and what was seen of them; all float64."""
+    """Cameras, points and observations; all float64."""
 
     poses: Tensor
-    """World to camera [C, 4, 4]."""
+    """World-to-camera poses [C, 4, 4]."""
     points: Tensor
-    """[P, 3] in the world."""
+    """World positions [P, 3]."""
     camera: Tensor
-    """int64 [M]: which camera saw ..."""
+    """Camera index of each observation, int64 [M]."""
     point: Tensor
-    """int64 [M]: ... which point ..."""
+    """Point index of each observation, int64 [M]."""
     rays: Tensor
-    """[M, 2]: ... where, as x / z and y / z."""
+    """Observed ray of each observation as x / z and y / z, [M, 2]."""
     focal_px: float
-    """Turns errors of rays into pixels."""
+    """Focal length in pixels; converts ray errors to pixels."""
 
 
 def errors_px(bundle: Bundle) -> Tensor:
-    """Distance [M] between where each point was seen and where it would be, in pixels."""
+    """Return the reprojection error of each observation [M] in pixels."""
     residual, _, _ = _residuals(bundle)
     return residual.norm(dim=1)
 
@@ -47,12 +50,18 @@ def errors_px(bundle: Bundle) -> Tensor:
 def adjust(
     bundle: Bundle, *, fixed: Tensor, rounds: int = 15, spread_px: float = 1.0, points_move: bool = True
 ) -> Bundle:
-    """The bundle after at most `rounds` steps, of which each lessens the robust error.
+    """Minimise the robust reprojection error.
 
     Args:
-        fixed: bool [C]; cameras that stay where they are. One at least, or the whole may drift.
-        spread_px: errors well above this decide little (Cauchy's scale).
-        points_move: False: only cameras do, each by itself.
+        bundle: start values.
+        fixed: bool [C], cameras that keep their pose. At least one must be fixed, or the whole
+            scene may drift.
+        rounds: maximum number of Levenberg-Marquardt steps.
+        spread_px: Cauchy scale in pixels; errors well above it have little influence.
+        points_move: optimise the points as well. If False, each camera is optimised independently.
+
+    Returns:
+        The adjusted bundle. Its robust error is never larger than that of the input.
     """
     step = lambda bundle, damping: _step(bundle, fixed, spread_px, damping, points_move)
     return descend(bundle, step, lambda bundle: _cost(bundle, spread_px), rounds)[0]
@@ -64,7 +73,9 @@ def _cost(bundle: Bundle, spread_px: float) -> float:
 
 
 def _residuals(bundle: Bundle) -> tuple[Tensor, Tensor, Tensor]:
-    """Residuals [M, 2] in pixels, the points in their cameras [M, 3], and the cameras' rotations [M, 3, 3]."""
+    """Return residuals [M, 2] in pixels, points in camera coordinates [M, 3] and camera rotations
+    [M, 3, 3].
+    """
     pose = bundle.poses[bundle.camera]
     rotation = pose[:, :3, :3]
     local = (rotation @ bundle.points[bundle.point][:, :, None])[:, :, 0] + pose[:, :3, 3]
@@ -94,7 +105,8 @@ def _step(bundle: Bundle, fixed: Tensor, spread_px: float, damping: float, point
     h = summed((weighted_point @ residual[:, :, None])[:, :, 0], bundle.point, points)
     V = V + damping * diagonal_of(V)
     inverse = torch.linalg.inv(V)
-    # Cameras by points, dense: a few hundred cameras and some thousand points are small for that.
+    # Dense camera-by-point blocks: small enough for a few hundred cameras and a few thousand
+    # points.
     W = torch.zeros(cameras * points, 6, 3, dtype=local.dtype)
     W.index_add_(0, bundle.camera * points + bundle.point, weighted.transpose(1, 2) @ by_point)
     W = W.view(cameras, points, 6, 3)[free]

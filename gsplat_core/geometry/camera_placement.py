@@ -1,7 +1,8 @@
-"""One camera moved to where known points are seen: as bundle adjustment with points that stand (`bundle.adjust`), quick enough for every frame of a stream.
+"""Pose of a single camera from known static points, fast enough to run on every frame of a stream.
 
-Gauss-Newton with Cauchy's robust weights, the scale of which is what points are off by at first, and less with each round: so that a start that is off by many pixels is as good as
-one that is nearly right.
+Gauss-Newton with Cauchy's robust weights. The Cauchy scale follows the current median error, so a
+start that is off by many pixels converges as well as a good one. `bundle.adjust` solves the same
+problem for many cameras.
 """
 
 from __future__ import annotations
@@ -10,19 +11,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 SPREAD_PX = 1.0
-"""Errors well above this decide little in the last rounds (Cauchy's scale)."""
+"""Smallest Cauchy scale in pixels, used in the last rounds."""
 ROUNDS, LAST_ROUNDS = 8, 3
 DONE = 1e-5
-"""A step that is shorter, in radians and relative to the distance, is the last one."""
+"""Step length, in radians plus translation relative to the median depth, below which the iteration
+ends.
+"""
 
 Array = NDArray[np.float64]
 
 
 def placed(pose: Array, points: Array, rays: Array, focal_px: float) -> tuple[Array, Array]:
-    """The pose, world to camera [4, 4], from which `points` [N, 3] are seen along `rays` [N, 2] (x / z and y / z), beginning at `pose`; and by how many pixels each
-    is off [N]."""
+    """Estimate a camera pose from points and their observed rays.
+
+    Args:
+        pose: start value, world to camera [4, 4].
+        points: world positions [N, 3].
+        rays: observed rays [N, 2] as x / z and y / z.
+        focal_px: focal length in pixels.
+
+    Returns:
+        The pose [4, 4] and the reprojection error of each point [N] in pixels.
+    """
     left, pose = 0, pose.copy()
-    # Products of poses are turned by rounding errors, which grow from frame to frame.
+    # Orthonormalise: rounding errors in products of poses accumulate from frame to frame.
     u, _, v = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = u @ v
     for _ in range(ROUNDS):
@@ -43,7 +55,9 @@ def placed(pose: Array, points: Array, rays: Array, focal_px: float) -> tuple[Ar
 
 
 def moved(pose: Array, twist: Array) -> Array:
-    """A pose after a small twist (translation [3], rotation vector [3]) in the camera's own coordinates, as `gsplat_core.geometry.pose.exp(twist) @ pose`."""
+    """Apply a small twist (translation [3], rotation vector [3]) in camera coordinates: `exp(twist)
+    @ pose`.
+    """
     along, turn = twist[:3], twist[3:]
     angle = max(float(np.linalg.norm(turn)), 1e-12)
     cross = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
@@ -58,7 +72,7 @@ def moved(pose: Array, twist: Array) -> Array:
 
 
 def _seen(pose: Array, points: Array, rays: Array, focal_px: float) -> tuple[Array, Array]:
-    """Points in the camera [N, 3], and by how many pixels each is off [N, 2]."""
+    """Return points in camera coordinates [N, 3] and their residuals [N, 2] in pixels."""
     local = points @ pose[:3, :3].T + pose[:3, 3]
     nearest = 1e-3 * abs(float(np.median(local[:, 2]))) + 1e-12
     local[:, 2] = np.maximum(local[:, 2], nearest)
@@ -66,7 +80,7 @@ def _seen(pose: Array, points: Array, rays: Array, focal_px: float) -> tuple[Arr
 
 
 def _by_twist(local: Array) -> Array:
-    """How a twist of the camera moves the rays of points in it [N, 2, 6]."""
+    """Return the derivatives of rays by a twist of the camera, [N, 2, 6]."""
     x, y, z = local.T
     result = np.zeros((len(local), 2, 6))
     result[:, 0, 0] = result[:, 1, 1] = 1 / z

@@ -1,4 +1,4 @@
-"""The point of a triangle mesh that is closest to another point."""
+"""Closest points on a triangle mesh."""
 
 from __future__ import annotations
 
@@ -12,52 +12,57 @@ from gsplat_core.errors import InvalidSetting
 Array = NDArray[np.float64]
 
 SAMPLES = 100_000
-"""Points spread over the mesh, about so many, among which the nearest are searched first."""
+"""Approximate number of samples spread over the mesh for the nearest-neighbour search."""
 CANDIDATES = 6
-"""So many of the nearest samples are looked at; the closest point is taken from their triangles. Where triangles of very different sizes meet it may be on
-another one; the error is less than the distance between samples."""
+"""Nearest samples whose triangles are tested exactly. The closest point may be on another triangle
+where triangles of very different sizes meet. The error is then less than the distance between
+samples.
+"""
 MOST_TRIANGLES = 5_000_000
 LEAST_EXTENT, MOST_EXTENT = 1e-6, 1e9
-"""Diagonal of a mesh, in its unit."""
+"""Accepted range of a mesh's bounding-box diagonal, in its unit."""
 EXACT_KD_TREE = 4
-"""FLANN's single k-d tree: an exact search; its other indices are approximate."""
+"""FLANN's exact single k-d tree; its other indices are approximate."""
 
 
 class Closest(NamedTuple):
-    """For each of N points."""
+    """Closest points on a mesh for N query points."""
 
     points: Array
-    """[N, 3] on the mesh."""
+    """Points on the mesh [N, 3]."""
     normals: Array
-    """[N, 3]: of the triangle."""
+    """Unit normals [N, 3] of the triangles that contain the points."""
     distances: Array
-    """[N], at least 0."""
+    """Non-negative distances [N]."""
 
 
 class ClosestPoints:
-    """A mesh that is asked for its closest points. Raises InvalidSetting for one without triangles of any area."""
+    """Index for closest-point queries on a mesh.
+
+    Raises:
+        InvalidSetting: for a mesh without triangles of non-zero area, with too many triangles, or
+            of an implausible size.
+    """
 
     def __init__(self, vertices: Array, triangles: NDArray[np.integer]) -> None:
         if len(triangles) > MOST_TRIANGLES:
-            raise InvalidSetting(f"the mesh has {len(triangles)} triangles; at most {MOST_TRIANGLES} are taken")
+            raise InvalidSetting(f"the mesh has {len(triangles)} triangles; at most {MOST_TRIANGLES} are supported")
         corners = vertices[triangles].astype(np.float64).reshape(-1, 3, 3)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         areas = 0.5 * np.linalg.norm(normals, axis=1)
         usable = areas > 1e-12 * max(float(areas.max(initial=0.0)), 1e-300)
         if not usable.any():
-            raise InvalidSetting(
-                "the mesh has no triangles with an area; a surface is needed to measure distances from"
-            )
+            raise InvalidSetting("the mesh has no triangles with an area; distances can only be measured to a surface")
         self._corners, areas = corners[usable], areas[usable]
         self._normals = normals[usable] / (2 * areas[:, None])
         self.extent = float(np.linalg.norm(np.ptp(self._corners.reshape(-1, 3), axis=0)))
         if not LEAST_EXTENT <= self.extent <= MOST_EXTENT:
             raise InvalidSetting(
-                f"the mesh is {self.extent:.3g} across; from {LEAST_EXTENT:g} to {MOST_EXTENT:g} is taken, export it again in millimetres"
+                f"the mesh is {self.extent:.3g} across; the supported range is {LEAST_EXTENT:g} to {MOST_EXTENT:g}, export it again in millimetres"
             )
         samples, self._triangle = _sampled(self._corners, areas)
         self._centre = samples.mean(0)
-        # float32 is enough to find candidates once the middle is taken off, and the size divided out.
+        # float32 is precise enough for candidates once the mesh is centred and scaled to unit size.
         import cv2
 
         self._samples = np.ascontiguousarray(((samples - self._centre) / self.extent).astype(np.float32))
@@ -66,7 +71,7 @@ class ClosestPoints:
         )
 
     def closest(self, points: Array) -> Closest:
-        """The closest points of the mesh to points [N, 3]."""
+        """Return the closest points of the mesh to query points [N, 3]."""
         count = min(CANDIDATES, len(self._samples))
         asked = np.ascontiguousarray(((points - self._centre) / self.extent).astype(np.float32))
         found, _ = self._tree.knnSearch(asked, count, params={"checks": -1, "eps": 0.0, "sorted": True})
@@ -82,7 +87,9 @@ class ClosestPoints:
 
 
 def closest_on_triangles(points: Array, corners: Array) -> Array:
-    """The point of each triangle [N, 3, 3] that is closest to its point [N, 3] (Ericson 2005, section 5.1.5)."""
+    """Return the closest point of each triangle [N, 3, 3] to the query point [N, 3] of the same row
+    (Ericson 2005, "Real-Time Collision Detection", section 5.1.5).
+    """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     edges = np.stack([_on_segment(points, a, b), _on_segment(points, b, c), _on_segment(points, c, a)], 1)
     nearest = np.linalg.norm(edges - points[:, None], axis=2).argmin(1)
@@ -103,8 +110,10 @@ def _on_segment(points: Array, start: Array, end: Array) -> Array:
 
 
 def _sampled(corners: Array, areas: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Points spread evenly over the triangles, at least one each, and the triangle of each."""
-    # A triangle is cut into n² equal ones; the centroid of each is a sample.
+    """Return points spread evenly over the triangles, at least one each, and their triangle
+    indices.
+    """
+    # Each triangle is cut into n² equal parts; the centroid of each part is a sample.
     cuts = np.clip(np.ceil(np.sqrt(areas * SAMPLES / areas.sum())), 1, 400).astype(int)
     samples, owners = [], []
     for n in np.unique(cuts):
@@ -116,7 +125,7 @@ def _sampled(corners: Array, areas: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def _middles(n: int) -> Array:
-    """Barycentric coordinates [n², 3] of the middles of the n² equal triangles that a triangle is cut into."""
+    """Return barycentric coordinates [n², 3] of the centroids of a triangle's n² equal parts."""
     upright = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
     turned = [(i + 2 / 3, j + 2 / 3) for i in range(n - 1) for j in range(n - 1 - i)]
     two = np.array(upright + turned) / n

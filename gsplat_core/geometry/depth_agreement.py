@@ -1,8 +1,11 @@
-"""Validation of depth that was found in pictures: two looks at the same tissue, from other places and at other times, have to find the same relief.
+"""Validation of depth by parallax: two depth maps of the same tissue, from other poses and times,
+must show the same relief.
 
-Pictures alone do not tell whether the poses explain them: tissue that moves evenly for a while looks like tissue that stands still at another distance, and a
-warp by the wrong depth fits as well as one by the true depth. But the tissue's own motion changes, and with it the depth that it feigns. Where two
-looks differ by a fair share of the relief that they show, a level plane is as close to the tissue as they are.
+The reprojection error does not reveal wrong poses or moving tissue. Tissue that moves evenly for a
+while looks like static tissue at another distance, and a warp by the wrong depth fits as well as
+one by the true depth. The tissue's motion changes over time, however, and so does the depth error
+that it causes. If two depth maps differ by a fair share of the relief that they show, a level plane
+is as accurate as they are.
 """
 
 from __future__ import annotations
@@ -18,29 +21,36 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.projection import moved, pixel_rays, pixels_of
 
 LONGEST_PX = 160
-"""Longest side of the maps that are compared."""
+"""Longest side of the compared depth maps, in pixels."""
 MOST_DISAGREEMENT = 0.25
-"""Typical difference of two looks, over the typical relief that they show, up to which both are used."""
+"""Largest accepted median difference of two depth maps, as a share of their median relief."""
 LEAST_SHARED = 0.1
-"""Share of the picture that both looks have to know."""
+"""Share of the picture that both depth maps must cover."""
 UNCONFIRMED = "two looks at the tissue by parallax do not find the same relief, so that a level plane may be as close"
-"""Doubt about depth that no second look confirms."""
+"""Reason given for depth that no second depth map confirms."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """A depth map at reduced size, and the camera that saw it."""
+    """Depth map at reduced size with its camera."""
 
     inverse: NDArray[np.float32]
     """Inverse depth [h, w]."""
     believed: NDArray[np.float32]
-    """[h, w]; 1 where it is believed, 0 elsewhere."""
+    """Validity [h, w]: 1 where the depth is confident, 0 elsewhere."""
     camera: Camera
-    """Camera scaled to the size of the map, with its pose."""
+    """Camera with its pose, scaled to the size of the map."""
 
     @classmethod
     def of(cls, depth: NDArray[np.float32], confidence: NDArray[np.float32] | None, camera: Camera) -> Look:
-        """Return the look of a depth map [H, W], 0 = unknown, and its confidence [H, W]; without one, what is known is believed."""
+        """Return the reduced depth map. Without a confidence, every known depth counts as
+        confident.
+
+        Args:
+            depth: float32 [H, W], 0 = unknown.
+            confidence: float32 [H, W], 0 to 1, or None.
+            camera: camera at full size, with its pose.
+        """
         known = (depth > 0) if confidence is None else (depth > 0) & (confidence >= BELIEVED)
         small = camera.scaled(min(1.0, LONGEST_PX / max(depth.shape)))
         size = small.width_px, small.height_px
@@ -53,9 +63,10 @@ class Look:
 
 
 def disagreement(first: Look, second: Look) -> float:
-    """Return the typical relative difference of two looks over the typical relief of the second one; infinite where they share too little tissue.
+    """Return the median relative depth difference over the median relief of the second map;
+    infinite if they share too little tissue.
 
-    Typical is the median of absolute values. Differences of the distance as a whole count, too: the poses give it.
+    Differences of the overall distance count as well, since the poses determine it.
     """
     inverse = np.where(first.inverse > 0, first.inverse, 1)
     points = pixel_rays(first.camera) / inverse[..., None]
@@ -78,5 +89,5 @@ def disagreement(first: Look, second: Look) -> float:
 
 
 def agree(first: Look, second: Look) -> bool:
-    """Return True where two looks confirm each other."""
+    """Return True if two depth maps confirm each other."""
     return disagreement(first, second) <= MOST_DISAGREEMENT

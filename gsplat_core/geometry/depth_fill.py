@@ -1,7 +1,8 @@
-"""Depth where none is known: the surface around it, continued.
+"""Extrapolation of depth into regions without depth by fitted planes.
 
-A plane's inverse depth is linear in the picture. So planes are fitted to the inverse depths that are known: one to the whole picture, then to what is
-left one round each pixel, weighted by a Gaussian window, wide and then narrow, where enough is known.
+The inverse depth of a plane is linear in picture coordinates. One plane is fitted to all known
+inverse depths. Local planes are then fitted to the residual around each pixel, weighted by a wide
+and then a narrow Gaussian window.
 """
 
 from __future__ import annotations
@@ -15,21 +16,30 @@ from gsplat_core.geometry.local_planes import at_middles, terms_of
 Plane = NDArray[np.float32]
 
 CELL_PX = 4
-"""Side of the cells in which it is worked out, at least."""
+"""Smallest side of the grid cells on which planes are fitted, in pixels."""
 WINDOWS = (0.12, 0.03)
-"""Standard deviations of the windows, as shares of the picture's width."""
+"""Standard deviations of the Gaussian windows, as shares of the picture's width."""
 CELLS_A_WINDOW = 4.0
-"""Standard deviation of a window in cells: a wide one takes large cells, or its sums take longer than a frame of a live stream has."""
+"""Standard deviation of a window in grid cells; a wide window uses large cells to limit its cost.
+"""
 LEAST_KNOWN = 0.02
-"""Share of a window that has to be known for its plane to count half."""
+"""Share of a window with known depth at which its plane gets half its weight."""
 TILT_DOUBT = 0.003
-"""As `LEAST_KNOWN`, for the plane's slope, when what is known is spread like the window; beside one edge alone the slope counts less."""
+"""Regularisation of a plane's slope. The slope is damped more if the known values are along one
+edge than if they fill the window.
+"""
 
 
 def filled_depth(depth: Plane, known: NDArray[np.bool_]) -> Plane:
-    """A smooth depth for every pixel [H, W] by the depth of those that are `known` [H, W], positive and finite; close to it where it is known.
+    """Return a smooth depth [H, W] for every pixel that is close to the known depth.
 
-    Never nearer than half the nearest known depth, nor farther than twice the farthest. Zero everywhere where nothing is known.
+    Args:
+        depth: float32 [H, W], positive and finite where known.
+        known: bool [H, W].
+
+    Returns:
+        float32 [H, W] between half the nearest and twice the farthest known depth; all zero if no
+            depth is known.
     """
     height, width = depth.shape
     if not known.any():
@@ -54,7 +64,9 @@ def filled_depth(depth: Plane, known: NDArray[np.bool_]) -> Plane:
 
 
 def _whole_plane(values: Plane, weight: Plane) -> Plane:
-    """The plane that fits all weighted values best, in each cell; the less steep, the fewer there are."""
+    """Return the weighted least-squares plane evaluated in each cell. Its slope is damped more, the
+    fewer values are known.
+    """
     rows, columns = (np.linspace(-1, 1, n) for n in values.shape)
     terms = np.stack([np.ones(values.shape), *np.broadcast_arrays(columns, rows[:, None])], axis=-1).reshape(-1, 3)
     weighted = terms * weight.reshape(-1, 1)
@@ -64,8 +76,16 @@ def _whole_plane(values: Plane, weight: Plane) -> Plane:
 
 
 def local_plane(values: Plane, weight: Plane, sigma: float) -> Plane:
-    """At each cell [h, w] the value of the plane that fits the values around it best, weighted from 0 to 1 and by a Gaussian window of `sigma` cells; the less
-    is known there, the nearer to zero."""
+    """Return the locally fitted plane evaluated at each cell.
+
+    Args:
+        values: float32 [h, w].
+        weight: float32 [h, w], 0 to 1.
+        sigma: standard deviation of the Gaussian window in cells.
+
+    Returns:
+        float32 [h, w]; shrunk towards zero where little of the window is known.
+    """
     rows, columns = (np.arange(n, dtype=np.float64) / sigma for n in values.shape)
     x, y = np.broadcast_to(columns, values.shape), np.broadcast_to(rows[:, None], values.shape)
     sums = tuple(

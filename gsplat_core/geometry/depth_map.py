@@ -1,4 +1,4 @@
-"""How far away each pixel of a picture is, and how far that is to be believed."""
+"""Depth maps with confidence, as depth estimators return them."""
 
 from __future__ import annotations
 
@@ -11,27 +11,38 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.frames import DepthOrigin
 
 BELIEVED = 0.5
-"""Confidence from which a depth is used where it can only be used or left out."""
+"""Confidence from which a depth is used where it can only be used or rejected."""
 POSSIBLE = 0.03
-"""Confidence from which a matched depth is rather started from than a guess by what lies around it."""
+"""Confidence from which a stereo depth is a better start value than one extrapolated from its
+neighbourhood.
+"""
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """What an estimator found for one picture. Raises InvalidInput for planes of other types, or that do not fit together."""
+    """Depth estimated for one picture.
+
+    Raises:
+        InvalidInput: for planes that are not float32 [H, W] of one shape, or a rejected map with
+            non-zero confidence.
+    """
 
     depth: NDArray[np.float32]
-    """z [H, W]; 0 = unknown. Millimetres where `metric`."""
+    """Depth along the optical axis, float32 [H, W]; 0 = unknown. In millimetres if `metric`."""
     confidence: NDArray[np.float32]
-    """[H, W], 0 to 1: how probable it is that the depth is right; 0 where it is unknown."""
+    """Probability that the depth is right, float32 [H, W], 0 to 1; 0 where the depth is unknown."""
     origin: DepthOrigin
     metric: bool
-    """Whether the unit is known; otherwise depth is relative, right up to one factor."""
+    """True if the depth is in millimetres; otherwise it is known up to one factor."""
     doubt: str | None = None
-    """What speaks against the whole of it, in a sentence; the confidence is 0 everywhere then."""
+    """Reason why the whole map is rejected, as a sentence, or None. A rejected map has zero
+    confidence everywhere.
+    """
 
     remark: str | None = None
-    """What whoever uses it should know, in a sentence. Like `doubt` it says the same up to its first colon, whatever the numbers behind it."""
+    """Information for the user about the whole map, as a sentence, or None. Like `doubt`, its text
+    up to the first colon does not depend on numbers, so repeated messages can be recognised.
+    """
 
     def __post_init__(self) -> None:
         for name in ("depth", "confidence"):
@@ -41,21 +52,23 @@ class DepthMap:
                     f"{name} must be float32 {list(self.depth.shape)}, got {plane.dtype} {list(plane.shape)}"
                 )
         if self.doubt is not None and np.any(self.confidence):
-            raise InvalidInput("a depth that is doubted as a whole must have no confidence anywhere")
+            raise InvalidInput("a depth map with a doubt must have confidence 0 everywhere")
 
     @property
     def believed(self) -> NDArray[np.float32]:
-        """The depth where it is believed, 0 everywhere else."""
+        """Depth where its confidence is at least `BELIEVED`, 0 elsewhere."""
         return np.where(self.confidence >= BELIEVED, self.depth, np.float32(0))
 
     @property
     def kept(self) -> NDArray[np.float32]:
-        """The depth that a frame goes on with beside its confidence, 0 elsewhere: where it is believed, and of two eyes where it is possible."""
+        """Depth that is stored with the frame, 0 elsewhere: confident depth, for stereo also depth
+        of at least `POSSIBLE` confidence.
+        """
         least = POSSIBLE if self.origin is DepthOrigin.STEREO else BELIEVED
         return np.where(self.confidence >= least, self.depth, np.float32(0))
 
 
 def doubted(shape: tuple[int, int], origin: DepthOrigin, doubt: str) -> DepthMap:
-    """No depth at all [H, W], and why."""
+    """Return a rejected depth map [H, W] without depth, with the reason."""
     nothing = np.zeros(shape, np.float32)
     return DepthMap(nothing, nothing, origin, metric=False, doubt=doubt)

@@ -1,8 +1,11 @@
-"""How far each pixel of the left eye's picture lies to the right of the same point in the right eye's: semi-global matching, then a local fit.
+"""Dense disparity of a rectified stereo pair by semi-global matching followed by a local sub-pixel
+fit.
 
-`disparity` is x of the left eye minus x of the right one, in pixels. Matching decides which surface a pixel belongs to, in sixteenths of a pixel that
-gather around whole ones; the fit that follows moves each of them to where the pictures agree best, and says how well the pictures tell. Both are ops of
-`gsplat_core.ops`, for the CPU and for CUDA: tensors stay where they are, and nothing here waits for a device.
+Disparity is x in the left picture minus x in the right picture, in pixels. Matching selects the
+surface of each pixel in sixteenths of a pixel, which cluster around whole pixels. The fit then
+moves each disparity to the best photometric agreement and estimates its standard deviation. Both
+steps are ops of `gsplat_core.ops` for CPU and CUDA. Tensors stay on their device, and no function
+here synchronises with it.
 """
 
 from __future__ import annotations
@@ -20,48 +23,60 @@ from gsplat_core.ops.edge_aware_filter.edge_aware_filter import smooth_within_ed
 from gsplat_core.ops.stereo_matching.stereo_matching import COUNT_STEP, SIXTEENTHS, UNKNOWN, match_disparities
 
 EDGE_ERROR_PX = 1.5
-"""Standard deviation of what is matched near edges and holes."""
+"""Standard deviation of matched disparities near edges and holes, in pixels."""
 SMOOTHNESS, SMOOTH_GREY = 100.0, 5.0
-"""Of the edge-aware filter: its strength, and the step of grey values that it does not smooth over."""
+"""Strength of the edge-aware filter, and the grey-value step across which it does not smooth."""
 LEAST_VARIANCE_PX2 = 0.05
-"""What is known better weighs no more in the filter."""
+"""Lower bound of a disparity's variance in the filter, in pixels²; limits the weight of the best
+values.
+"""
 LEAST_WEIGHT = 1e-4
-"""Of the known disparities that a smoothed one is made from."""
+"""Smallest filtered weight of known disparities for a smoothed disparity to count as known."""
 
 
 @dataclass(frozen=True)
 class Disparity:
-    """A disparity for each pixel of the left picture."""
+    """Disparity of each pixel of the left picture, with validity and standard deviation."""
 
     px: Tensor
-    """[H, W] float32; 0 where it is not known."""
+    """Disparity in pixels, float32 [H, W]; 0 where unknown."""
     known: Tensor
-    """[H, W] bool."""
+    """Validity, bool [H, W]."""
     error_px: Tensor
-    """[H, W] float32: standard deviation, from what the pictures tell; infinite where nothing is known."""
+    """Standard deviation in pixels estimated from the pictures, float32 [H, W]; infinite where
+    unknown.
+    """
 
 
 @dataclass(frozen=True)
 class Span:
-    """The disparities that are looked for: `count` of them, a multiple of 16, from `lowest` on."""
+    """Search range of disparities: `count` values, a multiple of 16, starting at `lowest`."""
 
     lowest: int
     count: int
 
     @classmethod
     def around(cls, low: float, high: float) -> Span:
-        """The smallest span with everything from `low` to `high`."""
+        """Return the smallest range that contains `low` to `high`, in pixels."""
         lowest = int(np.floor(low))
         return cls(lowest, COUNT_STEP * max(1, int(np.ceil((high - lowest + 1) / COUNT_STEP))))
 
     @property
     def highest(self) -> int:
-        """The last one."""
+        """Largest disparity of the range, in pixels."""
         return self.lowest + self.count - 1
 
 
 def find_disparity(left: Tensor, right: Tensor, span: Span) -> Disparity:
-    """Matches two grey pictures [H, W] uint8 whose rows correspond. Raises InvalidInput for a span of more than 256 disparities."""
+    """Match two rectified grey pictures.
+
+    Args:
+        left, right: uint8 [H, W] on one device; corresponding points are in the same row.
+        span: search range.
+
+    Raises:
+        InvalidInput: for a range of more than 256 disparities.
+    """
     matches = match_disparities(left, right, span.lowest, span.count)
     fitted = fit_disparities(left, right, matches.sixteenths)
     doubtful = torch.where(matches.one_surface, fitted.error_px, fitted.error_px.square().add(EDGE_ERROR_PX**2).sqrt())
@@ -71,7 +86,9 @@ def find_disparity(left: Tensor, right: Tensor, span: Span) -> Disparity:
 def match(
     left: NDArray[np.uint8], right: NDArray[np.uint8], span: Span
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Disparities of two grey pictures [H, W] by matching alone, on the CPU, and where they are known."""
+    """Match two grey pictures uint8 [H, W] on the CPU without the sub-pixel fit. Returns disparity
+    float32 [H, W] and validity bool [H, W].
+    """
     left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
     found = match_disparities(
         torch.from_numpy(left), torch.from_numpy(right), span.lowest, span.count
@@ -81,7 +98,12 @@ def match(
 
 
 def smoothed(found: Disparity, guide: Tensor) -> Disparity:
-    """Known disparities smoothed within what looks like one surface in `guide` [H, W] or [H, W, 3], each weighted by how well it is known."""
+    """Smooth known disparities with an edge-aware filter, each weighted by its inverse variance.
+
+    Args:
+        found: disparity to smooth.
+        guide: picture [H, W] or [H, W, 3] whose edges are preserved.
+    """
     weight = torch.where(found.known, 1 / (LEAST_VARIANCE_PX2 + found.error_px.square()), 0)
     total, share = smooth_within_edges(torch.stack([weight * found.px, weight]), guide, SMOOTHNESS, SMOOTH_GREY)
     known = found.known & (share > LEAST_WEIGHT)
@@ -89,7 +111,7 @@ def smoothed(found: Disparity, guide: Tensor) -> Disparity:
 
 
 def shrunk(picture: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """A picture that is smaller by a whole factor; each pixel is the mean of those that it stands for."""
+    """Reduce a picture by an integer factor with area averaging."""
     if factor == 1:
         return picture
     size = picture.shape[1] // factor, picture.shape[0] // factor
@@ -97,7 +119,9 @@ def shrunk(picture: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
 
 
 def enlarged(found: Disparity, width_px: int, height_px: int) -> Disparity:
-    """A disparity of shrunk pictures at full size; known where all that it is interpolated from is."""
+    """Upsample a disparity of reduced pictures to full size. A pixel is known if all values it is
+    interpolated from are known.
+    """
     if (height_px, width_px) == tuple(found.px.shape):
         return found
     factor = width_px / found.px.shape[1]

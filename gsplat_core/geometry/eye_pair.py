@@ -1,7 +1,9 @@
-"""What two pictures say of the pair of eyes that took them: how far apart points lie in them, and what speaks against a rectified pair.
+"""Plausibility check of a stereo pair: disparity range, row alignment and reasons against a
+rectified pair.
 
-Corners of the left picture are found in the right one, first along the row at low resolution over the whole range, then by Lucas and Kanade's method
-in both directions at full size. In a rectified pair a point is in the same row in both.
+Corners of the left picture are searched in the right one, first along the row at low resolution
+over the whole disparity range, then with Lucas-Kanade optical flow in both directions at full size.
+In a rectified pair corresponding points are in the same row.
 """
 
 from __future__ import annotations
@@ -16,43 +18,58 @@ from gsplat_core.geometry.disparity import Span, match
 from gsplat_core.geometry.point_flow import Points, followed
 
 COARSE_WIDTH_PX = 200
-"""Width at which the whole range is looked through."""
+"""Picture width at which the whole disparity range is searched, in pixels."""
 COARSE_RANGE = (-0.3, 0.5)
-"""That range, as shares of the width: even what no pair of eyes has, so that a swapped pair is seen as one."""
+"""Searched disparities as shares of the width. The negative part is implausible and reveals swapped
+eyes.
+"""
 CORNERS, CORNER_QUALITY, CORNER_APART_PX = 400, 0.01, 7
 SATURATED = 250
-"""Grey value from which a pixel shows the light and not the tissue."""
+"""Grey value from which a pixel counts as saturated."""
 BACK_PX = 0.5
-"""How far a point may come back from where it started."""
+"""Largest accepted forward-backward error of the flow, in pixels."""
 LEAST_POINTS = 24
-"""Fewer of them say nothing about a pair."""
+"""Fewest points from which a pair is judged."""
 LEAST_SHARE = 0.2
-"""Share of the corners that must be found in the other eye, and of those found that must lie on the fitted rows. Pictures of two moments give 0.14."""
+"""Share of the corners that must be found in the other eye, and share of the found ones that must
+fit the common rows.
+"""
 ROW_ERROR_PX = 1.5
-"""A point further from its row counts as wrongly matched."""
+"""Row error in pixels above which a point counts as wrongly matched."""
 MOST_SLOPE_PX = 1.0
-"""How far rows may be off at the edge of the picture, beside an offset that all of them share."""
+"""Largest accepted row difference at the edge of the picture in pixels, relative to the common row
+offset.
+"""
 MOST_OFFSET = 0.03
-"""Largest such offset, as a share of the picture's height."""
+"""Largest accepted common row offset, as a share of the picture's height."""
 LEAST_DISPARITY_PX = 0.5
-"""A median below it, beside the calibration's, is no pair of eyes: the same picture twice, or tissue at infinity."""
+"""Median disparity in pixels, after subtracting the calibration's, below which a pair has no
+parallax: the same picture twice, or tissue at infinity.
+"""
 
 
 @dataclass(frozen=True)
 class PairLook:
-    """What was found in one pair. `doubt` says why it cannot be used, and then the rest means nothing."""
+    """Result of the check of one pair. If `doubt` is set, the other fields are meaningless."""
 
     disparities: Points
-    """[N] of points that were found in both eyes, in pixels."""
+    """Disparities [N] of points found in both eyes, in pixels."""
     rows: NDArray[np.float64]
-    """[3]: by how much the right eye's rows are lower, in pixels: in the middle of the picture, and what is added at its right and at its lower edge."""
+    """Row difference right minus left in pixels, [3]: value in the middle of the picture, and
+    increments at its right and lower edges.
+    """
     row_error_px: float
-    """Median distance of the points from these rows."""
+    """Median distance of the points from the fitted rows, in pixels."""
     doubt: str | None = None
 
 
 def look_at(left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[np.uint8] | None = None) -> PairLook:
-    """Look at two grey pictures [H, W]. usable: [H, W], 0 where nothing is to be compared."""
+    """Check two grey pictures of a stereo pair.
+
+    Args:
+        left, right: uint8 [H, W].
+        usable: uint8 [H, W], 0 where pixels are ignored, or None.
+    """
     here, there, corners = _points_in_both(left, right, usable)
     dim, bright = (float(np.mean(each)) for each in (left < SATURATED, left >= SATURATED))
     if corners < LEAST_POINTS:
@@ -62,21 +79,21 @@ def look_at(left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[n
         )
     if len(here) < max(LEAST_POINTS, LEAST_SHARE * corners):
         return _doubt(
-            f"the eyes do not show the same: {len(here)} of {corners} points of the left picture were found in the right one; "
-            "check that both are of one moment and of one scene, and that the left one is the left one"
+            f"the two eyes show different content: {len(here)} of {corners} points of the left picture were found in the right one; "
+            "check that both show one scene at one time and that the eyes are not swapped"
         )
     height, width = left.shape
     rows, agree = _fitted_rows(here, there[:, 1] - here[:, 1], width, height)
     if agree.mean() < LEAST_SHARE or agree.sum() < LEAST_POINTS:
         return _doubt(
-            "the points of the two eyes lie in no common rows; check the calibration that the pair was rectified with"
+            "corresponding points of the two eyes are not in common rows; check the calibration used for rectification"
         )
     error_px = float(np.median(np.abs(_off_rows(rows, here, there[:, 1] - here[:, 1], width, height)[agree])))
     look = PairLook((here - there)[agree, 0], rows, error_px)
     slope, offset = float(np.abs(rows[1:]).max()), float(abs(rows[0]))
     if slope > MOST_SLOPE_PX:
         return _doubt(
-            f"the pair is not rectified: rows of the two eyes are apart by up to {offset + slope:.1f} px, and differently across the picture; "
+            f"the pair is not rectified: rows of the two eyes differ by up to {offset + slope:.1f} px and not uniformly across the picture; "
             "check the calibration"
         )
     if offset > MOST_OFFSET * height:
@@ -93,7 +110,9 @@ def _doubt(text: str) -> PairLook:
 def _points_in_both(
     left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[np.uint8] | None
 ) -> tuple[Points, Points, int]:
-    """Points [N, 2] (x, y) of the left picture, where they are in the right one, and how many corners there were."""
+    """Return points [N, 2] (x, y) of the left picture, the same points in the right picture, and
+    the number of corners tried.
+    """
     shown = (left < SATURATED).astype(np.uint8) if usable is None else usable * (left < SATURATED)
     shown = np.asarray(cv2.erode(shown, np.ones((7, 7), np.uint8)), np.uint8)
     corners = cv2.goodFeaturesToTrack(_levelled(left), CORNERS, CORNER_QUALITY, CORNER_APART_PX, mask=shown)
@@ -109,14 +128,16 @@ def _points_in_both(
 
 
 def _levelled(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """With noise of a grey value or two taken out: a black picture must have no corners."""
+    """Set pixels without texture above noise level to zero, so that a black picture has no corners."""
     return np.where(cv2.GaussianBlur(cv2.absdiff(grey, cv2.blur(grey, (9, 9))), (0, 0), 2) > 1, grey, 0).astype(
         np.uint8
     )
 
 
 def _coarse_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], at: Points) -> NDArray[np.float32]:
-    """[N]: disparity at points [N, 2], to a few pixels; where none was found, the median of those that were."""
+    """Return approximate disparities [N] at points [N, 2], or the median disparity where none was
+    found.
+    """
     factor = max(1.0, left.shape[1] / COARSE_WIDTH_PX)
     size = max(1, round(left.shape[1] / factor)), max(1, round(left.shape[0] / factor))
     small = [np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8) for each in (left, right)]
@@ -147,7 +168,9 @@ def _basis(here: Points, width: int, height: int) -> NDArray[np.float64]:
 
 
 def _fitted_rows(here: Points, lower: Points, width: int, height: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """By how much the right eye's rows are lower [3], and which points [N] lie on them: reweighted least squares from the median on."""
+    """Return the fitted row difference [3] and the inliers [N], by iteratively reweighted least
+    squares starting from the median.
+    """
     basis = _basis(here, width, height)
     rows = np.array([float(np.median(lower)), 0.0, 0.0])
     scale = 4 * ROW_ERROR_PX

@@ -1,8 +1,10 @@
-"""The focal length of a moving scope whose camera nobody calibrated, from the pictures alone, and how well they tell it.
+"""Focal length of an uncalibrated moving scope, estimated from its pictures, with a range of
+plausible values.
 
-Bundle adjustment over some key frames, once for each of a few focal lengths: the one with the least robust error fits best. A scope that hardly turns shows
-the same pictures with a longer lens and a deeper scene, and tissue that moves by itself fits no focal length better than another: the error then is nearly
-the same over a wide range, and the focal length is not known.
+Key frames are bundle-adjusted once for each of several focal lengths, and the one with the least
+robust error wins. The focal length is unobservable if the scope hardly turns, because a longer lens
+with a deeper scene gives the same pictures. The same holds if the tissue moves by itself. The error
+is then nearly constant over a wide range, and the focal length is reported as unknown.
 """
 
 from __future__ import annotations
@@ -25,47 +27,60 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.threads import one_thread
 
 SHORTEST, LONGEST = 0.6, 1.6
-"""Bounds of the search, in units of the picture's longer side: 80° to 35° across."""
+"""Bounds of the search in units of the picture's longer side, corresponding to fields of view of
+80° and 35°.
+"""
 CANDIDATES = 8
-"""Focal lengths between the bounds, in equal ratios, before the best one is refined."""
+"""Focal lengths tried between the bounds, in equal ratios, before refinement."""
 REFINEMENTS = 4
-"""Steps of a golden-section search."""
+"""Focal lengths evaluated by the golden-section search, two per step."""
 NEARLY_AS_WELL = 0.01
-"""A focal length whose error is larger by less than this share cannot be told from the best one: tissue that moves by itself changes the error by as much."""
+"""Relative increase of the error up to which a focal length is as plausible as the best one. Tissue
+motion changes the error by as much.
+"""
 WIDEST = 1.5
-"""Ratio of the longest to the shortest focal length that fits nearly as well, up to which the best one is known."""
+"""Largest ratio of the plausible range's ends for the focal length to count as known."""
 KEY_FRAMES = 20
 LEAST_SEEN = 3
-"""Key frames in which a point has to be seen."""
+"""Fewest key frames in which a point must be observed."""
 LEAST_POINTS = 50
 ROUNDS = 60
 OUTLIER_PX = (4.0, 3.0)
-"""Points that are further off after the first and the second adjustment are wrong ones."""
+"""Reprojection errors above which observations are rejected after the first and the second
+adjustment, in pixels.
+"""
 NEAREST = 0.05
-"""Of the median depth: points that are nearer, or behind the camera, were not found."""
+"""Share of the median depth below which a point counts as wrongly triangulated; includes points
+behind the camera.
+"""
 
 
 @dataclass(frozen=True)
 class FocalLength:
-    """What pictures tell about a focal length, in pixels."""
+    """Estimate of a focal length in pixels, with its plausible range."""
 
     assumed_px: float
     best_px: float
-    """The one that fits best."""
+    """Focal length with the least error."""
     range_px: tuple[float, float]
-    """All between these fit nearly as well; at a bound of the search perhaps more."""
+    """Lowest and highest plausible focal length. At a bound of the search the true range may be
+    wider.
+    """
     known: bool
-    """Whether that range is narrow, and away from the bounds of the search."""
+    """True if the range is narrow and away from the bounds of the search."""
 
 
 def focal_length_of(frames: Iterable[Frame], camera: Camera, found: Trajectory) -> FocalLength | None:
-    """Search for the focal length.
+    """Estimate the focal length.
 
     Args:
-        frames: those of which `found` is the trajectory, once more.
-        camera: the one that was assumed: a pinhole with one focal length for both axes; its principal point stays.
+        frames: the frames from which `found` was estimated, iterated a second time.
+        camera: assumed pinhole camera with one focal length for both axes; its principal point is
+            kept.
+        found: trajectory estimated with `camera`.
 
-    None where too few points can be followed far enough.
+    Returns:
+        The estimate, or None if too few points can be tracked far enough.
     """
     tracks = FeatureTracks()
     for frame in frames:
@@ -78,8 +93,16 @@ def focal_length_of(frames: Iterable[Frame], camera: Camera, found: Trajectory) 
 def trajectory_without_calibration(
     read: Callable[[], Iterable[Frame]], camera: Camera
 ) -> tuple[Trajectory, FocalLength | None]:
-    """As `trajectory_of`, for frames of an assumed camera, which `read` gives as often as it is called: the trajectory for the focal length that the
-    pictures tell, or for the assumed one where they do not, and what they tell of it."""
+    """Estimate a trajectory together with the focal length.
+
+    Args:
+        read: returns a new iterator over the frames at each call.
+        camera: assumed pinhole camera.
+
+    Returns:
+        The trajectory, with the estimated focal length if it is known and with the assumed one
+            otherwise, and the estimate or None.
+    """
     found = trajectory_of(read(), camera)
     focal = focal_length_of(read(), camera, found)
     if focal is not None and focal.known:
@@ -88,7 +111,9 @@ def trajectory_without_calibration(
 
 
 def with_focal_length(camera: Camera, focal_px: float) -> Camera:
-    """The same pinhole with another focal length for both axes."""
+    """Return a pinhole camera with the same principal point and pose but another focal length in
+    pixels.
+    """
     K = camera.K.copy()
     K[0, 0] = K[1, 1] = focal_px
     return Camera(K, camera.width_px, camera.height_px, camera.world_to_camera)
@@ -96,7 +121,7 @@ def with_focal_length(camera: Camera, focal_px: float) -> Camera:
 
 @dataclass(frozen=True)
 class _Try:
-    """The adjusted scene for one focal length."""
+    """Adjusted scene for one focal length with its robust cost."""
 
     bundle: Bundle
     cost: float
@@ -112,7 +137,7 @@ def _search(start: Bundle, side_px: float) -> FocalLength:
     first = _Try(start, math.inf)
     focals = np.geomspace(SHORTEST * side_px, LONGEST * side_px, CANDIDATES)
     tries: dict[float, _Try] = {}
-    # Outwards from the assumed one: each starts from its neighbour's scene.
+    # Outwards from the assumed focal length; each adjustment starts from its neighbour's scene.
     for side in (focals[focals >= start.focal_px], focals[focals < start.focal_px][::-1]):
         near = first
         for focal_px in side:
@@ -125,7 +150,9 @@ def _search(start: Bundle, side_px: float) -> FocalLength:
 
 
 def _refine(tries: dict[float, _Try], tried: Callable[[float, _Try], _Try]) -> None:
-    """Golden-section search between the neighbours of the best candidate, by the logarithm."""
+    """Refine by golden-section search between the neighbours of the best candidate, on a
+    logarithmic scale.
+    """
     ordered = sorted(tries)
     at = min(range(len(ordered)), key=lambda number: tries[ordered[number]].cost)
     low, high = ordered[max(at - 1, 0)], ordered[min(at + 1, len(ordered) - 1)]
@@ -142,7 +169,9 @@ def _refine(tries: dict[float, _Try], tried: Callable[[float, _Try], _Try]) -> N
 
 
 def _range(tries: dict[float, _Try], best_px: float) -> tuple[float, float]:
-    """Between which focal lengths the error is nearly that of the best one, interpolated between those that were tried."""
+    """Return the ends of the range in which the cost is at most `NEARLY_AS_WELL` above the best,
+    interpolated between tried values.
+    """
     limit = tries[best_px].cost * (1 + NEARLY_AS_WELL)
     ends = []
     for side in (sorted((f for f in tries if f <= best_px), reverse=True), sorted(f for f in tries if f >= best_px)):
@@ -157,7 +186,9 @@ def _range(tries: dict[float, _Try], best_px: float) -> tuple[float, float]:
 
 
 def _start(seen: Observations, camera: Camera, found: Trajectory) -> Bundle | None:
-    """The key frames' scene for the assumed focal length, without points that are wrong."""
+    """Triangulate and adjust the key frames for the assumed focal length and reject outliers.
+    Returns None with too few points.
+    """
     count = len(found.poses)
     keys = np.unique(np.linspace(0, count - 1, min(count, KEY_FRAMES)).round().astype(np.int64))
     seen = seen.of(np.isin(seen.frame, keys))
@@ -185,7 +216,9 @@ def _adjusted(bundle: Bundle, spread_px: float) -> Bundle:
 
 
 def _with_focal(bundle: Bundle, focal_px: float) -> Bundle:
-    """The same pictures with another focal length, and a scene to start from: a nearly flat one far away then looks the same."""
+    """Rescale rays, poses and points for another focal length. The result is exact for a flat scene
+    far away and otherwise a start value.
+    """
     ratio = bundle.focal_px / focal_px
     stretch = torch.tensor([ratio, ratio, 1.0, ratio, ratio, 1.0], dtype=torch.float64)
     return replace(
@@ -195,7 +228,9 @@ def _with_focal(bundle: Bundle, focal_px: float) -> Bundle:
 
 
 def _triangulated(poses: Tensor, camera: Tensor, point: Tensor, rays: Tensor, count: int) -> Tensor:
-    """Points [count, 3] nearest to their rays, by linear least squares (Hartley and Zisserman 2004, section 12.2)."""
+    """Triangulate points [count, 3] by linear least squares (Hartley and Zisserman 2004, section
+    12.2).
+    """
     pose = poses[camera]
     rows = pose[:, :2, :3] - rays[:, :, None] * pose[:, 2:3, :3]
     right = rays * pose[:, 2:3, 3] - pose[:, :2, 3]
@@ -207,7 +242,9 @@ def _triangulated(poses: Tensor, camera: Tensor, point: Tensor, rays: Tensor, co
 
 
 def _without_outliers(bundle: Bundle, limit_px: float) -> Bundle:
-    """The bundle without what is too far off, and without points that too few cameras see then."""
+    """Remove observations with large errors or implausible depths, and points left with too few
+    observations.
+    """
     pose = bundle.poses[bundle.camera]
     depth = (pose[:, 2, :3] * bundle.points[bundle.point]).sum(1) + pose[:, 2, 3]
     kept = (errors_px(bundle) < limit_px) & (depth > NEAREST * depth.median())

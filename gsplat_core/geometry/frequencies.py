@@ -1,4 +1,4 @@
-"""At which frequencies tissue moves: breathing and heart beat are looked for in what a moving scope sees of it."""
+"""Search for the breathing and heart frequencies of tissue seen by a scope with known poses."""
 
 from __future__ import annotations
 
@@ -13,32 +13,41 @@ from gsplat_core.geometry.periodic_motion import Array, PeriodicMotion, fitted
 BREATHING_HZ = 0.1, 0.8
 HEART_HZ = 0.8, 3.0
 LEAST_CYCLES = 0.6
-"""Of what is slower, so little is seen that it could be any drift."""
+"""Fewest cycles over the recording of the slowest frequency tried; slower motion cannot be
+distinguished from drift.
+"""
 STEP_CYCLES = 0.25
-"""From one frequency that is tried to the next, in cycles over the recording: two that differ by less look the same."""
+"""Spacing of the tried frequencies in cycles over the recording; closer ones are indistinguishable.
+"""
 COARSE, FINE = (5, 5), (8, 7)
-"""Nodes of the fits that are only compared: at first, and near the best one."""
+"""Node counts of the motion fits used for comparison: in the coarse search and near the optimum."""
 POINTS, TIMES = 400, 48
-"""That are looked at."""
+"""Numbers of points and times used for the search."""
 ROUNDS = 4
 BREATHES, BEATS = 0.9, 0.96
-"""What is left of the robust error with a frequency, relative to without, from which on the tissue is taken to move with it."""
+"""Largest ratio of the robust cost with a frequency to the cost without, from which breathing and
+heart beat are accepted.
+"""
 AS_GOOD = 1.06
-"""A frequency whose error is not more than so many times the best one's may be the right one."""
+"""Ratio to the lowest cost up to which another frequency counts as equally plausible."""
 
 
 @dataclass(frozen=True)
 class Frequencies:
-    """What was found."""
+    """Frequencies of the tissue's motion, with the uncertainty of the depth."""
 
     hz: tuple[float, ...]
-    """None where tissue stands still; breathing; breathing and heart."""
+    """Empty for static tissue, otherwise the breathing frequency, or the breathing and heart
+    frequencies.
+    """
     error: float
-    """How much the distance of the tissue would change with frequencies that explain the pictures as well, relative to it."""
+    """Relative change of the tissue's depth between equally plausible frequencies."""
 
 
 def found_in(tracks: GridTracks) -> Frequencies:
-    """The frequencies that explain best where points were seen, none where they explain little more than a tissue that stands still does."""
+    """Find the frequencies that best explain the tracks; none if static tissue explains them nearly
+    as well.
+    """
     few = _few(tracks)
     still = fitted(few, (), rounds=2 * ROUNDS, nodes=COARSE)
     rest = still.terms[:, :, 0]
@@ -89,7 +98,9 @@ def _changed(best: PeriodicMotion, which: int, change: float) -> tuple[float, ..
 
 
 def _spread(tried: Iterable[PeriodicMotion], best: PeriodicMotion, tracks: GridTracks) -> float:
-    """How much distances of those differ, as a median, that explain the pictures about as well as the best."""
+    """Return the largest median relative depth difference between the best fit and all equally
+    plausible fits.
+    """
     pose = tracks.poses[len(tracks.poses) // 2]
     depths = [each.terms[:, :, 0] @ pose[2, :3] + pose[2, 3] for each in tried if each.cost <= AS_GOOD * best.cost]
     return float(max(np.median(np.abs(depth / depths[-1] - 1)) for depth in depths))

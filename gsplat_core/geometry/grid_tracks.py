@@ -1,8 +1,9 @@
-"""A grid of points of some key pictures, found in all other pictures of a recording.
+"""Tracks of a grid of key-frame points through all pictures of a recording.
 
-Flow is looked for between a key picture and each other one directly, from where it was at the picture before: errors do not add up along the
-way, as they do where points are followed from one picture to the next. Pictures are compared by their texture alone, each part relative to its
-surroundings: the light moves with the scope, and so do reflections.
+Optical flow is computed directly between a key picture and every other one, initialised with the
+flow to the neighbouring picture. Errors therefore do not accumulate as in frame-to-frame tracking.
+Pictures are compared by local texture relative to the surrounding contrast, because light and
+reflections move with the scope.
 """
 
 from __future__ import annotations
@@ -20,55 +21,59 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
 LONGEST_PX = 320
-"""Side of the pictures that are compared."""
+"""Longest side of the compared pictures, in pixels."""
 SPACING_PX = 10
-"""Of the grid."""
+"""Spacing of the grid, in pixels."""
 DARK = 8
-"""Grey levels added before the logarithm, so that what is black has no texture."""
+"""Grey levels added before the logarithm, so that black regions have no texture."""
 BROAD_PX, CONTRAST_PX = 5.0, 10.0
-"""What is broader than that is light, not texture; and the surroundings whose contrast each part is measured by (standard deviations)."""
+"""Standard deviations in pixels of the high-pass filter that removes illumination, and of the
+window for the local contrast.
+"""
 LEAST_CONTRAST = 0.01
-"""Of the logarithm: less is noise, and not brought up to the usual contrast."""
+"""Lower bound of the local contrast of log brightness; lower contrast is noise and is not
+amplified.
+"""
 MARGIN_PX = 5
-"""Around tools and reflections, where flow is torn between both."""
+"""Distance from tools in pixels within which flow is ignored."""
 BORDER_PX = 6
 RETURN_PX = 1.0
-"""How far from its start a point may come back from the other picture."""
+"""Largest accepted forward-backward error of the flow, in pixels."""
 LEAST_SEEN = 0.3
-"""Share of the pictures in which a point has to be seen."""
+"""Share of the pictures in which a point must be observed."""
 
 Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class TexturedPicture:
-    """One picture as it is compared."""
+    """Picture reduced to its local texture."""
 
     texture: Picture
-    """[H, W]."""
+    """Normalised texture, uint8 [H, W]."""
     usable: Picture
-    """[H, W]; 1 where tissue can be followed."""
+    """Validity, uint8 [H, W]; 1 where tissue can be tracked."""
     camera: Camera
 
 
 @dataclass(frozen=True)
 class GridTracks:
-    """Where `N` points are in `T` pictures."""
+    """Tracks of N points in T pictures."""
 
     rays: NDArray[np.float64]
-    """[T, N, 2]: x / z and y / z."""
+    """Observed rays as x / z and y / z, float64 [T, N, 2]."""
     seen: NDArray[np.bool_]
-    """[T, N]; elsewhere `rays` says nothing."""
+    """Validity of `rays`, bool [T, N]."""
     poses: NDArray[np.float64]
-    """[T, 4, 4]: world to camera."""
+    """World-to-camera poses, float64 [T, 4, 4]."""
     times_s: NDArray[np.float64]
     focal_px: float
-    """Turns errors of rays into pixels."""
+    """Focal length in pixels; converts ray errors to pixels."""
     extent: tuple[float, float]
-    """Half of a picture's width and height, as rays."""
+    """Half the picture's width and height, as rays."""
 
     def of(self, points: NDArray[Any] | slice, times: NDArray[Any] | slice = slice(None)) -> GridTracks:
-        """Some of the points, at some of the times."""
+        """Select points, and optionally times."""
         return GridTracks(
             self.rays[times][:, points],
             self.seen[times][:, points],
@@ -80,12 +85,14 @@ class GridTracks:
 
 
 def small_camera(frame: Frame, camera: Camera) -> Camera:
-    """The camera of a frame's picture with no side longer than `LONGEST_PX`."""
+    """Return the camera scaled so that no side of the picture is longer than `LONGEST_PX`."""
     return camera.scaled(min(1.0, LONGEST_PX / max(frame.image.shape[:2])))
 
 
 def seen_by(frame: Frame, camera: Camera) -> TexturedPicture:
-    """A frame with no side longer than `LONGEST_PX`, its light and reflections taken out."""
+    """Return the normalised texture of a frame, reduced to `LONGEST_PX`, with tools and highlights
+    marked unusable.
+    """
     height, width = frame.image.shape[:2]
     small = small_camera(frame, camera)
     size = small.width_px, small.height_px
@@ -115,7 +122,17 @@ def seen_by(frame: Frame, camera: Camera) -> TexturedPicture:
 def follow_grids(
     pictures: Sequence[TexturedPicture], times_s: NDArray[np.float64], keys: Sequence[int], spacing_px: int = SPACING_PX
 ) -> GridTracks:
-    """The grids of the key pictures `keys` in all `pictures`, which have one size. A point that few of them show is left out."""
+    """Track the grids of the key pictures through all pictures.
+
+    Args:
+        pictures: T pictures of one size.
+        times_s: float64 [T], times in seconds.
+        keys: indices of the key pictures.
+        spacing_px: grid spacing in pixels.
+
+    Returns:
+        Tracks of the points observed in at least `LEAST_SEEN` of the pictures.
+    """
     height, width = pictures[0].texture.shape
     row, column = np.mgrid[spacing_px // 2 : height : spacing_px, spacing_px // 2 : width : spacing_px]
     start = np.stack([column.ravel(), row.ravel()], 1).astype(np.float32)
@@ -136,7 +153,9 @@ def follow_grids(
 def _from_key(
     pictures: Sequence[TexturedPicture], key: int, start: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Where the points `start` [N, 2] of a picture are in all others [T, N, 2], and where they were found [T, N]."""
+    """Return positions [T, N, 2] and validity [T, N] of the points `start` [N, 2] of a key picture
+    in all pictures.
+    """
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     here = start.astype(int)
     usable = pictures[key].usable[here[:, 1], here[:, 0]] > 0
@@ -157,7 +176,7 @@ def _from_key(
 def _found(
     start: NDArray[np.float32], pixels: NDArray[np.float32], back: NDArray[np.float32], usable: Picture
 ) -> NDArray[np.bool_]:
-    """Which points come back to where they started, by way of tissue."""
+    """Return which points pass the forward-backward check and are on tissue, away from the border."""
     height, width = usable.shape
     x, y = pixels[:, :1], pixels[:, 1:]
     returned = pixels + cv2.remap(back, x, y, cv2.INTER_LINEAR)[:, 0]

@@ -1,4 +1,4 @@
-"""Depth of a stream from a moving scope, by comparing its frames with key frames that came before."""
+"""Depth by parallax for a stream from a moving scope, comparing each frame with earlier key frames."""
 
 from __future__ import annotations
 
@@ -12,28 +12,30 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
 STREAM_PX = 160
-"""Longest side of the pictures that are compared: a quarter of the work of offline, for an error a third larger."""
+"""Longest side of the compared pictures in pixels; smaller than offline to keep up with the stream.
+"""
 MOST_KEY_FRAMES = 8
-"""That are kept. When there are more, the one that is nearest to another leaves."""
+"""Largest number of key frames. When it is exceeded, one of the two closest key frames is removed.
+"""
 LONGEST_S = 3.0
-"""Key frames that are older are not compared: tissue does not stay as it is."""
+"""Largest age of a key frame in seconds, limited because tissue deforms."""
 EVERY_S = 0.2
-"""Time between two frames whose depth is found; before the first one every frame is asked."""
+"""Time between two depth estimates in seconds; until the first one every frame is tried."""
 
 
 class ParallaxDepth:
-    """Finds depth every `EVERY_S`, and none for the frames between. Memory and time do not grow with the stream.
+    """Depth estimator by parallax for streams, with bounded memory and time per frame.
 
-    Depth is given once a look agrees with the one before (`depth_agreement`).
-
-    Frames without a pose, or of another projection than a pinhole, have nothing to find depth from.
+    Depth is estimated every `EVERY_S` and not for the frames between. A depth map is returned only
+    if it agrees with the previous one (`depth_agreement`). Frames without a pose, and cameras other
+    than pinholes, get no depth.
     """
 
     def __init__(self) -> None:
         self._kept: list[tuple[float, View]] = []
         self._found_s: float | None = None
         self._look: Look | None = None
-        """The one at `_found_s`."""
+        """Depth map found at `_found_s`."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """See `Estimator`."""
@@ -60,7 +62,9 @@ class ParallaxDepth:
         return found
 
     def _confirmed(self, found: DepthMap, camera: Camera, now_s: float) -> DepthMap | None:
-        """Return the depth if it agrees with the look before, else a doubted one; None for a first look."""
+        """Return the depth if it agrees with the previous depth map, a rejected map if not, or None
+        for the first one.
+        """
         is_first = self._found_s is None or not 0 <= now_s - self._found_s <= LONGEST_S
         before, self._look = self._look, Look.of(found.depth, found.confidence, camera)
         self._found_s = now_s
@@ -69,7 +73,9 @@ class ParallaxDepth:
         return found if agree(before, self._look) else doubted(found.depth.shape, found.origin, UNCONFIRMED)
 
     def _is_elsewhere(self, camera: Camera) -> bool:
-        """Whether the scope is farther from every key frame than most of them from their neighbours, or there are few."""
+        """Return True if the scope is farther from every key frame than the closest two key frames
+        are from each other, or if there are still few key frames.
+        """
         if not self._kept:
             return True
         nearest = min(float(np.linalg.norm(view.camera.position - camera.position)) for _, view in self._kept)
@@ -78,11 +84,11 @@ class ParallaxDepth:
     def _keep(self, now_s: float, view: View) -> None:
         self._kept.append((now_s, view))
         if len(self._kept) > MOST_KEY_FRAMES:
-            # Of the two that are nearest to each other the older one comes first.
+            # argmin returns the older of the two closest key frames.
             self._kept.pop(int(np.argmin(self._gaps())))
 
     def _gaps(self) -> list[float]:
-        """How far each key frame is from the nearest other one."""
+        """Return the distance of each key frame to its nearest neighbour."""
         views = [view for _, view in self._kept]
         return [min(_apart(one, other) for other in views if other is not one) for one in views]
 

@@ -1,7 +1,8 @@
-"""Relative depth by a network of the user's, an ONNX model.
+"""Relative depth by a monocular network supplied by the user as an ONNX model.
 
-Networks that see one picture say depth, or mostly its inverse, up to a factor and a summand, and another pair of them for each picture. Where a frame came with
-depth the pair is found by that; else by the answer before, so that depth does not flicker; and in a stream's first frame it is assumed.
+Monocular networks predict depth or inverse depth up to a scale and offset that differ for each
+picture. The alignment uses the frame's own depth if it has one, otherwise the previous answer,
+which avoids flicker. The first frame of a stream without depth gets an assumed alignment.
 """
 
 from __future__ import annotations
@@ -26,45 +27,51 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 Values = Literal["inverse", "depth"]
 VALUES_IN_ADDRESS = "?values="
 MULTIPLES_PX = (14, 32)
-"""Sides of pictures for a network that takes any size are multiples of the first of these with which it works: vision transformers have patches of 14."""
+"""Granularity of the input size for networks that accept any size. The first one that works is
+used; vision transformers have patches of 14 pixels.
+"""
 SMALLEST_PX = 4
 GRID_PX = 80
-"""Longer side of the grid on which answers are compared."""
+"""Longer side of the grid on which answers are compared, in cells."""
 EVERY_S = 0.3
-"""Time from one look to the next; the answer holds on meanwhile, unless the scope moves."""
+"""Time from one inference to the next in seconds; the last answer is reused in between unless the
+scope moves.
+"""
 ALIKE = 0.6
-"""Correlation with the depth before from which it is the same scene."""
+"""Correlation with the reference depth from which the two show the same scene."""
 LEAST_SEEN = 0.05
 """Share of the picture that must be tissue."""
 
 UNSEEN = "too little of the picture is tissue for a depth network"
 NOT_FINITE = "the depth network gave values that are not finite"
-FLAT = "the depth network says that everything is at one distance"
-AGAINST = "the depth network's answer runs against the depth that the frame came with; its values are of the other kind (values=depth or values=inverse)"
-UNLIKE = "the depth network's answer has little to do with the depth that the frame came with"
-GIVEN = "factor and summand of the depth network's answers were found by the depth that frames came with"
+FLAT = "the depth network returned the same depth for the whole picture"
+AGAINST = "the depth network's output is inverted relative to the frame's own depth; use the other one of values=depth and values=inverse"
+UNLIKE = "the depth network's output does not correlate with the frame's own depth"
+GIVEN = "the depth network's output was scaled to the frames' own depth"
 
 
 class DepthSettings(PictureSettings):
-    """What cannot be seen in the shapes of a network that finds depth."""
+    """Settings of a depth network that its tensor shapes do not reveal."""
 
     mean: tuple[Finite, Finite, Finite] = (0.485, 0.456, 0.406)
     std: tuple[Positive, Positive, Positive] = (0.229, 0.224, 0.225)
     values: Values = "inverse"
-    """What comes out: depth along the camera's axis, or its inverse."""
+    """Kind of the output: depth along the optical axis, or its inverse."""
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
     try:
         about = path.stat()
-    except OSError:  # what is wrong with it is said by who reads it
+    except OSError:  # a missing file is reported by the loader
         return None
     return about.st_mtime_ns, about.st_size
 
 
 @lru_cache(maxsize=1)
 def _network(path: Path, stamps: tuple[tuple[int, int] | None, ...]) -> OnnxNetwork[DepthSettings]:
-    """Loaded and tried out once for all streams, and for the check before them; stamps: of its files, which may change."""
+    """Load a network and try it once; cached for all streams. `stamps` are the files' modification
+    times and sizes, so a changed file is reloaded.
+    """
     network = OnnxNetwork(path, "depth network", DepthSettings, multiple_px=MULTIPLES_PX[0])
     noise = np.random.default_rng(0).integers(0, 256, (256, 320, 3), np.uint8)
     try:
@@ -80,12 +87,19 @@ def _network(path: Path, stamps: tuple[tuple[int, int] | None, ...]) -> OnnxNetw
 
 
 class LearnedDepth:
-    """Asks a network from time to time for one stream's depth; steady from one answer to the next. Without a unit, whatever the network says."""
+    """Depth estimator of one stream that runs a network at intervals and keeps its scale steady.
+    The depth is never metric.
+    """
 
     def __init__(self, address: str) -> None:
-        """address: the path of the model; `?values=depth` or `?values=inverse` behind it goes before its own settings.
+        """Load the network.
 
-        Raises InvalidSetting, with a sentence, for a network that cannot be used.
+        Args:
+            address: path of the model. A suffix `?values=depth` or `?values=inverse` overrides the
+                model's own setting.
+
+        Raises:
+            InvalidSetting: for a network that cannot be used.
         """
         name, found, values = address.rpartition(VALUES_IN_ADDRESS)
         if found and values not in get_args(Values):
@@ -101,11 +115,15 @@ class LearnedDepth:
         self._looked_ns: int | None = None
         self._answer: DepthMap | None = None
         self._before: NDArray[np.float64] | None = None
-        """The last believed answer on the grid, as values of the network's kind."""
+        """Last confident answer on the grid, as values of the network's kind."""
         self._pose: NDArray[np.float64] | None = None
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """See `Estimator`. Raises InvalidSetting where the network fails on a picture."""
+        """See `Estimator`.
+
+        Raises:
+            InvalidSetting: if the network fails on a picture.
+        """
         if frame.new_scene is not None or self._resized(frame):
             self._forget()
         if self._looked_ns is not None and 0 <= frame.pts_ns - self._looked_ns < EVERY_S * 1e9:
@@ -140,7 +158,7 @@ class LearnedDepth:
         large = cv2.resize(values, (size[1], size[0]), interpolation=cv2.INTER_LINEAR).astype(np.float64)
         found = solved.of(large)
         depth = self._kind(np.maximum(found, least)).astype(np.float32)
-        # Nothing tells how far a network is right, nor where.
+        # A network gives no estimate of its error, so the confidence is the threshold everywhere.
         return DepthMap(
             depth,
             np.where(found > least, BELIEVED, 0).astype(np.float32),
@@ -150,11 +168,13 @@ class LearnedDepth:
         )
 
     def _kind(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Depth to values of the network's kind, or back."""
+        """Convert depth to values of the network's kind, or back."""
         return 1 / values if self._inverse else values
 
     def _by_given(self, grid: NDArray[np.float64], seen: NDArray[np.bool_], frame: Frame) -> Affine | str | None:
-        """Solved by the depth that the frame came with; None where it has too little of it, a doubt where the two do not go together."""
+        """Align to the frame's own depth. Returns None if it covers too little, or a rejection
+        reason if the two do not correlate.
+        """
         if frame.depth is None:
             return None
         depth = frame.depth
@@ -168,14 +188,14 @@ class LearnedDepth:
         return AGAINST if found.alike <= -ALIKE else UNLIKE
 
     def _by_before(self, grid: NDArray[np.float64], seen: NDArray[np.bool_]) -> Affine | None:
-        """Solved by the answer before; None where there is none, or where it is of another scene."""
+        """Align to the previous answer. Returns None if there is none or it shows another scene."""
         if self._before is None:
             return None
         found = fitted(grid[seen], self._before[seen])
         return found if found is not None and found.alike >= ALIKE else None
 
     def _assumed(self, values: NDArray[np.float64]) -> Affine:
-        """Of values of which nothing else is known."""
+        """Return the alignment that is assumed without any reference depth."""
         zero = with_assumed_zero(values)
         positive = np.clip(zero.of(values), *np.percentile(zero.of(values), ENDS))
         factor = self._kind(np.array(DISTANCE)) / np.exp(np.log(positive).mean())
@@ -183,14 +203,14 @@ class LearnedDepth:
 
 
 def _tissue(frame: Frame) -> NDArray[np.uint8]:
-    """[H, W]; 0 where a tool is, or what is outside of the field of view."""
+    """Return a mask uint8 [H, W], 0 for tools and pixels outside the field of view."""
     masks = [mask for mask in (frame.mask, frame.loss_mask) if mask is not None]
     whole = np.ones((frame.height_px, frame.width_px), np.bool_)
     return np.logical_and.reduce([whole, *masks]).astype(np.uint8)
 
 
 def _on_grid(plane: NDArray[np.generic], size: tuple[int, int], how: int = cv2.INTER_NEAREST) -> NDArray[np.float64]:
-    """A plane of any size as it covers a picture of `size`, on the grid."""
+    """Resample a plane of any size that covers a picture of `size` to the comparison grid."""
     scale = GRID_PX / max(size)
     columns, rows = (max(1, round(side * scale)) for side in (size[1], size[0]))
     return np.asarray(cv2.resize(np.asarray(plane, np.float32), (columns, rows), interpolation=how), np.float64)

@@ -1,6 +1,7 @@
-"""What bundle adjustments share: damped steps for as long as they lessen the cost, derivatives of a projection, sums over what belongs together.
+"""Levenberg-Marquardt iteration, projection derivatives and segment sums shared by the bundle
+adjustments.
 
-Levenberg-Marquardt as in Triggs et al., "Bundle Adjustment: a Modern Synthesis", 2000, section 4.2.
+Triggs et al., "Bundle Adjustment: a Modern Synthesis", 2000, section 4.2.
 """
 
 from __future__ import annotations
@@ -14,18 +15,25 @@ from torch import Tensor
 State = TypeVar("State")
 
 DONE = 1e-6
-"""Of the cost: when a step gains less than this share of it, the last one was made."""
+"""Relative decrease of the cost below which the iteration ends."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e4
 EASIER, HARDER = 5, 8
-"""The damping is divided by the first after a step that lessened the cost, and multiplied by the second after one that did not."""
+"""Divisor of the damping after a successful step, and its factor after a rejected one."""
 
 
 def descend(
     start: State, step: Callable[[State, float], State], cost_of: Callable[[State], float], rounds: int
 ) -> tuple[State, float]:
-    """The state after at most `rounds` steps that were tried, of which only those are made that lessen the cost; and its cost.
+    """Minimise a cost with damped steps.
 
-    step: the state after a step with a damping.
+    Args:
+        start: start state.
+        step: returns the state after one step with the given damping.
+        cost_of: returns the cost of a state.
+        rounds: maximum number of steps, including rejected ones.
+
+    Returns:
+        The best state and its cost, which is at most that of the start.
     """
     state, cost, damping = start, cost_of(start), FIRST_DAMPING
     for _ in range(rounds):
@@ -44,8 +52,12 @@ def descend(
 
 
 def ray_derivatives(local: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives of the rays (x / z, y / z) of points [M, 3] in their camera by the point [M, 2, 3], and of the point by the rotation of a twist
-    [M, 3, 3]: a twist moves the point by t + w x p."""
+    """Return derivatives for points [M, 3] in camera coordinates.
+
+    Returns:
+        Derivatives of the rays (x / z, y / z) by the point [M, 2, 3], and of the point by the
+            rotation of a twist [M, 3, 3]. A twist (t, w) moves a point p by t + w x p.
+    """
     x, y, z = local.unbind(1)
     zero = torch.zeros_like(z)
     by_point = torch.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], 1).reshape(-1, 2, 3)
@@ -54,10 +66,12 @@ def ray_derivatives(local: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def summed(parts: Tensor, index: Tensor, count: int) -> Tensor:
-    """Sums [count, …] of the parts [M, …] with the same index [M]."""
+    """Return sums [count, …] of the parts [M, …] that have the same index [M]."""
     return torch.zeros(count, *parts.shape[1:], dtype=parts.dtype).index_add_(0, index, parts)
 
 
 def diagonal_of(blocks: Tensor) -> Tensor:
-    """The diagonals of square blocks [N, k, k], as such blocks and never 0: what damping is a multiple of."""
+    """Return the diagonals of square blocks [N, k, k] as diagonal blocks, offset to be non-zero.
+    Levenberg-Marquardt scales them by the damping.
+    """
     return torch.diag_embed(blocks.diagonal(dim1=-2, dim2=-1) + 1e-9)

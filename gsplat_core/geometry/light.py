@@ -1,8 +1,9 @@
-"""Relative depth of one fixed eye, from what the scope's own light tells.
+"""Relative depth for a static scope from the shading of its own light.
 
-Brightness falls with the square of the distance and with the cosine to the surface, glints show where it faces the lamp (`relief`), and the brightness
-of tissue that is followed changes with nothing but these (`light_change`). It is never metric: how strong the lamp is, and how much of its light the
-tissue gives back, is known of no scope.
+Brightness falls with the square of the distance and the cosine of the incidence angle, and
+highlights mark surfaces that face the lamp (`relief`). Brightness changes of tracked tissue depend
+on distance and slope alone (`light_change`). The depth is never metric, since neither the lamp's
+power nor the tissue's albedo is known.
 """
 
 from __future__ import annotations
@@ -22,26 +23,34 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 
 DISTANCE = 60.0
-"""Geometric mean of every depth, in no unit: where a scene without depth starts."""
+"""Geometric mean of every depth map, in arbitrary units; also the start depth of a scene without
+depth.
+"""
 EVERY_S = 0.3
-"""Time from one look to the next; frames between get the last answer."""
+"""Time from one estimate to the next in seconds; frames between reuse the last answer."""
 MOST_LOOKS = 12
-"""That are held against each other."""
+"""Largest number of looks fitted together."""
 NEWEST = 0.2
-"""Weight of the newest relief beside what went before, followed until now; the first few count alike."""
+"""Least weight of the newest relief relative to the tracked earlier one. The first few estimates
+are averaged equally.
+"""
 LEAST_SEEN = 0.25
-"""Share of the picture that must be tissue, lit neither too dark nor too bright."""
+"""Share of the picture that must be tissue, neither under- nor overexposed."""
 ERROR = 0.05
-"""Standard deviation in log brightness of what pigment, and errors in what the tissue is like, feign."""
+"""Standard deviation of log brightness caused by pigment and model errors."""
 REACH = 0.05
-"""Distance from usable cells at which confidence has fallen to a half, as a share of the picture's longer side."""
+"""Distance from usable cells at which the confidence halves, as a share of the picture's longer
+side.
+"""
 
 UNSEEN = "too little of the picture is tissue that is lit neither too dark nor too bright to find depth by light"
 FLAT = "brightness does not change more than pigment could explain, so depth by light is no better than a plane"
 
 
 class LightDepth:
-    """Estimates the relative depth of one stream's frames; follows the tissue while the scope does not move."""
+    """Depth estimator by shading for one stream. It tracks the tissue while the scope does not
+    move.
+    """
 
     def __init__(self) -> None:
         self._forget()
@@ -55,7 +64,7 @@ class LightDepth:
         self._recent: deque[Look] = deque(maxlen=MOST_LOOKS // 2)
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """See `Estimator`. A doubted answer says why there is no more than a plane to see."""
+        """See `Estimator`. A rejected map states why the relief cannot be distinguished from a plane."""
         if camera.model != "pinhole":
             return None
         if frame.new_scene is not None or self._resized(frame) or self._moved(camera):
@@ -94,12 +103,19 @@ class LightDepth:
 
 
 def shows_enough(look: Look) -> bool:
-    """Whether there is enough tissue to find depth by."""
+    """Return True if enough tissue is visible for depth by shading."""
     return bool(look.shading.known.mean() >= LEAST_SEEN)
 
 
 def answer(grid: Grid, relief: Array | None, look: Look, frame: Frame) -> DepthMap:
-    """The depth of a frame, whose relief has these coefficients; None: too little is seen of it."""
+    """Return the depth map of a frame from its relief coefficients.
+
+    Args:
+        grid: cell grid of the picture.
+        relief: coefficients, or None if too little tissue is visible.
+        look: shading of the frame.
+        frame: frame that determines the size of the map.
+    """
     size = frame.image.shape[0], frame.image.shape[1]
     if relief is None:
         return doubted(size, DepthOrigin.LIGHT, UNSEEN)
@@ -108,14 +124,22 @@ def answer(grid: Grid, relief: Array | None, look: Look, frame: Frame) -> DepthM
 
 
 def share_of_distance(grid: Grid, reliefs: Array) -> float:
-    """How much of what reliefs [times, cosines] change brightness by is not feigned: its variance by distance, over that plus the one of errors."""
+    """Return the share of brightness variance that distance explains, relative to distance plus
+    expected errors, 0 to 1.
+
+    Args:
+        grid: cell grid.
+        reliefs: coefficients [times, cosines].
+    """
     values = Places.at(grid, *grid.middles()).value @ reliefs.T
     by_distance = float(np.mean(np.var(2 * values, axis=0)))
     return by_distance / (by_distance + ERROR**2)
 
 
 def shown(grid: Grid, relief: Array, share: float, look: Look, size: tuple[int, int]) -> DepthMap:
-    """The depth of a picture of this size [H, W]. share: how far its relief is to be believed."""
+    """Return the depth map of size [H, W] for a relief. `share` is the confidence in the relief as
+    a whole, 0 to 1.
+    """
     logarithm = (Places.at(grid, *grid.middles()).value @ relief).reshape(grid.height, grid.width)
     return DepthMap(
         _enlarged(DISTANCE * np.exp(logarithm), size),
@@ -126,7 +150,7 @@ def shown(grid: Grid, relief: Array, share: float, look: Look, size: tuple[int, 
 
 
 def _near_seen(shading: Shading) -> Array:
-    """[h, w]: 1 among cells that were seen, falling to 0 away from them."""
+    """Return weights [h, w]: 1 in observed cells, decaying to 0 with the distance from them."""
     seen = shading.known.astype(np.uint8)
     away = cv2.distanceTransform(1 - seen, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float64)
     return np.asarray(np.exp2(-away / (REACH * max(seen.shape))))

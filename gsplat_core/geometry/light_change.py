@@ -1,6 +1,8 @@
-"""How much brighter each piece of tissue became, wherever it went: pigment stays what it is, so that only light and slope change it.
+"""Brightness change of each piece of tissue between two pictures. Pigment is constant, so the
+change depends on light and slope alone.
 
-Tissue is followed from a key picture by optical flow, forth and back. What its wet surface mirrors is left out (`log_diffuse`).
+Tissue is tracked from a key picture by optical flow with a forward-backward check. Specular
+reflections are removed beforehand (`log_diffuse`).
 """
 
 from __future__ import annotations
@@ -18,18 +20,20 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
 RETURN_PX = 1.0
-"""How far from its start a pixel may come back from the other picture."""
+"""Largest accepted forward-backward error of the flow, in pixels."""
 MOST = 0.5
-"""Changes of log light of one pixel beyond that are errors, or shadows."""
+"""Largest accepted change of a pixel's log brightness; larger changes are errors or shadows."""
 LEAST_FOUND = 0.6
-"""Share of the key picture's tissue that must be found again ..."""
+"""Share of the key picture's tissue that must be found again for a view to count as tracked."""
 WIDEST = 0.15
-"""... and the largest standard deviation of its changes of log light: a scope that moves changes more, and nearly all at once."""
+"""Largest standard deviation of the change of log brightness for a view to count as tracked; a
+moving scope changes the light more.
+"""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What one picture tells about its light, and how it is found again in others."""
+    """Shading and texture of one picture, as input of the comparison with others."""
 
     shading: Shading
     picture: SmallPicture
@@ -40,37 +44,39 @@ class Look:
 
 @dataclass(frozen=True)
 class Change:
-    """Of the tissue in each cell of a key picture, from there to another one."""
+    """Change of the tissue in each cell of a key picture relative to another picture."""
 
     brighter: NDArray[np.float64]
-    """Of the logarithm of light [h, w], mean over the cell."""
+    """Change of log brightness, float64 [h, w], mean over the cell."""
     share: NDArray[np.float64]
-    """[h, w]: of the cell's pixels that were found again."""
+    """Share of the cell's pixels found again, float64 [h, w]."""
     moved: NDArray[np.float64]
-    """[h, w, 2]: columns and rows, counted in cells."""
+    """Displacement in cells (columns, rows), float64 [h, w, 2]."""
     found: float
-    """Share of the key picture's tissue that was found again."""
+    """Share of the key picture's tissue found again."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """The cells of which enough was found again [h, w]."""
+        """Cells of which enough pixels were found again, bool [h, w]."""
         return self.share >= LEAST_KNOWN
 
     @property
     def is_followed(self) -> bool:
-        """Whether it is the same view of the same tissue, little changed."""
+        """True if the other picture shows the same tissue with little change."""
         known = self.known
         return self.found >= LEAST_FOUND and bool(known.any()) and float(np.std(self.brighter[known])) <= WIDEST
 
 
 def look_at(frame: Frame, camera: Camera) -> Look:
-    """At a frame."""
+    """Compute shading and texture of a frame."""
     picture = SmallPicture.of(frame)
     return Look(shading_in(picture), picture, seen_by(frame, camera), *log_diffuse(picture))
 
 
 class Follower:
-    """Finds one key picture's tissue in other pictures of the same size, which best come in the order of their times, away from the key."""
+    """Tracks the tissue of one key picture to other pictures of the same size. Pictures are best
+    passed in temporal order away from the key, since each flow starts from the previous one.
+    """
 
     def __init__(self, key: Look) -> None:
         self._key = key
@@ -79,7 +85,7 @@ class Follower:
         self._method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def change_to(self, look: Look) -> Change:
-        """From the key picture to another one."""
+        """Compute the change from the key picture to another one."""
         key = self._key
         first, second = key.texture.texture, look.texture.texture
         self._there = self._method.calc(first, second, self._there)

@@ -1,7 +1,9 @@
-"""Depth by the scope's own light of a recording of which all frames are known: each is held against those before and after it.
+"""Depth by shading for a complete recording, in which each frame is compared with frames before and
+after it.
 
-The tissue of a key frame is followed to the frames around it. Where that holds over the whole recording, the change of depth from frame to frame is the
-tissue's motion along the line of sight, right up to one factor for all of them.
+The tissue of a key frame is tracked to the frames around it. If that succeeds over the whole
+recording, the change of depth from frame to frame is the tissue's motion along the line of sight,
+known up to one factor for all frames.
 """
 
 from __future__ import annotations
@@ -19,15 +21,23 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 
 LOOKS = 160
-"""In longer recordings there are so many, farther apart."""
+"""Largest number of looks; they are spaced further apart in longer recordings."""
 REACH = MOST_LOOKS // 2
-"""Looks before and after a key that are held against it; there is a key for every so many."""
+"""Number of looks before and after a key that are compared with it, and the spacing of keys."""
 
 
 def frames_with_light(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[Frame], bool]:
-    """The frames, and whether their depth by light shows the tissue's motion. Where it does it was found anew, from all of them.
+    """Replace the shading depth of a recording by one estimated from all frames together.
 
-    cameras: those of the frames. Nothing is done unless a scope at rest showed the same tissue all the time, and depth by light was asked for.
+    The frames are returned unchanged unless shading depth was requested, the scope is static and
+    all frames show the same tissue.
+
+    Args:
+        frames: all frames of the recording.
+        cameras: camera of each frame.
+
+    Returns:
+        The frames, and True if their depth was replaced and shows the tissue's motion.
     """
     given = list(frames)
     at_rest = all(np.array_equal(camera.world_to_camera, cameras[0].world_to_camera) for camera in cameras)
@@ -58,7 +68,7 @@ def frames_with_light(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tup
 
 
 def _looked_at(frames: Sequence[Frame]) -> list[int]:
-    """Numbers of the frames that are looked at."""
+    """Return the indices of the frames that are compared."""
     apart_s = max(EVERY_S, (frames[-1].time_s - frames[0].time_s) / LOOKS)
     numbers = [0]
     for number, frame in enumerate(frames):
@@ -68,7 +78,9 @@ def _looked_at(frames: Sequence[Frame]) -> list[int]:
 
 
 def _reliefs(grid: Grid, looks: Sequence[Look]) -> Array | None:
-    """The reliefs that the looks see [looks, cosines]; None where tissue cannot be followed from each key to the looks around it."""
+    """Return the relief coefficients of all looks [looks, cosines], or None if tissue cannot be
+    tracked from each key to its neighbours.
+    """
     total, weight = np.zeros((len(looks), len(grid.half_waves))), np.zeros(len(looks))
     keys = range(REACH, max(len(looks) - REACH, REACH + 1), REACH) if len(looks) > 2 * REACH else [len(looks) // 2]
     for key in keys:
@@ -80,7 +92,7 @@ def _reliefs(grid: Grid, looks: Sequence[Look]) -> Array | None:
             return None
         window.solve()
         near = np.zeros(len(looks))
-        # From one key to the next the answers are faded over.
+        # Blend linearly between the answers of neighbouring keys.
         near[first:end] = 1 - np.abs(np.arange(first, end) - key) / (max(end - key, key - first) + 1)
         found = np.zeros_like(total)
         for number in range(first, end):

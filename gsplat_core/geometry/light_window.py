@@ -1,4 +1,4 @@
-"""Several looks at the same tissue by the same light, held against each other."""
+"""Joint shading estimate from several looks at the same tissue."""
 
 from __future__ import annotations
 
@@ -9,14 +9,23 @@ from gsplat_core.geometry.relief import Array, Grid
 from gsplat_core.geometry.relief_fit import find_change, find_reliefs
 
 SOLVED_AT = (1, 2, 4, 8, 12)
-"""Numbers of looks at which the relief is found anew from all of them; in between it holds, and only its change is found."""
+"""Numbers of looks at which all reliefs are re-estimated jointly; in between only the newest look's
+change is estimated.
+"""
 
 
 class LightWindow:
-    """Looks at tissue that can be followed from one of them, the key, to all others."""
+    """Looks at tissue that can be tracked from one of them, the key, to all others."""
 
     def __init__(self, grid: Grid, key: Look, before: Sequence[Look] = ()) -> None:
-        """before: earlier looks, in order; those up to the last one that cannot be followed are left out."""
+        """Create a window around a key.
+
+        Args:
+            grid: cell grid.
+            key: look from which tissue is tracked.
+            before: earlier looks in temporal order. Looks up to the last one that cannot be tracked
+                are dropped.
+        """
         self._grid = grid
         self.looks = [key]
         self._changes: list[Change | None] = [None]
@@ -28,7 +37,15 @@ class LightWindow:
         self.solve()
 
     def add(self, look: Look, *, solve: bool = True) -> bool:
-        """Take a later look; says whether it can be followed, without which nothing changes. solve: find its relief at once."""
+        """Add a later look.
+
+        Args:
+            look: look to add.
+            solve: estimate its relief at once.
+
+        Returns:
+            True if it can be tracked; otherwise the window is unchanged.
+        """
         if not self._take(look, self._ahead):
             return False
         if not solve:
@@ -42,12 +59,12 @@ class LightWindow:
         return True
 
     def solve(self) -> None:
-        """Find all reliefs from all looks."""
+        """Estimate all reliefs from all looks jointly."""
         found = find_reliefs(self._grid, [look.shading for look in self.looks], self._changes)
         self._reliefs = [found.key + change for change in found.changes]
 
     def relief_of(self, look: Look) -> Array | None:
-        """The coefficients of the relief that a look sees; None where it is not among these."""
+        """Return the relief coefficients of a look, or None if the window does not contain it."""
         pairs = zip(self.looks, self._reliefs, strict=True)
         return next((relief for each, relief in pairs if each is look), None)
 

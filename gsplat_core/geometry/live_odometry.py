@@ -1,10 +1,14 @@
-"""Where the scope is at each frame of a stream, from the pictures so far: visual odometry of bounded memory and time.
+"""Visual odometry of a stream with bounded memory and time per frame.
 
-Corners of the tissue are followed on small pictures (`stream_tracks`); each frame's camera starts where it would be if the scope went on as before, and is moved until the
-points fit. Where the pictures have moved on a key frame is taken, new corners get the depth of the known ones around them, and with every frame a few steps of bundle adjustment
-over the newest key frames improve these and the points (`local_map`). As in `odometry` the scene starts as a plane, `DISTANCE` away unless the first frame has depth.
+Tissue corners are tracked on reduced pictures (`stream_tracks`). Each frame's camera starts at the
+pose predicted by constant motion and is optimised until the points fit. A key frame is added once
+the pictures have moved far enough; its new corners get the depth of known ones around them. A few
+bundle adjustment steps over the newest key frames refine poses and points with every frame
+(`local_map`). As in `odometry`, the scene starts as a plane at `DISTANCE` unless the first frame
+has depth.
 
-A pose that was given out stays as it was. Tissue is taken to be at rest: what moves as a whole, by breathing or by the heart, is in the poses.
+A returned pose is never revised. The tissue is assumed static, so global motion by breathing or the
+heart is part of the poses.
 """
 
 from __future__ import annotations
@@ -27,46 +31,66 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 FEWEST_POINTS = 20
-"""That have to fit, or the frame is not placed."""
+"""Fewest points that must fit for a frame to be placed."""
 FITS_PX = 4.0
-"""Points that are off by no more fit."""
+"""Largest reprojection error of a point that fits, in pixels."""
 FITTING = 0.4
-"""Share of the points that have to."""
+"""Share of the points that must fit for a frame to be placed."""
 GIVEN_UP_PX = 8.0
-"""Points that are off by more are followed no longer."""
+"""Reprojection error in pixels above which a point is no longer tracked."""
 MOVED_PX = 16.0
-"""How far the points have moved, as a median, where the next key frame is taken."""
+"""Median displacement of the points since the last key frame from which a new one is added, in
+pixels.
+"""
 OFF_PX = 0.4
-"""By how much points are off, as a median, where one is taken, too: what is known of them does not hold here."""
+"""Median reprojection error from which a key frame is added at the earliest `OFF_EVERY` frames
+after the last one, in pixels. A larger error means that the points' positions no longer fit.
+"""
 OFF_EVERY = 5
 LEFT = 0.7
-"""Share of the points that are still followed below which one is taken, too."""
+"""Share of the last key frame's points below which a new key frame is added."""
 ADJUSTED = 2
-"""Frames from a key frame on with which the newest ones are adjusted."""
+"""Number of frames after a key frame in which the newest key frames are adjusted."""
 FIRST_KEYS = 6
-"""At first every frame is one in which points have moved by `FIRST_MOVED_PX`."""
+"""Number of key frames at the start that are added after a displacement of only `FIRST_MOVED_PX`.
+"""
 FIRST_MOVED_PX = 0.5
 FOLLOWED_KEYS = 3
-"""Where a key frame is taken, so many of the nearest earlier ones are looked for by following their points to where the pose has them, and ..."""
+"""Nearest earlier key frames whose points are searched at their predicted positions when a key
+frame is added.
+"""
 MATCHED_KEYS, NEAR_KEYS = 2, 12
-"""... so many by their features, in turn, of so many that are nearest and of the places that were left."""
+"""Key frames matched by features when a key frame is added. They are taken in turn from the
+`NEAR_KEYS` nearest ones and the key frames of earlier maps.
+"""
 MATCHED_WHEN_LOST = 5
-"""That are looked for by their features where a frame could not be placed."""
+"""Key frames matched by features when a frame could not be placed."""
 MOST_LEFT = 2
-"""Places that were left, whose key frames are kept."""
+"""Earlier maps whose key frames are kept for recognition."""
 CORRECTED_PX = 1.0
-"""By how much their points have to be off, as a median, so that what was found since is moved; with less, bundle adjustment does it."""
+"""Median error of a recognised key frame's points from which the poses since then are corrected, in
+pixels. Bundle adjustment handles smaller errors.
+"""
 MOSTLY = 0.75
-"""Share of the pictures' motion that poses have to explain, or the scope may well stand still."""
+"""Share of the image motion that poses must explain; below it the scope may be static."""
 MOST_NOT_PLACED = 15
-"""After so many frames in a row that could not be placed points are taken up anew."""
+"""Consecutive frames that cannot be placed after which a new map is started."""
 
 
 class LiveOdometry:
-    """Places frames, in order. The same frames give the same poses. Raises InvalidInput for a camera that is no pinhole."""
+    """Visual odometry of one stream. Frames are placed in order, and equal frames give equal poses.
+
+    Raises:
+        InvalidInput: for a camera that is not a pinhole.
+    """
 
     def __init__(self, camera: Camera, *, measured: bool = True) -> None:
-        """camera: its intrinsics, and with its pose where the first frame stands. measured: whether depth of the frames, or of their two eyes, is made use of."""
+        """Create the odometry of a stream.
+
+        Args:
+            camera: intrinsics, and the pose of the first frame.
+            measured: use measured depth or stereo of the frames to set the scale.
+        """
         if camera.model != "pinhole":
             raise InvalidInput(
                 f"poses are estimated for pinhole cameras, this one is {camera.model}: undistort the pictures"
@@ -80,45 +104,47 @@ class LiveOdometry:
         self._key_numbers: Numbers = np.zeros(0, np.int64)
         self._waiting = self._since_key = 0
         self.frames = self.not_placed = self.begun = 0
-        """How many were seen, how many stand where the one before stood, and how often points were taken up anew."""
+        """Numbers of frames processed, of frames that kept the previous pose because they could not
+        be placed, and of maps started.
+        """
         self.returned = 0
-        """How often an earlier key frame was seen again."""
+        """Number of times an earlier key frame was recognised."""
         self.is_measured = False
-        """Whether lengths have the unit of the frames' depth."""
+        """True if lengths have the unit of the frames' depth."""
         self._error_px = self._still_px = 0.0
 
     def place(self, frame: Frame) -> NDArray[np.float64]:
-        """The frame's pose, world to camera [4, 4]."""
+        """Return the frame's pose, world to camera float64 [4, 4]."""
         self.frames += 1
         if frame.withheld is not None or frame.status is FrameStatus.DAMAGED:
-            self._stand()
+            self._hold_pose()
         else:
             picture = self._pictures.of(frame)
             if not self.map.keys:
                 self._begin(picture, frame)
-            elif not self._follow(picture, frame) and not self._find_back(picture):
-                self._stand()
+            elif not self._follow(picture, frame) and not self._relocalise(picture):
+                self._hold_pose()
                 if self._waiting > MOST_NOT_PLACED or frame.new_scene is not None:
                     self._begin(picture, frame)
         return np.asarray((self._pose @ self._start).numpy())
 
     @property
     def explained(self) -> float:
-        """Share of the pictures' motion, as a typical square, that the poses explain."""
+        """Share of the squared image motion that the poses explain."""
         return 1 - (self._error_px / max(self._still_px, 1e-9)) ** 2
 
-    def _stand(self) -> None:
-        """The scope is taken to stand where it stood."""
+    def _hold_pose(self) -> None:
+        """Keep the previous pose and reset the motion prediction."""
         self._waiting += 1
         self.not_placed += 1
         self._motion = torch.eye(4, dtype=torch.float64)
 
     def _begin(self, picture: SmallPicture, frame: Frame) -> None:
-        """Take up points of a scene of which nothing is known yet."""
+        """Start a new map from a picture of an unknown scene."""
         self._tracks.begin(picture)
         new = self._tracks.take_up()
         if len(new) < FEWEST_POINTS:
-            self._stand()
+            self._hold_pose()
             return
         self.begun += 1
         self._waiting = 0
@@ -133,7 +159,7 @@ class LiveOdometry:
         self._take_key(picture, frame)
 
     def _follow(self, picture: SmallPicture, frame: Frame) -> bool:
-        """Place the next picture; False where too few points tell where it is."""
+        """Place the next picture by tracking. Returns False if too few points fit."""
         tracks = self._tracks
         guess = self._motion @ self._pose
         local = self.map.points(tracks.numbers)
@@ -156,7 +182,7 @@ class LiveOdometry:
         tracks.keep(off < GIVEN_UP_PX)
         key = self._is_key(float(np.median(off)))
         if key:
-            self._look_back(picture)
+            self._close_loop(picture)
             self._take_key(picture, frame)
         if self._since_key < ADJUSTED or len(self.map.keys) <= FIRST_KEYS:
             self.map.adjust()
@@ -164,8 +190,10 @@ class LiveOdometry:
             self._pose = self.map.keys[-1].pose
         return True
 
-    def _look_back(self, picture: SmallPicture) -> None:
-        """Where the picture shows an earlier key frame again its points are followed from here on, and what was found since is corrected by them."""
+    def _close_loop(self, picture: SmallPicture) -> None:
+        """Search the picture for an earlier key frame. If one is recognised, track its points from
+        here on and correct the poses since then.
+        """
         found = self._seen_by_pose(picture)
         if found is None:
             others = [(key, places) for places in self._left for key in places.keys]
@@ -175,7 +203,7 @@ class LiveOdometry:
             return
         self.returned += 1
         if found.places is not self.map:
-            self._go_back(found, picture)
+            self._continue_from(found, picture)
             return
         tracks, known = self._tracks, self.map.points(found.numbers)
         before = known @ self._pose[:3, :3].T + self._pose[:3, 3]
@@ -196,8 +224,10 @@ class LiveOdometry:
                 return found
         return None
 
-    def _find_back(self, picture: SmallPicture) -> bool:
-        """Whether a picture that could not be placed shows one of the key frames, of this place or of one that was left."""
+    def _relocalise(self, picture: SmallPicture) -> bool:
+        """Relocalise a picture that could not be placed by the key frames of all kept maps. Returns
+        True on success.
+        """
         maps = [self.map, *self._left]
         found = self._recognition.find(
             picture, [(key, each) for each in maps for key in each.keys[::-1]], MATCHED_WHEN_LOST
@@ -205,11 +235,11 @@ class LiveOdometry:
         if found is None:
             return False
         self.returned += 1
-        self._go_back(found, picture)
+        self._continue_from(found, picture)
         return True
 
-    def _go_back(self, found: Recognised, picture: SmallPicture) -> None:
-        """Go on from where a picture was recognised, with nothing but its points."""
+    def _continue_from(self, found: Recognised, picture: SmallPicture) -> None:
+        """Continue from a recognised key frame, tracking only its points."""
         if found.places is not self.map:
             self._left = [self.map, *(each for each in self._left if each is not found.places)][:MOST_LEFT]
             self.map = found.places
@@ -220,7 +250,7 @@ class LiveOdometry:
         self._key_numbers, self._key_pixels = found.numbers, found.pixels
 
     def _is_key(self, off_px: float) -> bool:
-        """Whether the pictures have moved on since the last key frame, or the points are off."""
+        """Return True if a new key frame is due."""
         self._since_key += 1
         if off_px > OFF_PX and self._since_key >= OFF_EVERY:
             return True
@@ -232,7 +262,7 @@ class LiveOdometry:
         return float(np.median(moved)) > (FIRST_MOVED_PX if len(self.map.keys) < FIRST_KEYS else MOVED_PX)
 
     def _seen_depth(self, frame: Frame, picture: SmallPicture, pixels: Points) -> Tensor:
-        """[N]; 0 where the frame does not tell."""
+        """Return measured depths [N] at pixels, 0 where the frame has none."""
         return torch.from_numpy(seen_depth(frame, picture, pixels) if self._measured else np.zeros(len(pixels)))
 
     def _take_key(self, picture: SmallPicture, frame: Frame) -> None:

@@ -133,7 +133,7 @@ def rotated(picture, degrees, scale=1.0):
         (lambda left, right: (left, rotated(right, 1.0)), "the pair is not rectified"),
         (lambda left, right: (left, rotated(right, 0, 1.03)), "the pair is not rectified"),
         (lambda left, right: (left, np.roll(right, 12, axis=0)), "the pair is not rectified"),
-        (lambda left, right: (left, right[::-1]), "the eyes do not show the same"),
+        (lambda left, right: (left, right[::-1]), "the two eyes show different content"),
         (lambda left, right: (left * 0 + 80, right * 0 + 80), "too little texture"),
         (lambda left, right: (left * 0, right * 0), "too little texture"),
         (lambda left, right: (left + 250, right + 250), "overexposed"),
