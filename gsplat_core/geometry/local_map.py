@@ -1,4 +1,6 @@
-"""Points of the tissue and key frames that saw them, while the scope goes on: a bounded number of both, adjusted a little with every frame."""
+"""Bounded map of tissue points and key frames for live odometry, adjusted a little with every
+frame.
+"""
 
 from __future__ import annotations
 
@@ -17,45 +19,47 @@ from gsplat_core.geometry.pose import exp, inverse, log
 from gsplat_core.geometry.stream_tracks import Numbers, SmallPicture
 
 WINDOW = 12
-"""The newest key frames, whose poses are adjusted."""
+"""Number of newest key frames whose poses are adjusted."""
 ANCHORS = 5
-"""Earlier ones that share points with them, and stand."""
+"""Number of earlier key frames sharing points with the window that are kept fixed."""
 MOST_KEY_FRAMES = 40
-"""That are kept; when there are more, one that lies near another leaves."""
+"""Largest number of key frames. When it is exceeded, the one closest to another is removed."""
 NEIGHBOURS = 5
-"""Known points around a new one, whose depth it starts with."""
+"""Known points around a new one whose median depth initialises it."""
 MOST_SIGHTINGS = 1500
-"""In a step of the adjustment: while there are fewer, as many steps are made as look at so many ..."""
+"""Budget of observations per adjustment: the number of steps is this divided by the observations of
+the window ...
+"""
 MOST_ROUNDS = 5
-"""... but not more."""
+"""... but at most this many steps."""
 
 
 @dataclass
 class KeyFrame:
-    """A picture and the points that it showed."""
+    """Key frame with its pose and its observations of map points."""
 
     pose: Tensor
-    """World to camera [4, 4]."""
+    """World-to-camera pose [4, 4]."""
     numbers: Numbers
-    """Of the points, ascending."""
+    """Numbers of the observed points, ascending."""
     pixels: Points
     picture: SmallPicture
     rays: NDArray[np.float64]
     features: Any = None
-    """By which it is recognised, once they were asked for."""
+    """ORB corners and descriptors, computed on first use."""
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """Of its camera."""
+        """Camera centre in the world, [3]."""
         return position_of(self.pose)
 
 
 class LocalMap:
-    """What is known of the tissue's places. Everything float64 on the CPU."""
+    """Points and key frames of one continuous piece of a stream. All values are float64 on the CPU."""
 
     def __init__(self) -> None:
         self.keys: list[KeyFrame] = []
-        """In the order of time."""
+        """Key frames in temporal order."""
         self._numbers: Numbers = np.zeros(0, np.int64)
         self._points = torch.zeros(0, 3, dtype=torch.float64)
 
@@ -63,23 +67,26 @@ class LocalMap:
         return len(self._numbers)
 
     def points(self, numbers: Numbers) -> Tensor:
-        """Where known points are [N, 3]."""
+        """Return the world positions [N, 3] of points in the map."""
         return self._points[torch.from_numpy(np.searchsorted(self._numbers, numbers))]
 
     def knows(self, numbers: Numbers) -> NDArray[np.bool_]:
-        """Which of the points are known [N]."""
+        """Return which of the points are in the map, bool [N]."""
         return np.isin(numbers, self._numbers)
 
     def add_points(self, numbers: Numbers, places: Tensor) -> None:
-        """New points; their numbers are larger than all before."""
+        """Add points [N] at world positions [N, 3]. Their numbers must be larger than all earlier
+        ones.
+        """
         self._numbers = np.concatenate([self._numbers, numbers])
         self._points = torch.cat([self._points, places])
 
     def add_key(self, key: KeyFrame) -> None:
-        """Another key frame, the newest."""
+        """Append the newest key frame, evicting one if the map is full."""
         self.keys.append(key)
         if len(self.keys) > MOST_KEY_FRAMES:
-            # Those of the window are needed, and the first one says where the world is.
+            # Keep the window, which is adjusted, and the first key frame, which fixes the world
+            # coordinates.
             places = np.stack([key.position for key in self.keys[:-WINDOW]])
             apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.diag(np.full(len(places), np.inf))
             self.keys.pop(1 + int(np.argmin(apart[1:].min(1))))
@@ -88,15 +95,34 @@ class LocalMap:
     def depth_around(
         self, pose: Tensor, rays: NDArray[np.float64], numbers: Numbers, seen: NDArray[np.float64]
     ) -> Tensor:
-        """Depth of points seen along `rays` [N, 2]: that of the known points `numbers` around them, which are seen at `seen` [K, 2]."""
+        """Return the depth of new points as the median depth of the known points nearest to them in
+        the picture.
+
+        Args:
+            pose: world-to-camera pose [4, 4] of the picture.
+            rays: rays of the new points [N, 2].
+            numbers: numbers [K] of known points.
+            seen: rays of the known points [K, 2].
+
+        Returns:
+            float64 [N].
+        """
         local = self.points(numbers) @ pose[:3, :3].T + pose[:3, 3]
         apart = torch.cdist(torch.from_numpy(rays), torch.from_numpy(seen))
         nearest = apart.topk(min(NEIGHBOURS, len(numbers)), largest=False).indices
         return local[:, 2][nearest].median(1).values
 
     def brought_back(self, key: KeyFrame, after: Tensor, scale: float) -> None:
-        """What came after an earlier key frame is off by what was found out when that one was seen again: the newest of it by a motion of the world `after` [4, 4]
-        about the world's origin, behind a factor, the rest by a share of that."""
+        """Correct the drift accumulated since an earlier key frame that was recognised again.
+
+        The newest key frame and its points get the full correction, those between get a share that
+        grows linearly.
+
+        Args:
+            key: the recognised key frame.
+            after: rigid correction [4, 4] about the world's origin, applied after scaling.
+            scale: scale correction.
+        """
         start = next(index for index, each in enumerate(self.keys) if each is key)
         newer = self.keys[start + 1 :]
         moved = np.isin(self._numbers, np.concatenate([each.numbers for each in self.keys[: start + 1]]))
@@ -110,13 +136,18 @@ class LocalMap:
             each.pose = scaled(each.pose, factor) @ inverse(step)
 
     def earlier(self, position: NDArray[np.float64], most: int) -> list[KeyFrame]:
-        """Key frames before the window, those that are nearest to a position first."""
+        """Return the `most` key frames before the window that are nearest to a position [3],
+        nearest first.
+        """
         before = self.keys[:-WINDOW]
         order = np.argsort([float(np.linalg.norm(key.position - position)) for key in before], kind="stable")
         return [before[index] for index in order[:most]]
 
     def adjust(self) -> None:
-        """A few steps of bundle adjustment over the newest key frames. The earliest one stands, and how far away its points are, as a median."""
+        """Run a few steps of bundle adjustment over the newest key frames. The earliest key frame
+        is fixed. With fewer than two anchors its median point depth is kept as well, because the
+        scale is then free.
+        """
         window = self.keys[-WINDOW:]
         anchors = self._anchors(window)
         chosen = [*anchors, *window]
@@ -147,7 +178,7 @@ class LocalMap:
             self._rescale(chosen[0], float(before / self._depth_of(chosen[0])))
 
     def _anchors(self, window: list[KeyFrame]) -> list[KeyFrame]:
-        """Of the key frames before the window those that share most points with it."""
+        """Return the key frames before the window that share the most points with it."""
         seen = np.unique(np.concatenate([key.numbers for key in window]))
         before = self.keys[: -len(window)]
         shared = [int(np.isin(key.numbers, seen).sum()) for key in before]
@@ -155,12 +186,12 @@ class LocalMap:
         return [before[index] for index in sorted(best) if shared[index] >= 6]
 
     def _depth_of(self, key: KeyFrame) -> Tensor:
-        """Of the points of a key frame, as a median."""
+        """Return the median depth of a key frame's points."""
         local = self.points(key.numbers) @ key.pose[2, :3] + key.pose[2, 3]
         return local.median()
 
     def _rescale(self, about: KeyFrame, factor: float) -> None:
-        """All lengths times a factor, as seen from a key frame that stands."""
+        """Scale all lengths about the position of a key frame."""
         if not 0.1 < factor < 10:
             return
         centre = torch.from_numpy(about.position)
@@ -171,25 +202,27 @@ class LocalMap:
             key.pose[:3, 3] = -key.pose[:3, :3] @ position
 
     def _forget(self) -> None:
-        """Points that no key frame shows any more."""
+        """Remove points that no key frame observes any more."""
         seen = np.unique(np.concatenate([key.numbers for key in self.keys]))
         kept = np.isin(self._numbers, seen)
         self._numbers, self._points = self._numbers[kept], self._points[torch.from_numpy(kept)]
 
 
 def unprojected(pose: Tensor, rays: NDArray[np.float64], depth: Tensor) -> Tensor:
-    """Places in the world [N, 3] of points that the camera of a pose [4, 4] sees along `rays` [N, 2] at `depth` [N]."""
+    """Return the world positions [N, 3] of points seen along `rays` [N, 2] at `depth` [N] by a
+    camera with `pose` [4, 4].
+    """
     local = torch.cat([torch.from_numpy(rays), torch.ones(len(rays), 1, dtype=torch.float64)], 1) * depth[:, None]
     return (local - pose[:3, 3]) @ pose[:3, :3]
 
 
 def scaled(pose: Tensor, factor: float) -> Tensor:
-    """The pose [4, 4] of a world whose lengths are so many times larger."""
+    """Return the pose [4, 4] in a world whose lengths are multiplied by a factor."""
     pose = pose.clone()
     pose[:3, 3] *= factor
     return pose
 
 
 def position_of(pose: Tensor) -> NDArray[np.float64]:
-    """Where a camera is [3]."""
+    """Return the camera centre [3] of a pose."""
     return np.asarray((-pose[:3, :3].T @ pose[:3, 3]).numpy())

@@ -1,8 +1,10 @@
-"""The surface behind matched depth: what neighbours tell together, and of the rest what their noise does not explain.
+"""Surface reconstruction from stereo disparities by local planes and Wiener shrinkage of the
+residual.
 
-Disparities are off by less than a tenth of a pixel, but neighbours are off alike, over some ten pixels: too little for depth to suffer, enough to tilt
-a surface by 10 degrees. So planes are fitted in windows of a share of the picture; a plane's disparity is linear in the picture. What is left, folds and
-edges, is kept by the share of its variance that the disparities' own is too small for (James and Stein's, Wiener's).
+Errors of disparities are below a tenth of a pixel but correlated over about ten pixels. That is
+harmless for depth but tilts a surface by up to 10 degrees. Planes are therefore fitted in larger
+windows; the disparity of a plane is linear in picture coordinates. The residual, folds and edges,
+is kept by the share of its variance that exceeds the noise (James-Stein and Wiener estimators).
 """
 
 from __future__ import annotations
@@ -19,15 +21,22 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 Plane = NDArray[np.float32]
 
 WINDOW = 0.03
-"""Standard deviation of the window of a plane, as a share of the picture's width."""
+"""Standard deviation of a plane's window, as a share of the picture's width."""
 ALIKE_PX2 = 0.1**2
-"""Variance that neighbouring disparities have in common, beyond what the matcher says of each, in squares of the pixels that were matched."""
+"""Variance of the error shared by neighbouring disparities, in squared pixels of the matched
+pictures. It is added to the variance that the matcher estimates.
+"""
 
 
 def with_matched_surface(frame: Frame, camera: Camera, tissue: NDArray[np.bool_]) -> Frame:
-    """The frame with the surface in place of its matched depth; any other frame as it is.
+    """Replace the stereo depth of a frame by a reconstructed surface; frames with other depth are
+    returned unchanged.
 
-    camera: the left one. tissue: where depth is that of one surface [H, W]: elsewhere, as on a tool and beside it, it stays as it is and tells nothing.
+    Args:
+        frame: frame with stereo depth and confidence.
+        camera: left camera.
+        tissue: bool [H, W], pixels whose depth belongs to the tissue surface. Other pixels, such as
+            tools and their surroundings, keep their depth and are ignored by the fit.
     """
     if frame.depth is None or frame.depth_confidence is None or frame.depth_origin is not DepthOrigin.STEREO:
         return frame
@@ -42,9 +51,16 @@ def with_matched_surface(frame: Frame, camera: Camera, tissue: NDArray[np.bool_]
 
 
 def smooth_disparity(disparity: Plane, known: NDArray[np.bool_], variance: Plane) -> Plane:
-    """Disparities [H, W] px, positive where they are `known`, as a surface; `variance` px², positive. Unknown ones mean nothing.
+    """Fit a surface to disparities.
 
-    Never below half of what is known least, nor above twice the most.
+    Args:
+        disparity: float32 [H, W] in pixels, positive where known.
+        known: bool [H, W].
+        variance: float32 [H, W] in pixels², positive.
+
+    Returns:
+        Disparity [H, W] between half the smallest and twice the largest known value; meaningless
+            where unknown.
     """
     least = float(variance[known].min())
     weight = np.where(known, least / variance, 0).astype(np.float32)
@@ -58,7 +74,7 @@ def smooth_disparity(disparity: Plane, known: NDArray[np.bool_], variance: Plane
 
 
 def _planes(values: Plane, weight: Plane) -> Plane:
-    """The planes that fit weighted values round each pixel best, each at its pixel [H, W]."""
+    """Return the weighted plane fit around each pixel, evaluated at the pixel [H, W]."""
     height, width = values.shape
     cells = min(width, round(CELLS_A_WINDOW / WINDOW))
     grid = cells, max(1, round(cells * height / width))
@@ -70,9 +86,12 @@ def _planes(values: Plane, weight: Plane) -> Plane:
 
 
 def _share_beyond_noise(rest: Plane, weight: Plane, least: float) -> Plane:
-    """How much of what is left of disparities is more than noise, 0 to 1 [H, W]: by its weighted variance round each pixel, of which `least` is noise."""
+    """Return the share of the residual that exceeds noise, 0 to 1 [H, W], from its locally weighted
+    variance and the noise variance `least`.
+    """
     sigma = max(1.0, WINDOW * rest.shape[1] / 2)
     mean = lambda plane: cv2.GaussianBlur(plane.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-    # The weight is the inverse variance: of noise alone, weight times square is `least` wherever something is known.
+    # Weights are `least` / variance, so weight times squared noise has the mean `least` at every
+    # known pixel.
     found, noise = mean(weight * rest * rest), least * mean((weight > 0).astype(np.float32))
     return np.asarray(np.clip(1 - noise / np.maximum(found, 1e-12), 0, 1), np.float32)

@@ -1,8 +1,9 @@
-"""Points, distances and lengths on a model's surface, each with its error, or refused.
+"""Measurement of points, distances and lengths on a model's surface, each with a standard error.
 
-The standard error of a point has three parts, taken as independent: how far z spreads along the ray (`Surface.spread`), how far the surface is from the
-point if what was blended is half transparent, and the error of the depth that the model was trained on (`ORIGIN_ERROR`). The last one is the same for the
-whole scene to a good part; it is taken as independent between two points, which errs to the side of a larger error. The camera is taken as exact.
+The standard error of a point has three parts that are treated as independent: the spread of z along
+the ray (`Surface.spread`), the depth ambiguity of partly transparent pixels, and the error of the
+depth source used in training (`ORIGIN_ERROR`). The last part is largely common to the whole scene.
+Treating it as independent between two points overestimates the error. The camera is assumed exact.
 """
 
 from __future__ import annotations
@@ -29,53 +30,56 @@ ORIGIN_ERROR: dict[DepthOrigin | None, float] = {
     DepthOrigin.LEARNED: 0.2,
     None: 0.3,
 }
-"""Standard error of depth over depth by where it comes from, beside what the model shows. They are assumed, from what such methods are known to reach."""
+"""Assumed relative standard error of depth for each depth source, in addition to the errors visible
+in the model.
+"""
 MOST_STEPS = 4096
-"""Of a length along the surface."""
+"""Largest number of steps of a length along the surface."""
 
 
 @dataclass(frozen=True)
 class SurfacePoint:
-    """Where the surface is that a pixel shows."""
+    """Surface point shown by a pixel."""
 
     pixel: tuple[float, float]
     """Column and row; the first pixel's centre is at (0.5, 0.5)."""
     position: tuple[float, float, float]
-    """In the world."""
+    """World coordinates."""
     depth: float
-    """z in the camera."""
+    """z in camera coordinates."""
     depth_error: float
-    """Standard error of z: the point lies on its pixel's ray, and this is how far it may be off along it, as z."""
+    """Standard error of z. The point is exactly on the pixel's ray."""
     opacity: float
     confidence: float
     along_ray: tuple[float, float, float]
-    """How the position changes with z, in the world."""
+    """Derivative of the world position by z."""
 
     @property
     def position_error(self) -> float:
-        """Standard error of the position, along the ray."""
+        """Standard error of the position along the ray."""
         return self.depth_error * math.hypot(*self.along_ray)
 
 
 @dataclass(frozen=True)
 class Length:
-    """A length and its standard error, in the model's unit."""
+    """Length with its standard error, in the model's unit."""
 
     value: float
     error: float
 
 
 class Measurement:
-    """A model's surface from one camera at one time, for measuring on it.
+    """Surface of a model at one time and camera, for measurements.
 
-    Raises InvalidSetting for a time outside of the model's window.
+    Raises:
+        InvalidSetting: for a time outside the model's window.
     """
 
     def __init__(self, model: Model, time_s: float, camera: Camera | None = None) -> None:
         start_s, end_s = model.time_window_s
         if not start_s - 1e-6 <= time_s <= end_s + 1e-6:
             raise InvalidSetting(
-                f"the model has seen nothing at {time_s:g} s; its window is {start_s:.3f} to {end_s:.3f} s"
+                f"the model contains nothing at {time_s:g} s; its window is {start_s:.3f} to {end_s:.3f} s"
             )
         self.camera = camera or model.camera
         self.metric = model.metric
@@ -84,13 +88,14 @@ class Measurement:
 
     @property
     def unit(self) -> str:
-        """`mm`, or `relative` where the model's lengths have no known unit."""
+        """`mm`, or `relative` if the model's scale is unknown."""
         return "mm" if self.metric else "relative"
 
     def point(self, x: float, y: float) -> SurfacePoint:
-        """The surface at pixel coordinates, at the centre of the pixel that they lie in.
+        """Return the surface point at the centre of the pixel that contains (x, y).
 
-        Raises InvalidSetting outside of the picture and where nothing was ever observed.
+        Raises:
+            InvalidSetting: outside the picture, or where no tissue was observed.
         """
         camera, surface = self.camera, self._surface
         if not (0 <= x < camera.width_px and 0 <= y < camera.height_px):
@@ -103,7 +108,7 @@ class Measurement:
             )
         start, step = rays_of(camera, np.array([column + 0.5, row + 0.5]))
         spread = float(surface["spread"][row, column])
-        # What shines through may as well be as far off as the median says.
+        # In half-transparent pixels the point may as well be at the median depth.
         median = float(surface["median_depth"][row, column])
         split = abs(depth - median) if median > 0 else spread
         error = math.hypot(spread, (1 - opacity) * depth, split, ORIGIN_ERROR[self.origin] * depth)
@@ -118,16 +123,20 @@ class Measurement:
         )
 
     def distance(self, first: SurfacePoint, second: SurfacePoint) -> Length:
-        """Straight from one point to the other."""
+        """Return the straight distance between two points."""
         between = np.subtract(second.position, first.position)
         value = float(np.linalg.norm(between))
         return Length(value, _error_of_distance(first, second, between / value if value > 0 else np.zeros(3)))
 
     def length_along(self, first: SurfacePoint, second: SurfacePoint) -> Length:
-        """Along the surface below the straight line in the picture from one point to the other; a gap that was never observed is refused.
+        """Return the length along the surface under the straight line between two points in the
+        picture.
 
-        Steps are as long as the splats' detail is coarse, two pixels, so that what z jitters from pixel to pixel does not lengthen the way.
-        The error is that of the two ends, and of each step's own jitter. Raises InvalidSetting where nothing was observed on the way.
+        Steps are two pixels long, about the detail of the splats, so that jitter of z does not
+        lengthen the path. The error combines the errors of both ends and the jitter.
+
+        Raises:
+            InvalidSetting: if any point of the path was not observed.
         """
         (x0, y0), (x1, y1) = first.pixel, second.pixel
         steps = min(MOST_STEPS, max(1, round(math.hypot(x1 - x0, y1 - y0) / 2)))
@@ -140,16 +149,21 @@ class Measurement:
 
 
 def _error_of_distance(first: SurfacePoint, second: SurfacePoint, direction: NDArray[np.floating]) -> float:
-    """To first order from both points' errors along their rays; across the rays a distance grows with the square of the error."""
+    """Return the first-order error from both points' errors along their rays. Errors across the
+    rays are of second order.
+    """
     parts = [point.depth_error * abs(float(np.dot(point.along_ray, direction))) for point in (first, second)]
-    # Both ends may be off together, by one factor: a distance across the rays is then off by it, too.
+    # Both depths may share one scale error, which changes distances across the rays by the same
+    # factor.
     across = 0.5 * (first.depth_error / first.depth + second.depth_error / second.depth)
     length = float(np.linalg.norm(np.subtract(second.position, first.position)))
     return math.hypot(*parts, across * length)
 
 
 def _roughness(places: NDArray[np.floating]) -> float:
-    """By how much a way through such points is longer than one through each other of them."""
+    """Return the difference in length between the path through all points and the path through
+    every other point.
+    """
     if len(places) < 3:
         return 0.0
     fine = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())

@@ -1,7 +1,8 @@
-"""Which pixels of a measured depth map are to be believed.
+"""Confidence of measured depth maps.
 
-Sensors, renderers and whoever resizes their pictures leave pixels at edges that lie on neither side, some near nothing beside what is unknown, and a row or
-column of something else along the border. A scene that starts there has Gaussians that float before the tissue, and hide it when they are carried along.
+Sensors, renderers and resizing produce edge pixels that belong to neither side, near-zero values
+next to unknown depth, and wrong rows or columns along the border. Gaussians initialised there float
+in front of the tissue and occlude it when they move.
 """
 
 from __future__ import annotations
@@ -10,23 +11,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 ALIKE = 0.1
-"""Two neighbours lie on one surface where they differ by less than this share of the farther one."""
+"""Largest relative depth difference of neighbours on one surface, as a share of the farther one."""
 NEAREST = 0.1
-"""What is nearer than this share of the median depth is not tissue but noise about zero."""
+"""Share of the median depth below which a value is noise around zero."""
 STRIDE = 4
-"""The median is that of each fourth pixel of each fourth row."""
+"""Subsampling of rows and columns for the median."""
 PAIRS = (
     (np.s_[:, :-1], np.s_[:, 1:]),
     (np.s_[:-1, :], np.s_[1:, :]),
     (np.s_[:-1, :-1], np.s_[1:, 1:]),
     (np.s_[:-1, 1:], np.s_[1:, :-1]),
 )
-"""Every pixel and four of its neighbours; the other four see it as theirs."""
+"""Slices that pair every pixel with four of its neighbours; the other four are covered by symmetry.
+"""
 
 
 def measured_confidence(depth: NDArray[np.floating]) -> NDArray[np.float32]:
-    """The confidence [H, W] of measured depth [H, W]: 0 where it is not a positive finite number, where it is far too near, and where more of the
-    neighbours with such depth differ from it than are like it; 1 elsewhere. A pixel without neighbours is believed."""
+    """Return the confidence of measured depth.
+
+    A pixel gets 0 if its depth is not finite and positive, if it is far below the median, or if
+    most of its known neighbours differ from it. Other pixels get 1, including those without known
+    neighbours.
+
+    Args:
+        depth: floating [H, W].
+
+    Returns:
+        float32 [H, W], 0 or 1.
+    """
     known = np.isfinite(depth) & (depth > 0)
     values = np.where(known, depth, 0).astype(np.float32)
     known &= values >= NEAREST * _median(values)
@@ -41,7 +53,7 @@ def measured_confidence(depth: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def _median(values: NDArray[np.float32]) -> float:
-    """Of what is not 0; 0 where there is nothing."""
+    """Return the median of the non-zero values, or 0 if there are none."""
     for some in (values[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE], values):
         if np.any(some):
             return float(np.median(some[some > 0]))

@@ -1,4 +1,6 @@
-"""A model's surface at a time as triangles with colours: the depth that a camera sees, connected between neighbouring pixels and cut at occlusion edges."""
+"""Coloured triangle meshes of a model's surface at one time, made from a depth map and cut at
+occlusion edges.
+"""
 
 from __future__ import annotations
 
@@ -16,28 +18,38 @@ from gsplat_core.scene.model import Model
 from gsplat_core.transfers import HostCopy
 
 LEAST_OPACITY = 0.5
-"""Of a pixel that becomes part of the surface; `COVERED` only says that something is there."""
+"""Least opacity of a pixel that becomes part of the mesh, stricter than `COVERED`."""
 assert LEAST_OPACITY >= COVERED
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """V vertices and T triangles."""
+    """Triangle mesh with V vertices and T triangles."""
 
     vertices: NDArray[np.float32]
-    """[V, 3]."""
+    """Vertex positions [V, 3]."""
     normals: NDArray[np.float32]
-    """[V, 3], of unit length, on the side that was seen."""
+    """Unit vertex normals [V, 3] on the visible side."""
     colours: NDArray[np.uint8]
-    """[V, 3]: red, green, blue, as displayed."""
+    """Displayed RGB colours [V, 3]."""
     triangles: NDArray[np.int32]
-    """[T, 3], counter-clockwise from the side that was seen; empty: a point cloud."""
+    """Vertex indices [T, 3], counter-clockwise seen from the visible side; empty for a point cloud.
+    """
 
 
 def mesh_of(model: Model, time_s: float, camera: Camera | None = None) -> Mesh:
-    """The surface that `camera` (the model's own when None) sees at a time, in the world: a vertex for each pixel that shows tissue.
+    """Mesh the surface that a camera sees at a time, with one vertex per pixel that shows tissue.
 
-    Raises ExportError where it sees none.
+    Args:
+        model: model to export.
+        time_s: time in seconds.
+        camera: viewpoint; None for the model's own camera.
+
+    Returns:
+        The mesh in world coordinates.
+
+    Raises:
+        ExportError: if no surface is visible.
     """
     camera = camera or model.camera
     with torch.inference_mode():
@@ -50,7 +62,19 @@ def mesh_of(model: Model, time_s: float, camera: Camera | None = None) -> Mesh:
 
 
 def mesh_of_depth(depth: NDArray[np.float32], image: NDArray[np.uint8], camera: Camera) -> Mesh:
-    """The surface of a depth map z [H, W], 0 = unknown, in the world. Raises ExportError where no three neighbouring pixels are on one surface."""
+    """Mesh a depth map.
+
+    Args:
+        depth: float32 [H, W], z in camera coordinates, 0 = unknown.
+        image: uint8 [H, W, 3], colours.
+        camera: camera of both planes.
+
+    Returns:
+        The mesh in world coordinates.
+
+    Raises:
+        ExportError: if no three neighbouring pixels are on one surface.
+    """
     across, down = joined(depth, camera, 1), joined(depth, camera, 0)
     triangles = _triangles(across, down)
     if not len(triangles):
@@ -67,7 +91,9 @@ def mesh_of_depth(depth: NDArray[np.float32], image: NDArray[np.uint8], camera: 
 
 
 def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Normals [V, 3] of unit length: those of the triangles around each vertex, weighted by their area; 0 for a vertex without any."""
+    """Return unit vertex normals [V, 3], the area-weighted mean of the adjacent triangles' normals;
+    0 for a vertex without triangles.
+    """
     a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
     faces = np.cross(b - a, c - a)
     corners, weights = triangles.T.ravel(), np.tile(faces, (3, 1))
@@ -77,14 +103,16 @@ def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.integer
 
 
 def _triangles(across: NDArray[np.bool_], down: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Numbers of pixels [T, 3]: two triangles for each square whose four sides go on, one where a corner is cut off."""
+    """Return pixel indices [T, 3]: two triangles for each square with four connected sides, one if
+    a corner is cut off.
+    """
     height, width = across.shape[0], down.shape[1]
     pixel = np.arange(height * width).reshape(height, width)
     upper_left, upper_right = pixel[:-1, :-1], pixel[:-1, 1:]
     lower_left, lower_right = pixel[1:, :-1], pixel[1:, 1:]
     top, bottom, left, right = across[:-1], across[1:], down[:, :-1], down[:, 1:]
     whole = top & bottom & left & right
-    # Pixel rows go down, so that this order is counter-clockwise for who looks along z.
+    # Pixel rows increase downwards, so this order is counter-clockwise for a viewer along +z.
     corners = (
         (whole | (top & left), upper_left, lower_left, upper_right),
         (whole | (bottom & right), lower_right, upper_right, lower_left),

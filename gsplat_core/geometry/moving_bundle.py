@@ -1,8 +1,11 @@
-"""Bundle adjustment before tissue that repeats its motion: cameras, places at rest, and how far each part swings at some frequencies.
+"""Bundle adjustment of cameras in front of periodically moving tissue.
 
-A point is at its place at rest and, for each wave w(t), w(t) times a vector that changes smoothly over the surface (`surface_field`). Cameras, places and
-vectors follow together from where points were seen: Levenberg-Marquardt with Cauchy's weights, places eliminated (Schur complement). What tissue and
-scope do alike cannot be told by any picture; the prior of the trajectory (`trajectory_prior`) decides that. The unit of length is the tissue's median distance.
+The position of a point is its rest position plus the sum over waves w(t) of w(t) times a vector.
+The vectors vary smoothly over the surface (`surface_field`). Cameras, rest positions and vectors
+are estimated together by Levenberg-Marquardt with Cauchy weights, with rest positions eliminated
+(Schur complement). Rigid motion common to tissue and scope is unobservable from pictures; the
+trajectory prior (`trajectory_prior`) decides it. The unit of length is the tissue's median
+distance.
 """
 
 from __future__ import annotations
@@ -19,50 +22,53 @@ from gsplat_core.geometry.trajectory_prior import TrajectoryPrior
 from gsplat_core.threads import one_thread
 
 SIGMA = 0.002
-"""Standard deviation of a ray (x / z): 0.6 pixels of a picture that is 320 wide, as neighbours in time err alike."""
+"""Standard deviation of a ray (x / z). It corresponds to 0.6 pixels at a width of 320 and includes
+the correlation of errors over time.
+"""
 RELIEF = 0.3
-"""How far points may be expected from their median distance."""
+"""Prior standard deviation of the points' depth from their median, in units of the median depth."""
 NEAREST = 0.05
-"""What is nearer is taken to be there."""
+"""Smallest depth used in projections, in units of the median depth."""
 HELD = 1e3
-"""Where no prior of the trajectory decides: how firmly the tissue's common rigid motion stays as it is."""
+"""Stiffness that holds the tissue's common rigid motion constant when there is no trajectory prior.
+"""
 
 
 @dataclass(frozen=True)
 class MovingBundle:
-    """Cameras, tissue and what was seen of it; all float64."""
+    """Cameras, moving points and observations; all float64."""
 
     poses: Tensor
-    """World to camera [C, 4, 4]; the first one stays."""
+    """World-to-camera poses [C, 4, 4]; the first one is fixed."""
     rest: Tensor
-    """Places at rest [P, 3] in the world."""
+    """Rest positions [P, 3] in the world."""
     amplitudes: Tensor
-    """Vectors at the nodes [M, 3, B], one for each wave."""
+    """Motion vectors at the field's nodes, one for each wave, [M, 3, B]."""
     camera: Tensor
-    """int64 [K]: which camera saw ..."""
+    """Camera index of each observation, int64 [K]."""
     point: Tensor
-    """int64 [K]: ... which point ..."""
+    """Point index of each observation, int64 [K]."""
     rays: Tensor
-    """[K, 2]: ... where, as x / z and y / z."""
+    """Observed rays as x / z and y / z, [K, 2]."""
     waves: Tensor
-    """[C, B]: each wave when each camera looked."""
+    """Value of each wave at each camera's time, [C, B]."""
     influence: Tensor
-    """[P, M]: how much each point has of each node's vector."""
+    """Weight of each node's vector at each point, [P, M]."""
     field: SurfaceField
-    """The nodes."""
+    """Nodes and prior of the motion field."""
 
     def places(self) -> Tensor:
-        """Where each point was when it was seen [K, 3]."""
+        """Return the world position of the point at each observation, [K, 3]."""
         amplitudes_at = torch.einsum("pm,mjb->pjb", self.influence, self.amplitudes)
         return self.rest[self.point] + torch.einsum("kjb,kb->kj", amplitudes_at[self.point], self.waves[self.camera])
 
     def off(self) -> Tensor:
-        """Rays from where points were seen to where they would be [K, 2]."""
+        """Return the ray residuals predicted minus observed, [K, 2]."""
         return _residuals(self)[0]
 
 
 def with_waves(bundle: MovingBundle, waves: Tensor) -> MovingBundle:
-    """The same with other waves [C, B]: what more there are than before is still to be found."""
+    """Replace the waves [C, B]. Vectors of additional waves start at zero."""
     amplitudes = torch.zeros(len(bundle.field.nodes), 3, waves.shape[1], dtype=torch.float64)
     amplitudes[:, :, : bundle.amplitudes.shape[2]] = bundle.amplitudes
     return replace(bundle, waves=waves, amplitudes=amplitudes)
@@ -72,9 +78,16 @@ def with_waves(bundle: MovingBundle, waves: Tensor) -> MovingBundle:
 def adjust(
     bundle: MovingBundle, spread: float, rounds: int, prior: TrajectoryPrior | None = None
 ) -> tuple[MovingBundle, float]:
-    """The bundle after at most `rounds` steps, of which each lessens the cost, and the cost.
+    """Minimise the robust cost.
 
-    spread: rays that are off by well more than this decide little (Cauchy's scale).
+    Args:
+        bundle: start values.
+        spread: Cauchy scale of ray errors; errors well above it have little influence.
+        rounds: maximum number of Levenberg-Marquardt steps.
+        prior: prior of the scope's trajectory, or None.
+
+    Returns:
+        The adjusted bundle and its cost, which is at most that of the start.
     """
     step = lambda bundle, damping: _in_unit(_step(bundle, spread, damping, prior))
     return descend(bundle, step, lambda bundle: _cost(bundle, spread, prior), rounds)
@@ -90,7 +103,7 @@ def _cost(bundle: MovingBundle, spread: float, prior: TrajectoryPrior | None) ->
 
 
 def _in_unit(bundle: MovingBundle) -> MovingBundle:
-    """The same with the median depth of the places at rest as the unit."""
+    """Rescale to the median depth of the rest positions as the unit of length."""
     unit = bundle.rest[:, 2].median().abs()
     poses = bundle.poses.clone()
     poses[:, :3, 3] /= unit
@@ -98,7 +111,9 @@ def _in_unit(bundle: MovingBundle) -> MovingBundle:
 
 
 def _residuals(bundle: MovingBundle) -> tuple[Tensor, Tensor, Tensor]:
-    """Residuals [K, 2] of rays, the points in their cameras [K, 3], and the cameras' rotations [K, 3, 3]."""
+    """Return ray residuals [K, 2], points in camera coordinates [K, 3] and camera rotations [K, 3,
+    3].
+    """
     pose = bundle.poses[bundle.camera]
     rotation = pose[:, :3, :3]
     local = (rotation @ bundle.places()[:, :, None])[:, :, 0] + pose[:, :3, 3]
@@ -108,20 +123,22 @@ def _residuals(bundle: MovingBundle) -> tuple[Tensor, Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class _Places:
-    """The equations of places at rest, as far as cameras and swings are concerned."""
+    """Blocks of the normal equations needed to eliminate the rest positions."""
 
     inverse: Tensor
-    """[P, 3, 3]."""
+    """Inverse blocks of the rest positions, [P, 3, 3]."""
     slope: Tensor
-    """[P, 3]."""
+    """Gradients of the rest positions, [P, 3]."""
     by_camera: Tensor
-    """[C, P, 6, 3]."""
+    """Coupling to cameras, [C, P, 6, 3]."""
     by_amplitude: Tensor
-    """[P, 3, 3 B]."""
+    """Coupling to motion vectors, [P, 3, 3 B]."""
 
 
 def _step(bundle: MovingBundle, spread: float, damping: float, prior: TrajectoryPrior | None) -> MovingBundle:
-    """One step. Unknowns: twists of all cameras but the first, then amplitudes in the order (axis, wave, node)."""
+    """Compute one damped step. Unknowns are the twists of all cameras but the first, then
+    amplitudes in the order (axis, wave, node).
+    """
     residual, local, rotation = _residuals(bundle)
     weight = 1 / (SIGMA**2 * (1 + (residual / spread).square().sum(1)))
     by_local, by_rotation = ray_derivatives(local)
@@ -169,7 +186,9 @@ def _eliminated(bundle: MovingBundle, square: Tensor, pull: Tensor, by_camera: T
 def _amplitude_terms(
     bundle: MovingBundle, square: Tensor, pull: Tensor, places: _Places, eliminated: Tensor, *, held: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What swings have to do with cameras [6 C, n] and with one another [n, n], and their slopes [n], without the places."""
+    """Return coupling of amplitudes to cameras [6 C, n], their own matrix [n, n] and gradient [n],
+    after eliminating the rest positions.
+    """
     count, waves = len(bundle.rest), bundle.waves[bundle.camera]
     cameras, wave_count, nodes = len(bundle.poses), waves.shape[1], bundle.influence.shape[1]
     size = 3 * wave_count
@@ -201,7 +220,7 @@ def _amplitude_terms(
 
 
 def _rigid(bundle: MovingBundle, wave_count: int) -> Tensor:
-    """What holds the common rigid motion of the swings as it is [3 B, M, 3 B, M]."""
+    """Return the penalty matrix [3 B, M, 3 B, M] that holds the rigid motion of the amplitudes."""
     at = bundle.field.nodes - bundle.field.middle
     x, y, z = at.unbind(1)
     one, zero = torch.ones_like(x), torch.zeros_like(x)

@@ -1,9 +1,12 @@
-"""Depth of every frame of a recording whose scope moves while the tissue breathes, from poses and all frames together.
+"""Depth of every frame of a recording with a moving scope and breathing tissue, from poses and all
+frames together.
 
-Points of a grid are followed through windows of some seconds (`grid_tracks`), the frequencies of breathing and heart beat are looked for
-(`frequencies`), and with them each point's distance and motion (`periodic_motion`). A frame's depth is a smooth surface through the points that it
-shows, believed as far as these are known: by how well the window tells the scope's way from the tissue's, how well other frequencies would do, and how far
-a point is from where the motion that was found has it. What is pulled by a tool is not where it has it, and not believed for so long.
+Grid points are tracked through windows of several seconds (`grid_tracks`). Breathing and heart
+frequencies are searched (`frequencies`) and each point's distance and motion are fitted
+(`periodic_motion`). The depth of a frame is a smooth surface through its visible points. Its
+confidence combines three errors: the ambiguity between scope and tissue motion, the spread between
+plausible frequencies, and the distance of each point from its fitted motion. Tissue pulled by a
+tool deviates from the fitted motion and has low confidence meanwhile.
 """
 
 from __future__ import annotations
@@ -26,63 +29,72 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 
 WINDOW_S = 8.0
-"""In which tissue is taken to repeat its motion. Of a longer recording there are several, each half over the next."""
+"""Length in seconds of a window in which motion is assumed periodic. Windows of longer recordings
+overlap by half.
+"""
 RATE_HZ = 12.5
-"""Frames that are looked at in a second, at most: a heart beat has several."""
+"""Largest number of frames used per second; several per heart beat."""
 KEY_EVERY_S = 1.2
 SHORTEST_S = 1.0
 LEAST_CYCLES = 1.0
-"""Of breathing: less of it can be any motion of the scope."""
+"""Fewest breathing cycles in a window; with less, the motion may be the scope's."""
 FEWEST_POINTS = 100
 MOST_ERROR = 0.04
-"""Relative error of a distance with which it is believed by one half."""
+"""Relative error of a distance at which its confidence is one half."""
 MOST_OFF_PX = 1.0
-"""Median distance of points from where the motion that was found has them, beyond which it is none."""
+"""Median error in pixels of the fitted motion above which it is rejected."""
 OWN_MOTION = 3.0
-"""A point that is off by so much across its ray may be off along it by this many times that."""
+"""Factor from a point's error across its ray to its assumed error along the ray."""
 PULL_FRAMES = 3
-"""Frames before and after, of those that are looked at, in which a tool is taken to pull in one direction."""
+"""Frames before and after, at the sampled rate, in which a tool's pull is assumed to have one
+direction.
+"""
 PULL_ERROR = 0.4
-"""Of how far a pull moves tissue along the line of sight: how uncertain that is."""
+"""Relative uncertainty of the depth change caused by a pull."""
 TOO_SHORT = (
-    "the recording is too short, or the scope moves too much as the tissue does, for depth to be told from breathing"
+    "the recording is too short, or the scope's motion is too similar to the breathing, for depth to be determined"
 )
-OTHERWISE = "the tissue itself moves, and not as breathing and a heart beat do: depth cannot be told from that"
-TOO_FEW = "too few points of the tissue can be followed"
+OTHERWISE = "the tissue moves in a way other than breathing and heart beat: depth cannot be determined"
+TOO_FEW = "too few points of the tissue can be tracked"
 
 
 @dataclass(frozen=True)
 class _Window:
-    """What was found of some of the frames."""
+    """Result for one time window of a recording."""
 
     middle_s: float
     tracks: GridTracks
     motion: PeriodicMotion
     off: Array
-    """[T, N, 2]: rays, from where the motion has each point to where it was seen."""
+    """Ray errors [T, N, 2], observed minus predicted by the motion."""
     error: float
-    """Relative error of all distances together."""
+    """Relative error common to all distances."""
 
 
 class MovingTissue:
-    """The frames' depth, found when it is asked for. The same frames give the same bytes."""
+    """Depth of a recording's frames, computed on request. The same frames give the same bytes."""
 
     def __init__(self, frames: Sequence[Frame], cameras: Sequence[Camera]) -> None:
-        """cameras: of the frames, with their poses."""
+        """Fit all windows of a recording.
+
+        Args:
+            frames: frames of the recording.
+            cameras: camera of each frame, with its pose.
+        """
         self._frames, self._cameras = frames, cameras
         self._times = np.array([frame.time_s for frame in frames])
         found = [_found(*each) for each in _windows(frames, cameras, self._times)]
         self._windows = [each for each in found if isinstance(each, _Window)]
         self.doubts = tuple(each for each in found if isinstance(each, str))
-        """Why there is nothing of some windows, in sentences."""
+        """Reasons why windows were rejected, as sentences."""
 
     @property
     def frequencies_hz(self) -> tuple[tuple[float, ...], ...]:
-        """At which the tissue moves, of each window that is believed."""
+        """Frequencies of the tissue's motion in Hz, for each accepted window."""
         return tuple(each.motion.frequencies_hz for each in self._windows)
 
     def depth_of(self, number: int) -> DepthMap:
-        """Depth of frame `number`, in the unit of the poses."""
+        """Return the depth of frame `number`, in the unit of the poses."""
         frame, time_s = self._frames[number], self._times[number]
         near = [each for each in self._windows if each.tracks.times_s[0] <= time_s <= each.tracks.times_s[-1]]
         if not near:
@@ -107,7 +119,7 @@ class MovingTissue:
 def _windows(
     frames: Sequence[Frame], cameras: Sequence[Camera], times_s: Array
 ) -> list[tuple[list[TexturedPicture], Array]]:
-    """The pictures that are looked at, and their times, of each window."""
+    """Return the sampled pictures and their times for each window."""
     length_s = float(times_s[-1] - times_s[0])
     count = 1 if length_s <= WINDOW_S else int(np.ceil(2 * length_s / WINDOW_S)) - 1
     starts = times_s[0] + np.linspace(0, max(0.0, length_s - WINDOW_S), count)
@@ -126,7 +138,7 @@ def _windows(
 
 
 def _found(pictures: list[TexturedPicture], times_s: Array) -> _Window | str:
-    """The motion in one window, or in a sentence why there is none to believe."""
+    """Fit the motion of one window, or return the reason for rejecting it."""
     length_s = float(times_s[-1] - times_s[0])
     if length_s < SHORTEST_S:
         return TOO_SHORT
@@ -149,17 +161,17 @@ def _found(pictures: list[TexturedPicture], times_s: Array) -> _Window | str:
 
 
 def _share(window: _Window, time_s: float) -> float:
-    """1 in the window's middle, little at its ends."""
+    """Return the weight of a window at a time, from 1 in its middle to almost 0 at its ends."""
     half = 0.5 * float(np.ptp(window.tracks.times_s))
     return max(0.02, 1 - abs(time_s - window.middle_s) / half)
 
 
 def _surface(window: _Window, camera: Camera, time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Depth and confidence [h, w] of a frame from the points of one window."""
+    """Return depth and confidence [h, w] of a frame from the points of one window."""
     tracks = window.tracks
     after = int(np.clip(np.searchsorted(tracks.times_s, time_s), 1, len(tracks.times_s) - 1))
     share = (time_s - tracks.times_s[after - 1]) / (tracks.times_s[after] - tracks.times_s[after - 1])
-    # A frame that was not looked at shows what both neighbours show, and what is off there.
+    # A frame between two samples gets the points visible in both, and their interpolated error.
     ends = [each for each, weight in ((after - 1, 1 - share), (after, share)) if weight > 1e-6]
     seen = np.logical_and.reduce([tracks.seen[each] for each in ends])
     off = np.average(window.off[ends], axis=0, weights=[each for each in (1 - share, share) if each > 1e-6])
@@ -176,7 +188,9 @@ def _surface(window: _Window, camera: Camera, time_s: float) -> tuple[NDArray[np
 
 
 def _pulled(window: _Window, index: int, pose: Array, rays: Array, off: Array) -> tuple[Array, Array]:
-    """By how much points are farther than their periodic motion has them, relative to their distance, and how uncertain that is."""
+    """Return the relative depth change of pulled points against their periodic motion, and its
+    uncertainty.
+    """
     tracks = window.tracks
     near = range(max(0, index - PULL_FRAMES), min(len(tracks.times_s), index + PULL_FRAMES))
     seen = [tracks.seen[each] for each in near]

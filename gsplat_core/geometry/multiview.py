@@ -1,8 +1,9 @@
-"""Depth of one picture of a moving scope, from pictures of the same tissue from elsewhere whose poses are known.
+"""Depth of one picture of a moving scope from other pictures with known poses.
 
-First corners that are followed are held against the poses (`pose_check`), which also says between which distances the tissue is. Then these distances are swept
-(`plane_sweep`), neighbours are made to agree (`semi_global`), and each pixel is judged by how well and how clearly the views agree there. What deforms
-does not agree between times, and what has no texture does not agree clearly: both get no confidence, and a depth that is only a smooth continuation.
+Tracked corners are first checked against the poses (`pose_check`), which also gives the range of
+distances. That range is swept (`plane_sweep`) and regularised (`semi_global`). Each pixel's
+confidence reflects how well and how uniquely the views match. Deforming or textureless tissue gets
+no confidence, and its depth is a smooth extrapolation.
 """
 
 from __future__ import annotations
@@ -21,35 +22,45 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthOrigin, Frame
 
 WORKING_PX = 320
-"""Longest side of the pictures that are compared, where there is time."""
+"""Longest side in pixels of the compared pictures, when there is no real-time limit."""
 MOST_VIEWS = 6
-"""Other views that are compared with one picture."""
+"""Largest number of other views compared with one picture."""
 SHORTEST_BASELINE = 0.1
-"""Of the longest one: views nearer than that add noise and no depth."""
+"""Share of the longest baseline below which a view is ignored because it adds noise."""
 WIDEST_TURN = 0.7
-"""Cosine of the angle between two cameras' axes from which they may see the same tissue."""
+"""Smallest cosine between the optical axes of two cameras that are compared."""
 LABEL_PX = 0.75
-"""Parallax from one distance of the sweep to the next, in the view that has most of it."""
+"""Parallax between neighbouring distances of the sweep, in pixels of the view with the most
+parallax.
+"""
 LABELS = 24, 96
 """Fewest and most distances of a sweep."""
 MARGIN = 1.6
-"""How many times nearer and farther than the corners are is looked for."""
+"""Factor by which the sweep extends the range of the corners' distances at both ends."""
 WORST_COST, BEST_COST = 0.35, 0.15
-"""Mean cost (half of 1 - ZNCC) from which a depth is not believed at all, and below which nothing speaks against it."""
+"""Mean matching cost ((1 - ZNCC) / 2) at which the confidence is 0, and below which it is not
+reduced.
+"""
 UNIQUE = 0.2
-"""How much more, relatively, any other depth has to cost for nothing to speak against this one."""
+"""Relative cost margin to any other depth from which the confidence is not reduced."""
 SMALLEST_PATCH = 0.0014
-"""Share of the picture that a connected patch of depth has at least; less is a chance agreement."""
+"""Smallest connected patch of confident depth, as a share of the picture; smaller ones are chance
+matches.
+"""
 MOST_OWN_MOTION = 0.06
-"""Motion of the tissue's own, relative to parallax, with which no depth is believed; from half of it on confidence falls."""
-DEFORMS = "the tissue itself moves too much beside the scope for depth to be told from parallax"
-"""What is to be said of a depth that is believed nowhere."""
+"""Tissue motion relative to parallax at which the confidence is 0; it decreases from half this
+value.
+"""
+DEFORMS = "the tissue moves too much relative to the scope for depth by parallax"
+"""Reason given if no pixel has confident depth."""
 FILLED = 0.2
-"""Confidence of a depth that is only continued from its surroundings."""
+"""Confidence of extrapolated depth."""
 
 
 def view_of(frame: Frame, camera: Camera, longest_px: int = WORKING_PX) -> View:
-    """A frame with no side longer than `longest_px`, seen by `camera`, which has the frame's pose."""
+    """Reduce a frame so that no side is longer than `longest_px`. `camera` is the frame's camera
+    with its pose.
+    """
     height, width = frame.image.shape[:2]
     scale = min(1.0, longest_px / max(height, width))
     small = camera.scaled(scale)
@@ -67,7 +78,9 @@ def view_of(frame: Frame, camera: Camera, longest_px: int = WORKING_PX) -> View:
 
 
 def chosen_views(reference: View, candidates: Sequence[View]) -> list[View]:
-    """At most `MOST_VIEWS` of the candidates that may see the same tissue, from the shortest useful baseline to the longest."""
+    """Select at most `MOST_VIEWS` candidates facing the same way, evenly spread from the shortest
+    useful baseline to the longest.
+    """
     axis = reference.camera.world_to_camera[2, :3]
     position = reference.camera.position
     facing = [view for view in candidates if float(axis @ view.camera.world_to_camera[2, :3]) >= WIDEST_TURN]
@@ -83,9 +96,17 @@ def chosen_views(reference: View, candidates: Sequence[View]) -> list[View]:
 
 
 def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, int]) -> DepthMap:
-    """Depth for pictures of `size` (height, width), in the unit of the poses; doubted where the poses do not explain the pictures.
+    """Estimate the depth of a picture.
 
-    Where the tissue itself moves too much, none of it is believed; it is still the rough distance at which a scene may start.
+    Args:
+        reference: picture whose depth is wanted.
+        candidates: other pictures with poses.
+        size: height and width of the result.
+
+    Returns:
+        Depth in the unit of the poses. The map is rejected if the poses contradict the pictures. If
+            the tissue itself moves too much, all confidences are low and the depth is only a rough
+            start value.
     """
     others = chosen_views(reference, candidates)
     if not others:
@@ -101,7 +122,7 @@ def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, 
     costs = np.take_along_axis(cost, nearest, 2)[..., 0]
     agreeing = np.take_along_axis(votes, nearest, 2)[..., 0]
     confidence = np.minimum((WORST_COST - costs) / (WORST_COST - BEST_COST), unique / UNIQUE)
-    # The nearest and the farthest distance stand for all beyond them.
+    # The end labels also collect everything beyond the range.
     inside = (nearest[..., 0] > 0) & (nearest[..., 0] < len(inverse_depths) - 1)
     confidence = np.clip(confidence, 0, 1) * float(np.clip(2 - 2 * found.own_motion / MOST_OWN_MOTION, 0, 1))
     confidence = confidence * inside * (reference.tissue != 0) * (agreeing >= min(2, len(found.views)))
@@ -110,7 +131,9 @@ def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, 
 
 
 def _distances(found: Parallax) -> NDArray[np.float64]:
-    """Inverse depths between which the tissue is, evenly spaced: so is parallax then."""
+    """Return evenly spaced inverse depths over the tissue's range; parallax is linear in inverse
+    depth.
+    """
     low, high = np.percentile(found.inverse_depths, [2, 98])
     low, high = low / MARGIN, high * MARGIN
     span_px = found.parallax_px * (high - low) / found.plane
@@ -118,7 +141,7 @@ def _distances(found: Parallax) -> NDArray[np.float64]:
 
 
 def _without_speckles(labels: NDArray[np.float32], confidence: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Small patches of believed depth that differ from all around them are not believed."""
+    """Reduce the confidence of small patches of depth that differ from their surroundings."""
     steps = np.where(confidence >= BELIEVED, labels * 16, -16).astype(np.int16)
     cv2.filterSpeckles(steps, -16, round(SMALLEST_PATCH * steps.size), 24)
     return np.where((steps == -16) & (confidence >= BELIEVED), np.float32(FILLED), confidence)
@@ -127,7 +150,9 @@ def _without_speckles(labels: NDArray[np.float32], confidence: NDArray[np.float3
 def _filled(
     inverse: NDArray[np.float32], confidence: NDArray[np.float32], found: Parallax
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where a depth is not believed it continues smoothly what is believed around it, and far from that the plane that fits best."""
+    """Replace unconfident depth by a smooth continuation of the confident depth around it, and far
+    from any by the mean plane.
+    """
     height, width = inverse.shape
     believed = (confidence >= BELIEVED).astype(np.float32)
     smooth = np.full_like(inverse, found.plane)

@@ -1,13 +1,16 @@
-"""Where the scope was at each frame of a recording, from the pictures alone: visual odometry with bundle adjustment over key frames.
+"""Visual odometry of a complete recording with bundle adjustment over key frames.
 
-Corners of the tissue are followed (`tracks`), tools left out. The scene starts as a plane seen by a camera that stands still; each frame's
-camera starts where the one before was and is moved until the points fit, and bundle adjustment over the key frames so far improves cameras and
-points together, at frame 3 and whenever their number has grown by a third. Small motions of a near-planar scene, as a scope shows them, need no
-other start (Yu and Gallup, "3D Reconstruction from Accidental Motion", 2014); an essential matrix of two frames is ill-conditioned there.
+Tissue corners are tracked (`tracks`), excluding tools. The scene starts as a plane in front of a
+static camera. Each frame's camera starts at the previous pose and is optimised until the points
+fit. Bundle adjustment over all key frames so far runs at the third key frame and whenever their
+number has grown by a third. Small motions in front of a near-planar scene need no other
+initialisation (Yu and Gallup, "3D Reconstruction from Accidental Motion", 2014), and an essential
+matrix is ill-conditioned there.
 
-Tissue that moves by itself looks like motion of the scope as far as it moves as a whole. What is left of it counts little (a robust loss), and where it
-repeats itself, as breathing does, and long enough to be told from the scope's trajectory, cameras are refined against points that move (`breathing_trajectory`).
-Lengths have no scale: the median depth of the first frame's points is taken to be `DISTANCE`.
+Tissue motion that is rigid as a whole is indistinguishable from scope motion. Other tissue motion
+is suppressed by a robust loss. Periodic motion, such as breathing, is modelled explicitly if the
+recording is long enough (`breathing_trajectory`). The scale is unknown: the median depth of the
+first frame's points is set to `DISTANCE`.
 """
 
 from __future__ import annotations
@@ -30,66 +33,85 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.threads import one_thread
 
 LEAST_SEEN = 4
-"""Frames in which a point has to be seen."""
+"""Fewest frames in which a point must be observed."""
 LEAST_POINTS = 24
-"""That a frame has to share with the ones before."""
+"""Fewest known points that a frame must observe to be placed."""
 MOST_FRAMES = 3000
 KEY_FRAMES = 60
-"""Of a short recording; a longer one has one in ten frames at least."""
+"""Number of key frames of a short recording; longer ones have at least one in `FARTHEST_APART`
+frames.
+"""
 FARTHEST_APART = 10
 NEIGHBOURS = 5
-"""Known points around a new one, whose depth it starts with."""
+"""Known points around a new one whose median depth initialises it."""
 POSE_ROUNDS, ROUNDS = 10, 25
 DISTANCE = 60.0
-"""Of the tissue in the first frame: where a scene without depth starts (`ReconstructorConfig.default_depth_mm`), so that both agree."""
+"""Distance of the tissue in the first frame, equal to `ReconstructorConfig.default_depth_mm`, the
+start depth of a scene without depth.
+"""
 GROWTH = 1.3
-"""Of the number of key frames, from one bundle adjustment to the next."""
+"""Growth factor of the number of key frames from one bundle adjustment to the next."""
 
 
 @dataclass(frozen=True)
 class Breathing:
-    """How tissue moves that was told from the scope's trajectory."""
+    """Periodic tissue motion that was separated from the scope's trajectory."""
 
     frequencies_hz: tuple[float, ...]
-    """Of breathing, or of breathing and the heart."""
+    """Breathing frequency, or breathing and heart frequencies."""
     uncertain: float
-    """How much of the trajectory may be the tissue's all the same, or the other way round: root mean square, in the unit of the trajectory."""
+    """Root mean square of the motion that may be attributed to the wrong one of scope and tissue,
+    in the trajectory's unit.
+    """
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The scope's trajectory through a recording."""
+    """Trajectory of the scope through a recording."""
 
     poses: NDArray[np.float64]
-    """World to camera [N, 4, 4]; the first one is the identity."""
+    """World-to-camera poses [N, 4, 4]; the first one is the identity."""
     points: NDArray[np.float64]
-    """Tissue [P, 3] in the world."""
+    """Tissue points [P, 3] in the world."""
     error_px: float
-    """Median distance between where a point was seen and where these poses and points have it."""
+    """Median reprojection error in pixels."""
     still_error_px: float
-    """The same for a scope that had not moved at all."""
+    """Median distance of observations from their track's median position in pixels: the error of a
+    static scope.
+    """
     lost: tuple[int, ...]
-    """Frames that share too few points with the others, or none; each stands where the frame before it stood."""
+    """Indices of frames with too few known points; each keeps the pose of the frame before it."""
     breathing: Breathing | None = None
-    """None: the tissue is taken to be at rest; if it breathes, its breathing is in the poses."""
+    """Periodic tissue motion, or None if the tissue is assumed static. Breathing is then part of
+    the poses.
+    """
 
     @property
     def path(self) -> float:
-        """Length of the scope's trajectory, in the unit in which the first frame's tissue is `DISTANCE` away."""
+        """Length of the trajectory, in the unit in which the first frame's tissue is `DISTANCE`
+        away.
+        """
         centres = -np.einsum("nji,nj->ni", self.poses[:, :3, :3], self.poses[:, :3, 3])
         return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
 
     @property
     def explained(self) -> float:
-        """Share of the pictures' motion, as a typical square, that the scope's motion explains, and the breathing that was found; the rest moves otherwise."""
+        """Share of the squared image motion that scope motion and breathing explain; the rest is
+        other tissue motion.
+        """
         return 1 - (self.error_px / max(self.still_error_px, 1e-9)) ** 2
 
 
 def trajectory_of(frames: Iterable[Frame], camera: Camera) -> Trajectory:
-    """Estimate the poses of a recording's frames, which are read once.
+    """Estimate the poses of a recording's frames.
 
-    camera: their intrinsics; a pinhole. Raises InvalidInput for another camera model, fewer than three frames, more than `MOST_FRAMES`, and
-    where too few points can be followed to say anything.
+    Args:
+        frames: frames in temporal order, read once.
+        camera: intrinsics of all frames; must be a pinhole.
+
+    Raises:
+        InvalidInput: for another camera model, fewer than 3 or more than `MOST_FRAMES` frames, or
+            too few tracked points.
     """
     if camera.model != "pinhole":
         raise InvalidInput(
@@ -113,13 +135,17 @@ def trajectory_of(frames: Iterable[Frame], camera: Camera) -> Trajectory:
 
 
 def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
-    """[H, W]; 0 where nothing is followed: tools, what is outside of the field of view, reflections of the lamp."""
+    """Return a mask uint8 [H, W], 0 on tools, highlights and outside the field of view, or None if
+    everything may be tracked.
+    """
     masks = [each for each in (frame.mask, frame.loss_mask, without_highlights(frame.image)) if each is not None]
     return np.logical_and.reduce([mask != 0 for mask in masks]).astype(np.uint8) if masks else None
 
 
 class _Odometry:
-    """One recording's estimate, while it is made. Everything float64 on the CPU; the same observations give the same bytes."""
+    """State of one recording's estimate, float64 on the CPU. The same observations give the same
+    bytes.
+    """
 
     def __init__(self, seen: Observations, camera: Camera, times_s: list[float]) -> None:
         K, count = camera.K, len(times_s)
@@ -140,7 +166,9 @@ class _Odometry:
 
     @one_thread()
     def run(self) -> Trajectory:
-        """Frame after frame, then all of them once more with the final points."""
+        """Process all frames in order, then place the frames between key frames again with the
+        final points.
+        """
         self._take_up(0)
         keys, next_adjustment = 1, 3
         for frame in range(1, self._count):
@@ -168,7 +196,7 @@ class _Odometry:
         return slice(int(self._bounds[frame]), int(self._bounds[frame + 1]))
 
     def _place(self, frame: int) -> bool:
-        """Move a frame's camera to where the known points fit; False where there are too few of them."""
+        """Optimise a frame's pose with the known points. Returns False if there are too few."""
         here = self._of(frame)
         known = self._known[self._point[here]]
         if int(known.sum()) < LEAST_POINTS:
@@ -183,7 +211,7 @@ class _Odometry:
         return True
 
     def _take_up(self, frame: int) -> None:
-        """Give the points that a frame shows and nobody knows yet the depth of the known ones around them."""
+        """Initialise a frame's new points with the median depth of the nearest known ones."""
         here = self._of(frame)
         point, rays = self._point[here], self._rays[here]
         known = self._known[point]
@@ -200,10 +228,10 @@ class _Odometry:
         self._known[point[new]] = True
 
     def _adjust(self, last: int) -> None:
-        """Bundle adjustment over the key frames up to `last`; the whole is brought back to its unit of length."""
+        """Run bundle adjustment over the key frames up to `last` and restore the unit of length."""
         keys = torch.nonzero(self._is_key[: last + 1])[:, 0]
         chosen = self._is_key[self._frame] & (self._frame <= last)
-        # A point that two cameras see says something about them.
+        # A point constrains poses only if at least two cameras observe it.
         times = torch.bincount(self._point[chosen], minlength=len(self._points))
         chosen &= times[self._point] >= 2
         used, point = torch.unique(self._point[chosen], return_inverse=True)
@@ -247,7 +275,9 @@ class _Odometry:
         )
 
     def _still_errors_px(self) -> Tensor:
-        """How far each point was seen from the middle of where it was seen [M]."""
+        """Return the distance of each observation from the median position of its track in pixels
+        [M].
+        """
         order = torch.argsort(self._point, stable=True)
         point, rays = self._point[order], self._rays[order]
         middles = torch.stack([group.median(0).values for group in rays.split(torch.bincount(point).tolist())])

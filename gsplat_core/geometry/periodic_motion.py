@@ -1,11 +1,12 @@
-"""Tissue that breathes, seen by a scope that moves: where each point is, how it moves, and how well that is known.
+"""Fit of periodic tissue motion and depth to point tracks of a moving scope with known poses.
 
-A point's position at time t is its place at rest and, for each of a few frequencies f that all of the tissue shares, a cos(2 pi f t) + b sin(2 pi f t)
-with vectors a and b of its own, which change smoothly over the surface. With known cameras the distance of each point and these vectors follow from
-where the points were seen. Breathing and heart beat repeat themselves and the way of the scope does not; that is what tells them apart.
+The position of a point at time t is its rest position plus a cos(2 pi f t) + b sin(2 pi f t) for
+each of a few frequencies f common to all tissue. The vectors a and b vary smoothly over the
+surface. Breathing and heart beat are periodic and the scope's trajectory is not, which separates
+the two.
 
-Gauss-Newton on the distances in the pictures, with Cauchy's weights; places at rest are eliminated (Schur complement), so that what is to be solved has
-the vectors at the nodes of a coarse grid alone.
+The fit is Gauss-Newton on reprojection errors with Cauchy weights. Rest positions are eliminated
+(Schur complement), so only the vectors at the nodes of a coarse grid remain as unknowns.
 """
 
 from __future__ import annotations
@@ -21,58 +22,64 @@ from gsplat_core.geometry.spline_grid import smoothness, splines
 Array = NDArray[np.float64]
 
 NODES = 9, 8
-"""Of the grid of vectors, along the picture's width and height."""
+"""Number of nodes of the vector grid along the picture's width and height."""
 OUTSIDE = 0.15
-"""How far that grid goes beyond the picture, as a share of its side."""
+"""Extension of the grid beyond the picture, as a share of its side."""
 AMPLITUDE = 0.04
-"""How far tissue may be expected to move, relative to its distance (standard deviation)."""
+"""Prior standard deviation of the motion, relative to the tissue's distance."""
 BEND = 0.008
-"""How far a vector may be expected to differ from what its neighbours on either side say, relative to the distance."""
+"""Prior standard deviation of a node's vector from the mean of its neighbours, relative to the
+distance.
+"""
 RELIEF = 0.5
-"""How far points may be expected from their median distance, relative to it."""
+"""Prior standard deviation of the points' depth from the median, relative to it."""
 SPREAD_PX = 0.5
-"""Errors well above this decide little (Cauchy's scale)."""
+"""Cauchy scale of reprojection errors, in pixels."""
 TRACK_PX = 0.35
-"""Standard deviation of where a point is found ..."""
+"""Standard deviation of a tracked position in pixels."""
 TOGETHER = 3.0
-"""... and how many such errors are one and the same: neighbours in time err alike."""
+"""Number of consecutive observations with the same error; errors of neighbouring times are
+correlated.
+"""
 ALIKE = 3.0
-"""How many times larger errors of distances are than if all points erred by themselves: light that moves with the scope moves what it shines on alike."""
+"""Factor by which depth errors exceed those of independent points. Light that moves with the scope
+shifts neighbouring points alike.
+"""
 NEAREST, FARTHEST = 0.25, 4.0
-"""Of the median distance: nothing is taken to be nearer or farther."""
+"""Bounds of a point's depth relative to the median depth."""
 
 
 @dataclass(frozen=True)
 class PeriodicMotion:
-    """What was found of `N` points."""
+    """Fitted motion of N points."""
 
     frequencies_hz: tuple[float, ...]
     terms: Array
-    """[N, 3, 1 + 2 F]: place at rest, then a and b of each frequency, in the world."""
+    """Rest position, then a and b of each frequency, in the world [N, 3, 1 + 2 F]."""
     error: Array
-    """[N]: standard deviation of the distance, relative to it."""
+    """Relative standard deviation of each point's distance [N]."""
     cost: float
-    """Mean of the robust errors; smaller is better."""
+    """Mean robust cost; smaller is better."""
 
     def at(self, times_s: Array) -> Array:
-        """Where the points are [T, N, 3]."""
+        """Return the positions at times [T] in seconds, [T, N, 3]."""
         return np.einsum("njb,tb->tnj", self.terms, waves(times_s, self.frequencies_hz))
 
 
 def waves(times_s: Array, frequencies_hz: tuple[float, ...]) -> Array:
-    """[T, 1 + 2 F]: 1, then cosine and sine of each frequency."""
+    """Return 1, then cosine and sine of each frequency, at each time [T, 1 + 2 F]."""
     angles = 2 * np.pi * np.outer(times_s, frequencies_hz)
     pairs = np.stack([np.cos(angles), np.sin(angles)], 2).reshape(len(times_s), -1)
     return np.concatenate([np.ones((len(times_s), 1)), pairs], 1)
 
 
 def in_cameras(points: Array, poses: Array) -> Array:
-    """Points [T, N, 3] in the coordinates of the cameras `poses` [T, 4, 4]."""
+    """Transform points [T, N, 3] to the coordinates of the cameras `poses` [T, 4, 4]."""
     return np.asarray(points @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3])
 
 
 def off_px(points: Array, tracks: GridTracks) -> Array:
-    """How far points [T, N, 3] of the world are from where they were seen, in pixels [T, N, 2]."""
+    """Return residuals predicted minus observed in pixels [T, N, 2] of world points [T, N, 3]."""
     local = in_cameras(points, tracks.poses)
     return np.asarray(tracks.focal_px * (local[..., :2] / local[..., 2:] - tracks.rays))
 
@@ -84,15 +91,21 @@ def fitted(
     rounds: int = 8,
     nodes: tuple[int, int] = NODES,
 ) -> PeriodicMotion:
-    """What explains the tracks best with these frequencies; with none of them nothing moves.
+    """Fit the motion to tracks.
 
-    begin: places at rest [N, 3]; None: on one sphere around the cameras, of the radius that fits best.
+    Args:
+        tracks: observations of N points.
+        frequencies_hz: frequencies of the motion; empty for static tissue.
+        begin: rest positions [N, 3] to start from; None for a sphere around the cameras with the
+            best-fitting radius.
+        rounds: number of Gauss-Newton steps.
+        nodes: size of the vector grid.
     """
     return _Fit(tracks, frequencies_hz, begin, nodes).run(rounds)
 
 
 class _Fit:
-    """One fit, while it is made."""
+    """State of one fit."""
 
     def __init__(
         self, tracks: GridTracks, frequencies_hz: tuple[float, ...], begin: Array | None, nodes: tuple[int, int]
@@ -122,7 +135,7 @@ class _Fit:
         return float(np.median(self._terms[:, :, 0] @ pose[2, :3] + pose[2, 3]))
 
     def _weights(self, local: Array) -> tuple[Array, Array]:
-        """Errors [T, N, 2] in pixels and what each observation weighs [T, N]; notes the cost."""
+        """Return residuals in pixels [T, N, 2] and weights [T, N], and store the cost."""
         seen = self._tracks.seen
         off = self._tracks.focal_px * (local[..., :2] / local[..., 2:] - self._tracks.rays)
         squared = (off**2).sum(-1) / SPREAD_PX**2
@@ -130,8 +143,9 @@ class _Fit:
         return off, seen / (1 + squared)
 
     def _step(self) -> None:
-        """One step of Gauss-Newton. Slopes are those of where points would be seen: taken from where they were seen, noise would be in them twice, and
-        distances come out too short."""
+        """Do one Gauss-Newton step. Derivatives are taken at predicted positions. At observed
+        positions their noise would correlate with the residual and bias distances to be too short.
+        """
         tracks, focal = self._tracks, self._tracks.focal_px
         local = in_cameras(self._points(), tracks.poses)
         local[..., 2] = np.maximum(local[..., 2], NEAREST * self._distance)
@@ -150,12 +164,12 @@ class _Fit:
         self._solve(H, g)
 
     def _solve(self, H: Array, g: Array) -> None:
-        """The terms with the smallest sum of squares H and g and of what is expected beforehand."""
+        """Minimise the quadratic form (H, g) plus the priors."""
         pose = self._tracks.poses[self._middle]
         axis, count = pose[2, :3], len(H)
         known = 1 / (RELIEF * self._distance) ** 2
         V = H[:, :, 0, :, 0] + known * (np.outer(axis, axis) + 1e-3 * np.eye(3))
-        # Beforehand a point is as far along the axis as the median, and where it is across it.
+        # The prior mean has the median depth along the axis and the current position across it.
         rest = self._terms[:, :, 0]
         expected = rest + np.outer(self._distance - (rest @ axis + pose[2, 3]), axis)
         v = g[:, :, 0] + known * expected @ (np.outer(axis, axis) + 1e-3 * np.eye(3))
@@ -167,23 +181,25 @@ class _Fit:
             return
         U = H[:, :, 0, :, 1:].reshape(count, 3, 3 * moving)
         W = H[:, :, 1:, :, 1:].reshape(count, 3 * moving, 3 * moving)
-        told = inverse @ U
-        S = W - U.transpose(0, 2, 1) @ told
-        s = g[:, :, 1:].reshape(count, -1) - np.einsum("nij,ni->nj", told, v)
+        gain = inverse @ U
+        S = W - U.transpose(0, 2, 1) @ gain
+        s = g[:, :, 1:].reshape(count, -1) - np.einsum("nij,ni->nj", gain, v)
         nodes = self._nodes()
         field, spread = self._field(S, s, nodes)
         vectors = nodes @ field
         self._terms[:, :, 1:] = vectors.reshape(count, 3, moving)
         self._terms[:, :, 0] = self._limited(
-            np.einsum("nij,nj->ni", inverse, v) - np.einsum("nij,nj->ni", told, vectors)
+            np.einsum("nij,nj->ni", inverse, v) - np.einsum("nij,nj->ni", gain, vectors)
         )
-        along = np.einsum("i,nij->nj", axis, told)
+        along = np.einsum("i,nij->nj", axis, gain)
         lever = np.einsum("np,nc->npc", along, nodes).reshape(count, -1)
         variance = np.einsum("i,nij,j->n", axis, inverse, axis) + ((lever @ spread) * lever).sum(1)
         self._error = ALIKE * np.sqrt(variance) / self._distance
 
     def _field(self, S: Array, s: Array, nodes: Array) -> tuple[Array, Array]:
-        """Vectors at the nodes [nodes, 3 * 2 F], and the covariance of all of them, in the order (vector, node)."""
+        """Return vectors at the nodes [nodes, 3 * 2 F], and the covariance of all of them in the
+        order (vector, node).
+        """
         size, count = S.shape[1], nodes.shape[1]
         whole = np.zeros((size, count, size, count))
         for row in range(size):
@@ -200,7 +216,9 @@ class _Fit:
         return np.asarray(field.reshape(size, count).T), np.asarray(covariance)
 
     def _nodes(self) -> Array:
-        """How much each point has of each node's vector [N, nodes]: cubic B-splines over the picture in the middle of the time."""
+        """Return the weight of each node at each point [N, nodes], by cubic B-splines over the
+        picture at the middle time.
+        """
         pose = self._tracks.poses[self._middle]
         local = self._terms[:, :, 0] @ pose[:3, :3].T + pose[:3, 3]
         share = (local[:, :2] / local[:, 2:]) / self._tracks.extent / 2 + 0.5
@@ -210,7 +228,7 @@ class _Fit:
         return np.asarray((across[:, :, None] * down[:, None, :]).reshape(len(local), -1))
 
     def _limited(self, rest: Array) -> Array:
-        """No place at rest nearer or farther than anything is taken to be."""
+        """Clamp depths of rest positions to `NEAREST` and `FARTHEST`."""
         pose = self._tracks.poses[self._middle]
         local = rest @ pose[:3, :3].T + pose[:3, 3]
         depth = np.clip(local[:, 2], NEAREST * self._distance, FARTHEST * self._distance)
@@ -220,7 +238,9 @@ class _Fit:
 
 
 def _at_one_distance(tracks: GridTracks) -> Array:
-    """Places [N, 3] at one distance from where each was first seen: the one that explains best where it was seen later."""
+    """Return positions [N, 3] on the rays of first observation at one common distance, the one that
+    best explains the later observations.
+    """
     first = tracks.seen.argmax(0)
     number = np.arange(len(first))
     pose = tracks.poses[first]
@@ -230,7 +250,7 @@ def _at_one_distance(tracks: GridTracks) -> Array:
     rotation = tracks.poses[:, :3, :3]
     turned = np.einsum("tij,nj->tni", rotation, along)
     moved = np.einsum("tij,nj->tni", rotation, centre) + tracks.poses[:, None, :3, 3]
-    # In the picture, inverse depth w: c w = d.
+    # A point of inverse depth w satisfies c w = d in the picture.
     c = moved[..., :2] - tracks.rays * moved[..., 2:]
     d = tracks.rays * turned[..., 2:] - turned[..., :2]
     c, d = c[tracks.seen], d[tracks.seen]

@@ -1,8 +1,11 @@
-"""Where a camera is, from one picture and the Gaussians that it shows: refined by the renderer's own gradient with respect to `viewmats`.
+"""Refinement of a camera pose by the photometric error of rendered Gaussians, with the renderer's
+gradient by `viewmats`.
 
-Each round renders once forward and back. The gradient is exact. The first Hessian is Gauss-Newton's, for pixels that move as their depth says (Baker and
-Matthews, "Lucas-Kanade 20 Years On", 2004); BFGS updates it after each step (Nocedal and Wright, 2006, section 6.1): before a flat surface a rotation
-and a sideways translation look so much alike that the first Hessian alone does not converge. A step is only taken when the error falls.
+Each round renders once forward and backward, so the gradient is exact. The first Hessian is
+Gauss-Newton's for pixels that move according to their depth (Baker and Matthews, "Lucas-Kanade 20
+Years On", 2004). BFGS updates it after each step (Nocedal and Wright, 2006, section 6.1). The
+update is needed because rotation and sideways translation look nearly alike in front of a flat
+surface. A step is accepted only if the error falls.
 """
 
 from __future__ import annotations
@@ -22,23 +25,25 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.threads import one_thread
 
 SOFT = 0.05
-"""Of the Charbonnier loss, as a share of full brightness: residuals well below it count by their square, those well above it by their size."""
+"""Scale of the Charbonnier loss as a share of full brightness; residuals are squared well below it
+and linear well above.
+"""
 COVERED = 0.5
 """Opacity from which a pixel shows the scene."""
 LEAST_PIXELS = 64
 DONE = 1e-5
-"""Converged when a step lessens the error by less than this share of it."""
+"""Relative decrease of the error by a step below which the refinement ends."""
 
 
 @dataclass(frozen=True)
 class RefinedPose:
-    """A camera that was moved to where the picture fits."""
+    """Camera refined to fit a picture."""
 
     camera: Camera
     before: float
-    """Mean error of the picture, 0 to about 1, with the pose it started from ..."""
+    """Mean photometric error at the start pose, 0 to about 1."""
     after: float
-    """... and with the one that was found; never larger."""
+    """Mean photometric error at the refined pose; never larger than `before`."""
     rounds: int
 
 
@@ -50,14 +55,19 @@ def refine_pose(
     *,
     rounds: int = 20,
 ) -> RefinedPose:
-    """Move a camera until the Gaussians look like a picture. It has to start within a few pixels of the right place.
+    """Refine a camera pose until the rendered Gaussians match a picture. The start must be within a
+    few pixels of the solution.
 
     Args:
+        gaussians: scene to render.
+        camera: camera with the start pose.
         image: RGB uint8 [H, W, 3], of the camera's size.
-        mask: [H, W]; 0 = left out. None: all of it counts.
-        rounds: steps that are tried at most.
+        mask: [H, W], 0 = ignored; None to use all pixels.
+        rounds: maximum number of steps tried.
 
-    Raises InvalidInput for a picture or mask of another size, and where fewer than 64 pixels can be compared.
+    Raises:
+        InvalidInput: for a picture or mask of another size, or with fewer than 64 comparable
+            pixels.
     """
     size = (camera.height_px, camera.width_px)
     for name, plane in (("image", image), ("mask", mask)):
@@ -95,13 +105,13 @@ def refine_pose(
 class _Comparison:
     error: float
     gradient: Tensor
-    """[6]: derivatives by a twist of the camera (`pose`)."""
+    """Derivatives by a twist of the camera (`pose`), [6]."""
     hessian: Tensor
-    """[6, 6]."""
+    """Gauss-Newton Hessian, [6, 6]."""
 
 
 def _compare(gaussians: Gaussians, camera: Camera, viewmat: Tensor, target: Tensor, counted: Tensor) -> _Comparison:
-    """Compare the picture of a pose with what it should be."""
+    """Render a pose and return its photometric error with derivatives."""
     twist = torch.zeros(6, dtype=torch.float32, device=viewmat.device, requires_grad=True)
     intrinsics = camera.matrices(viewmat.device)[1]
     scene = {name: getattr(gaussians, name).detach() for name in ("means", "quats", "scales", "opacities")}
@@ -131,7 +141,7 @@ def _compare(gaussians: Gaussians, camera: Camera, viewmat: Tensor, target: Tens
 
 
 def _improved(hessian: Tensor, step: Tensor, change: Tensor) -> Tensor:
-    """The Hessian after BFGS' update with a step and the change of the gradient; as it was where it would not stay positive definite."""
+    """Return the Hessian after a BFGS update, or unchanged if it would not stay positive definite."""
     along = hessian @ step
     curvature = step @ change
     if not curvature > 1e-6 * step.norm() * change.norm():
@@ -140,7 +150,9 @@ def _improved(hessian: Tensor, step: Tensor, change: Tensor) -> Tensor:
 
 
 def _by_twist(picture: Tensor, depth: Tensor, intrinsics: Tensor) -> Tensor:
-    """Jacobian [H, W, 3, 6] of each pixel's colour by a twist of the camera, if the surface keeps its colour."""
+    """Return the Jacobian [H, W, 3, 6] of each pixel's colour by a twist of the camera, assuming
+    constant surface colour.
+    """
     down, right = torch.gradient(picture, dim=(0, 1))
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
@@ -148,14 +160,15 @@ def _by_twist(picture: Tensor, depth: Tensor, intrinsics: Tensor) -> Tensor:
     y = ((torch.arange(height, device=depth.device) + 0.5 - cy) / fy)[:, None].expand(height, width)
     near = 1 / depth.clamp(min=1e-6)
     zero = torch.zeros_like(x)
-    # Motion of a pixel by a twist (t, w) of the point behind it: Chaumette and Hutchinson, "Visual Servo Control", 2006, equation 11.
+    # Pixel motion by a twist (t, w): Chaumette and Hutchinson, "Visual Servo Control", 2006,
+    # equation 11.
     along_x = fx * torch.stack([near, zero, -x * near, -x * y, 1 + x * x, -y], -1)
     along_y = fy * torch.stack([zero, near, -y * near, -1 - y * y, x * y, x], -1)
     return -(right[..., None] * along_x[:, :, None] + down[..., None] * along_y[:, :, None])
 
 
 def _rigid(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The pose with an exact rotation: products in float32 are off by a little."""
+    """Orthonormalise the rotation, which products in float32 distort slightly."""
     left, _, right = np.linalg.svd(pose[:3, :3])
     exact = np.eye(4)
     exact[:3, :3], exact[:3, 3] = left @ right, pose[:3, 3]

@@ -1,4 +1,6 @@
-"""Key frames that are kept are recognised when the scope sees again what they show: by where it is, or, when that is not known, by how they look."""
+"""Recognition of earlier key frames in a picture, by a predicted pose or, if the pose is unknown,
+by ORB features.
+"""
 
 from __future__ import annotations
 
@@ -16,44 +18,59 @@ from gsplat_core.geometry.point_flow import Points
 from gsplat_core.geometry.stream_tracks import Numbers, SmallPicture, found_again
 
 FEWEST_POINTS = 20
-"""Of a key frame that have to be found where a pose says."""
+"""Fewest points of a key frame that must be found at their predicted positions."""
 SHOWN = 0.4
-"""Share of its points that have to lie within the picture for it to be looked for."""
+"""Share of a key frame's points that must be inside the picture for it to be searched."""
 FOUND = 0.3
-"""Share of these that have to be found, and ..."""
+"""Share of the searched points that must be found."""
 AGREE, AGREE_PX = 0.5, 4.0
-"""... share of the found ones that have to agree on a pose, to so many pixels."""
+"""Share of the found points that must agree on a pose, and their largest reprojection error in
+pixels.
+"""
 FEATURES = 400
-"""Of a picture, by which a key frame is looked for when nothing is known of where the scope is."""
+"""Largest number of ORB features per picture."""
 CLEARER = 0.8
-"""The best match of a feature is nearer than the second one by this factor."""
+"""Largest ratio of the best to the second-best descriptor distance of a match (Lowe's ratio test).
+"""
 FEWEST_MATCHES, MATCH_PX = 12, 8.0
-"""That have to agree on a pose by RANSAC, and how far they may be off: their depth is that of known points around."""
+"""Fewest RANSAC inliers and their largest reprojection error in pixels. The error is large because
+their depth is interpolated from known points.
+"""
 TRIES = 100
-"""Of RANSAC."""
+"""RANSAC iterations."""
 
 Pose = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Recognised:
-    """A key frame whose points a picture shows."""
+    """Key frame recognised in a picture."""
 
     key: KeyFrame
     places: LocalMap
     pose: Pose
-    """Of the picture, world to camera, by these points alone."""
+    """Pose of the picture estimated from these points alone, world to camera [4, 4]."""
     numbers: Numbers
-    """Of the points that were found, ascending."""
+    """Numbers of the points found, ascending."""
     pixels: Points
-    """Where they are."""
+    """Pixel positions of these points [N, 2]."""
 
 
 def seen_again(
     key: KeyFrame, places: LocalMap, picture: SmallPicture, pose: Pose, followed: Numbers | None = None
 ) -> Recognised | None:
-    """A key frame found in a picture that was taken from about `pose`; None where it is not seen, or those of its points that are not `followed` already are too
-    few."""
+    """Search the points of a key frame in a picture with a predicted pose.
+
+    Args:
+        key: key frame.
+        places: map that contains the key frame.
+        picture: picture to search.
+        pose: predicted world-to-camera pose [4, 4].
+        followed: points already tracked; they are not counted.
+
+    Returns:
+        The recognition, or None if too few points are found or agree.
+    """
     new = places.knows(key.numbers)
     if followed is not None:
         new &= ~np.isin(key.numbers, followed)
@@ -78,7 +95,7 @@ def seen_again(
 
 
 class PlaceRecognition:
-    """Recognises key frames by features that do not depend on how the scope is turned (ORB; Rublee et al. 2011)."""
+    """Recognises key frames by rotation-invariant ORB features (Rublee et al. 2011)."""
 
     def __init__(self) -> None:
         self._orb: Any = cv2.ORB_create(nfeatures=FEATURES, nlevels=4)  # type: ignore[attr-defined]
@@ -86,7 +103,9 @@ class PlaceRecognition:
         self._turn = 0
 
     def find(self, picture: SmallPicture, kept: Sequence[tuple[KeyFrame, LocalMap]], most: int) -> Recognised | None:
-        """The first of at most so many key frames that the picture shows; they take turns from call to call."""
+        """Return the first recognised of at most `most` key frames. Candidates rotate from call to
+        call.
+        """
         candidates = [kept[(self._turn + number) % len(kept)] for number in range(min(most, len(kept)))]
         self._turn += len(candidates)
         if not candidates:
@@ -109,7 +128,7 @@ class PlaceRecognition:
     def _pose_by(
         self, key: KeyFrame, places: LocalMap, picture: SmallPicture, corners: Points, features: Any
     ) -> Pose | None:
-        """About where the picture was taken, if it shows what the key frame shows."""
+        """Return an approximate pose of the picture by feature matches with a key frame, or None."""
         if key.features is None:
             key.features = self._features(key.picture)
         before, kept = key.features

@@ -1,4 +1,6 @@
-"""How well pictures from elsewhere agree with one picture, for a list of distances: a plane sweep (Collins 1996)."""
+"""Plane sweep (Collins 1996): matching costs of one picture with other views for a list of inverse
+depths.
+"""
 
 from __future__ import annotations
 
@@ -13,32 +15,44 @@ from numpy.typing import NDArray
 from gsplat_core.scene.cameras import Camera
 
 WINDOW_PX = 7
-"""Side of the square in which two pictures are compared."""
+"""Side of the correlation window in pixels."""
 NOISE_GREY = 2.0
-"""Standard deviation of a picture's noise in grey levels; patches with no more contrast than that do not correlate."""
+"""Standard deviation of image noise in grey levels, added to variances so that patches without
+contrast do not correlate.
+"""
 DISAGREES = 0.5
-"""The cost of uncorrelated patches, and the largest one: a view in which the point is hidden must not outvote the others."""
+"""Cost of uncorrelated patches, also the upper bound, so that an occluded view cannot outvote the
+others.
+"""
 AGREES = 0.2
-"""The cost below which a view votes for a distance: a correlation of 0.6."""
+"""Cost below which a view votes for a distance, corresponding to a correlation of 0.6."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A picture whose camera is known."""
+    """Grey picture with its camera."""
 
     grey: NDArray[np.float32]
-    """[H, W], 0 to 255."""
+    """Grey levels 0 to 255, float32 [H, W]."""
     tissue: NDArray[np.uint8]
-    """[H, W]; 1 where it shows tissue that can be followed."""
+    """Validity uint8 [H, W]; 1 on tissue that can be tracked."""
     camera: Camera
 
 
 def sweep(
     reference: View, others: Sequence[View], inverse_depths: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Matching costs of each inverse depth at each pixel of `reference` [H, W, D], from 0 to `DISAGREES`, and how many views vote for it [H, W, D].
+    """Compute matching costs by zero-mean normalised cross-correlation, which is invariant to the
+    brightness changes of a moving light.
 
-    Patches are compared by zero-mean normalised cross-correlation, which does not depend on brightness: the light moves with the scope.
+    Args:
+        reference: picture whose depth is wanted.
+        others: views to compare with.
+        inverse_depths: float64 [D].
+
+    Returns:
+        Mean costs float32 [H, W, D] from 0 to `DISAGREES`, and numbers of agreeing views uint8 [H,
+            W, D].
     """
     height, width = reference.grey.shape
     cost = np.empty((len(inverse_depths), height, width), np.float32)
@@ -65,7 +79,9 @@ def sweep(
 
 
 def _plane_homography(reference: Camera, view: Camera, inverse_depth: float) -> NDArray[np.float64]:
-    """Where `view` sees what `reference` sees at that inverse depth, for OpenCV's pixels, whose centres are at whole numbers."""
+    """Return the homography from `reference` to `view` for a fronto-parallel plane, in OpenCV pixel
+    coordinates (pixel centres at integers).
+    """
     between = view.world_to_camera @ np.linalg.inv(reference.world_to_camera)
     centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
     plane = between[:3, :3] + np.outer(between[:3, 3], [0, 0, inverse_depth])
@@ -82,14 +98,14 @@ def _moments(grey: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np
 
 
 def _whole_patches(tissue: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """1 where the whole patch around a pixel is tissue."""
+    """Return 1 where the whole correlation window is tissue."""
     return np.asarray(cv2.erode((tissue != 0).astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8)), np.float32)
 
 
 def _cost(
     grey: NDArray[np.float32], mean: NDArray[np.float32], variance: NDArray[np.float32], other: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(1 - ZNCC) / 2 [H, W]."""
+    """Return (1 - ZNCC) / 2 [H, W]."""
     sums = _mean(np.dstack([other, other * other, grey * other]))
     other_mean = sums[..., 0]
     other_variance = np.maximum(sums[..., 1] - other_mean * other_mean, 0) + np.float32(NOISE_GREY**2)

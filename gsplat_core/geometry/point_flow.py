@@ -1,4 +1,4 @@
-"""Points of one picture found again in another one, with their forward-backward error (Kalal et al. 2010)."""
+"""Sparse optical flow with forward-backward error (Kalal et al. 2010)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Points = NDArray[np.float32]
-"""[N, 2]: x and y, the centre of the first pixel at 0, as OpenCV counts."""
+"""Pixel positions (x, y) float32 [N, 2] in OpenCV's convention: the centre of the first pixel is at
+0.
+"""
 
 
 def followed(
@@ -21,14 +23,18 @@ def followed(
     window_px: int,
     levels: int,
 ) -> tuple[Points, NDArray[np.float32]]:
-    """Where points of `first` are in `second` [N, 2], and how far from its start each arrives when it is followed back [N], in pixels; infinity where it was lost.
-
-    By Lucas and Kanade's method in a pyramid, on grey pictures [H, W].
+    """Track points by the pyramidal Lucas-Kanade method.
 
     Args:
-        guess: where to begin to look for each; None: where it was.
-        window_px: side of the square by which a point is recognised.
-        levels: of the pyramid, beside the picture itself.
+        first, second: grey pictures uint8 [H, W].
+        points: positions in `first`.
+        guess: start positions in `second`; None for the positions in `first`.
+        window_px: side of the square patch that is tracked.
+        levels: pyramid levels in addition to the full picture.
+
+    Returns:
+        Positions in `second` [N, 2], and forward-backward errors in pixels [N], infinite for lost
+            points.
     """
     if not len(points):
         return points, np.zeros(0, np.float32)

@@ -1,10 +1,13 @@
-"""Rigid motions, SE(3): twists, poses, and how they are averaged and compared.
+"""Rigid motions in SE(3): exponential and logarithm of twists, inversion and interpolation of
+poses.
 
-A twist is (translation [3], rotation vector [3] in radians); `exp` makes the pose [4, 4] of it, which leads from one camera's coordinates to
-another's. All functions take any leading dimensions and are differentiable, so that a pose can be refined by what a renderer says about its
-`viewmats`: `exp(twist) @ viewmat` moves the camera by a small twist in its own coordinates.
+A twist is (translation [3], rotation vector [3] in radians). `exp` maps it to a pose [4, 4] between
+two coordinate systems. All functions accept leading dimensions and are differentiable, so poses can
+be refined with the gradient of a renderer by its `viewmats`: `exp(twist) @ viewmat` moves the
+camera by a small twist in camera coordinates.
 
-Source of the maths: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, appendices B and D.
+Source: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", 2018,
+appendices B and D.
 """
 
 from __future__ import annotations
@@ -13,11 +16,15 @@ import torch
 from torch import Tensor
 
 SMALL = 1e-4
-"""Angle in radians below which Taylor series replace the quotients; their next term is below float64's precision."""
+"""Angle in radians below which Taylor series replace the quotients; the truncation error is below
+float64 precision.
+"""
 
 
 def hat(vector: Tensor) -> Tensor:
-    """The matrix [..., 3, 3] whose product with w is the cross product of `vector` [..., 3] with w."""
+    """Return the skew-symmetric matrix [..., 3, 3] whose product with w is the cross product of
+    `vector` [..., 3] and w.
+    """
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     rows = [zero, -z, y, z, zero, -x, -y, x, zero]
@@ -25,7 +32,7 @@ def hat(vector: Tensor) -> Tensor:
 
 
 def exp(twist: Tensor) -> Tensor:
-    """The pose [..., 4, 4] of a twist [..., 6]."""
+    """Return the pose [..., 4, 4] of a twist [..., 6]."""
     along, turn = twist[..., :3], twist[..., 3:]
     squared = (turn * turn).sum(-1)[..., None, None]
     cross = hat(turn)
@@ -39,7 +46,7 @@ def exp(twist: Tensor) -> Tensor:
 
 
 def log(pose: Tensor) -> Tensor:
-    """The twist [..., 6] of a pose [..., 4, 4] that turns by less than half a turn."""
+    """Return the twist [..., 6] of a pose [..., 4, 4] with a rotation of less than 180 degrees."""
     rotation, shift = pose[..., :3, :3], pose[..., :3, 3]
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
     off = rotation - rotation.transpose(-1, -2)
@@ -57,19 +64,21 @@ def log(pose: Tensor) -> Tensor:
 
 
 def inverse(pose: Tensor) -> Tensor:
-    """The pose [..., 4, 4] that leads back."""
+    """Return the inverse pose [..., 4, 4]."""
     rotation = pose[..., :3, :3].transpose(-1, -2)
     shift = -rotation @ pose[..., :3, 3:]
     return torch.cat([torch.cat([rotation, shift], -1), pose[..., 3:, :]], -2)
 
 
 def between(first: Tensor, second: Tensor, share: float) -> Tensor:
-    """The pose a share of the way from `first` to `second` [..., 4, 4], along one screw motion."""
+    """Interpolate poses [..., 4, 4] along one screw motion; `share` 0 gives `first`, 1 gives
+    `second`.
+    """
     return exp(share * log(second @ inverse(first))) @ first
 
 
 def _coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sin x / x, (1 - cos x) / x², (x - sin x) / x³ for x² [...]."""
+    """Return sin x / x, (1 - cos x) / x² and (x - sin x) / x³ for x² [...]."""
     small = squared < SMALL**2
     angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
     a = torch.where(small, 1 - squared / 6, torch.sin(angle) / angle)

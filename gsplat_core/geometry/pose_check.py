@@ -1,7 +1,8 @@
-"""Whether the poses that come with pictures explain how these differ, before anything is built on them.
+"""Consistency check between given camera poses and the observed image motion.
 
-That a point of inverse depth w is seen at a certain place of another picture is a condition linear in w (triangulation; Hartley and Zisserman 2004, section 12.2). So a
-corner that is followed to another picture gives, with the two poses, a least-squares w and a residual that no w removes. With right poses it is small.
+For given poses, the position of a point in another picture is linear in its inverse depth w
+(triangulation; Hartley and Zisserman 2004, section 12.2). A tracked corner therefore gives a
+least-squares w and a residual that no w removes. The residual is small if the poses are right.
 """
 
 from __future__ import annotations
@@ -18,59 +19,71 @@ from gsplat_core.geometry.point_flow import followed
 from gsplat_core.scene.cameras import Camera
 
 POINTS = 400
-"""Corners of a picture that are followed."""
+"""Largest number of tracked corners."""
 APART_PX = 5
-"""How far apart they are at least."""
+"""Smallest distance between corners in pixels."""
 RETURNS_PX = 0.5
-"""A corner that is followed to another picture and back has to arrive this near to where it was."""
+"""Largest accepted forward-backward error in pixels."""
 FEWEST_POINTS = 24
-"""That have to be followed to a view, so that it says anything."""
+"""Fewest tracked corners from which a view is used."""
 TRACK_ERROR_PX = 0.5
-"""Standard deviation of where a corner is found."""
+"""Standard deviation of a tracked position in pixels."""
 RELIEF = 0.5
-"""Standard deviation of the tissue's inverse depth before it is seen, relative to that of the plane that fits best."""
+"""Prior standard deviation of inverse depth, relative to that of the best-fitting plane."""
 LARGEST_RELIEF = 4.0
-"""Nothing is taken to be so many times nearer or farther than that plane."""
+"""Bound of the ratio between a point's inverse depth and that of the plane."""
 LEAST_PARALLAX_PX = 1.5
-"""Median parallax of the corners in the view that has most of it: with less, depth is the pictures' noise."""
+"""Smallest median parallax in pixels, in the view with the most parallax; with less, depth is
+noise.
+"""
 MOST_LEFT_PX, MOST_LEFT = 1.0, 0.25
-"""A view contradicts its pose where the median residual is more than so many pixels, and more than this share of its parallax."""
+"""A view contradicts its pose if its median residual exceeds both this many pixels and this share
+of its parallax.
+"""
 POSE_ERROR_PX = 0.6
-"""Residual of tissue that stands still, by errors of poses and tracking."""
+"""Residual of static tissue in pixels, from errors of poses and tracking."""
 FEWEST_AGREEING = 0.6
-"""Share of the views whose poses have to explain their pictures."""
+"""Share of the views whose poses must explain their pictures."""
 CONTRADICTED = "the poses do not explain how the pictures move: they are wrong, or the tissue itself moves"
-"""What is to be said of poses with which fewer of them agree."""
+"""Reason given if fewer views agree with their poses."""
 ROUNDS = 6
-"""Of iteratively reweighted least squares, so that corners that move by themselves have little weight."""
+"""Rounds of iteratively reweighted least squares, which reduces the weight of corners on moving
+objects.
+"""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Parallax:
-    """What poses and followed corners say together about one picture."""
+    """Depth of tracked corners and consistency of the poses for one picture."""
 
     inverse_depths: Array
-    """[n]: of the corners that agree with the poses."""
+    """Inverse depths of the corners that agree with the poses, [n]."""
     plane: float
-    """The inverse depth of the plane that fits best."""
+    """Inverse depth of the best-fitting fronto-parallel plane."""
     views: tuple[int, ...]
-    """Which of the other views agree with their poses."""
+    """Indices of the views that agree with their poses."""
     parallax_px: float
-    """How far the median corner moves by parallax in the view where it does so most."""
+    """Median parallax in pixels in the view with the most parallax."""
     own_motion: float
-    """The residual that no depth explains, as a share of the parallax, in the median view: tissue that moves by itself. As much motion along the
-    parallax is taken for depth, which is then off by about this share, or twice that."""
+    """Median residual that no depth explains, as a share of the parallax: the tissue's own motion.
+    Motion along the parallax direction is mistaken for depth, so the relative depth error is about
+    this share, or up to twice as large.
+    """
 
 
 def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | str:
-    """Depth of corners of `reference` that are followed to the other views, and which of these agree; or, in a sentence, why there is none."""
+    """Check poses with corners tracked from `reference` to the other views.
+
+    Returns:
+        The corners' depths and the agreeing views, or the reason for rejection as a sentence.
+    """
     corners = _corners(reference)
     tracks = [_followed(reference, view, corners) for view in others]
     usable = [number for number, (_, found) in enumerate(tracks) if found.sum() >= FEWEST_POINTS]
     if not usable:
-        return "too few points of the tissue can be followed"
+        return "too few points of the tissue can be tracked"
     terms = [_terms(corners, tracks[number][0], reference.camera, others[number].camera) for number in usable]
     c, d = (np.stack(each) for each in zip(*terms, strict=True))
     seen = np.stack([tracks[number][1] for number in usable])
@@ -100,7 +113,7 @@ def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | st
 
 
 def _corners(view: View) -> NDArray[np.float32]:
-    """[n, 2]: points of the tissue that can be recognised, as OpenCV counts pixels."""
+    """Return trackable corners of the tissue in OpenCV pixel coordinates [n, 2]."""
     found = cv2.goodFeaturesToTrack(
         view.grey.astype(np.uint8), POINTS, 0.005, APART_PX, mask=cv2.erode(view.tissue, np.ones((9, 9), np.uint8))
     )
@@ -110,7 +123,9 @@ def _corners(view: View) -> NDArray[np.float32]:
 def _followed(
     reference: View, view: View, corners: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Where each corner is in the other picture [n, 2], and whether it was found there, on tissue."""
+    """Return the position of each corner in the other picture [n, 2], and which were found on
+    tissue [n].
+    """
     first, second = (each.grey.astype(np.uint8) for each in (reference, view))
     there, misses_px = followed(first, second, corners, window_px=15, levels=4)
     height, width = view.tissue.shape
@@ -123,7 +138,9 @@ def _followed(
 def _terms(
     corners: NDArray[np.float32], target: NDArray[np.float32], before: Camera, after: Camera
 ) -> tuple[Array, Array]:
-    """[n, 2] each: c and d with w c = d for a corner's inverse depth w, in units of the focal length."""
+    """Return c and d [n, 2] of the equation w c = d for the corners' inverse depths w, in units of
+    the focal length.
+    """
     between = after.world_to_camera @ np.linalg.inv(before.world_to_camera)
     first, second = _normalised(corners, before), _normalised(target, after)
     ray = np.concatenate([first, np.ones((len(first), 1))], 1) @ between[:3, :3].T
@@ -131,17 +148,17 @@ def _terms(
 
 
 def _normalised(pixels: NDArray[np.float32], camera: Camera) -> Array:
-    """Rays of pixels whose centres OpenCV has at whole numbers."""
+    """Convert OpenCV pixel coordinates to rays."""
     return np.asarray((pixels.astype(np.float64) + 0.5 - camera.K[:2, 2]) / np.diag(camera.K)[:2])
 
 
 def _medians(values: Array, seen: NDArray[np.bool_]) -> Array:
-    """Of each view's points that were followed, [views]."""
+    """Return the median over each view's tracked points [views]."""
     return np.array([float(np.median(row[mask])) for row, mask in zip(values, seen, strict=True)])
 
 
 def _plane(c: Array, d: Array, seen: NDArray[np.bool_], focal: float) -> float:
-    """The one inverse depth w that fits most of w c = d, both [views, points, 2]."""
+    """Return one inverse depth that robustly fits w c = d; c and d are [views, points, 2]."""
     weight, inverse = seen.astype(np.float64), 0.0
     for _ in range(ROUNDS):
         inverse = float((weight * (c * d).sum(-1)).sum() / max((weight * (c * c).sum(-1)).sum(), 1e-20))
@@ -150,20 +167,24 @@ def _plane(c: Array, d: Array, seen: NDArray[np.bool_], focal: float) -> float:
 
 
 def _relief(c: Array, d: Array, seen: NDArray[np.bool_], focal: float, plane: float) -> Array:
-    """Each point's inverse depth [points], by robust least squares over all views, with the plane as the prior mean."""
+    """Return each point's inverse depth [points] by robust least squares over all views, with the
+    plane as prior mean.
+    """
     prior = 1 / (RELIEF * plane) ** 2
     inverse = np.full(c.shape[1], plane)
     for _ in range(ROUNDS):
         weight = seen * _agreement(c, d, focal, inverse) * (focal / TRACK_ERROR_PX) ** 2
-        told, information = (weight * (c * d).sum(-1)).sum(0), (weight * (c * c).sum(-1)).sum(0)
+        evidence, information = (weight * (c * d).sum(-1)).sum(0), (weight * (c * c).sum(-1)).sum(0)
         inverse = np.clip(
-            (told + prior * plane) / (information + prior), plane / LARGEST_RELIEF, plane * LARGEST_RELIEF
+            (evidence + prior * plane) / (information + prior), plane / LARGEST_RELIEF, plane * LARGEST_RELIEF
         )
     return np.asarray(inverse)
 
 
 def _agreement(c: Array, d: Array, focal: float, inverse: Array) -> Array:
-    """Weights [views, points] with which repeated least squares minimise the sum of distances (L1), which outliers hardly move."""
+    """Return weights [views, points] for iteratively reweighted least squares that minimise the
+    robust L1 norm.
+    """
     return np.asarray(TRACK_ERROR_PX / np.maximum(_off_px(c, d, focal, inverse), TRACK_ERROR_PX))
 
 

@@ -1,7 +1,9 @@
-"""How far tissue that a tool pulls comes nearer or goes away, from how it moves across the picture.
+"""Motion along the line of sight of tissue pulled by a tool, estimated from its image motion.
 
-Where a tool drags tissue, all of it moves in one direction, less and less with the distance from the tool. In the picture such motion points to, or from,
-one point, as does that of still tissue before a scope that goes straight; where that point is says how much of the motion is along the line of sight.
+Tissue dragged by a tool moves in one direction, with an amplitude that decreases with the distance
+from the tool. The image motion of such points converges to a vanishing point, like that of static
+tissue in front of a translating scope. The vanishing point gives the share of the motion along the
+line of sight.
 """
 
 from __future__ import annotations
@@ -14,30 +16,42 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MOVES_PX = 2.0
-"""A point that is off by so much may be pulled."""
+"""Error against the periodic motion in pixels from which a point may be pulled."""
 FEWEST_POINTS = 30
-"""That have to be, to say anything."""
+"""Average number of such points per picture needed for an estimate."""
 SPREAD_PX = 0.7
-"""Errors well above this decide little (Cauchy's scale)."""
+"""Cauchy scale of errors in pixels."""
 ROUNDS = 8
 HEAD_ON = 0.05
-"""Sine of the angle to the line of sight below which a motion is hardly seen, and not taken for as large as it would have to be."""
+"""Regularising sine of the angle between motion and line of sight; limits the estimate for motion
+seen head-on.
+"""
 LEAST_TOLD = 15.0
-"""How many times the errors the second smallest eigenvalue has to be: with less any direction in a plane would do."""
+"""Smallest ratio of the second smallest to the smallest generalised eigenvalue; below it the
+direction is ambiguous.
+"""
 
 
 @dataclass(frozen=True)
 class Pull:
-    """One direction in which tissue moves."""
+    """Common direction of moving tissue."""
 
     direction: Array
-    """[3], in the camera's coordinates, of length 1."""
+    """Unit direction in camera coordinates, [3]."""
     error_px: float
-    """How far points are from moving along it."""
+    """Median deviation of the points from this direction in pixels."""
 
     def along(self, rays: Array, off: Array) -> tuple[Array, Array]:
-        """How far points that are seen at `rays` [N, 2], and are `off` [N, 2] from where they were expected, have come along the line of sight, relative
-        to their distance, and what of `off` is not explained [N]."""
+        """Return the relative motion along the line of sight and the unexplained error.
+
+        Args:
+            rays: observed rays [N, 2].
+            off: ray errors against the expected positions [N, 2].
+
+        Returns:
+            Motion away from the camera relative to the distance [N], and the length of the part of
+                `off` that is not explained [N].
+        """
         across = self.direction[:2] - rays * self.direction[2]
         amount = (off * across).sum(1) / ((across**2).sum(1) + HEAD_ON**2)
         unexplained = np.linalg.norm(off - amount[:, None] * across, axis=1)
@@ -45,9 +59,16 @@ class Pull:
 
 
 def pull_of(rays: list[Array], off: list[Array], turns: list[Array], focal_px: float) -> Pull | None:
-    """The one direction in which points move that are off, in some pictures shortly after one another; None where there is none to be told.
+    """Estimate the common direction of deviating points in a few consecutive pictures.
 
-    rays, off: of each picture [n, 2]. turns: from each camera's coordinates to those in which the direction is wanted [3, 3].
+    Args:
+        rays: observed rays of each picture [n, 2].
+        off: ray errors of each picture [n, 2].
+        turns: rotation [3, 3] from each picture's camera to the camera of the result.
+        focal_px: focal length in pixels.
+
+    Returns:
+        The direction, or None if too few points deviate or the direction is ambiguous.
     """
     moved = [np.linalg.norm(each, axis=1) * focal_px > MOVES_PX for each in off]
     if sum(each.sum() for each in moved) < FEWEST_POINTS * len(off):
@@ -60,7 +81,7 @@ def pull_of(rays: list[Array], off: list[Array], turns: list[Array], focal_px: f
         unturned.append(np.repeat(turn[None], len(r), 0))
         where.append(r)
     c, turn, ray = np.concatenate(rows), np.concatenate(unturned), np.concatenate(where)
-    # What noise would make of each: p - r p_z is as long as it counts.
+    # Derivative of each constraint by image noise.
     reach = np.stack([np.tile([1.0, 0.0], (len(ray), 1)), np.tile([0.0, 1.0], (len(ray), 1)), -ray], 2) @ turn.swapaxes(
         1, 2
     )

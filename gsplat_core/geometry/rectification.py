@@ -1,4 +1,6 @@
-"""From pictures of two eyes as they came to a rectified pair: no distortion, parallel axes, points in the same row in both."""
+"""Rectification of calibrated stereo pairs: undistorted pictures with parallel axes and
+corresponding rows.
+"""
 
 from __future__ import annotations
 
@@ -12,38 +14,42 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 
 PIXEL_CENTRE = 0.5
-"""Calibrations count from the middle of the first pixel, `Camera` from its corner."""
+"""Offset between OpenCV calibrations, which count from the first pixel's centre, and `Camera`,
+which counts from its corner.
+"""
 
 
 @dataclass(frozen=True)
 class StereoCalibration:
-    """Two eyes as calibration programs give them: OpenCV's model and axes, a pixel's centre at whole numbers."""
+    """Stereo calibration in OpenCV's model and axes, with pixel centres at integers."""
 
     left_K: NDArray[np.float64]
-    """[3, 3]."""
+    """Left camera matrix [3, 3]."""
     left_distortion: NDArray[np.float64]
-    """[4], [5] or [8]: k1, k2, p1, p2, k3, ..."""
+    """Left distortion coefficients k1, k2, p1, p2, k3, ...; [4], [5] or [8]."""
     right_K: NDArray[np.float64]
     right_distortion: NDArray[np.float64]
     rotation: NDArray[np.float64]
-    """[3, 3]: from the left camera's axes to the right one's."""
+    """Rotation from left to right camera coordinates [3, 3]."""
     translation_mm: NDArray[np.float64]
-    """[3]: where the right camera sees the left one's origin."""
+    """Translation from left to right camera coordinates in millimetres [3]: the left camera's
+    origin seen from the right.
+    """
     source: str
-    """The file's name."""
+    """Name of the calibration file."""
     size: tuple[int, int] | None = None
-    """(width, height) of the pictures that it is for, where that is stated."""
+    """(width, height) of the calibrated pictures, or None if not stated."""
 
     def wrong(self) -> str | None:
-        """What cannot be, in a sentence; None where all can."""
+        """Return the reason why the calibration is impossible, as a sentence, or None."""
         sides = (("left", self.left_K, self.left_distortion), ("right", self.right_K, self.right_distortion))
         for eye, K, distortion in sides:
             if not np.isfinite(K).all() or min(K[0, 0], K[1, 1]) <= 1 or np.abs(K).max() > 1e6:
-                return f"the {eye} eye's intrinsics {K.tolist()} are not those of a camera"
+                return f"the {eye} eye's intrinsics {K.tolist()} are impossible for a camera"
             if not np.isfinite(distortion).all() or np.abs(distortion).max(initial=0) > 1e3:
-                return f"the {eye} eye's distortion {distortion.tolist()} is that of no lens"
+                return f"the {eye} eye's distortion {distortion.tolist()} is impossible for a lens"
         if np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(self.rotation) < 0:
-            return f"the rotation between the eyes {self.rotation.tolist()} is no rotation"
+            return f"the rotation between the eyes {self.rotation.tolist()} is not a rotation matrix"
         away = self.translation_mm
         if not np.isfinite(away).all() or not 1e-3 < np.linalg.norm(away) < 1e4:
             return f"the eyes are {np.linalg.norm(away):g} mm apart"
@@ -53,7 +59,11 @@ class StereoCalibration:
 
 
 class Rectification:
-    """How both eyes' pictures of one size are rectified. Raises InvalidInput for a calibration that is `wrong`, or for pictures of another size."""
+    """Rectification maps of both eyes for one picture size.
+
+    Raises:
+        InvalidInput: for an impossible calibration, or pictures of another size.
+    """
 
     def __init__(self, calibration: StereoCalibration, width_px: int, height_px: int) -> None:
         why = calibration.wrong()
@@ -61,7 +71,7 @@ class Rectification:
             why = f"the calibration is for pictures of {calibration.size}, these are {(width_px, height_px)}"
         for eye, K in (("left", calibration.left_K), ("right", calibration.right_K)):
             if why is None and not (0 < K[0, 2] < width_px and 0 < K[1, 2] < height_px):
-                why = f"the {eye} eye's principal point ({K[0, 2]:g}, {K[1, 2]:g}) lies outside of its picture of {width_px}x{height_px} px"
+                why = f"the {eye} eye's principal point ({K[0, 2]:g}, {K[1, 2]:g}) is outside its picture of {width_px}x{height_px} px"
         if why is not None:
             raise InvalidInput(f"{calibration.source}: {why}")
         size = width_px, height_px
@@ -78,23 +88,23 @@ class Rectification:
         )
         K[:2, 2] += PIXEL_CENTRE
         self.turn = np.eye(4)
-        """From the left camera's axes as they were to those of the rectified one [4, 4]."""
+        """Transform from the original to the rectified left camera coordinates [4, 4]."""
         self.turn[:3, :3] = left_turn
         self.left_camera = Camera(K, width_px, height_px)
-        """At the origin."""
+        """Rectified left camera, at the origin."""
         self.right_camera = self.left_camera.right_eye(float(-right_P[0, 3] / right_P[0, 0]))
-        """Its pose leads from the left camera's coordinates to its own."""
+        """Rectified right camera; its pose maps left to right camera coordinates."""
         self.inside = self.plane(np.ones((height_px, width_px), np.uint8))
-        """[H, W]: 1 where the left eye's rectified picture shows something."""
+        """Validity uint8 [H, W]: 1 where the rectified left picture has content."""
 
     def left(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The left eye's picture, rectified."""
+        """Rectify a left picture [H, W, 3]."""
         return np.asarray(cv2.remap(image, *self._left, cv2.INTER_CUBIC), np.uint8)
 
     def right(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The right eye's picture, rectified."""
+        """Rectify a right picture [H, W, 3]."""
         return np.asarray(cv2.remap(image, *self._right, cv2.INTER_CUBIC), np.uint8)
 
     def plane(self, plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """A mask of the left eye's picture, rectified: no value that was not there, 0 outside."""
+        """Rectify a mask [H, W] of the left picture with nearest-neighbour sampling; 0 outside."""
         return np.asarray(cv2.remap(plane, *self._left, cv2.INTER_NEAREST), np.uint8)

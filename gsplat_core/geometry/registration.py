@@ -1,7 +1,9 @@
-"""A surface laid onto another one without bending it, and how far they are apart then: a reconstruction beside a CT.
+"""Rigid registration of a reconstruction to a reference surface such as a CT, and signed distances
+between them.
 
-Point-to-plane ICP (Chen and Medioni 1991) with trimming (Chetverikov et al. 2002): the closest pairs alone decide, because a reconstruction shows a part of
-the surface, and some of what the CT does not have. From an initial guess, or from three and more pairs of points that are known to belong together.
+Point-to-plane ICP (Chen and Medioni 1991) with trimming (Chetverikov et al. 2002). Only the closest
+pairs are used, because a reconstruction covers part of the reference and contains structures that
+it lacks. The start is an initial guess or three or more corresponding point pairs.
 """
 
 from __future__ import annotations
@@ -18,29 +20,35 @@ from gsplat_core.geometry.closest import ClosestPoints
 Array = NDArray[np.float64]
 
 TRIM = 0.8
-"""Share of the pairs that decide, the closest ones."""
+"""Share of the pairs used, closest first."""
 MOST_ROUNDS = 60
 SETTLED = 1e-6
-"""A round that moves the points by less than this share of the surface's extent is the last one."""
+"""Largest displacement of a point in one round, as a share of the surface's extent, below which the
+iteration ends.
+"""
 MOST_POINTS = 5000
-"""Of the surface that is moved: every second, third, ... one of more."""
+"""Largest number of points used; larger sets are subsampled."""
 
 
 @dataclass(frozen=True)
 class Registration:
-    """How a surface was moved, and how well that went."""
+    """Result of a registration."""
 
     transform: Array
-    """[4, 4]: from the moved surface's coordinates to the other one's; a rotation and a translation, and `scale` where that was asked for."""
+    """Transform from the moved to the fixed surface's coordinates [4, 4]: rotation and translation,
+    and `scale` if requested.
+    """
     scale: float
     rounds: int
     rmse: float
-    """Of the distances to the planes of the pairs that decided."""
+    """Root mean square point-to-plane distance of the pairs used."""
 
 
 @dataclass(frozen=True)
 class Distances:
-    """Of points from a surface, positive on the side that its normals point to."""
+    """Statistics of signed point-to-surface distances, positive on the side of the surface's
+    normals.
+    """
 
     mean: float
     median: float
@@ -49,15 +57,21 @@ class Distances:
     absolute_p95: float
     rmse: float
     inlier_share: float
-    """Share of the points that are closer than `inlier_distance`."""
+    """Share of the points closer than `inlier_distance`."""
     inlier_distance: float
     points: int
 
 
 def from_pairs(moved: Array, fixed: Array, *, with_scale: bool = False) -> Array:
-    """The rigid transform [4, 4] that brings points [K, 3] onto others best, by least squares (Umeyama 1991).
+    """Return the least-squares transform [4, 4] between corresponding points (Umeyama 1991).
 
-    Raises InvalidSetting for fewer than three pairs, or for points that lie on one line.
+    Args:
+        moved: points to move [K, 3].
+        fixed: corresponding target points [K, 3].
+        with_scale: estimate a scale as well.
+
+    Raises:
+        InvalidSetting: for fewer than three pairs, or for collinear points.
     """
     if moved.shape != fixed.shape or moved.ndim != 2 or moved.shape[1] != 3 or len(moved) < 3:
         raise InvalidSetting(
@@ -68,7 +82,7 @@ def from_pairs(moved: Array, fixed: Array, *, with_scale: bool = False) -> Array
     for points in (a, b):
         sizes = np.linalg.svd(points, compute_uv=False)
         if not sizes[1] > 1e-6 * max(sizes[0], 1e-300):
-            raise InvalidSetting("the points of the pairs lie on one line; give some that do not")
+            raise InvalidSetting("the points of the pairs are collinear; add pairs off their common line")
     u, sizes, v = np.linalg.svd(b.T @ a)
     proper = np.diag([1.0, 1.0, math.copysign(1.0, np.linalg.det(u @ v))])
     rotation = u @ proper @ v
@@ -80,15 +94,23 @@ def from_pairs(moved: Array, fixed: Array, *, with_scale: bool = False) -> Array
 
 
 def moved_by(transform: Array, points: Array) -> Array:
-    """Points [N, 3] after a transform [4, 4]."""
+    """Apply a transform [4, 4] to points [N, 3]."""
     return np.asarray(points @ transform[:3, :3].T + transform[:3, 3])
 
 
 def register(points: Array, surface: ClosestPoints, initial: Array | None = None, trim: float = TRIM) -> Registration:
-    """Move points [N, 3] rigidly onto a surface, from an initial transform (where they are, when None).
+    """Register points to a surface by ICP, which converges to the nearest local minimum.
 
-    It finds the nearest arrangement, not the best one: the guess must be within about a quarter of the surface's detail. Raises InvalidSetting where
-    it cannot be decided: too few points, or a surface on which they slide (a plane, a sphere).
+    Args:
+        points: points to move [N, 3].
+        surface: target surface.
+        initial: initial transform [4, 4], None for the identity. Its error must be below about a
+            quarter of the size of the surface's detail.
+        trim: share of the pairs used, 0.1 to 1.
+
+    Raises:
+        InvalidSetting: for a bad `trim`, too few points, or a surface without a unique solution,
+            such as a plane or a sphere.
     """
     if not 0.1 <= trim <= 1:
         raise InvalidSetting(f"trim is {trim:g}; it must be from 0.1 to 1")
@@ -113,7 +135,7 @@ def register(points: Array, surface: ClosestPoints, initial: Array | None = None
 
 
 def _step(here: Array, normals: Array, gaps: Array) -> Array:
-    """The small rigid motion that brings points onto the planes of their partners, by least squares."""
+    """Return the small rigid motion that minimises point-to-plane distances."""
     import cv2
 
     centre = here.mean(0)
@@ -134,7 +156,7 @@ def _step(here: Array, normals: Array, gaps: Array) -> Array:
 
 
 def distances(points: Array, surface: ClosestPoints, inlier_distance: float) -> tuple[Array, Distances]:
-    """Signed distances [N] of points from a surface, and what they come to."""
+    """Return signed distances [N] of points [N, 3] from a surface, and their statistics."""
     found = surface.closest(points)
     side = np.sign(np.einsum("ij,ij->i", points - found.points, found.normals))
     signed = found.distances * np.where(side == 0, 1, side)

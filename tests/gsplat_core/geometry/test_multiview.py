@@ -157,7 +157,7 @@ def test_nothing_that_can_be_followed() -> None:
     nothing = np.zeros((HEIGHT, WIDTH), np.uint8)
     for blind in ({"mask": nothing}, {"loss_mask": nothing}, {"image": np.full((HEIGHT, WIDTH, 3), 90, np.uint8)}):
         found = found_in([frame.with_fields(**blind) for frame in frames], cameras)
-        assert found.doubt == "too few points of the tissue can be followed"
+        assert found.doubt == "too few points of the tissue can be tracked"
 
 
 def test_views_are_spread_over_the_baselines() -> None:

@@ -73,11 +73,11 @@ def test_what_neither_pixel_shows_is_marked():
         ({"translation_mm": np.array([4.0, 0, 0])}, "swap the eyes"),
         ({"translation_mm": np.array([-1.0, 4, 0])}, "not to the right"),
         ({"translation_mm": np.zeros(3)}, "the eyes are 0 mm apart"),
-        ({"rotation": np.diag([1.0, 1, -1])}, "is no rotation"),
-        ({"left_K": np.diag([0.0, 300, 1])}, "not those of a camera"),
-        ({"right_distortion": np.array([np.nan, 0, 0, 0])}, "that of no lens"),
+        ({"rotation": np.diag([1.0, 1, -1])}, "is not a rotation matrix"),
+        ({"left_K": np.diag([0.0, 300, 1])}, "impossible for a camera"),
+        ({"right_distortion": np.array([np.nan, 0, 0, 0])}, "impossible for a lens"),
         ({"size": (640, 512)}, "is for pictures of"),
-        ({"left_K": np.array([[300.0, 0, 500], [0, 300, 128], [0, 0, 1]])}, "lies outside of its picture"),
+        ({"left_K": np.array([[300.0, 0, 500], [0, 300, 128], [0, 0, 1]])}, "is outside its picture"),
     ],
 )
 def test_a_calibration_that_cannot_be_is_refused(fields, sentence):
