@@ -1,1 +1,3 @@
-"""Depth of a frame from its two eyes, from a moving scope or from its light, and what is made of depth: surfaces, meshes, measurement."""
+"""Depth from stereo, parallax, shading or networks, camera poses, and surfaces, meshes and
+measurements made from depth.
+"""

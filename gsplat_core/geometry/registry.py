@@ -1,4 +1,4 @@
-"""Where the depth of frames comes from, by name."""
+"""Registered depth sources, and the selection of a source for each frame of a stream."""
 
 from __future__ import annotations
 
@@ -18,27 +18,36 @@ from gsplat_core.scene.frames import DepthOrigin, Frame, FrameStatus
 
 
 class Estimator(Protocol):
-    """Finds the depth of one frame after another of one stream, in order; it may remember what it has seen. The same frames give the same bytes."""
+    """Depth source of one stream. Frames are passed in order, and an estimator may keep state. The
+    same frames give the same bytes.
+    """
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """The frame's depth, seen from `camera` (with the frame's pose, where that is known); None: there is nothing in it to find depth from.
+        """Estimate the depth of a frame.
 
-        A frame with `new_scene` has nothing to do with those before it.
+        Args:
+            frame: frame; `new_scene` marks a cut after which earlier frames are unrelated.
+            camera: camera of the frame, with its pose if known.
+
+        Returns:
+            The depth map, or None if the frame contains nothing to estimate depth from.
         """
         ...
 
 
 @runtime_checkable
 class OnDevice(Protocol):
-    """An estimator that need not work on the CPU."""
+    """Estimator that can run on a device other than the CPU."""
 
     def work_on(self, device: str) -> None:
-        """From now on work on this device, beside what else goes on there."""
+        """Run on this device from now on, concurrently with other work there."""
         ...
 
 
 class RecordedDepth:
-    """The depth that a frame came with. Where no confidence came with it, single pixels are doubted (`measured_confidence`)."""
+    """Depth that is part of the frame. Without a confidence in the frame, outlier pixels are
+    rejected (`measured_confidence`).
+    """
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """See `Estimator`."""
@@ -51,7 +60,7 @@ class RecordedDepth:
 
 
 class NoDepth:
-    """None, whatever a frame came with."""
+    """Depth source that ignores all depth, including the frame's own."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """See `Estimator`."""
@@ -69,9 +78,9 @@ DEPTHS: Registry[Callable[..., Estimator]] = Registry(
         "none": NoDepth,
     },
 )
-"""Estimators by name: what makes one for a stream, from an address if its name is in `WITH_ADDRESS`."""
+"""Estimator factories by name. A factory takes an address if its name is in `WITH_ADDRESS`."""
 WITH_ADDRESS = {"onnx": "onnx:FILE"}
-"""Whose name is followed by a colon and an address, and how that looks."""
+"""Names that are followed by a colon and an address, with an example of the syntax."""
 
 
 def _always(frame: Frame) -> bool:
@@ -87,13 +96,18 @@ def _has_pose(frame: Frame) -> bool:
 
 
 AUTO: dict[str, Callable[[Frame], bool]] = {"recorded": _always, "stereo": _has_calibrated_eyes}
-"""What `auto` asks, in this order and for such frames, until one of them answers ..."""
+"""Sources tried by `auto` in real-time use, in order, with the condition that a frame must meet."""
 AUTO_WITH_TIME: dict[str, Callable[[Frame], bool]] = {**AUTO, "parallax": _has_pose}
-"""... and where no camera has to be kept up with."""
+"""Sources tried by `auto` without a real-time limit."""
 
 
 def check_depth(choice: str) -> None:
-    """Raises InvalidSetting for what is neither `auto` nor in `DEPTHS`, and as what makes an estimator from an address."""
+    """Check a depth source name, and the address if there is one.
+
+    Raises:
+        InvalidSetting: for an unknown name, a missing address, or an address that the estimator
+            rejects.
+    """
     name, colon, address = choice.partition(":")
     if name in WITH_ADDRESS and not address:
         raise InvalidSetting(f"depth is {choice!r}; it needs an address: {WITH_ADDRESS[name]}")
@@ -105,45 +119,53 @@ def check_depth(choice: str) -> None:
 
 
 def depth_inputs(choice: str) -> tuple[Path, ...]:
-    """Return the files that a depth source reads: those of a name in `WITH_ADDRESS`."""
+    """Return the files that a depth source reads."""
     name, _, address = choice.partition(":")
     path = address.partition("?")[0]
     return (Path(path),) if name in WITH_ADDRESS and path else ()
 
 
 def new_estimator(choice: str) -> Estimator:
-    """The estimator that `choice` names, for one stream. Raises as `check_depth`."""
+    """Create the estimator `choice` for one stream. Raises like `check_depth`."""
     name, _, address = choice.partition(":")
     return DEPTHS[name](address) if name in WITH_ADDRESS else DEPTHS[name]()
 
 
 class Sentences:
-    """Sentences that were said of frames, each kind once: what is the same up to the first colon differs in its numbers alone."""
+    """Counter of messages about frames. Messages with the same text before the first colon count as
+    one kind.
+    """
 
     def __init__(self) -> None:
         self._first: dict[str, str] = {}
         self._frames: Counter[str] = Counter()
 
     def add(self, sentence: str | None) -> None:
-        """Take what was said of one frame; None: nothing."""
+        """Count a message about one frame; None is ignored."""
         if sentence is not None:
             kind = sentence.partition(":")[0]
             self._first.setdefault(kind, sentence)
             self._frames[kind] += 1
 
     def counted(self) -> dict[str, int]:
-        """The first sentence of each kind, and of how many frames it was said, or one like it."""
+        """Return the first message of each kind with its number of frames."""
         return {self._first[kind]: frames for kind, frames in sorted(self._frames.items())}
 
 
 class DepthFinder:
-    """Gives the frames of one stream the depth that a setting asks for."""
+    """Selects the depth of each frame of one stream according to a setting."""
 
     def __init__(self, choice: str, camera: Camera, *, has_time: bool = False, device: str = "cpu") -> None:
-        """choice: `auto` or as `new_estimator` takes it. camera: that of the frames. has_time: what takes long may be asked by `auto`, too. device: where
-        an estimator works that need not work on the CPU.
+        """Create the estimators of a stream.
 
-        Raises as `check_depth`.
+        Args:
+            choice: `auto` or a name for `new_estimator`.
+            camera: camera of the frames.
+            has_time: let `auto` use slow estimators as well.
+            device: device for estimators that support one.
+
+        Raises:
+            InvalidSetting: like `check_depth`.
         """
         check_depth(choice)
         self._camera = camera
@@ -154,20 +176,26 @@ class DepthFinder:
             if isinstance(estimator, OnDevice):
                 estimator.work_on(device)
         self.doubts, self.remarks = Sentences(), Sentences()
-        """What spoke against a frame's depth as a whole, and what else was said about it."""
+        """Reasons for rejected depth maps, and remarks about used ones."""
 
     def seeks_in(self, frame: Frame) -> bool:
-        """Whether there is anything to look for in a frame, beside the depth that it came with."""
+        """Return True if any source other than the frame's own depth applies to a frame."""
         return any(
             suits(frame) for estimator, suits in self._asked if not isinstance(estimator, RecordedDepth | NoDepth)
         )
 
     def find(self, frame: Frame, *, shown_only: bool = False) -> DepthMap | None:
-        """The first answer that is not doubted; None where there is none. shown_only: nothing is learned from the frame, nor about later ones."""
+        """Return the first depth map that is not rejected, or None.
+
+        Args:
+            frame: frame to find depth for.
+            shown_only: the frame is displayed but not used for training, so only its own depth is
+                returned.
+        """
         camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)
         if (camera.width_px, camera.height_px) != (frame.width_px, frame.height_px):  # a stream may change its size
             camera = camera.resized(frame.width_px, frame.height_px)
-        # What is not learned from needs no depth; what it came with costs nothing.
+        # Frames that are not trained on need no estimated depth; their own depth is free.
         shown_only = shown_only or frame.status is FrameStatus.DAMAGED or frame.withheld is not None
         for estimator, suits in self._asked:
             if not suits(frame) or (shown_only and not isinstance(estimator, RecordedDepth)):
@@ -182,12 +210,12 @@ class DepthFinder:
         return None
 
     def with_depth(self, frame: Frame, *, shown_only: bool = False) -> Frame:
-        """The frame with what was found, and without the depth that it came with where that is not it."""
+        """Return the frame with the selected depth, or without depth if there is none."""
         found = self.find(frame, shown_only=shown_only)
         if found is None:
             return frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
         if found.depth is frame.depth:
-            # What is believed wherever it is known needs no second plane.
+            # A second plane is stored only if some known depth is rejected.
             doubts = bool(np.any((found.confidence == 0) & (frame.depth > 0)))
             return frame.with_fields(depth_confidence=found.confidence) if doubts else frame
         return frame.with_fields(depth=found.kept, depth_confidence=found.confidence, depth_origin=found.origin)

@@ -1,12 +1,16 @@
-"""A surface in the scope's own light: what brightness and glints a relief would show.
+"""Shading model of a relief lit by the scope's own lamp: brightness and highlights with
+derivatives.
 
-Logarithms of depth are a sum of cosines along the picture's sides: u = Σ c_k cos_k, z = exp(u). A surface in the light of a small lamp at the
-camera's centre has the brightness cos θ / r², for the angle θ between its normal and the ray, and the distance r along the ray. With x = X / z
-and y = Y / z that is, without approximation (∂ are derivatives by x and y):
+The logarithm of depth is a sum of cosines along the picture's sides: u = Σ c_k cos_k, z = exp(u). A
+surface lit by a small lamp at the camera's centre has the brightness cos θ / r², where θ is the
+angle between its normal and the ray and r the distance along the ray. With x = X / z, y = Y / z and
+partial derivatives ∂x, ∂y this is exactly
 
-    r² = z² (1 + x² + y²),   cos θ = 1 / (√(1 + x² + y²) |N|),   N = (-∂x u, -∂y u, 1 + x ∂x u + y ∂y u)
+    r² = z² (1 + x² + y²),   cos θ = 1 / (√(1 + x² + y²) |N|),   N = (-∂x u, -∂y u, 1 + x ∂x u + y
+        ∂y u)
 
-(Prados and Faugeras 2005.) Wet tissue glints where its normal points at the lamp, that is where θ is small.
+(Prados and Faugeras 2005). Wet tissue shows highlights where its normal points to the lamp, that is
+where θ is small.
 """
 
 from __future__ import annotations
@@ -23,32 +27,38 @@ Array = NDArray[np.float64]
 HALF_WAVES = 9
 """Half periods of the finest cosine along the longer side."""
 SOFTNESS = 0.25
-"""Subsurface scattering and light from the walls around also reach slopes that face away: (cos θ + SOFTNESS) / (1 + SOFTNESS) in place of cos θ."""
+"""Fill light by subsurface scattering and surrounding walls: cos θ is replaced by (cos θ +
+SOFTNESS) / (1 + SOFTNESS).
+"""
 ROUND = 0.1
-"""Angles, in radians, below which a smaller one hardly makes a difference for glints: fine bumps are never all level."""
+"""Angle in radians below which differences hardly affect highlights, since fine bumps are never all
+level.
+"""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The cells of a picture, and the rays through them."""
+    """Cell grid of a picture with the intrinsics of its rays."""
 
     height: int
     width: int
     focal: tuple[float, float]
     """Focal lengths along rows and columns, in cells."""
     centre: tuple[float, float]
-    """The principal point, in cells."""
+    """Principal point, in cells."""
 
     @classmethod
     def of(cls, camera: Camera, shape: tuple[int, ...]) -> Grid:
-        """Cells [h, w] of the whole picture of a pinhole camera."""
+        """Return the grid of `shape` [h, w] over the whole picture of a pinhole camera."""
         across, down = shape[1] / camera.width_px, shape[0] / camera.height_px
         focal = float(camera.K[0, 0]) * across, float(camera.K[1, 1]) * down
         return cls(shape[0], shape[1], focal, (float(camera.K[0, 2]) * across, float(camera.K[1, 2]) * down))
 
     @property
     def waves(self) -> list[tuple[int, int, float]]:
-        """Half periods of the cosines down and across, and counted along the longer side; the constant one is left out."""
+        """Half periods of each cosine down and across, and along the longer side. The constant is
+        excluded.
+        """
         longer = max(self.height, self.width)
         all_waves = ((j, i) for j in range(HALF_WAVES) for i in range(HALF_WAVES))
         counted = [(j, i, float(np.hypot(i * longer / self.width, j * longer / self.height))) for j, i in all_waves]
@@ -56,31 +66,31 @@ class Grid:
 
     @property
     def half_waves(self) -> Array:
-        """[cosines], along the longer side."""
+        """Half periods of each cosine along the longer side, float64 [cosines]."""
         return np.array([count for _, _, count in self.waves])
 
     def middles(self) -> tuple[Array, Array]:
-        """Columns and rows of the cells' middles [h, w], counted in cells."""
+        """Return columns and rows of the cell centres [h, w], in cells."""
         column, row = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         return column, row
 
 
 @dataclass(frozen=True)
 class Places:
-    """Places in a picture, and the cosines there."""
+    """Positions in a picture with the values and derivatives of the cosines there."""
 
     x: Array
-    """X / z of the ray [places]."""
+    """X / z of the ray, [places]."""
     y: Array
     value: Array
-    """[places, cosines]."""
+    """Values of the cosines, [places, cosines]."""
     by_x: Array
-    """Derivative by x."""
+    """Derivatives of the cosines by x, [places, cosines]."""
     by_y: Array
 
     @classmethod
     def at(cls, grid: Grid, column: Array, row: Array) -> Places:
-        """At columns and rows, counted in cells, of any shape."""
+        """Evaluate the cosines at columns and rows of any shape, in cells."""
         column, row = column.ravel(), row.ravel()
         order = np.arange(HALF_WAVES)
         across, down = (
@@ -100,24 +110,32 @@ class Places:
 
     @property
     def axis(self) -> Array:
-        """Logarithm of the cosine of the rays' angle to the camera's axis."""
+        """Logarithm of the cosine of the rays' angle to the optical axis, [places]."""
         return np.asarray(-0.5 * np.log1p(self.x**2 + self.y**2))
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """What is seen of a relief at places, and its derivatives by the coefficients [places, cosines]."""
+    """Appearance of a relief and its derivatives by the coefficients [places, cosines]."""
 
     lit: Array
     """Logarithm of brightness [places]."""
     lit_by: Array
     angle: Array
-    """Between normal and ray, in radians while it is not large, and rounded off at zero (`ROUND`)."""
+    """Angle between normal and ray [places], approximately in radians and rounded off near zero
+    (`ROUND`).
+    """
     angle_by: Array
 
 
 def appearance(places: Places, coefficients: Array, slopes: float = 1.0) -> Appearance:
-    """What is seen of the relief with these coefficients. slopes: how much of the cosine counts for brightness, from 0 (distance alone) to 1."""
+    """Compute the appearance of a relief.
+
+    Args:
+        places: positions.
+        coefficients: float64 [cosines].
+        slopes: weight of the cosine term in brightness, from 0 (distance only) to 1.
+    """
     x, y, axis = places.x, places.y, places.axis
     u, u_x, u_y = (basis @ coefficients for basis in (places.value, places.by_x, places.by_y))
     towards = 1 + x * u_x + y * u_y

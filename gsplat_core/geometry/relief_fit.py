@@ -1,14 +1,19 @@
-"""The relief of tissue that one eye sees, by all that the scope's light tells about it at several times (shape from shading, and more).
+"""Relief of tissue from the shading of a single static camera at several times (shape from shading
+with further cues).
 
-What is looked for is the relief at a key time, and how it differs at each other time. Three things are held against it:
+The unknowns are the relief at a key time and its change at every other time. Three cues are used:
 
-* **Brightness** of each picture, by a mixture of its channels and by what is not mirrored. Pigment that is left in it is another sum of cosines; lamp
-  and lens darken towards the border by a power of the cosine of the angle to the axis.
-* **Change of brightness of tissue that is followed** from the key time on: pigment plays no part in it. How much light there is may change.
-* **Glints** on wet tissue: the rarer, the more the surface turns away from the lamp, exponentially. How rare is not known.
+* **Brightness** of each picture, from a mixture of its channels and from the diffuse part.
+Remaining pigment is modelled as another sum of cosines, and vignetting as a power of the cosine of
+the angle to the axis.
+* **Change of brightness of tracked tissue** since the key time, which is independent of pigment.
+The total light may change.
+* **Highlights** on wet tissue. Their frequency falls exponentially with the surface's angle to the
+lamp, at an unknown rate.
 
-All unknowns have Gaussian priors. The widths of those of relief and changes are estimated from the pictures (evidence maximisation, MacKay 1992). The
-maximum a posteriori is found by Gauss-Newton; what belongs to one kind of evidence alone is eliminated from the equations of the relief.
+All unknowns have Gaussian priors. The widths for relief and changes are estimated by evidence
+maximisation (MacKay 1992). The maximum a posteriori is found by Gauss-Newton. Unknowns of a single
+cue are eliminated from the equations of the relief.
 """
 
 from __future__ import annotations
@@ -23,58 +28,83 @@ from gsplat_core.geometry.relief import Appearance, Array, Grid, Places, appeara
 from gsplat_core.geometry.shading import Cells, Shading
 
 RELIEF, RELIEF_COUNT = 0.05, 100
-"""Prior standard deviation of the coefficients of coarse cosines, and the weight of that value while it is estimated: as if so many had shown it."""
+"""Prior standard deviation of the coefficients of coarse cosines, and the number of
+pseudo-observations with which that value enters its estimate.
+"""
 RELIEF_LIMITS = 0.025, 2.0
 CHANGE, CHANGE_COUNT, CHANGE_LIMITS = 0.03, 20, (0.005, 0.3)
-"""The same for the change of the relief from one time to another."""
+"""Prior standard deviation of the relief's change between two times, its pseudo-observations, and
+bounds of its estimate.
+"""
 FINER_HALF_WAVES, FINER_POWER = 1.5, 4.0
-"""Prior standard deviations fall with finer cosines as (1 + (half waves / FINER_HALF_WAVES)²) to the power of -FINER_POWER / 2."""
+"""Prior standard deviations of finer cosines are multiplied by (1 + (half waves /
+FINER_HALF_WAVES)²) ** (-FINER_POWER / 2).
+"""
 PIGMENT = 0.5
-"""Prior standard deviation of the coefficients of coarse cosines of the pigment that is left, in units of `Shading.detail` ..."""
+"""Prior standard deviation of the coarse cosines of remaining pigment, in units of
+`Shading.detail`.
+"""
 PIGMENT_HALF_WAVES = 2.0
-"""... and from how many half waves on it falls, with their square."""
+"""Number of half waves beyond which the pigment's prior falls quadratically."""
 FALL_OFF, FALL_OFF_DEVIATION = 1.0, 0.5
-"""Prior of the power of the cosine to the axis by which it darkens towards the border: 1 for a flat lamp."""
+"""Prior mean and standard deviation of the vignetting exponent; 1 is a flat lamp."""
 CHANGE_ERROR = 0.02
 """Standard deviation of a cell's change of log brightness."""
 CHANGES_TELL = 0.3
-"""How much changes count for the relief itself: neighbouring cells err alike, and what they err by is no relief."""
+"""Weight of brightness changes for the relief itself. It is below 1 because errors of neighbouring
+cells are correlated and carry no relief information.
+"""
 RARER, RARER_DEVIATION = 12.0, 0.4
-"""Prior of how fast glints become rarer with the angle, by radian, and of the logarithm of that."""
+"""Prior of the decay rate of highlights with the angle, per radian, and the standard deviation of
+its logarithm.
+"""
 GLINT_LOOKS = 4.0
-"""Glints of all times together count as those of so many: tissue that moves little glints at the same places again."""
+"""Effective number of independent highlight pictures; slowly moving tissue repeats highlights at
+the same positions.
+"""
 GLINT_CELL_SHARE = 1 / 64
-"""Of a cell: one glint's size."""
+"""Size of one highlight as a share of a cell."""
 FEWEST_GLINTS = 0.3
-"""A cell's expected number of glints is uncertain by so much at least."""
+"""Lower bound added to the variance of a cell's expected number of highlights."""
 BRIGHTNESS_LOOKS = 5
-"""The brightness of so many pictures is looked at, spread evenly."""
+"""Number of evenly spaced pictures whose brightness is used."""
 ROUNDS = 16
 ROUNDS_OF_CHANGE = 4
 ROUNDS_TO_SLOPES = 4
-"""Over these the cosine term is faded in: by distance alone brightness is linear in the unknowns. Only then are glints looked at."""
+"""Number of rounds over which the cosine term is faded in. Distance alone makes brightness linear
+in the unknowns, so the fit starts without it. Highlights are used after these rounds.
+"""
 DAMPING = 0.6
-"""Share of each step, where glints are looked at: with them the problem is far from linear."""
+"""Step size once highlights are used, because they make the problem strongly non-linear."""
 
 
 @dataclass(frozen=True)
 class Reliefs:
-    """What was found."""
+    """Fitted reliefs of all times."""
 
     key: Array
-    """Coefficients [cosines] at the key time."""
+    """Coefficients at the key time, [cosines]."""
     changes: Array
-    """What is added to them at each time [times, cosines]."""
+    """Change of the coefficients at each time, [times, cosines]."""
 
 
 class Equations:
-    """Linear equations for a step of the relief, from least squares in which the evidence's own unknowns were eliminated."""
+    """Normal equations of a relief step for one cue, with the cue's own unknowns eliminated."""
 
     def __init__(
         self, own: Array, relief: Array, off: Array, weight: Array, prior: Array, away: Array, tell: float = 1.0
     ) -> None:
-        """Derivatives by the own unknowns [N, M] and by the relief [N, cosines], what is unexplained [N], weights [N]; the inverse variances of the
-        own unknowns [M] and how far these are from what is expected [M]; tell: how much the whole counts for the relief."""
+        """Set up the equations from a linearised cue.
+
+        Args:
+            own: derivatives by the cue's own unknowns [N, M].
+            relief: derivatives by the relief [N, cosines].
+            off: residuals [N].
+            weight: weights [N].
+            prior: inverse prior variances of the own unknowns [M].
+            away: deviation of the own unknowns from their prior means [M].
+            tell: weight of the cue for the relief.
+        """
         weighted = own * weight[:, None]
         self.inverse = np.linalg.inv(own.T @ weighted + np.diag(prior))
         self._right = weighted.T @ off - prior * away
@@ -84,15 +114,22 @@ class Equations:
         self.pull = tell * (relief.T @ (weight * off) - gain @ self._right)
 
     def own_step(self, step: Array) -> Array:
-        """That of the own unknowns, where the relief makes this step."""
+        """Return the step of the own unknowns [M] for a step of the relief [cosines]."""
         return np.asarray(self.inverse @ (self._right - self._mixed @ step))
 
 
 class Brightness:
-    """That of several pictures, with the pigment and the light that they share."""
+    """Brightness cue of several pictures with common pigment and light."""
 
     def __init__(self, grid: Grid, shadings: Sequence[Cells], times: Sequence[int], counts: float) -> None:
-        """times: of the pictures. counts: what share of the pictures' brightness this is."""
+        """Set up the cue.
+
+        Args:
+            grid: cell grid.
+            shadings: brightness of each picture.
+            times: time index of each picture.
+            counts: weight of this kind of brightness among all kinds.
+        """
         self._known = [shading.known.ravel() for shading in shadings]
         self._times = times
         column, row = grid.middles()
@@ -113,7 +150,7 @@ class Brightness:
         ])  # fmt: skip
 
     def equations(self, key: Array, changes: Array, slopes: float) -> Equations:
-        """At this relief."""
+        """Linearise at the current relief."""
         shown = [
             appearance(each, key + changes[time], slopes) for each, time in zip(self._places, self._times, strict=True)
         ]
@@ -124,12 +161,12 @@ class Brightness:
         return self._last
 
     def take(self, step: Array) -> None:
-        """Go on with what the relief's step means for pigment and light."""
+        """Update pigment and light for a step of the relief."""
         self._own = self._own + self._last.own_step(step)
 
 
 class Followed:
-    """How the brightness of tissue changed from the key time to another."""
+    """Cue from the brightness change of tracked tissue between the key time and another time."""
 
     def __init__(self, grid: Grid, change: Change) -> None:
         known = change.known.ravel()
@@ -143,7 +180,7 @@ class Followed:
         self._finer, self._width, self._light = _finer(grid), CHANGE, 0.0
 
     def equations(self, key: Array, change: Array, slopes: float = 1.0) -> Equations:
-        """At this relief and this change of it."""
+        """Linearise at the current relief and change."""
         before, after = appearance(self._before, key, slopes), appearance(self._after, key + change, slopes)
         off = self._brighter - (after.lit - before.lit) - self._light
         weight = self._weight / np.sqrt(1 + (off / CHANGE_ERROR) ** 2)
@@ -156,14 +193,14 @@ class Followed:
         return self._last
 
     def take(self, step: Array) -> Array:
-        """What the relief's step means for the change."""
+        """Update the light and return the step of the relief's change for a step of the key relief."""
         own = self._last.own_step(step)
         self._light += float(own[-1])
         return own[:-1]
 
 
 class Glints:
-    """How many of them each cell shows at each time."""
+    """Cue from the number of highlights in each cell at each time."""
 
     def __init__(self, grid: Grid, shadings: Sequence[Shading]) -> None:
         self._places = Places.at(grid, *grid.middles())
@@ -174,7 +211,7 @@ class Glints:
         self._looks = min(GLINT_LOOKS, len(shadings)) / len(shadings)
 
     def equations(self, key: Array, changes: Array) -> Equations:
-        """At this relief."""
+        """Linearise at the current relief."""
         shown: list[Appearance] = [appearance(self._places, key + change) for change in changes]
         angle, by_relief = (
             np.concatenate([each.angle for each in shown]),
@@ -192,13 +229,19 @@ class Glints:
         return self._last
 
     def take(self, step: Array) -> None:
-        """Go on with what the relief's step means for how rare glints are."""
+        """Update the frequency of highlights for a step of the relief."""
         self._own = self._own + np.clip(self._last.own_step(step), -1, 1)
 
 
 def find_reliefs(grid: Grid, shadings: Sequence[Shading], followed: Sequence[Change | None]) -> Reliefs:
-    """The most probable reliefs of several times, of which each has a `Shading`, and how brightness changed since the key time; None at that time
-    and where nothing could be followed: the relief is taken to be as at the key time."""
+    """Estimate the most probable reliefs of several times.
+
+    Args:
+        grid: cell grid.
+        shadings: shading of each time.
+        followed: brightness change since the key time for each time. None at the key time, and
+            where tracking failed; the relief of such a time is taken as that of the key.
+    """
     times = np.unique(np.linspace(0, len(shadings) - 1, BRIGHTNESS_LOOKS).round().astype(int)).tolist()
     kinds: list[list[Cells]] = [[shadings[k] for k in times]]
     diffuse = [each for k in times if (each := shadings[k].diffuse) is not None]
@@ -230,7 +273,9 @@ def find_reliefs(grid: Grid, shadings: Sequence[Shading], followed: Sequence[Cha
 
 
 def find_change(grid: Grid, key: Array, change: Change) -> Array:
-    """What is to be added to the coefficients of a relief that is known at the key time, for the time of the change."""
+    """Return the change of the coefficients [cosines] for one time, with the relief of the key time
+    fixed.
+    """
     followed, added = Followed(grid, change), np.zeros(len(key))
     for _ in range(ROUNDS_OF_CHANGE):
         followed.equations(key, added)
@@ -239,12 +284,14 @@ def find_change(grid: Grid, key: Array, change: Change) -> Array:
 
 
 def _finer(grid: Grid) -> Array:
-    """How prior standard deviations fall with finer cosines."""
+    """Return the relative prior standard deviations of all cosines."""
     return np.asarray((1 + (grid.half_waves / FINER_HALF_WAVES) ** 2) ** (-FINER_POWER / 2))
 
 
 def _width(scaled: Array, undecided: Array, usual: float, count: float, limits: tuple[float, float]) -> float:
-    """The prior's width that makes what was found most probable; `undecided`: posterior over prior variance of each coefficient."""
+    """Return the prior's standard deviation that maximises the evidence. `undecided` is the ratio
+    of posterior to prior variance of each coefficient.
+    """
     decided = float(np.sum(1 - undecided))
     variance = (float(scaled @ scaled) + count * usual**2) / (decided + count)
     return float(np.clip(np.sqrt(variance), *limits))

@@ -1,4 +1,4 @@
-"""How far away single points of a frame are, where the frame itself tells: by its depth, or by its two eyes."""
+"""Depth of single points from the frame's own depth map or its stereo pair."""
 
 from __future__ import annotations
 
@@ -12,12 +12,20 @@ from gsplat_core.geometry.stream_tracks import LEVELS, PATCH_PX, SmallPicture
 from gsplat_core.scene.frames import Frame
 
 RETURN_PX, ROWS_PX = 0.5, 1.5
-"""A point that is followed to the right eye comes back this near to its start, and stays this near to its row."""
+"""Largest accepted forward-backward error and row difference of a point tracked to the right eye,
+in pixels.
+"""
 LEAST_DISPARITY_PX = 0.5
 
 
 def seen_depth(frame: Frame, picture: SmallPicture, pixels: Points) -> NDArray[np.float64]:
-    """z [N] of points of a frame's small picture; 0 where it is not known."""
+    """Return z [N] of points in a frame's reduced picture, 0 where unknown.
+
+    Args:
+        frame: frame with depth or a right eye.
+        picture: reduced picture of the frame.
+        pixels: positions in the reduced picture [N, 2].
+    """
     if frame.depth is not None:
         return _of_map(frame, picture, pixels)
     if frame.right_image is not None and frame.right_camera is not None:

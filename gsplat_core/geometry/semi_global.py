@@ -1,4 +1,6 @@
-"""Semi-global matching (Hirschmüller 2008): labels (distances) of low cost that change little from pixel to pixel."""
+"""Semi-global matching (Hirschmüller 2008): smooth labels of low cost, here for the distances of a
+plane sweep.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 SMALL_STEP = 0.02
-"""Penalty for a difference of one label between neighbours (P1)."""
+"""Penalty P1 for a difference of one label between neighbours."""
 LARGE_STEP = 0.1
-"""Penalty for any larger one (P2)."""
+"""Penalty P2 for any larger difference."""
 
 
 def aggregated(cost: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Costs [H, W, D] summed over the cheapest paths from the four sides to each pixel."""
+    """Aggregate matching costs [H, W, D] over paths from four directions."""
     total = np.zeros_like(cost)
     _add_paths(cost, total)
     sideways, across = (
@@ -24,7 +26,7 @@ def aggregated(cost: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _add_paths(cost: NDArray[np.float32], total: NDArray[np.float32]) -> None:
-    """Along the first axis, in both directions."""
+    """Accumulate path costs along the first axis in both directions."""
     for rows in (range(len(cost)), range(len(cost) - 1, -1, -1)):
         before: NDArray[np.float32] | None = None
         for row in rows:
@@ -40,8 +42,15 @@ def _add_paths(cost: NDArray[np.float32], total: NDArray[np.float32]) -> None:
 
 
 def best_labels(total: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The cheapest label of each pixel [H, W], refined between whole ones by a parabola, and its uniqueness [H, W]: by how much the next best label
-    further than two away costs more, as a share of its own cost."""
+    """Select the best labels.
+
+    Args:
+        total: aggregated costs float32 [H, W, D].
+
+    Returns:
+        Labels [H, W] with sub-label precision by a parabola fit, and their uniqueness [H, W]: the
+            relative cost increase of the best label more than two steps away.
+    """
     labels = total.shape[2]
     best = total.argmin(axis=2)
     inner = np.clip(best, 1, labels - 2)[..., None]

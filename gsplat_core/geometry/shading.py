@@ -1,11 +1,12 @@
-"""How brightly each part of a picture is lit, told apart from what colour it has.
+"""Separation of illumination and pigment in a picture.
 
-Light that gets weaker with distance weakens red, green and blue alike; pigment takes them away unequally. Fine detail of a picture is mostly
-pigment, since what changes by distance and slope changes slowly. So log brightness is the weighted sum of the channels' logarithms, with weights that
-sum to 1, that has the least fine detail (the best linear unbiased estimate; Aitken 1936).
+Light that weakens with distance reduces red, green and blue alike, while pigment absorbs them
+unequally. Fine detail is mostly pigment, since distance and slope change slowly. Log brightness is
+therefore the weighted sum of the channels' logarithms, with weights summing to 1, that has the
+least fine detail (best linear unbiased estimate; Aitken 1936).
 
-Wet tissue also mirrors the lamp, which adds white. What red has more than green and blue is free of that, and how much white a pixel has more than its
-surroundings shows glints.
+Wet tissue also reflects the lamp, which adds white. The excess of red over green and blue is free
+of reflections. The excess of a pixel's white over its surroundings reveals highlights.
 """
 
 from __future__ import annotations
@@ -20,86 +21,100 @@ from gsplat_core.endoscope.highlights import without_highlights
 from gsplat_core.scene.frames import Frame
 
 LONG_SIDE_PX = 320
-"""Larger pictures are looked at in this size."""
+"""Longest side of the analysed pictures, in pixels."""
 CELLS = 40
-"""Along the longer side of the grid on which brightness is averaged."""
+"""Number of cells along the longer side of the brightness grid."""
 BRIGHTEST, DARKEST = 249, 20
-"""Levels of the brightest channel beyond which it is clipped, or noise."""
+"""Levels of the brightest channel above which a pixel is clipped and below which it is noise."""
 DARKEST_CHANNEL = 5
-"""Levels of any channel below which its logarithm is noise."""
+"""Level of any channel below which its logarithm is noise."""
 SHOULDER = 0.8
-"""How far cameras compress what is bright after their gamma: linear light x is recorded as (1 - exp(-SHOULDER x)) / SHOULDER. Cameras differ; 0 is none."""
+"""Strength of the camera's highlight compression: linear light x is recorded as (1 - exp(-SHOULDER
+x)) / SHOULDER. It differs between cameras.
+"""
 BESIDE_TOOLS = 0.07
-"""Margin around tools that is left out because of their shadows, as a share of the longer side."""
+"""Margin around tools excluded because of shadows, as a share of the longer side."""
 LEAST_KNOWN = 0.3
-"""Share of a cell's pixels that must be tissue lit neither too dark nor too bright."""
+"""Share of a cell's pixels that must be tissue that is neither under- nor overexposed."""
 LEAST_DETAIL = 0.01
-"""Lower bound of `Shading.detail`: no picture has less noise."""
+"""Lower bound of `Shading.detail`, the least noise of any picture."""
 LEAST_RED = 0.1
-"""What red has more than green and blue, by red: with less, tissue is not red, and light without what is mirrored is noise."""
+"""Smallest excess of red over green and blue, relative to red, for the diffuse part to be usable.
+"""
 GLINT = 0.35
-"""White that a glint has more than its surroundings, by the brightness of these."""
+"""Smallest excess of white over the surroundings of a highlight, relative to the surroundings'
+brightness.
+"""
 SURROUNDINGS = 0.025
-"""Their standard deviation, as a share of the longer side."""
+"""Standard deviation of the window for a highlight's surroundings, as a share of the longer side.
+"""
 BESIDE_TOOL_EDGE = 0.0125
-"""Margin around tools in which there are no glints of tissue, as a share of the longer side."""
+"""Margin around tools excluded from the search for highlights, as a share of the longer side."""
 
 
 @dataclass(frozen=True)
 class Cells:
-    """How brightly the cells of a picture are lit."""
+    """Brightness of a picture's cells."""
 
     brightness: NDArray[np.float64]
-    """Logarithm [h, w] of how bright the cell would be without its pigment, up to one summand; meaningless where `share` is too small."""
+    """Log brightness without pigment up to an offset, [h, w]; meaningless where `share` is too
+    small.
+    """
     share: NDArray[np.float64]
-    """[h, w]: share of the cell's pixels that could be used."""
+    """Share of usable pixels in each cell, [h, w]."""
     detail: float
-    """Standard deviation of `brightness` between neighbouring cells: pigment that is left, and noise."""
+    """Standard deviation of brightness between neighbouring cells caused by remaining pigment and
+    noise.
+    """
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """The cells of which enough could be used [h, w]."""
+        """Cells with enough usable pixels, bool [h, w]."""
         return self.share >= LEAST_KNOWN
 
 
 @dataclass(frozen=True)
 class Shading(Cells):
-    """What a picture tells about its light; its brightness is that of the mixture of channels."""
+    """Shading of a picture; its brightness is from the mixture of channels."""
 
     glints: NDArray[np.float64]
-    """[h, w]: share of the cell's pixels that are glints of wet tissue."""
+    """Share of each cell's pixels in highlights of wet tissue, [h, w]."""
     wet_share: NDArray[np.float64]
-    """[h, w]: share in which glints could be seen."""
+    """Share of each cell's pixels in which highlights are detectable, [h, w]."""
     diffuse: Cells | None = None
-    """By what comes out of the tissue (`log_diffuse`): it errs otherwise than the mixture. None where it is not known of any cell."""
+    """Brightness of the diffuse part (`log_diffuse`), whose errors differ from those of the
+    mixture. None if no cell has any.
+    """
 
 
 @dataclass(frozen=True)
 class SmallPicture:
-    """A picture in the size in which its light is looked at."""
+    """Picture reduced for the analysis of its light."""
 
     levels: NDArray[np.uint8]
-    """RGB [H, W, 3]."""
+    """RGB levels [H, W, 3]."""
     usable: NDArray[np.float32]
-    """[H, W]: 1 where it shows tissue by its own colour, off shadows of tools; 0 elsewhere."""
+    """Weights [H, W]: 1 on tissue that is well exposed and away from tool shadows, else 0."""
     tissue: NDArray[np.uint8]
-    """[H, W]: 0 on tools and close to them."""
+    """Mask [H, W]: 0 on and near tools and where it is too dark."""
 
     @classmethod
     def of(cls, frame: Frame) -> SmallPicture:
-        """Of a frame; its exposure plays no part: it is the same everywhere."""
+        """Reduce a frame. Exposure is ignored since it is uniform over the picture."""
         return _reduced(frame)
 
     @property
     def cells(self) -> tuple[int, int]:
-        """Columns and rows of the grid on which brightness is averaged."""
+        """Columns and rows of the brightness grid."""
         height, width = self.levels.shape[:2]
         return max(2, round(width * CELLS / max(height, width))), max(2, round(height * CELLS / max(height, width)))
 
     def averaged(
         self, values: NDArray[np.float32], weight: NDArray[np.float32]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Weighted means of values [H, W] or [H, W, C] over the cells, and the mean weights [h, w]."""
+        """Average values [H, W] or [H, W, C] with weights [H, W] over the cells; also returns the
+        mean weights [h, w].
+        """
         share = cv2.resize(weight, self.cells, interpolation=cv2.INTER_AREA).astype(np.float64)
         weighted = values * (weight if values.ndim == 2 else weight[..., None])
         total = cv2.resize(weighted, self.cells, interpolation=cv2.INTER_AREA).astype(np.float64)
@@ -108,12 +123,12 @@ class SmallPicture:
 
 
 def shading_of(frame: Frame) -> Shading:
-    """The shading of a frame's tissue."""
+    """Compute the shading of a frame's tissue."""
     return shading_in(SmallPicture.of(frame))
 
 
 def shading_in(picture: SmallPicture) -> Shading:
-    """The shading of the tissue in a small picture."""
+    """Compute the shading of a reduced picture."""
     cells, share = picture.averaged(_LOG_LIGHT[picture.levels], picture.usable)
     weights = _least_pigment(_steps(cells, share))
     glints, wet_share = picture.averaged(_glints(picture), picture.tissue.astype(np.float32))
@@ -130,7 +145,7 @@ def shading_in(picture: SmallPicture) -> Shading:
 
 
 def _steps(cells: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Differences between neighbouring cells [N] or [N, channels], of those of which enough is known."""
+    """Return differences of neighbouring known cells, [N] or [N, channels]."""
     known = share >= LEAST_KNOWN
     across = (cells[:, 1:] - cells[:, :-1])[known[:, 1:] & known[:, :-1]]
     return np.concatenate([across, (cells[1:] - cells[:-1])[known[1:] & known[:-1]]])
@@ -141,7 +156,9 @@ def _spread(steps: NDArray[np.float64]) -> float:
 
 
 def log_diffuse(picture: SmallPicture) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Logarithm of the light [H, W] that came out of tissue, without what its wet surface mirrors, and where that is known [H, W]: tissue is red."""
+    """Return the logarithm of the diffuse light [H, W] without specular reflections, and where it
+    is known. It relies on tissue being red.
+    """
     light = np.exp(_LOG_LIGHT[picture.levels])
     diffuse = light[..., 0] - 0.5 * (light[..., 1] + light[..., 2])
     known = (picture.usable > 0) & (diffuse > LEAST_RED * light[..., 0])
@@ -157,7 +174,9 @@ def _glints(picture: SmallPicture) -> NDArray[np.float32]:
 
 
 def _least_pigment(steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights [3] of the channels that sum to 1, with the least mean square of `steps` [N, 3] weighted by them."""
+    """Return channel weights [3], summing to 1, that minimise the mean square of the weighted
+    `steps` [N, 3].
+    """
     covariance = steps.T @ steps / max(len(steps), 1) + 1e-5 * np.eye(3)
     weights = np.linalg.solve(covariance, np.ones(3))
     return np.asarray(weights / weights.sum())
@@ -191,7 +210,9 @@ def _shrunk(tissue: NDArray[np.uint8], margin_px: float) -> NDArray[np.uint8]:
 
 
 def _log_light() -> NDArray[np.float32]:
-    """Logarithm of the light that a level stands for [256]: the sRGB curve undone (IEC 61966-2-1), then the shoulder."""
+    """Return the log light of each level [256]: inverse sRGB curve (IEC 61966-2-1), then inverse
+    shoulder.
+    """
     level = np.arange(256) / 255
     linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
     return np.log(np.maximum(-np.log1p(-SHOULDER * linear) / SHOULDER, 1e-4)).astype(np.float32)

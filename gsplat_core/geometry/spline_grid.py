@@ -1,4 +1,4 @@
-"""Values that change smoothly over a picture: cubic B-splines between the nodes of a grid."""
+"""Uniform cubic B-splines on a regular grid."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 
 
 def splines(share: Array, count: int) -> Array:
-    """Uniform cubic B-splines [N, count] at places from 0 to 1; what is beyond is at the edge."""
+    """Return cubic B-spline weights [N, count] at positions 0 to 1; positions outside are clamped."""
     place = np.clip(share, 0, 1) * (count - 3)
     first = np.minimum(np.floor(place).astype(int), count - 4)
     t = place - first
@@ -21,7 +21,9 @@ def splines(share: Array, count: int) -> Array:
 
 
 def smoothness(grid: tuple[int, int]) -> Array:
-    """[nodes, nodes]: sum of the squares of second differences along both sides of the grid."""
+    """Return the matrix [nodes, nodes] whose quadratic form is the sum of squared second
+    differences along both sides of the grid.
+    """
     second = [np.diff(np.eye(count), 2, axis=0) for count in grid]
     across, down = (each.T @ each for each in second)
     return np.asarray(np.kron(across, np.eye(grid[1])) + np.kron(np.eye(grid[0]), down))

@@ -1,4 +1,6 @@
-"""Depth from the two eyes of a stereo scope: rectified pairs, matched frame by frame, doubted where the pictures speak against them."""
+"""Depth from rectified stereo pairs, matched frame by frame, with plausibility checks of the pair
+and its calibration.
+"""
 
 from __future__ import annotations
 
@@ -20,35 +22,43 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.transfers import HostCopy, tensor_of
 
 LOOK_EVERY = 30
-"""Frames after which the pair is looked at again: eyes do not move against each other, and what they look at comes nearer."""
+"""Frames between two checks of the pair; eyes are rigid, but the distance of the tissue changes."""
 KEPT_LOOKS = 15
-"""Of the looks whose rows are averaged."""
+"""Number of checks whose row offsets are combined by their median."""
 MATCHED_WIDTH_PX = 800
-"""Wider pictures are matched at half their size, or a third: endoscopes blur more than a pixel of theirs, and what is fitted is a fraction of one."""
+"""Width above which pictures are matched at an integer fraction of their size. Endoscopes blur by
+more than one of their pixels, and the fit is sub-pixel.
+"""
 MARGIN_SHARE, MARGIN_PX = 0.2, 4
-"""What is looked for beyond the disparities that were seen."""
+"""Margin of the search range around the observed disparities, as a share of their span and in
+pixels.
+"""
 HALF_BELIEVED_PX = 0.5
-"""Standard deviation of a disparity that is believed with a confidence of a half, in pixels of the pictures that are matched."""
+"""Standard deviation of a disparity at which its confidence is one half, in pixels of the matched
+pictures.
+"""
 SAMPLED_PX = 200
-"""Pixels along a row that are enough to know the range of a picture's depth."""
+"""Number of samples along a row for the depth range of a picture."""
 LEAST_BELIEVED = 0.05
-"""Share of the pixels that must be believed."""
+"""Share of the pixels that must be confident."""
 ROWS_FROM_PX = 0.05
-"""Rows that are off by less are left as they are: taking it out costs sharpness."""
+"""Row differences below this are not corrected, since resampling costs sharpness, in pixels."""
 SAID_FROM_PX = 1.0
-"""Rows that are off by more are remarked on."""
+"""Row differences above this are reported, in pixels."""
 PLAUSIBLE_MM = (2.0, 1000.0)
-"""Median distance of what a scope in the body can be looking at."""
+"""Plausible median distances for a scope inside the body, in millimetres."""
 SAME_FOCAL, SAME_ROW_PX, SAME_AXES = 1e-3, SAID_FROM_PX, 1e-6
-"""How far the cameras of a rectified pair may differ: focal lengths as a share, rows of the principal points (what the pictures say about rows is
-taken out), turned axes."""
+"""Tolerances of a rectified pair: relative difference of focal lengths, row difference of principal
+points in pixels (row offsets are corrected), and deviation of the axes.
+"""
 
 
 class StereoDepth:
-    """Estimates the depth of rectified pairs.
+    """Depth estimator for rectified stereo pairs.
 
-    Without the right eye's camera depth is relative, in units of the distance between the eyes; the pictures are then taken as those of parallel cameras
-    with one principal point. On a GPU it works on a stream of its own: training goes on beside it, and only the thread that asks waits.
+    Without the right camera's calibration depth is relative, in units of the baseline, assuming
+    parallel cameras with a common principal point. On a GPU it runs on its own stream concurrently
+    with training; only the calling thread waits.
     """
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
@@ -56,7 +66,9 @@ class StereoDepth:
         self._forget((0, 0))
 
     def work_on(self, device: torch.device | str) -> None:
-        """See `OnDevice`: where pictures are matched. What looks at the pair as a whole, now and then, works on the CPU."""
+        """See `OnDevice`. Matching runs on the device; the occasional check of the pair runs on the
+        CPU.
+        """
         self._device = torch.device(device)
         self._stream = torch.cuda.Stream(self._device) if self._device.type == "cuda" else None
 
@@ -79,7 +91,7 @@ class StereoDepth:
         if why is not None:
             return doubted(shape, DepthOrigin.STEREO, why)
         left, right = grey(frame.image), grey(frame.right_image)
-        # What parallel rays have: principal points may differ.
+        # Disparity of points at infinity, since principal points may differ.
         parallel_px = 0.0 if frame.right_camera is None else float(camera.K[0, 2] - frame.right_camera.K[0, 2])
         if self._look_in == 0:
             why = self._look(left, right, frame, parallel_px)
@@ -88,20 +100,22 @@ class StereoDepth:
         self._look_in -= 1
         span = self._span_of(frame.width_px)
         if span.count > MOST_DISPARITIES:
-            why = f"the eyes see points at too many distances: {span.count} disparities would have to be looked through, {MOST_DISPARITIES} can be"
+            why = f"the range of distances is too large: {span.count} disparities would have to be searched, at most {MOST_DISPARITIES} are supported"
             return doubted(shape, DepthOrigin.STEREO, why)
         is_first = self._seen is None
         planes = self._planes(left, right, frame, camera, span, parallel_px)
         found = self._as_depth(planes, frame, camera, parallel_px)
         widened = self._span_of(frame.width_px)
         if is_first and found.doubt is None and span != widened and widened.count <= MOST_DISPARITIES:
-            # The first frame of a scene is matched as the ones after it are.
+            # Match the first frame of a scene with the same range as the following ones.
             planes = self._planes(left, right, frame, camera, widened, parallel_px)
             found = self._as_depth(planes, frame, camera, parallel_px)
         return found
 
     def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], frame: Frame, parallel_px: float) -> str | None:
-        """Learn rows and disparities of the pair. Returns a sentence that says why it cannot be used, or None."""
+        """Check the pair and update its rows and disparity range. Returns the reason why the pair
+        is unusable, or None.
+        """
         look = look_at(left, right, frame.loss_mask)
         why = look.doubt or _unlike_distances(look, parallel_px, calibrated=frame.right_camera is not None)
         if why is not None:
@@ -114,17 +128,18 @@ class StereoDepth:
         return None
 
     def _widen_to(self, seen: tuple[float, float]) -> None:
-        """Look for what was seen in the next frame, too.
+        """Extend the search range by the disparities of the last frame.
 
-        Until the next look the span only widens, and by one margin at most: wrong matches lie anywhere in it, so that it would widen without an end, and
-        pictures that are alike would be matched in another span, and otherwise, from frame to frame.
+        Until the next check of the pair the range only grows, by at most one margin. Wrong matches
+        occur anywhere in the range and would otherwise widen it without limit. A stable range also
+        matches similar pictures alike.
         """
         assert self._span is not None and self._looked is not None
         least, most = _widened(self._looked)
         self._span = min(self._span[0], max(seen[0], least)), max(self._span[1], min(seen[1], most))
 
     def _span_of(self, width_px: int) -> Span:
-        """Return the disparities to look for, in pixels of the pictures that are matched."""
+        """Return the search range in pixels of the matched pictures."""
         assert self._span is not None
         low, high = self._span
         shrink = _shrink(width_px)
@@ -140,7 +155,7 @@ class StereoDepth:
         span: Span,
         parallel_px: float,
     ) -> NDArray[np.float32]:
-        """Depth and confidence [2, H, W]."""
+        """Return depth and confidence [2, H, W]."""
         assert self._span is not None
         rows = np.median(self._rows, axis=0)
         aligned = _with_rows_of_left(right, rows, sum(self._span) / 2)
@@ -155,7 +170,7 @@ class StereoDepth:
             variance = (found.error_px.square() + off_px.square()) / (HALF_BELIEVED_PX * shrink) ** 2
             depth = torch.where(known, reach_of(frame, camera) / torch.where(known, shift, 1), 0)
             planes = HostCopy(torch.stack([depth, torch.where(known, 1 / (1 + variance), 0)]))
-        return planes.numpy().copy()  # frames may be kept for long, and page-locked memory is dear
+        return planes.numpy().copy()  # frames may be kept for long, and page-locked memory is scarce
 
     def _beside(self) -> AbstractContextManager[object]:
         return contextlib.nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
@@ -176,66 +191,74 @@ class StereoDepth:
         self._widen_to(self._seen)
         middle = float(np.median(believed_depth))
         if frame.right_camera is not None and not PLAUSIBLE_MM[0] <= middle <= PLAUSIBLE_MM[1]:
-            why = f"the distances cannot be those of a scope: {middle:.3g} mm in the middle; check the distance between the eyes and its unit"
+            why = f"the distances are implausible for a scope: {middle:.3g} mm in the middle; check the baseline and its unit"
             return doubted(depth.shape, DepthOrigin.STEREO, why)
         return DepthMap(
             depth, confidence, DepthOrigin.STEREO, frame.right_camera is not None, remark=self._remark(middle, reach)
         )
 
     def _remark(self, middle: float, reach: float) -> str | None:
-        """What is to be said of rows that are off: taken out they are, but whatever moved them may have moved columns, too."""
+        """Return a remark about corrected row offsets. Their cause may have shifted columns as
+        well.
+        """
         off = float(np.median(self._rows, axis=0)[0])
         if abs(off) < SAID_FROM_PX:
             return None
         return (
-            f"the rows of the two eyes are not the same: those of the right one were moved by {off:.1f} px; if its columns are off by as much,"
+            f"the rows of the two eyes differ: the right eye's rows were moved by {off:.1f} px; if its columns are off by as much,"
             f" depth is off by {abs(off) * middle / reach:.1%}, so check the calibration"
         )
 
 
 def _widened(span: tuple[float, float]) -> tuple[float, float]:
-    """Return a span of disparities with the margin at both ends."""
+    """Return a range of disparities extended by the margin at both ends."""
     margin = MARGIN_PX + MARGIN_SHARE * (span[1] - span[0])
     return span[0] - margin, span[1] + margin
 
 
 def _shrink(width_px: int) -> int:
-    """By which factor pictures are smaller while they are matched."""
+    """Return the integer factor by which pictures are reduced for matching."""
     return -(-width_px // MATCHED_WIDTH_PX)
 
 
 def variance_px2(confidence: NDArray[np.float32], width_px: int, beside: float) -> NDArray[np.float32]:
-    """Variances of disparities by their confidence above 0 [H, W], in squares of the pixels of pictures of this width.
+    """Return variances of disparities from their confidence.
 
-    beside: what is added, in squares of the pixels that are matched.
+    Args:
+        confidence: float32 [H, W], above 0.
+        width_px: width of the pictures.
+        beside: variance to add, in squared pixels of the matched pictures.
+
+    Returns:
+        float32 [H, W] in squared pixels of pictures of `width_px`.
     """
     own = HALF_BELIEVED_PX**2 * (1 / np.maximum(confidence, np.float32(1e-6)) - 1)
     return np.asarray(_shrink(width_px) ** 2 * (own + beside), np.float32)
 
 
 def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Brightness [H, W] of an RGB picture."""
+    """Return the grey levels uint8 [H, W] of an RGB picture [H, W, 3]."""
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _unlike_eyes(left: Camera, right: Camera | None) -> str | None:
-    """Why two cameras are not those of a rectified pair, in a sentence; None where they are."""
+    """Return the reason why two cameras are not a rectified pair, as a sentence, or None."""
     if right is None:
         return None
     pose = right.world_to_camera
     if np.abs(pose[:3, :3] - np.eye(3)).max() > SAME_AXES or np.abs(pose[1:3, 3]).max() > SAME_AXES * abs(pose[0, 3]):
-        return "the cameras are not those of a rectified pair: their axes or heights differ; rectify the pictures first"
+        return "the cameras are not a rectified pair: their axes or heights differ; rectify the pictures first"
     if abs(left.K[0, 0] / right.K[0, 0] - 1) > SAME_FOCAL or abs(left.K[1, 1] / right.K[1, 1] - 1) > SAME_FOCAL:
-        return f"the cameras are not those of a rectified pair: their focal lengths are {left.K[0, 0]:.1f} and {right.K[0, 0]:.1f} px"
+        return f"the cameras are not a rectified pair: their focal lengths are {left.K[0, 0]:.1f} and {right.K[0, 0]:.1f} px"
     if abs(left.K[1, 2] - right.K[1, 2]) > SAME_ROW_PX:
-        return f"the cameras are not those of a rectified pair: their principal points are in rows {left.K[1, 2]:.1f} and {right.K[1, 2]:.1f}"
+        return f"the cameras are not a rectified pair: their principal points are in rows {left.K[1, 2]:.1f} and {right.K[1, 2]:.1f}"
     if pose[0, 3] >= 0:
         return "the eyes are swapped in the calibration: its right camera is to the left of the left one"
     return None
 
 
 def _unlike_distances(look: PairLook, parallel_px: float, *, calibrated: bool) -> str | None:
-    """Why points of the two eyes cannot be at the distances that they have, in a sentence; None where they can."""
+    """Return the reason why the disparities are impossible, as a sentence, or None."""
     shift = look.disparities - parallel_px
     middle = float(np.median(shift))
     if abs(middle) < LEAST_DISPARITY_PX and float(np.ptp(shift)) < 4 * LEAST_DISPARITY_PX:
@@ -243,36 +266,42 @@ def _unlike_distances(look: PairLook, parallel_px: float, *, calibrated: bool) -
     behind = float((shift < LEAST_DISPARITY_PX).mean())
     if behind > 0.5:
         return (
-            f"the eyes are swapped: points lie {-middle:.1f} px further to the right in the right eye's picture than cameras side by side could see"
-            " them; swap the pictures, or check the calibration"
+            f"the eyes are swapped: points are {-middle:.1f} px further to the right in the right eye's picture than is possible for cameras side by side"
+            "; swap the pictures, or check the calibration"
         )
     if behind > 0.02:
-        what = "wrong calibration" if calibrated else "eyes that are not parallel, and no calibration that says how"
-        return f"some of the tissue would be behind the scope: {behind:.0%} of the points, by a {what}"
+        what = "wrong calibration" if calibrated else "uncalibrated eyes that are not parallel"
+        return f"some of the tissue would be behind the scope: {behind:.0%} of the points, because of {what}"
     return None
 
 
 def reach_of(frame: Frame, camera: Camera) -> float:
-    """Depth times disparity, for the left `camera` and the frame's right one; without that one depth is in distances between the eyes."""
+    """Return depth times disparity in millimetres times pixels; in baselines times pixels without a
+    right camera.
+    """
     baseline = 1.0 if frame.right_camera is None else -float(frame.right_camera.world_to_camera[0, 3])
     return float(camera.K[0, 0] * baseline)
 
 
 def _tensors_of(pictures: list[NDArray[np.uint8]], device: torch.device) -> list[Tensor]:
-    """The pictures on `device`, by one copy."""
+    """Copy several pictures to `device` in one transfer."""
     together = tensor_of(np.concatenate([each.ravel() for each in pictures]), device)
     parts = together.split([each.size for each in pictures])
     return [part.reshape(each.shape) for part, each in zip(parts, pictures, strict=True)]
 
 
 def _off_along_rows(rows: NDArray[np.float64], height: int, width: int, device: torch.device) -> Tensor:
-    """How far disparities may be off, in pixels [H, W]: an eye that is turned or nearer moves points along its rows as it moves them across."""
+    """Return the possible error of disparities in pixels [H, W]. A rotation or a scale difference
+    between the eyes shifts points along rows as well as across.
+    """
     y, x = torch.linspace(-1, 1, height, device=device)[:, None], torch.linspace(-1, 1, width, device=device)
     return torch.hypot(float(rows[1]) * height / width * y, float(rows[2]) * width / height * x)
 
 
 def _with_rows_of_left(right: NDArray[np.uint8], rows: NDArray[np.float64], disparity_px: float) -> NDArray[np.uint8]:
-    """The right picture with each point in the row in which the left eye has it; `rows` as in `PairLook`."""
+    """Warp the right picture so that each point is in the same row as in the left one; `rows` as in
+    `PairLook`.
+    """
     if np.abs(rows).sum() < ROWS_FROM_PX:
         return right
     height, width = right.shape

@@ -1,4 +1,4 @@
-"""Points of the tissue followed from one picture of a stream to the next, on small pictures. Memory and time do not grow with the stream."""
+"""Point tracking in a stream on reduced pictures, with bounded memory and time per frame."""
 
 from __future__ import annotations
 
@@ -14,43 +14,45 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
 SIDE_PX = 320
-"""Longest side of the pictures in which points are followed."""
+"""Longest side of the reduced pictures, in pixels."""
 MOST_POINTS = 220
-"""Followed at once."""
+"""Largest number of points tracked at once."""
 APART = 0.03
-"""Of the picture's longer side: how far points are apart when they are taken up."""
+"""Smallest distance between points when they are detected, as a share of the longer side."""
 LEAST_QUALITY = 0.005
-"""Of a corner, beside the picture's best one."""
+"""Quality of a corner relative to the picture's best one."""
 PATCH_PX = 17
-"""Side of the square by which a point is recognised."""
+"""Side of the square patch that is tracked, in pixels."""
 LEVELS = 3
 RETURN_PX = 0.5
-"""How far from its start a point may come back, when it is followed forth and back."""
+"""Largest accepted forward-backward error in pixels."""
 BORDER_PX = 6
 SAME_PX = 3.0
-"""Points that are nearer to each other are followed as one."""
+"""Distance in pixels below which two points count as one."""
 
 Numbers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class SmallPicture:
-    """What points are followed in."""
+    """Reduced grey picture for tracking."""
 
     grey: NDArray[np.uint8]
-    """[h, w]."""
+    """Grey levels uint8 [h, w]."""
     usable: NDArray[np.uint8]
-    """[h, w]; 0 where nothing is followed: tools, reflections, the border."""
+    """Validity uint8 [h, w]; 0 on tools, highlights and the border."""
     camera: Camera
-    """Of this size."""
+    """Camera scaled to this size."""
 
     def rays(self, pixels: Points) -> NDArray[np.float64]:
-        """x / z and y / z [N, 2] of points as OpenCV counts pixels."""
+        """Return rays x / z and y / z [N, 2] of pixel positions in OpenCV's convention."""
         K = self.camera.K
         return np.asarray((pixels.astype(np.float64) + 0.5 - K[:2, 2]) / [K[0, 0], K[1, 1]])
 
     def pixels(self, local: NDArray[np.float64]) -> Points:
-        """Where points of the camera's coordinates [N, 3] are seen, as OpenCV counts pixels; those behind it far outside."""
+        """Project points in camera coordinates [N, 3] to OpenCV pixel positions. Points behind the
+        camera project far outside.
+        """
         K = self.camera.K
         depth = np.where(local[:, 2] > 1e-9, local[:, 2], 1e-9)
         return np.asarray(
@@ -58,7 +60,7 @@ class SmallPicture:
         )
 
     def shows(self, pixels: Points) -> NDArray[np.bool_]:
-        """Which points lie where points may be followed [N]."""
+        """Return which positions are inside the picture and trackable [N]."""
         height, width = self.grey.shape
         column, row = (np.rint(np.nan_to_num(pixels[:, axis], nan=-1.0)).astype(np.int64) for axis in (0, 1))
         inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
@@ -67,14 +69,14 @@ class SmallPicture:
 
 
 class SmallPictures:
-    """Makes small pictures of frames."""
+    """Reduces the frames of one stream for tracking."""
 
     def __init__(self, camera: Camera, side_px: int = SIDE_PX) -> None:
         self._camera, self._side_px = camera, side_px
         self._highlights = HighlightFinder()
 
     def of(self, frame: Frame) -> SmallPicture:
-        """Without a colour, and with what is not to be followed left out."""
+        """Reduce a frame to grey and mark tools, highlights and the border as unusable."""
         share = min(1.0, self._side_px / max(frame.width_px, frame.height_px))
         size = max(1, round(share * frame.width_px)), max(1, round(share * frame.height_px))
         small = frame.image if share == 1 else np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA))
@@ -85,7 +87,7 @@ class SmallPictures:
             masks[2] = self._highlights.without(np.asarray(small, np.uint8))
         kept = [cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) != 0 for mask in masks if mask is not None]
         if kept:
-            # A corner's patch reaches over the edge of a tool, which moves otherwise.
+            # Exclude corners whose patch overlaps a tool, which moves differently.
             tissue = np.logical_and.reduce(kept).astype(np.uint8) * 255
             usable &= np.asarray(cv2.erode(tissue, np.ones((PATCH_PX, PATCH_PX), np.uint8)), np.uint8)
         grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
@@ -95,32 +97,38 @@ class SmallPictures:
 def found_again(
     before: SmallPicture, after: SmallPicture, points: Points, guess: Points
 ) -> tuple[Points, NDArray[np.bool_]]:
-    """Where points of a picture are in another one [N, 2], and which of them can be trusted [N]."""
+    """Track points to another picture.
+
+    Returns:
+        Positions [N, 2], and which of them are reliable [N].
+    """
     moved, misses_px = followed(before.grey, after.grey, points, guess, window_px=PATCH_PX, levels=LEVELS)
     return moved, (misses_px < RETURN_PX) & after.shows(moved)
 
 
 class StreamTracks:
-    """Follows points; each keeps its number while it is seen. Deterministic."""
+    """Point tracker. A point keeps its number while it is tracked. Results are deterministic."""
 
     def __init__(self) -> None:
         self.picture: SmallPicture | None = None
-        """That was followed last."""
+        """Last picture that was tracked."""
         self.pixels: Points = np.zeros((0, 2), np.float32)
-        """Where the points are in it."""
+        """Positions of the points in that picture [N, 2]."""
         self.numbers: Numbers = np.zeros(0, np.int64)
-        """Of the points, ascending."""
+        """Numbers of the points, ascending."""
         self.first: Points = np.zeros((0, 2), np.float32)
-        """Where each was taken up."""
+        """Positions where each point was first detected [N, 2]."""
         self._next = 0
 
     def begin(self, picture: SmallPicture) -> None:
-        """Forget the points and go on from this picture."""
+        """Drop all points and continue from this picture."""
         self.picture = picture
         self.keep(np.zeros(len(self.numbers), np.bool_))
 
     def follow(self, picture: SmallPicture, guess: Points) -> tuple[Numbers, Points]:
-        """The points that are found in the next picture; nothing is kept of it until `go_on`."""
+        """Track the points to the next picture, starting at `guess` [N, 2]. The tracker's state
+        changes only in `go_on`.
+        """
         assert self.picture is not None
         if picture.grey.shape != self.picture.grey.shape:
             return self.numbers[:0], self.pixels[:0]
@@ -128,16 +136,18 @@ class StreamTracks:
         return self.numbers[trusted], moved[trusted]
 
     def go_on(self, picture: SmallPicture, numbers: Numbers, pixels: Points) -> None:
-        """These of the points are followed from here on."""
+        """Accept a tracked picture with the given points."""
         self.first = self.first[np.searchsorted(self.numbers, numbers)]
         self.picture, self.numbers, self.pixels = picture, numbers, pixels
 
     def keep(self, kept: NDArray[np.bool_]) -> None:
-        """Give up the other points."""
+        """Drop the points that are not marked."""
         self.numbers, self.pixels, self.first = self.numbers[kept], self.pixels[kept], self.first[kept]
 
     def take_up(self) -> Numbers:
-        """Take up corners where there are few points; their numbers, which are larger than all before."""
+        """Detect new corners if points are missing. Returns their numbers, which are larger than
+        all earlier ones.
+        """
         picture, missing = self.picture, MOST_POINTS - len(self.numbers)
         if picture is None or missing < MOST_POINTS // 10:
             return np.zeros(0, np.int64)
@@ -154,7 +164,7 @@ class StreamTracks:
         return new
 
     def adopt(self, numbers: Numbers, pixels: Points) -> None:
-        """Follow these known points as well, in place of those that are as good as there."""
+        """Track known points as well, replacing tracked points at nearly the same position."""
         near = np.linalg.norm(self.pixels[:, None] - pixels[None], axis=2).min(1, initial=np.inf) < SAME_PX
         self.keep(~near & ~np.isin(self.numbers, numbers))
         self._add(numbers, pixels)

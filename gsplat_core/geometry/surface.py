@@ -1,4 +1,4 @@
-"""A depth map as a surface: its points, its normals, and where it is cut at occlusion edges."""
+"""Surface geometry of a depth map: points, normals and occlusion edges."""
 
 from __future__ import annotations
 
@@ -11,13 +11,20 @@ from gsplat_core.scene.cameras import Camera
 Array = NDArray[np.floating]
 
 TORN_DEGREES = 80.0
-"""A depth step between neighbouring pixels that would need a steeper tilt against the line of sight is taken for an occlusion edge."""
+"""Tilt against the line of sight in degrees above which a depth step between neighbouring pixels
+counts as an occlusion edge.
+"""
 MOST_ANGLE_RAD = 1.5
-"""Largest angle of a fisheye's ray to its axis: at a right angle a ray has no point at z = 1."""
+"""Largest angle of a fisheye ray to the axis in radians; at 90 degrees a ray has no point at z = 1.
+"""
 
 
 def rays_of(camera: Camera, pixels: Array) -> tuple[Array, Array]:
-    """Points at z = 0 and steps to z = 1 [..., 3] of the rays through pixel coordinates [..., 2], in the camera's axes."""
+    """Return the rays of pixel coordinates [..., 2].
+
+    Returns:
+        Points at z = 0 and steps to z = 1, both [..., 3] in camera coordinates.
+    """
     plane = (np.asarray(pixels, np.float64) - camera.K[:2, 2]) / np.diag(camera.K)[:2]
     zero, one = np.zeros_like(plane[..., :1]), np.ones_like(plane[..., :1])
     if camera.model == "ortho":
@@ -29,7 +36,9 @@ def rays_of(camera: Camera, pixels: Array) -> tuple[Array, Array]:
 
 
 def points_of(depth: Array, camera: Camera) -> NDArray[np.float64]:
-    """Points [H, W, 3] in the camera's axes at the pixels' centres; where depth z [H, W] is unknown (0) they mean nothing."""
+    """Return points [H, W, 3] in camera coordinates at the pixel centres of a depth map z [H, W];
+    meaningless where the depth is unknown (0).
+    """
     if depth.shape != (camera.height_px, camera.width_px):
         raise InvalidInput(
             f"the depth is {list(depth.shape)}; the camera's picture is [{camera.height_px}, {camera.width_px}]"
@@ -40,20 +49,29 @@ def points_of(depth: Array, camera: Camera) -> NDArray[np.float64]:
 
 
 def in_world(points: Array, camera: Camera) -> NDArray[np.float64]:
-    """Points [..., 3] of the camera's axes in the world's."""
+    """Transform points [..., 3] from camera to world coordinates."""
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     return np.asarray((points - translation) @ rotation, np.float64)
 
 
 def known(depth: Array) -> NDArray[np.bool_]:
-    """Where a depth map says something, bool."""
+    """Return where a depth map is known, bool [H, W]."""
     return np.asarray(np.isfinite(depth) & (depth > 0))
 
 
 def joined(depth: Array, camera: Camera, axis: int) -> NDArray[np.bool_]:
-    """Between which neighbours along `axis` (0: down, 1: across) the surface goes on; one shorter than [H, W] there.
+    """Return which neighbouring pixels are connected by the surface.
 
-    It does where both depths are known and the piece between them is tilted by less than `TORN_DEGREES` against the line of sight.
+    Two pixels are connected if both depths are known and the surface between them is tilted by less
+    than `TORN_DEGREES` against the line of sight.
+
+    Args:
+        depth: [H, W], z in camera coordinates, 0 = unknown.
+        camera: camera of the depth map.
+        axis: 0 for vertical, 1 for horizontal neighbours.
+
+    Returns:
+        bool, one element shorter than [H, W] along `axis`.
     """
     points = points_of(depth, camera)
     there = known(depth)
@@ -65,8 +83,9 @@ def joined(depth: Array, camera: Camera, axis: int) -> NDArray[np.bool_]:
 
 
 def normals_of(depth: Array, camera: Camera) -> NDArray[np.float32]:
-    """Normals [H, W, 3] in the camera's axes, of unit length and towards the camera, from the differences of neighbouring points on the same
-    surface; 0 where a pixel has no neighbour on its surface across or down."""
+    """Return unit normals [H, W, 3] in camera coordinates, facing the camera, from differences of
+    connected neighbours. Pixels without a connected neighbour in both directions get 0.
+    """
     points = points_of(depth, camera)
     (across, has_across), (down, has_down) = (_tangent(points, joined(depth, camera, axis), axis) for axis in (1, 0))
     normals = np.cross(down, across)  # x right, y down: towards the camera, where z is negative
@@ -82,7 +101,9 @@ def _pair(values: NDArray, axis: int) -> tuple[NDArray, NDArray]:
 
 
 def _tangent(points: Array, joins: NDArray[np.bool_], axis: int) -> tuple[Array, NDArray[np.bool_]]:
-    """How the point changes along `axis` [H, W, 3]: from both neighbours where there are both, else from the one there is."""
+    """Return the tangent along `axis` [H, W, 3], from both connected neighbours or one, and where
+    it exists [H, W].
+    """
     before, after = _pair(points, axis)
     step = np.where(joins[..., None], after - before, 0)
     padding = [(0, 0), (0, 0), (0, 0)]

@@ -1,7 +1,8 @@
-"""A field of vectors over tissue that is seen from anywhere: vectors at some nodes among its points, and smoothly in between.
+"""Smooth vector field over a tissue surface, given by vectors at nodes among its points.
 
-What is expected beforehand is a random field: a part that is linear in the place, of which a rigid motion is one kind, and one that changes over a length
-(kriging with a linear trend). All lengths are in units of the tissue's distance.
+The prior is a Gaussian random field with a linear part, which includes rigid motion, and a local
+part with a correlation length (kriging with a linear trend). Lengths are in units of the tissue's
+distance.
 """
 
 from __future__ import annotations
@@ -14,40 +15,42 @@ from torch import Tensor
 from gsplat_core.threads import one_thread
 
 LINEAR = 0.2
-"""How far the linear part may be expected to move tissue (standard deviation)."""
+"""Prior standard deviation of the linear part."""
 LOCAL = 0.03
-"""The same of the part that changes ..."""
+"""Prior standard deviation of the local part."""
 LENGTH = 0.3
-"""... over such a length."""
+"""Correlation length of the local part."""
 APART = 0.13
-"""Between nodes; more where that makes more than ..."""
+"""Smallest distance between nodes; larger if it would give more than `MOST_NODES`."""
 MOST_NODES = 48
 JITTER = 1e-6
-"""Of the mean variance: keeps what is nearly singular invertible."""
+"""Diagonal regularisation as a share of the mean variance."""
 
 
 @dataclass(frozen=True)
 class SurfaceField:
-    """Where vectors are given, and what follows from them."""
+    """Nodes of a vector field with its prior."""
 
     nodes: Tensor
-    """[M, 3]."""
+    """Node positions [M, 3]."""
     middle: Tensor
-    """[3]: of the points."""
+    """Median position of the points [3]."""
     stiffness: Tensor
-    """[M, M]: half of v' stiffness v is how unlikely values v at the nodes are beforehand."""
+    """Inverse covariance [M, M]; v' stiffness v / 2 is the negative log prior of values v at the
+    nodes.
+    """
 
     @classmethod
     @one_thread()
     def over(cls, points: Tensor, most: int = MOST_NODES) -> SurfaceField:
-        """Nodes spread over points [P, 3]."""
+        """Create a field with at most `most` nodes spread over points [P, 3]."""
         middle = points.median(0).values
         nodes = _spread(points, middle, most)
         return cls(nodes, middle, torch.linalg.inv(_settled(_covariance(nodes, nodes, middle))))
 
     @one_thread()
     def influence(self, points: Tensor) -> Tensor:
-        """How much each point has of each node's vector [P, M]."""
+        """Return interpolation weights [P, M] of the nodes' vectors at points [P, 3]."""
         return _covariance(points, self.nodes, self.middle) @ self.stiffness
 
 
@@ -62,7 +65,7 @@ def _settled(covariance: Tensor) -> Tensor:
 
 
 def _spread(points: Tensor, middle: Tensor, most: int) -> Tensor:
-    """The point nearest to the middle, then always the one that is farthest from those taken."""
+    """Return points selected by farthest-point sampling, starting nearest to the middle."""
     chosen = [int((points - middle).norm(dim=1).argmin())]
     away = (points - points[chosen[0]]).norm(dim=1)
     while len(chosen) < most and float(away.max()) > APART:

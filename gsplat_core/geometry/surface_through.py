@@ -1,4 +1,4 @@
-"""A smooth depth map through scattered points of a picture: at each pixel the plane that fits the points around it best."""
+"""Smooth depth map through scattered points of a picture, by local plane fits."""
 
 from __future__ import annotations
 
@@ -11,21 +11,29 @@ from gsplat_core.geometry.local_planes import at_middles, terms_of
 Array = NDArray[np.float64]
 
 CELL_PX = 2
-"""Side of the cells in which points are gathered."""
+"""Side of the cells in which points are accumulated, in pixels."""
 NEAR_PX, FAR_PX = 9.0, 24.0
-"""How far around a pixel points count (standard deviation): where there are enough of them, and where there are few."""
+"""Standard deviations in pixels of the window where points are dense and where they are sparse."""
 ENOUGH = 1.5
-"""Points, counted by how near they are, from which the near ones are followed fully."""
+"""Effective number of points in the narrow window from which the wide one is ignored."""
 FLOOR = 0.005
-"""Relative error that even the best points are taken to have, so that no single one decides."""
+"""Relative error added to every point so that none dominates."""
 LEVEL = 1e-3
-"""Of the weights: so much speaks for no slope, so that two points are no plane."""
+"""Regularisation of slopes as a share of the weights, so that two points do not define a plane."""
 
 
 def surface_through(pixels: Array, depth: Array, error: Array, size: tuple[int, int]) -> tuple[Array, Array, Array]:
-    """Depth, its relative error, and how well it is supported (0 to 1), each [H, W] of `size`; `pixels` [N, 2] is x, y with the first pixel's centre at 0.5.
+    """Interpolate a depth map. Planes are fitted to inverse depth, in which planes of the world are
+    linear.
 
-    Planes are of inverse depth: that is what a plane of the world is.
+    Args:
+        pixels: positions [N, 2] as x, y; the first pixel's centre is at 0.5.
+        depth: depths [N].
+        error: relative errors of the depths [N].
+        size: height and width of the result.
+
+    Returns:
+        Depth, its relative error, and support from 0 to 1, each [H, W].
     """
     height, width = -(-size[0] // CELL_PX), -(-size[1] // CELL_PX)
     x, y = pixels[:, 0] / CELL_PX, pixels[:, 1] / CELL_PX
@@ -42,7 +50,7 @@ def surface_through(pixels: Array, depth: Array, error: Array, size: tuple[int, 
         np.float64
     )
     near, far = (_blurred(sums, sigma / CELL_PX) for sigma in (NEAR_PX, FAR_PX))
-    # The wide neighbourhood counts as little as there is enough nearby.
+    # Blend to the wide window where the narrow one contains few points.
     count = near[..., 9] * 2 * np.pi * (NEAR_PX / CELL_PX) ** 2
     few = np.clip(1 - count / ENOUGH, 0.02, 1)[..., None]
     both = (1 - few) * near + few * far
@@ -61,12 +69,12 @@ def _blurred(sums: Array, sigma: float) -> Array:
 
 
 def _planes(sums: Array) -> Array:
-    """The value [h, w] at each cell's centre of the plane that fits best around it."""
+    """Return the locally fitted plane at each cell centre [h, w]."""
     row, column = np.mgrid[0 : sums.shape[0], 0 : sums.shape[1]] + 0.5
     return np.asarray(at_middles(tuple(np.moveaxis(sums[..., :9], 2, 0)), column, row, 1.0, LEVEL), np.float64)
 
 
 def _at_full_size(values: Array, size: tuple[int, int]) -> Array:
-    """Cells as pixels, between their centres linearly."""
+    """Upsample cells linearly to pixels."""
     large = cv2.resize(values, (values.shape[1] * CELL_PX, values.shape[0] * CELL_PX), interpolation=cv2.INTER_LINEAR)
     return np.asarray(large[: size[0], : size[1]], np.float64)

@@ -1,4 +1,4 @@
-"""Points of the tissue followed through the pictures: corners, moved on by optical flow, given up where they cannot be trusted."""
+"""Point tracking through a recording: corners moved by optical flow and dropped when unreliable."""
 
 from __future__ import annotations
 
@@ -12,38 +12,42 @@ from numpy.typing import NDArray
 from gsplat_core.geometry.point_flow import followed
 
 MOST_POINTS = 700
-"""Followed at once."""
+"""Largest number of points tracked at once."""
 APART = 0.025
-"""Of the picture's longer side: how far points are apart when they are taken up."""
+"""Smallest distance between points when they are detected, as a share of the longer side."""
 LEAST_QUALITY = 0.005
-"""Of a corner, beside the picture's best one."""
+"""Quality of a corner relative to the picture's best one."""
 PATCH_PX = 21
-"""Side of the square by which a point is recognised."""
+"""Side of the square patch that is tracked, in pixels."""
 LEVELS = 3
 RETURN_PX = 0.7
-"""How far from its start a point may come back, when it is followed forth and back."""
+"""Largest accepted forward-backward error in pixels."""
 BORDER_PX = 8
 SURVIVORS = 0.2
-"""Share of the points that a picture has to show again, or it is left out ..."""
+"""Share of the points that must be found again, or the picture is skipped."""
 MOST_LEFT_OUT = 15
-"""... at most so many times in a row; then points are taken up anew, in what seems to be another scene."""
+"""Largest number of consecutively skipped pictures. After that, tracking continues with new points
+as if in a new scene.
+"""
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Where points were seen: `pixels` [M, 2] (x, y; centre of the first pixel at 0.5) of `point` [M] in `frame` [M], in order of the frames."""
+    """Point observations in frame order: `frame` [M], `point` [M] and `pixels` [M, 2] as x, y with
+    the first pixel's centre at 0.5.
+    """
 
     frame: NDArray[np.int64]
     point: NDArray[np.int64]
     pixels: NDArray[np.float64]
 
     def of(self, chosen: NDArray[np.bool_]) -> Observations:
-        """Some of them."""
+        """Select observations by a mask [M]."""
         return Observations(self.frame[chosen], self.point[chosen], self.pixels[chosen])
 
 
 class FeatureTracks:
-    """Follows points from picture to picture; each keeps its number while it is seen. Deterministic."""
+    """Point tracker. A point keeps its number while it is tracked. Results are deterministic."""
 
     def __init__(self) -> None:
         self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
@@ -55,7 +59,12 @@ class FeatureTracks:
         self._seen: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
 
     def follow(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> None:
-        """Take the next picture, RGB [H, W, 3]; `mask` [H, W] is 0 where nothing is to be followed."""
+        """Track to the next picture.
+
+        Args:
+            image: RGB uint8 [H, W, 3].
+            mask: [H, W], 0 where nothing is tracked, or None.
+        """
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
         usable = self._usable(grey, mask)
         if self._before is not None and len(self._points):
@@ -71,7 +80,9 @@ class FeatureTracks:
         self._seen.append((self._numbers.copy(), self._points.astype(np.float64) + 0.5))
 
     def observations(self, least: int = 3) -> Observations:
-        """All that was seen so far, of points seen at least so many times; these are numbered anew from 0."""
+        """Return all observations so far of points observed at least `least` times, with the points
+        renumbered from 0.
+        """
         frames = np.concatenate([np.full(len(numbers), index) for index, (numbers, _) in enumerate(self._seen)])
         points = np.concatenate([numbers for numbers, _ in self._seen])
         pixels = np.concatenate([pixels for _, pixels in self._seen])
@@ -84,7 +95,7 @@ class FeatureTracks:
         inside = np.zeros(grey.shape, np.uint8)
         inside[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = 255
         if mask is not None:
-            # A corner's patch reaches over the edge of a tool, which moves otherwise.
+            # Exclude corners whose patch overlaps a tool, which moves differently.
             patch = np.ones((PATCH_PX, PATCH_PX), np.uint8)
             inside &= np.asarray(cv2.erode((mask != 0).astype(np.uint8) * 255, patch), np.uint8)
         return inside
@@ -92,7 +103,7 @@ class FeatureTracks:
     def _moved(
         self, before: NDArray[np.uint8], grey: NDArray[np.uint8], usable: NDArray[np.uint8]
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Where the points are in the next picture, and their numbers; without those that cannot be trusted."""
+        """Return positions and numbers of the points that were reliably found in the next picture."""
         flow = self._flow.calc(before, grey, None)
         height, width = grey.shape
         column, row = (

@@ -1,7 +1,10 @@
-"""Whether a scope's own trajectory can be told from breathing: what the prior of the trajectory takes for the tissue's at the breathing's frequency, and what it would take at those beside it.
+"""Test of whether the scope's own motion can be separated from breathing.
 
-The prior gives the tissue what of a line at its frequency a smooth trajectory does not have (`trajectory_prior`). Half a cycle of the recording to either side the tissue has no line: what would
-be given to it there is the scope's own, and as much may be wrong at the breathing's frequency. Where the scope swings nearly as fast as the tissue breathes, both sides show it.
+The trajectory prior attributes to the tissue the part of a motion at the breathing frequency that a
+smooth trajectory does not have (`trajectory_prior`). At neighbouring frequencies, half a cycle per
+recording away, the tissue has no motion. Anything attributed to it there is scope motion, and an
+error of the same size is expected at the breathing frequency. A scope that moves nearly as fast as
+the tissue breathes shows at both neighbours.
 """
 
 from __future__ import annotations
@@ -16,14 +19,27 @@ from gsplat_core.geometry.trajectory_prior import PLACES, TrajectoryPrior, coord
 from gsplat_core.threads import one_thread
 
 BESIDE_CYCLES = 0.5
-"""From the breathing's frequency to those beside it, in cycles over the recording."""
+"""Distance of the neighbouring frequencies, in cycles over the recording."""
 CLEARLY = 2.0
-"""What is given to the tissue has to be so many times what would be given to it beside its frequency, or poses may get worse by it."""
+"""Smallest ratio of the motion attributed to the tissue to that at the neighbouring frequencies;
+below it poses may get worse.
+"""
 
 
 @one_thread()
 def is_told(before: Tensor, poses: Tensor, times_s: Tensor, hz: Sequence[float]) -> tuple[bool, float]:
-    """Whether `poses` [C, 4, 4], from which breathing was taken, are to be believed more than those `before`; and how much of them may be the tissue's (root mean square)."""
+    """Compare the motion attributed to the tissue with its expected error.
+
+    Args:
+        before: poses estimated for static tissue [C, 4, 4].
+        poses: poses after separating the breathing [C, 4, 4].
+        times_s: times in seconds [C].
+        hz: breathing frequency, and heart frequency if found.
+
+    Returns:
+        True if `poses` are more reliable than `before`, and the root mean square scope motion that
+            may be attributed to the tissue.
+    """
     length_s = float(times_s[-1] - times_s[0])
     apart = BESIDE_CYCLES / length_s
     beside = [(hz[0] + change, *hz[1:]) for change in (-apart, apart)]
@@ -32,7 +48,9 @@ def is_told(before: Tensor, poses: Tensor, times_s: Tensor, hz: Sequence[float])
 
 
 def _given_to_tissue(poses: Tensor, like: Tensor, times_s: Tensor, hz: Sequence[float]) -> float:
-    """How far (root mean square) places swing at the first frequency by more than a trajectory like `like` may."""
+    """Return the root mean square motion at the first frequency beyond that of a trajectory like
+    `like`.
+    """
     swings = waves(times_s, hz)
     prior = learned_from(like, times_s, swings)
     y, _ = coordinates(poses)
@@ -41,6 +59,6 @@ def _given_to_tissue(poses: Tensor, like: Tensor, times_s: Tensor, hz: Sequence[
 
 
 def _line(prior: TrajectoryPrior, swings: Tensor, y: Tensor, axis: int) -> Tensor:
-    """The first frequency's part of a coordinate [C], by generalised least squares."""
+    """Return the first frequency's part of a coordinate [C] by generalised least squares."""
     pushed = swings.T @ prior.precision[axis]
     return swings[:, :2] @ torch.linalg.solve(pushed @ swings, pushed @ y)[:2]

@@ -1,9 +1,11 @@
-"""How a scope may be expected to go: smoothly, and without a line at the frequencies of breathing and heart beat.
+"""Prior of a scope's trajectory: smooth, and without a component at the breathing and heart
+frequencies.
 
-Pictures show where the scope is to the tissue. What both do as one rigid body, at a frequency of the breathing, they do not tell apart; the rest of the
-scope's trajectory does: it is taken for a random function whose smoothness is learned from the trajectory itself (a Gaussian process with a Matérn kernel of
-order 7/2, its length and noise by restricted maximum likelihood: what swings at the given frequencies takes no part). A trajectory that needs no line
-there is then more likely than one with it. How much of one it may have all the same follows, and gets less the longer the recording is.
+Pictures show the scope relative to the tissue. Rigid motion of both at a breathing frequency is
+ambiguous. It is resolved by modelling the trajectory as a Gaussian process with a Matérn kernel of
+order 7/2. The kernel's length and noise are learned from the trajectory by restricted maximum
+likelihood, excluding the component at the given frequencies. A trajectory without that component is
+then more likely. The remaining uncertainty decreases with the length of the recording.
 """
 
 from __future__ import annotations
@@ -17,31 +19,35 @@ from gsplat_core.geometry.pose import hat, log
 from gsplat_core.threads import one_thread
 
 LENGTHS_S = (0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6, 6.0, 8.0, 12.0)
-"""Of the kernel."""
+"""Candidate kernel lengths in seconds."""
 NOISES = (0.003, 0.01, 0.03, 0.1)
-"""How far a trajectory jitters, relative to how far it goes."""
+"""Candidate noise levels relative to the amplitude of the trajectory."""
 PLACES, TURNS = slice(0, 3), slice(3, 6)
-"""Coordinates that share a kernel."""
+"""Slices of the coordinates that share a kernel: positions and rotations."""
 
 
 @dataclass(frozen=True)
 class TrajectoryPrior:
-    """What is expected of the coordinates of some cameras: where they are, and rotation vectors from the one in the middle, times the distance of the tissue."""
+    """Gaussian prior of camera coordinates: positions, and rotation vectors relative to the middle
+    camera, in units of the tissue's distance.
+    """
 
     precision: Tensor
-    """[6, C, C]."""
+    """Precision matrix of each coordinate, [6, C, C]."""
     uncertain: float
-    """How far off the trajectory may be (root mean square) as far as it is along the given frequencies."""
+    """Root mean square uncertainty of the trajectory along the given frequencies."""
 
     @one_thread()
     def cost(self, poses: Tensor) -> float:
-        """How unlikely poses [C, 4, 4] are."""
+        """Return the negative log prior of poses [C, 4, 4], up to a constant."""
         y, _ = coordinates(poses)
         return 0.5 * float(torch.einsum("tj,jts,sj->", y, self.precision, y))
 
     @one_thread()
     def terms(self, poses: Tensor) -> tuple[Tensor, Tensor]:
-        """The cost's matrix [6 C, 6 C] and slope [6 C] by twists of the cameras."""
+        """Return the Gauss-Newton matrix [6 C, 6 C] and gradient [6 C] of the cost by twists of the
+        cameras.
+        """
         y, by_twist = coordinates(poses)
         pushed = torch.einsum("jts,sj->tj", self.precision, y)
         matrix = torch.einsum("jts,tja,sjb->tasb", self.precision, by_twist, by_twist)
@@ -50,7 +56,9 @@ class TrajectoryPrior:
 
 
 def coordinates(poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Coordinates [C, 6] of cameras, and how twists of the cameras change them [C, 6, 6]. The unit is the distance of the tissue."""
+    """Return camera coordinates [C, 6] and their derivatives by twists of the cameras [C, 6, 6], in
+    units of the tissue's distance.
+    """
     turned = poses[:, :3, :3].transpose(1, 2)
     place = -(turned @ poses[:, :3, 3:])[:, :, 0]
     relative = torch.eye(4, dtype=poses.dtype).repeat(len(poses), 1, 1)
@@ -65,7 +73,13 @@ def coordinates(poses: Tensor) -> tuple[Tensor, Tensor]:
 
 @one_thread()
 def learned_from(poses: Tensor, times_s: Tensor, waves: Tensor) -> TrajectoryPrior:
-    """The prior of trajectories like that of `poses` [C, 4, 4], at `times_s` [C], as far as that is not along the `waves` [C, B]."""
+    """Learn the prior from a trajectory.
+
+    Args:
+        poses: world-to-camera poses [C, 4, 4].
+        times_s: times in seconds [C].
+        waves: cosines and sines [C, B] whose component is excluded.
+    """
     y, _ = coordinates(poses)
     one = torch.ones(len(y), 1, dtype=y.dtype)
     apart = (times_s[:, None] - times_s).abs()
@@ -99,24 +113,24 @@ def learned_from(poses: Tensor, times_s: Tensor, waves: Tensor) -> TrajectoryPri
 
 @dataclass(frozen=True)
 class _Smoothness:
-    """One kernel, and how likely it makes a trajectory."""
+    """Kernel with its restricted likelihood for a trajectory."""
 
     likelihood: float
     factor: Tensor
-    """Of the kernel's matrix [C, C]."""
+    """Cholesky factor of the kernel matrix [C, C]."""
     triangle: Tensor
-    """Of the whitened constant and waves."""
+    """Triangular QR factor of the whitened constant and waves."""
     scale: Tensor
-    """[6]: variance of each coordinate."""
+    """Variance of each coordinate, [6]."""
 
     def precision(self, one: Tensor) -> Tensor:
-        """[6, C, C]; where a trajectory begins is not known beforehand."""
+        """Return the precision matrices [6, C, C] with a free constant offset."""
         inverse = torch.cholesky_inverse(self.factor)
         inverse = inverse - (inverse @ one) @ (one.T @ inverse) / inverse.sum()
         return inverse / self.scale[:, None, None]
 
     def variance(self, along: Tensor) -> Tensor:
-        """Of each coordinate [6], of what may be along the waves, as a mean over time."""
+        """Return the mean variance over time of each coordinate's component along the waves [6]."""
         projected = torch.linalg.solve_triangular(self.triangle.T, along.T, upper=False)
         return self.scale * projected.square().sum(0).mean()
 

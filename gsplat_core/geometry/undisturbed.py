@@ -1,8 +1,9 @@
-"""The motion that tissue repeats, from the times and places at which nothing else moves it.
+"""Robust fit of periodic motion that excludes tissue disturbed by tools.
 
-What a tool pulls is off from any periodic motion, and pulls a fit along with it, robust weights or not: points that are off by a little count nearly fully, and
-where they are pulled nearer, all of the motion along the line of sight is wrong. Such points are off *together*, as errors of single points are not. So sightings whose
-neighbours are off on average are left out, and the motion is fitted again to what is left.
+Tissue pulled by a tool biases a periodic fit even with robust weights, because small deviations
+keep nearly full weight. A pull towards the camera then corrupts the motion along the line of sight.
+Disturbed points deviate together, unlike points with independent errors. Observations whose
+neighbours deviate on average are therefore excluded and the motion is fitted again.
 """
 
 from __future__ import annotations
@@ -17,19 +18,21 @@ from gsplat_core.geometry.grid_tracks import GridTracks
 from gsplat_core.geometry.periodic_motion import SPREAD_PX, Array, PeriodicMotion, fitted, off_px
 
 AROUND_PX = 24.0
-"""How far around a point its neighbours are (standard deviation)."""
+"""Standard deviation of a point's neighbourhood in pixels."""
 CELL_PX = 4
-"""Side of the cells in which they are gathered."""
+"""Side of the cells in which deviations are accumulated, in pixels."""
 FAR_OFF_PX = 8.0
-"""Points that are off by more than that say little about their neighbours: they were not found, or are the tool's (Cauchy's scale)."""
+"""Cauchy scale in pixels; points with larger errors are mistracked or on the tool and have little
+weight for their neighbours.
+"""
 LEAST_LEFT = 0.3
-"""Share of a point's sightings that have to be left; with less of them all of them count."""
+"""Share of a point's observations that must remain; otherwise all of them are used."""
 TIMES = 2
-"""That it is fitted again."""
+"""Number of refits."""
 
 
 def fitted_undisturbed(tracks: GridTracks, motion: PeriodicMotion) -> PeriodicMotion:
-    """`motion`, which was fitted to all of the tracks, fitted again to what nothing else moves."""
+    """Refit a motion without disturbed observations."""
     for _ in range(TIMES):
         disturbed = together_px(off_px(motion.at(tracks.times_s), tracks), tracks) > SPREAD_PX
         left = tracks.seen & ~disturbed
@@ -39,7 +42,15 @@ def fitted_undisturbed(tracks: GridTracks, motion: PeriodicMotion) -> PeriodicMo
 
 
 def together_px(off: Array, tracks: GridTracks) -> Array:
-    """Length [T, N] of the mean by which the points that are seen around each one are off, of what each is off [T, N, 2] in pixels."""
+    """Return the length of the locally averaged error around each observation.
+
+    Args:
+        off: errors in pixels [T, N, 2].
+        tracks: observations.
+
+    Returns:
+        Lengths in pixels [T, N].
+    """
     half = np.array(tracks.extent) * tracks.focal_px
     columns, rows = np.ceil(2 * half / CELL_PX).astype(int)
     cells = np.clip(((tracks.rays * tracks.focal_px + half) / CELL_PX).astype(int), 0, [columns - 1, rows - 1])
@@ -54,6 +65,6 @@ def together_px(off: Array, tracks: GridTracks) -> Array:
 
 
 def _gathered(values: Array, where: NDArray[np.integer], size: tuple[int, int]) -> Array:
-    """Sums of `values` [N] in cells, and around each."""
+    """Return sums of `values` [N] over cells, blurred by the neighbourhood."""
     sums = np.bincount(where, values, size[0] * size[1]).reshape(size)
     return np.asarray(cv2.GaussianBlur(sums, (0, 0), AROUND_PX / CELL_PX, borderType=cv2.BORDER_CONSTANT))

@@ -174,8 +174,8 @@ def wrong_camera(kind):
     ("kind", "sentence"),
     [
         ("metres", "check the distance between the eyes and its unit"),
-        ("turned", "not those of a rectified pair"),
-        ("focal", "not those of a rectified pair"),
+        ("turned", "are not a rectified pair"),
+        ("focal", "are not a rectified pair"),
         ("swapped", "the eyes are swapped in the calibration"),
         ("columns", "some of the tissue would be behind the scope"),
     ],
@@ -211,7 +211,7 @@ def test_another_scene_is_looked_at_anew(left, right):
 
 def test_a_pair_with_too_many_distances_is_doubted(left, right, monkeypatch):
     monkeypatch.setattr("gsplat_core.geometry.stereo.MARGIN_PX", 200)
-    assert "too many distances: 432 disparities" in estimate(frame(left, right)).doubt
+    assert "range of distances is too large: 432 disparities" in estimate(frame(left, right)).doubt
 
 
 def test_a_frame_with_one_eye_has_nothing_to_match(left, right):
