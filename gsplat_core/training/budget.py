@@ -1,4 +1,4 @@
-"""How much work a frame may take: a number of steps, or the time until a deadline."""
+"""Training budget of a frame: a number of steps, or the time until a deadline."""
 
 from __future__ import annotations
 
@@ -14,31 +14,34 @@ import torch
 from gsplat_core.errors import InvalidInput
 
 Ending = Literal["steps", "deadline", "at_most"]
-"""Why training on a frame ended: its number of steps was made, another step would have ended after the deadline, or `at_most` steps were
-made before it."""
+"""Reason why training on a frame ended: the requested number of steps was made, another step would
+have missed the deadline, or `at_most` steps were made before it.
+"""
 MAX_IN_FLIGHT = 4
-"""Steps that may be queued on a GPU and not finished while a deadline is watched: enough to keep it busy between two."""
+"""Steps that may be queued on a GPU while a deadline is watched; enough to keep it busy."""
 
 
 TURNS, SECOND_EYE = 4, 2
-"""Where two eyes are trained on, the third of four steps is on the second one: the first one's picture is what is shown, and the host prepares the second
-one's while a GPU works on the first steps."""
+"""With two eyes, the third of every four steps trains the second eye. The first eye is the
+displayed one, and the host prepares the second eye's picture while the GPU works on the first
+steps.
+"""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """The work that one frame may take; made by `of_steps` or `until`."""
+    """Training budget of one frame, created by `of_steps` or `until`."""
 
     steps: int | None
-    """Exactly so many steps, whatever time they take; None: as many as fit before the deadline."""
+    """Exact number of steps, or None to train until the deadline."""
     deadline_s: float = math.inf
-    """When the last step has to be finished, on `clock`."""
+    """Time on `clock` by which the last step must be finished, in seconds."""
     at_least: int = 1
-    """Steps that are made even when they end after the deadline."""
+    """Steps that are made even if they miss the deadline."""
     at_most: int | None = None
-    """Steps after which the frame has had enough, though there is time left."""
+    """Largest number of steps before the deadline, or None."""
     clock: Callable[[], float] = time.monotonic
-    """Seconds; never runs backwards."""
+    """Monotonic clock in seconds."""
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 0:
@@ -52,12 +55,18 @@ class Budget:
 
     @staticmethod
     def of_steps(steps: int) -> Budget:
-        """So many steps: the same frames give the same model on every machine."""
+        """Return a budget of a fixed number of steps. The same frames then give the same model on
+        every machine.
+        """
         return Budget(steps)
 
     @staticmethod
     def given(budget: Budget | None, steps: int | None) -> Budget | None:
-        """A budget, or a number of steps in place of one; None where neither is given. Raises InvalidInput where both are."""
+        """Return the budget, or one of `steps` steps, or None if neither is given.
+
+        Raises:
+            InvalidInput: if both are given.
+        """
         if steps is None:
             return budget
         if budget is not None:
@@ -72,35 +81,45 @@ class Budget:
         at_most: int | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> Budget:
-        """The steps that end before `deadline_s` on `clock`, but at least and at most so many."""
+        """Return a budget of as many steps as end before `deadline_s` on `clock`, within `at_least`
+        and `at_most`.
+        """
         return Budget(None, deadline_s, at_least, at_most, clock)
 
     @property
     def is_timed(self) -> bool:
-        """Whether the number of steps depends on the clock."""
+        """True if the number of steps depends on the clock."""
         return self.steps is None
 
 
 class Spending:
-    """One frame's budget while it is spent: `allows_step` before each step, `step_made` after it."""
+    """Accounting of one frame's budget: call `allows_step` before each step and `step_made` after
+    it.
+    """
 
     def __init__(self, budget: Budget, step_s: float | None = None) -> None:
-        """`step_s` is how long a step took lately, in seconds; None where that is not known."""
+        """Start the accounting. `step_s` is the recent duration of a step in seconds, or None if
+        unknown.
+        """
         self._budget = budget
         self._expected_s = step_s or 0.0
         self._in_flight = 0
         self._has_queued = False
         self._was_last = False
-        """Whether the step that was allowed is the last one."""
+        """True if the step just allowed is the last one."""
         self._started_s = budget.clock() if budget.is_timed else 0.0
         self._first: tuple[int, float] | None = None
-        """Of queued steps: how many were finished when the first was seen to be, and when that was."""
+        """Number of finished queued steps at the first observation, and its time."""
         self.made = 0
-        """Steps made or queued so far."""
+        """Number of steps made or queued so far."""
 
     def allows_step(self, by_turns: bool = False) -> bool:
-        """Whether another step is to be made. by_turns: two eyes take turns (`turn`), and a step on the second one is made where there is time for one
-        on the first after it, which is made then in any case: the newest step is on what is shown."""
+        """Return True if another step should be made.
+
+        With `by_turns`, two eyes alternate (`turn`). A step on the second eye is started only if
+        there is time for one on the first eye after it. That one is then always made, so the newest
+        step trains the displayed eye.
+        """
         budget = self._budget
         if budget.steps is not None:
             return self.made < budget.steps
@@ -109,40 +128,47 @@ class Spending:
         if by_turns and self.made % TURNS == SECOND_EYE + 1:
             return True
         wanted = 2 if by_turns and self.turn else 1
-        if self._has_room_for(wanted):
+        if self._has_time_for(wanted):
             return True
-        # A recorded session knows the number of steps alone: one of the first eye in the second one's place is the last.
+        # Replays of a session know only the number of steps. A step on the first eye in a turn of
+        # the second one is therefore always the last.
         needed = self.made < budget.at_least
-        self._was_last = wanted == 2 and (self.made + 2 > budget.at_least if needed else self._has_room_for(1))
+        self._was_last = wanted == 2 and (self.made + 2 > budget.at_least if needed else self._has_time_for(1))
         return needed or self._was_last
 
-    def _has_room_for(self, steps: int) -> bool:
+    def _has_time_for(self, steps: int) -> bool:
         budget = self._budget
         if budget.at_most is not None and self.made + steps > budget.at_most:
             return False
-        # Steps that are queued come first; the next ones must be over in time as well.
+        # Queued steps finish first; the next ones must end before the deadline as well.
         return budget.clock() + (self._in_flight + steps) * self.step_s <= budget.deadline_s
 
     @property
     def turn(self) -> int:
-        """Whose turn the next step is where two eyes take turns, see `TURNS`: 0 for the first one, which also has the last step."""
+        """Eye of the next step when two eyes alternate (see `TURNS`): 0 for the first eye, which
+        also gets the last step.
+        """
         is_last = self._was_last or self.made + 1 == self._budget.steps
         return int(self.made % TURNS == SECOND_EYE and not is_last)
 
     def step_made(self, in_flight: int = 0) -> None:
-        """One more step was made, or queued; `in_flight` queued ones are not finished."""
+        """Record a step that was made or queued. `in_flight` is the number of queued steps that are
+        not finished.
+        """
         self.made += 1
         self._in_flight = in_flight
         self._has_queued = self._has_queued or in_flight > 0
         self._look()
 
     def all_finished(self) -> None:
-        """No step is in flight any more."""
+        """Record that all queued steps are finished."""
         self._in_flight = 0
         self._look()
 
     def planned(self) -> int:
-        """How many steps are still to come, at least 1: exactly, or estimated from the time that is left."""
+        """Return the number of remaining steps, at least 1: exact for a step budget, estimated for
+        a deadline.
+        """
         budget = self._budget
         if budget.steps is not None:
             return max(1, budget.steps - self.made)
@@ -155,10 +181,12 @@ class Spending:
 
     @property
     def step_s(self) -> float:
-        """How long a step takes: measured on this frame once a step of it is finished; 0 where nothing is known. Timed budgets only.
+        """Duration of a step in seconds, measured on this frame once possible, else the earlier
+        value; 0 if unknown. For timed budgets only.
 
-        The first of several queued steps may have waited for other work on the device, so the time after it counts; before there is another
-        one, it is what was known before the frame."""
+        The first of several queued steps may have waited for other work on the device, so only the
+        time after it is measured. Until a second one finishes, the earlier value is used.
+        """
         finished = self.made - self._in_flight
         if self._first is not None and finished > self._first[0]:
             return max(0.0, self._budget.clock() - self._first[1]) / (finished - self._first[0])
@@ -173,14 +201,14 @@ class Spending:
 
     @property
     def ending(self) -> Ending:
-        """Why no further step is made."""
+        """Reason why no further step is made."""
         if self._budget.steps is not None:
             return "steps"
         return "at_most" if self._budget.at_most is not None and self.made >= self._budget.at_most else "deadline"
 
 
 class StepsInFlight:
-    """Counts the steps that are queued on a device and not finished, and waits where there are more than a few."""
+    """Counter of steps queued on a device, which limits their number."""
 
     def __init__(self, device: torch.device, most: int = MAX_IN_FLIGHT) -> None:
         self._device = device
@@ -188,7 +216,9 @@ class StepsInFlight:
         self._events: deque[torch.cuda.Event] = deque()
 
     def queued(self) -> int:
-        """Call after a step was queued on the current stream: waits until at most `most` are not finished; returns how many those are."""
+        """Register a step queued on the current stream and wait until at most `most` are
+        unfinished. Returns the number of unfinished steps.
+        """
         if self._device.type != "cuda":
             return 0
         event = torch.cuda.Event()

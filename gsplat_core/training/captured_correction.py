@@ -1,4 +1,6 @@
-"""A scene on a GPU is corrected by a frame's depth in one launch: a live stream has no time for a hundred of them."""
+"""Depth correction of a scene on a GPU as a CUDA graph. A live stream has no time for its hundred
+separate launches.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +22,20 @@ from gsplat_core.training.surface_motion import NEAREST
 
 
 class CapturedCorrection:
-    """What `Placement` does at one time, as a CUDA graph, for a scene whose tensors stay where they are.
+    """Depth correction of `Placement` at one time, captured for a scene whose tensors keep their
+    addresses.
 
-    A frame whose splats do not fit the tile lists corrects nothing; the next one has longer lists.
+    A frame that overflows the tile lists corrects nothing; the lists are enlarged for the next one.
     """
 
     def __init__(self, rows: Gaussians, field: BasisField, camera: Camera) -> None:
-        """rows: all that the scene has memory for. camera: gives the size of every frame."""
+        """Prepare the correction.
+
+        Args:
+            rows: the scene's tensors with all allocated rows.
+            field: the scene's motion.
+            camera: camera with the size of every frame.
+        """
         device, shape = rows.device, (camera.height_px, camera.width_px)
         self._rows, self._field, self._weights, self._camera = rows, field, field.weights, camera
         self._controls = FrameControls(device, rates=1)
@@ -38,13 +47,19 @@ class CapturedCorrection:
         self._captured: CapturedSequence[None] | None = None
 
     def fits(self, rows: Gaussians, field: BasisField, camera: Camera) -> bool:
-        """Whether it was captured for these tensors and this size."""
+        """Return True if the graph fits these tensors and this size."""
         same_scene = rows is self._rows and field is self._field and field.weights is self._weights
         size = self._camera.width_px, self._camera.height_px
         return same_scene and size == (camera.width_px, camera.height_px)
 
     def __call__(self, observation: Observation, depth: Tensor, shown_s: float) -> None:
-        """Queue the correction at `shown_s` by the depth [H, W] (0: unknown) of what was observed."""
+        """Queue the correction for an observation.
+
+        Args:
+            observation: camera, time and mask of the frame.
+            depth: float32 [H, W], 0 = unknown.
+            shown_s: time in seconds at which the scene is changed.
+        """
         if (needs := self._status.wait()).overflowed:
             self._capacity, self._captured = capacity_for(needs.instances), None
         self._depth.copy_(depth)
@@ -68,13 +83,13 @@ class CapturedCorrection:
         self._status.queue(frame.status)
         known = (self._depth > 0) & (self._mask > 0) & (frame.alphas >= UNCOVERED_ALPHA)
         known &= frame.status[STATUS_OVERFLOW] == 0
-        # As `Seen` does it, which copies the camera from the host: that cannot be captured.
+        # `Seen` does the same but copies the camera from the host, which cannot be captured.
         rotation, translation = controls.viewmat[:3, :3], controls.viewmat[:3, 3]
         local = ((scene.means + seen[:, POSITION])[:, None, :] * rotation).sum(2) + translation
         focal, middle = controls.intrinsics.diagonal()[:2], controls.intrinsics[:2, 2]
         pixels = local[:, :2] / local[:, 2:].clamp(min=NEAREST) * focal + middle
         factor = smooth_factor(self._depth, frame.image[..., 3], known, pixels)
-        factor = torch.where(scene.logit_opacities.isfinite(), factor, 1.0)  # rows that are not in use stay as they are
+        factor = torch.where(scene.logit_opacities.isfinite(), factor, 1.0)  # unused rows keep their values
         moved = deltas_at(controls.rates)[:, :BASIS_CHANNELS].contiguous()
         move_along_rays_(moved, scene.means, factor, -(rotation * translation[:, None]).sum(0))
         self._field.move_to_at(controls.rates, moved)

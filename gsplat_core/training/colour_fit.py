@@ -1,4 +1,4 @@
-"""Colours that make a scene, as it stands, look like a picture: one linear least-squares problem, since blending is linear in colours."""
+"""Least-squares fit of colours to a picture with fixed geometry. Blending is linear in the colours."""
 
 from __future__ import annotations
 
@@ -13,15 +13,23 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 LEAST_WEIGHT = 1e-6
-"""Of a Gaussian in the picture, in pixels; one that is not seen has no gradient either."""
+"""Smallest weight of a Gaussian in the picture, in pixels; invisible ones have no gradient either.
+"""
 
 
 def colour_change(gaussians: Gaussians, camera: Camera, picture: Tensor, counts: Tensor, steps: int) -> Tensor:
-    """What to add to the constant coefficients, [N, 3], so that the camera sees `picture` [H, W, 3], 0 to 1, where `counts` [H, W] is 1.
+    """Return the change of the constant colour coefficients [N, 3] that fits a picture.
 
-    The update of `colour_correction`, repeated, with Nesterov's momentum: each Gaussian takes the mean of what its pixels lack, weighted as it is
-    blended into them. No rate has to be chosen, since the weights of a pixel sum to at most 1. Few steps correct what is large; what it takes
-    many for is smaller than a Gaussian.
+    The update of `colour_correction` is repeated with Nesterov's momentum. No step size is needed,
+    since the weights of a pixel sum to at most 1. A few steps remove large errors; further steps
+    only improve detail smaller than a Gaussian.
+
+    Args:
+        gaussians: scene.
+        camera: viewpoint.
+        picture: target float [H, W, 3], 0 to 1.
+        counts: weights [H, W], 1 for pixels to fit.
+        steps: number of iterations.
     """
     weights = _gathered(gaussians, gaussians.sh[:, 0], camera, torch.ones_like)
     per_weight = 1 / (SH_C0 * weights.clamp(min=LEAST_WEIGHT))
@@ -34,8 +42,9 @@ def colour_change(gaussians: Gaussians, camera: Camera, picture: Tensor, counts:
 
 
 def _gathered(gaussians: Gaussians, constant: Tensor, camera: Camera, of_pixels: Callable[[Tensor], Tensor]) -> Tensor:
-    """What pixels [H, W, 3] hold, which is made from the picture with those constant coefficients, summed for each Gaussian [N, 3] as it is
-    blended into them."""
+    """Return pixel values [H, W, 3], computed from the rendered picture, summed for each Gaussian
+    [N, 3] with its blending weights.
+    """
     leaf = constant.detach().requires_grad_()
     with torch.enable_grad():
         sh = torch.cat([leaf[:, None], gaussians.sh[:, 1:]], dim=1)

@@ -1,4 +1,4 @@
-"""Settings of the reconstructor: what is learned, how fast, from which frames."""
+"""Settings of the reconstructor: model size, learning rates, losses and frame selection."""
 
 from __future__ import annotations
 
@@ -15,28 +15,37 @@ from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.motion_priors import MOTION_PRIORS
 
 Eyes = Literal["left", "both"]
-"""Which pictures of a stereo scope are trained on."""
+"""Eyes of a stereo scope whose pictures are trained on."""
 
 
 def check_eyes(eyes: str) -> None:
-    """Raises InvalidSetting for something else than the name of a choice."""
+    """Check the name of an eye selection.
+
+    Raises:
+        InvalidSetting: for an unknown name.
+    """
     if eyes not in get_args(Eyes):
         raise InvalidSetting(f"eyes is {eyes!r}; choose {' or '.join(get_args(Eyes))}")
 
 
 MEASURED_WEIGHS, MEASURED_WEIGHS_ONLINE = 10.0, 3.0
-"""How many times more depth counts that was measured than depth that was found in pictures, where all frames are known and where they come one after
-another. With less of it, colours move Gaussians along the line of sight, which pictures hardly show, by more than a measured depth is off; with more, the
-few steps of a frame leave less for its picture."""
+"""Factors of the depth loss for measured depth relative to estimated depth, offline and online.
+Lower values let colours move Gaussians along the line of sight by more than the depth's error;
+higher values leave less of a frame's few steps to its picture.
+"""
 MATCHED_WEIGHS = 10.0
-"""The same of depth that two eyes were matched by, where all frames are known: it is then a surface (`matched_surface`), which colours make rough."""
+"""Factor of the depth loss for stereo depth offline, where it is reconstructed as a surface
+(`matched_surface`) that colours would roughen.
+"""
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's rates. Those of positions are in pixels of the training image: they are multiplied by depth / focal length.
+    """Learning rates of Adam. Those of positions are in pixels of the training image and are
+    multiplied by depth / focal length.
 
-    Raises InvalidSetting when a rate is not in 0..10.
+    Raises:
+        InvalidSetting: for a rate outside 0 to 10.
     """
 
     means_px: float = 0.03
@@ -45,10 +54,12 @@ class LearningRates:
     logit_opacities: float = 2e-2
     sh: float = 5e-3
     right_share: float = 0.1
-    """Of the rate `sh`, for the right eye's own colours. Where depth is not known, that one colour does not fit both pictures is what moves a Gaussian to where it
-    belongs: these come after that. Where matched depth holds the Gaussians (`MATCHED_WEIGHS`), they follow at once."""
+    """Factor of the rate `sh` for the right eye's own colours. Without depth, the colour difference
+    between the eyes is what moves Gaussians to the right depth, so these colours must follow
+    slowly. With stereo depth (`MATCHED_WEIGHS`) the factor is 1.
+    """
     field: FieldRates | None = None
-    """Rates of the deformation field, of the type that its kind has (`FIELDS[name].rates`); None: the kind's defaults."""
+    """Rates of the deformation field, of type `FIELDS[name].rates`; None for its defaults."""
 
     def __post_init__(self) -> None:
         check_rates({name: rate for name, rate in vars(self).items() if name != "field"})
@@ -56,55 +67,71 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class ReconstructorConfig:
-    """What a `Reconstructor` learns and how much work it does. Raises InvalidSetting for a value out of its range."""
+    """Settings of a `Reconstructor`.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     field: str = "auto"
-    """Deformation field: a name in `gsplat_core.deformation.FIELDS`. `auto` is the better one in `benchmarks/notes/replay.md`."""
+    """Deformation field: a name in `gsplat_core.deformation.FIELDS`. `auto` is the better one in
+    `benchmarks/notes/replay.md`.
+    """
     gaussians: int = 30_000
-    """Gaussians that the first frame starts with; frames that uncover new tissue add to them."""
+    """Number of Gaussians created from the first frame; frames that uncover new tissue add more."""
     max_gaussians: int = 60_000
-    """Bound on Gaussians over the whole stream."""
+    """Largest number of Gaussians over the whole stream."""
     sh_degree: int = 0
-    """Degree of the view-dependent colour; 0 suits a scope whose light moves with the camera."""
+    """Degree of the view-dependent colour. 0 suits a scope whose light moves with the camera."""
     steps_per_frame: int = 10
-    """Optimiser steps that each new frame gets."""
+    """Optimiser steps for each new frame."""
     first_frame_steps: int = 60
-    """Steps on the very first frame, from which the model starts."""
+    """Optimiser steps for the first frame of a scene."""
     newest_share: float = 0.7
-    """Share of the steps that go to the newest frame; the rest goes to the window."""
+    """Share of the steps spent on the newest frame; the others train on frames of the window."""
     window_frames: int = 30
-    """Recent frames that are trained on again, so that the model does not forget them."""
+    """Number of recent frames that are trained on again to prevent forgetting."""
     jump_ratio: float = 1.8
-    """A new frame whose loss is this many times the usual one shows a jump (a cut between shots, a sudden motion) and gets extra steps."""
+    """Ratio of a new frame's loss to the usual loss from which it counts as a jump (a cut or sudden
+    motion) and gets extra steps.
+    """
     jump_extra: int = 4
-    """Extra steps for a jump, in multiples of the frame's own."""
+    """Extra steps for a jump, in multiples of the frame's own steps."""
     bump_spacing_s: float = 0.2
-    """The shortest time within which motion changes its course: the time between the basis functions of the basis field."""
+    """Spacing of the basis field's functions in seconds: the shortest time in which motion can
+    change.
+    """
     squared_error: bool = False
-    """Whether colours are compared by the squared error, which PSNR measures, in place of L1."""
+    """Compare colours by squared error, which PSNR measures, instead of L1."""
     history_s: float | None = None
-    """How much of the past stays deformable online, with the basis field; None: all of it, in memory that grows with the stream."""
+    """Seconds of the past that remain deformable online with the basis field. None keeps all, with
+    memory that grows with the stream.
+    """
     preallocate: bool = False
-    """Take the memory for `max_gaussians` at once, so that nothing is captured again when Gaussians join or leave."""
+    """Allocate memory for `max_gaussians` at the start, so that CUDA graphs stay valid when
+    Gaussians are added or removed.
+    """
     ssim_weight: float = 0.0
-    """Weight of 1 - SSIM beside L1 or the squared error, 0..1."""
+    """Weight of 1 - SSIM relative to L1 or squared error, 0 to 1."""
     depth_weight: float = 0.1
-    """Weight of the inverse-depth term, where frames have depth, times the distance at which the scene starts: in any unit of length the same.
-    `MEASURED_WEIGHS` times as much where a scene with an end starts from measured depth, `MATCHED_WEIGHS` times where all frames are known and two eyes were
-    matched."""
+    """Weight of the inverse-depth loss of frames with depth, multiplied by the scene's initial
+    distance so that it does not depend on the unit. It is scaled by `MEASURED_WEIGHS` or
+    `MEASURED_WEIGHS_ONLINE` for measured depth and by `MATCHED_WEIGHS` for stereo depth offline.
+    """
     default_depth_mm: float = 60.0
-    """Distance of the plane on which a recording without depth starts."""
+    """Distance of the plane on which a scene without depth starts, in millimetres."""
     eyes: Eyes = "left"
-    """Whether the right eye's pictures are trained on, too, where frames have one and its camera is known."""
+    """Train on the right eye's pictures as well, for frames with a calibrated right eye."""
     motion_prior: str = "bumps"
-    """What is assumed about motion after the newest frame: a name in `MOTION_PRIORS`."""
+    """Prediction of motion after the newest frame: a name in `MOTION_PRIORS`."""
     motion_detail: Detail = "full"
-    """How closely a motion prior looks at pictures; `half` where it has to be quick."""
+    """Resolution at which a motion prior processes pictures; `half` is faster."""
     start_from_motion: bool = False
-    """Whether a motion prior moves the scene to where a new frame shows it, before the first step on that frame."""
+    """Move the scene by the motion prior to a new frame before its first step."""
     depth_from_motion: bool = False
-    """Whether the depth of the scene is found where the camera moves, its poses are given, and no depth is: online by the motion prior,
-    offline before training, in key frames (`training/parallax.py`)."""
+    """Estimate the scene's depth from camera motion if poses but no depth are given: online by the
+    motion prior, offline in key frames before training (`training/parallax.py`).
+    """
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:
@@ -144,23 +171,31 @@ class ReconstructorConfig:
 
     @classmethod
     def offline(cls, field: str = "auto") -> ReconstructorConfig:
-        """The configuration for `Reconstructor.fit`, which has time for more Gaussians and for finer motion than a stream.
+        """Return the configuration for `Reconstructor.fit`, with more Gaussians and finer motion
+        than for a stream.
 
-        It starts with `gaussians` and ends with `max_gaussians`.
+        Training starts with `gaussians` and ends with `max_gaussians` Gaussians.
         """
         return cls(
             field=field,
             gaussians=60_000,
             max_gaussians=80_000,
-            # The HexPlane's rows in time follow this, too; finer ones were not tried.
+            # The time resolution of the HexPlane follows this as well; finer values were not tried.
             bump_spacing_s=1 / 15 if field == "hexplane" else 0.05,
             squared_error=True,
             depth_from_motion=True,
         )
 
     def starting_from(self, frame: Frame, all_known: bool) -> ReconstructorConfig:
-        """The same for a scene that starts from `frame`. all_known: whether all frames are there. A stream without an end keeps its weights from scene to
-        scene, whatever these start from."""
+        """Return the settings for a scene that starts from `frame`, with weights that depend on its
+        depth source.
+
+        Streams with a limited `history_s` keep their weights for all scenes.
+
+        Args:
+            frame: first frame of the scene.
+            all_known: True offline, where all frames are available.
+        """
         if frame.depth is None or self.history_s is not None:
             return self
         if frame.depth_origin in (None, DepthOrigin.MEASURED):
@@ -173,5 +208,5 @@ class ReconstructorConfig:
 
     @property
     def chosen_field(self) -> str:
-        """The field's own name: for `auto`, of the field that it stands for."""
+        """Name of the field, with `auto` resolved."""
         return FIELDS[self.field].name

@@ -1,4 +1,4 @@
-"""How much of a frame's tissue a scene leaves uncovered: the question before Gaussians are added."""
+"""Detection of tissue that a scene does not cover, before Gaussians are added."""
 
 from __future__ import annotations
 
@@ -14,35 +14,47 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.transfers import HostCopy
 
 UNCOVERED_ALPHA = 0.5
-"""A pixel whose accumulated opacity is below this shows nothing of the model."""
+"""Accumulated opacity below which a pixel counts as uncovered."""
 SMALLEST_SHARE = 0.002
-"""Uncovered share of the frame from which on Gaussians are added; single pixels between Gaussians close by training."""
+"""Uncovered share of the frame from which Gaussians are added; training closes single-pixel gaps.
+"""
 
 
 def uncovered_pixels(alpha: Tensor, mask: Tensor) -> Tensor:
-    """bool [H, W]: tissue, in `mask` [H, W], where the accumulated opacity `alpha` [H, W] shows nothing of the model."""
+    """Return tissue pixels, bool [H, W], whose accumulated opacity is below `UNCOVERED_ALPHA`.
+
+    Args:
+        alpha: accumulated opacity [H, W].
+        mask: [H, W], non-zero on tissue.
+    """
     return (alpha < UNCOVERED_ALPHA) & (mask > 0)
 
 
 def are_worth_filling(uncovered: Tensor) -> bool:
-    """Whether the uncovered pixels [H, W] are more than gaps between Gaussians. Waits for one number."""
+    """Return True if the uncovered pixels [H, W] are more than single gaps. Synchronises with the
+    device.
+    """
     return HostCopy(torch.count_nonzero(uncovered)).item() >= SMALLEST_SHARE * uncovered.numel()
 
 
 class CapturedCoverage:
-    """Asks a scene on a GPU, frame after frame, whether it leaves much uncovered.
+    """Coverage test of a scene on a GPU by a captured graph.
 
-    The scene is copied into a slot and rendered by the graph that is captured for it, which stays valid while the scene grows. That takes a
-    tenth of the launches of deforming and rendering the scene where it is.
+    The scene is copied to a slot and rendered by a CUDA graph that stays valid while the scene
+    grows. This takes a tenth of the launches of deforming and rendering the scene directly.
     """
 
     def __init__(self, camera: Camera, device: torch.device, rows: int = 0) -> None:
-        """`rows`: Gaussians that the scene has room for; 0: a quarter more than it has first."""
+        """Prepare the test for at most `rows` Gaussians; 0 for a quarter more than the scene's
+        first size.
+        """
         self._slots = SnapshotSlots(device, most=2, rows=rows)  # the renderer holds one while the other is written
         self._renderer = AlphaRenderer(camera, device)
 
     def leaves_much_uncovered(self, gaussians: Gaussians, field: DeformationField, observation: Observation) -> bool:
-        """Whether tissue of the observation is worth filling with Gaussians. Waits for the device."""
+        """Return True if uncovered tissue of the observation should be filled with Gaussians.
+        Synchronises with the device.
+        """
         snapshot = self._slots.publish(
             gaussians, field, version=1, camera=observation.camera, time_window_s=field.time_window_s
         )

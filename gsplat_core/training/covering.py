@@ -1,4 +1,4 @@
-"""New Gaussians join a scene where a frame shows tissue that it does not cover."""
+"""Addition of Gaussians where a frame shows tissue that the scene does not cover."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from gsplat_core.training.step import TrainingStep
 
 
 class Covering:
-    """Looks for uncovered tissue in one frame after another.
+    """Search for uncovered tissue in consecutive frames.
 
-    With `beside` the host makes the Gaussians in a thread of its own, which takes longer than a live frame has, and they join with the next look,
-    whether that comes soon or late: the same looks give the same scene.
+    With `beside`, a host thread creates the Gaussians, which takes longer than a live frame. They
+    are added at the next search, independent of its time, so the same sequence of searches gives
+    the same scene.
     """
 
     def __init__(self, config: ReconstructorConfig, *, beside: bool = False) -> None:
@@ -32,16 +33,22 @@ class Covering:
         self._under_way: list[Future[Gaussians | None]] = []
 
     def begin(self, camera: Camera | None, device: torch.device, rows: int) -> None:
-        """Another scene. camera: with it a scene on a GPU is asked by a captured graph first, which holds for `rows` Gaussians; None: it is not."""
+        """Start another scene.
+
+        Args:
+            camera: camera for a captured coverage test on a GPU, or None for no such test.
+            device: device of the scene.
+            rows: largest number of Gaussians.
+        """
         self.forget()
         self._coverage = None if camera is None else CapturedCoverage(camera, device, rows)
 
     def forget(self) -> None:
-        """What is under way belongs to a scene that is left."""
+        """Discard Gaussians that are being created for a scene that is left."""
         self._under_way.clear()
 
     def join(self, step: TrainingStep) -> None:
-        """Let the Gaussians join that were made since the last look; waits for them."""
+        """Add the Gaussians created since the last search; waits for them."""
         under_way, self._under_way = self._under_way, []
         for each in under_way:
             self._append(step, each.result())
@@ -49,7 +56,14 @@ class Covering:
     def look(
         self, step: TrainingStep, observation: Observation, frame: Callable[[], Frame], *, has_depth: bool = False
     ) -> None:
-        """Find what the scene leaves uncovered of what one eye sees; `frame` is that as pictures, and with depth if that is said."""
+        """Search the tissue of one eye's view that the scene does not cover.
+
+        Args:
+            step: training step of the scene.
+            observation: the view.
+            frame: returns the view as a frame; called only if needed.
+            has_depth: True if the frame has depth to place Gaussians at.
+        """
         most = self._config.max_gaussians - step.gaussians.count
         if most <= 0:
             return

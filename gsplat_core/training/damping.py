@@ -1,4 +1,4 @@
-"""Which share of the last motion goes on, learned from what became of earlier ones."""
+"""Share of the last motion that is expected to continue, learned from earlier frames."""
 
 from __future__ import annotations
 
@@ -6,22 +6,26 @@ import torch
 from torch import Tensor
 
 AT_FIRST = 0.6
-"""Before anything was learned: the best constant over the recordings at hand, where single ones prefer 0.4 to 0.8."""
+"""Share before anything was learned. See benchmarks/notes/constants.md."""
 FOLLOWS = 0.15
-"""How fast the share follows the newest frame."""
+"""Weight of the newest frame in the moving average."""
 ONE_FRAME = (-0.5, 1.5)
-"""Bounds of what one frame may say, so that an outlier in the flow cannot decide."""
+"""Bounds of the share observed in one frame, which limit outliers of the optical flow."""
 
 
 class Damping:
-    """An exponentially weighted mean of each frame's least-squares share: realised = share * last. Kept on the device; nothing waits."""
+    """Exponentially weighted mean of the least-squares share in realised = share * last. It stays
+    on the device without synchronisation.
+    """
 
     def __init__(self) -> None:
         self._share: Tensor | None = None
 
     def learn(self, last: Tensor, realised: Tensor) -> None:
-        """Take the velocities [N, 3] of the Gaussians in two successive intervals. A frame without motion says nothing."""
-        # Summed in float64, where the order of the terms does not show in the result.
+        """Update the share with the velocities [N, 3] of the Gaussians in two successive intervals.
+        A frame without motion changes nothing.
+        """
+        # Summed in float64, where the order of summation does not affect the result.
         last, realised = last.double(), realised.double()
         share = self._share if self._share is not None else last.new_full((), AT_FIRST)
         seen = (last * realised).sum() / (last * last).sum()
@@ -29,5 +33,7 @@ class Damping:
         self._share = share + torch.where(seen.isfinite(), step, torch.zeros_like(step))
 
     def damped(self, moved: Tensor) -> Tensor:
-        """The share of a motion [N, 3] that is expected to go on: between nothing and all of it."""
+        """Return the part of a motion [N, 3] that is expected to continue, between none and all of
+        it.
+        """
         return moved * (AT_FIRST if self._share is None else self._share.clamp(0, 1).to(moved.dtype))

@@ -1,7 +1,9 @@
-"""More Gaussians where the pictures are still off, none where nobody sees them: between the steps of offline training.
+"""Densification between offline training steps: removes invisible Gaussians and splits those with
+large errors.
 
-A Gaussian's part in the error is the gradient trick of Rota Bulò et al. 2024 ("Revising Densification in Gaussian Splatting", section
-3.1): the gradient of a colour that every Gaussian has, for a picture weighted by the error, is the error under its blending weights.
+A Gaussian's share of the error is computed by the gradient trick of Rota Bulò et al. 2024
+("Revising Densification in Gaussian Splatting", section 3.1). The gradient of a colour common to
+all Gaussians, for a picture weighted by the error, is the error under their blending weights.
 """
 
 from __future__ import annotations
@@ -20,25 +22,28 @@ from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import Seen
 
 UNSEEN_PX = 0.5
-"""A Gaussian whose blending weights add up to less than this in every picture is not seen."""
+"""Sum of blending weights in every picture, in pixels, below which a Gaussian counts as invisible.
+"""
 SHRINK = 1.6
-"""Both halves of a split Gaussian are smaller than it by this factor (Kerbl et al. 2023, section 5.2)."""
+"""Factor by which the halves of a split Gaussian shrink (Kerbl et al. 2023, section 5.2)."""
 APART = 0.5
-"""How far the halves are moved from their parent's centre, in its own standard deviations along its longest axis."""
+"""Distance of the halves from their parent's centre, in its standard deviations along its longest
+axis.
+"""
 
 
 @dataclass(frozen=True)
 class Shares:
-    """What each Gaussian has to do with some pictures; tensors [N]."""
+    """Visibility and error of each Gaussian in a set of pictures; tensors [N]."""
 
     seen_px: Tensor
-    """Sum of its blending weights over tissue, in the picture where that is largest."""
+    """Largest sum of blending weights over tissue in one picture, in pixels."""
     error: Tensor
-    """Sum of its blending weights times the absolute error (mean of the channels), over all pictures."""
+    """Sum over all pictures of blending weights times absolute error (mean of the channels)."""
 
 
 def shares_of(step: TrainingStep, observations: Sequence[Observation]) -> Shares:
-    """Each Gaussian's part in the pictures of `observations` and in their error, as the scene is now."""
+    """Compute visibility and error of each Gaussian for the current scene."""
     count = step.gaussians.count
     seen, error = (step.gaussians.means.new_zeros(count) for _ in range(2))
     for one in observations:
@@ -47,7 +52,7 @@ def shares_of(step: TrainingStep, observations: Sequence[Observation]) -> Shares
             picture = render(now, one.camera).image
             tissue = (one.mask > 0).to(picture.dtype)
             off = (picture - one.image.to(picture.dtype) / 255).abs().mean(-1) * tissue
-        # All of one grey, so that no colour is clamped: only the blending weights are wanted.
+        # A uniform grey is not clamped, so its gradient contains the blending weights alone.
         grey = torch.zeros_like(now.sh).requires_grad_()
         picture = render(replace(now, sh=grey), one.camera).image
         weighted = (picture * torch.stack([tissue, off, torch.zeros_like(off)], -1)).sum()
@@ -60,7 +65,9 @@ def shares_of(step: TrainingStep, observations: Sequence[Observation]) -> Shares
 
 @torch.no_grad()
 def on_tissue(step: TrainingStep, observations: Sequence[Observation]) -> Tensor:
-    """Which Gaussians have their centre on tissue in at least one of these pictures, bool [N]; all where a camera is no pinhole."""
+    """Return which Gaussians have their centre on tissue in at least one picture, bool [N]; all if
+    a camera is not a pinhole.
+    """
     if any(one.camera.model != "pinhole" for one in observations):
         return torch.ones(step.gaussians.count, dtype=torch.bool, device=step.gaussians.device)
     found = torch.zeros(step.gaussians.count, dtype=torch.bool, device=step.gaussians.device)
@@ -72,7 +79,7 @@ def on_tissue(step: TrainingStep, observations: Sequence[Observation]) -> Tensor
 
 @torch.no_grad()
 def densify(step: TrainingStep, shares: Shares, count: int) -> None:
-    """Drop the Gaussians that nobody sees, and split those with the largest error until there are `count`."""
+    """Remove invisible Gaussians, and split those with the largest error until there are `count`."""
     unseen = shares.seen_px < UNSEEN_PX
     left = step.gaussians.count - int(torch.count_nonzero(unseen))
     wanted = min(count - left, left)
@@ -83,7 +90,7 @@ def densify(step: TrainingStep, shares: Shares, count: int) -> None:
 
 
 def halves(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
-    """Two Gaussians in the place of each: apart along the longest axis, smaller, and together about as opaque."""
+    """Split each Gaussian into two smaller ones along its longest axis."""
     longest = parents.log_scales.argmax(1)
     along = torch.nn.functional.one_hot(longest, 3).to(parents.dtype)
     axis = _turned(parents.quats, along)
@@ -95,7 +102,9 @@ def halves(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
 
 
 def _turned(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Vectors [N, 3] turned by quaternions wxyz [N, 4] of any length: v + 2 w (q x v) + 2 q x (q x v)."""
+    """Rotate vectors [N, 3] by quaternions wxyz [N, 4] of any norm: v + 2 w (q x v) + 2 q x (q x
+    v).
+    """
     unit = torch.nn.functional.normalize(quats, dim=1)
     w, q = unit[:, :1], unit[:, 1:]
     across = torch.linalg.cross(q, vectors)

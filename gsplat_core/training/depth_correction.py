@@ -1,4 +1,4 @@
-"""By how much a frame's depth moves the Gaussians that it shows, along their rays."""
+"""Correction of the depth of visible Gaussians along their rays by a frame's depth."""
 
 from __future__ import annotations
 
@@ -10,18 +10,28 @@ from gsplat_core.scene.layout import LOG_SCALE, POSITION
 from gsplat_core.training.hole_filling import filled
 
 LARGEST_STEP = 1.4
-"""Factor by which one frame changes the depth of one Gaussian at most, once the scene's distance is known."""
+"""Largest change of a Gaussian's depth by one frame, as a factor, once the scene's distance is
+known.
+"""
 SHARE = 0.5
-"""Of the way that a later frame moves a Gaussian: depths of several frames are averaged."""
+"""Share of the correction (of log depth) applied by one frame, which averages the depth of several
+frames.
+"""
 CORRECTED_PX = 16
-"""Side of the squares of a picture whose Gaussians are moved together."""
+"""Side of the picture blocks whose Gaussians move together, in pixels."""
 
 
 def smooth_factor(depth: Tensor, shown: Tensor, known: Tensor, pixels: Tensor) -> Tensor:
-    """By which factor [N] the depth of Gaussians at `pixels` [N, 2] changes. It is the same for neighbours: tissue moves smoothly, and Gaussians that
-    change their order along the line of sight change the picture.
+    """Return a smooth factor [N] for the depth of Gaussians.
 
-    depth, shown: where the tissue is, and where the scene shows it [H, W]. known: bool [H, W], the pixels at which both say something.
+    Neighbours get the same factor, since tissue moves smoothly and a changed order along the line
+    of sight would change the picture.
+
+    Args:
+        depth: target depth [H, W].
+        shown: depth of the scene [H, W].
+        known: bool [H, W], where both are known.
+        pixels: positions of the Gaussians [N, 2].
     """
     ratio = torch.where(known, depth / shown, 1.0).log()
     smooth = filled(ratio[None], known[None].to(ratio.dtype), CORRECTED_PX)
@@ -32,8 +42,17 @@ def smooth_factor(depth: Tensor, shown: Tensor, known: Tensor, pixels: Tensor) -
 
 
 def move_along_rays_(deltas: Tensor, means: Tensor, factor: Tensor, centre: Tensor) -> None:
-    """Change what a field adds to `means` [N, 3], raw rows `deltas`, so that each Gaussian is at `factor` [N] times its distance from a camera's `centre`
-    [3] and as many times as large: that camera sees the same picture."""
+    """Change raw field rows so that Gaussians move along their rays and scale with the distance, in
+    place.
+
+    The camera at `centre` sees the same picture as before.
+
+    Args:
+        deltas: rows that the field adds.
+        means: canonical positions [N, 3].
+        factor: factor of the distance from the camera [N].
+        centre: camera position [3].
+    """
     points = means + deltas[:, POSITION]
     deltas[:, POSITION] += (factor - 1)[:, None] * (points - centre)
     deltas[:, LOG_SCALE] += factor.log()[:, None]

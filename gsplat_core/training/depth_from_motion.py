@@ -1,10 +1,13 @@
-"""Depth of the scene from known camera motion and optical flow, for a moving scope without measured depth.
+"""Depth of the scene from known camera motion and optical flow, for a moving scope without measured
+depth.
 
-Without depth a scene starts on a plane at an arbitrary distance. Seen from a camera whose pose is known that plane moves wrongly, and the
-field would have to learn the error of every frame. Two frames say more: where a point of inverse depth w appears in the second one is linear in
-w (Hartley and Zisserman 2004, section 12.2), so that every Gaussian has a least-squares w.
+Without depth a scene starts on a plane at an arbitrary distance. With known poses that plane moves
+wrongly, and the field would have to learn the error of every frame. The position of a point in a
+second frame is linear in its inverse depth w (Hartley and Zisserman 2004, section 12.2), so every
+Gaussian has a least-squares w.
 
-A correction moves a Gaussian along its ray of the first camera, which sees the same picture as before.
+A correction moves a Gaussian along its ray of the first camera, which sees the same picture as
+before.
 """
 
 from __future__ import annotations
@@ -20,31 +23,39 @@ from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.surface_motion import SurfaceMotion, beside
 
 FLOW_ERROR_PX = 1.0
-"""Standard deviation of the motion that the camera's does not explain: the tissue's own, and errors of flow and pose."""
+"""Standard deviation in pixels of motion that the camera does not explain: tissue motion and errors
+of flow and pose.
+"""
 RELATIVE_ERROR = 0.15
-"""Standard deviation of a Gaussian's inverse depth before a frame, relative to it."""
+"""Prior standard deviation of a Gaussian's inverse depth, relative to it."""
 LARGEST_STEP = 1.4
-"""Factor by which one frame changes the depth of one Gaussian at most, once the scene's distance is known."""
+"""Largest change of a Gaussian's depth by one frame, as a factor, once the scene's distance is
+known.
+"""
 LEAST_PARALLAX_PX = 1.5
-"""Motion by parallax, as a median, from which the scene's distance is taken as a whole."""
+"""Median parallax in pixels from which the scene's distance is estimated."""
 LEAST_EXPLAINED = 0.5
-"""Share of the motion left by the camera's turning that one distance for the whole scene has to explain."""
+"""Share of the motion remaining after camera rotation that a single distance must explain."""
 SMALLEST_SHIFT = 1e-9
-"""Of a camera's centre along an axis, in the scene's units: less is rounding."""
+"""Smallest displacement of a camera along an axis in scene units; less is rounding."""
 ROUNDS = 4
-"""Of reweighting, so that points that move otherwise do not decide the distance."""
+"""Rounds of reweighting, which reduce the influence of independently moving points on the distance.
+"""
 
 
 class DepthFromMotion:
-    """Places one scene at the distance that the camera's motion shows, once, and refines the depth of each Gaussian with every frame."""
+    """Estimates the distance of a scene once from camera motion, and refines the depth of each
+    Gaussian with every frame.
+    """
 
     def __init__(self) -> None:
         self._distance_is_known = False
 
     def apply(self, step: TrainingStep, motion: SurfaceMotion, before_s: float) -> None:
-        """Correct the scene, which fits the frame at `before_s`, by how the picture moved since.
+        """Correct the scene by the image motion since the frame at `before_s`, which it fits.
 
-        Nothing changes where the camera only turned or stood still. On a GPU the host waits until the scene's distance is known.
+        Nothing changes if the camera only rotated or was static. On a GPU the host synchronises
+        until the distance is known.
         """
         if not np.any(translation_between(motion.before, motion.after)):
             return
@@ -76,7 +87,9 @@ class DepthFromMotion:
     def _distance(
         self, pixels: Tensor, target: Tensor, motion: SurfaceMotion, known: Tensor, information: Tensor
     ) -> float | None:
-        """The distance of a plane that explains most of the motion; None where there is too little parallax or none explains it."""
+        """Return the distance of a plane that explains most of the motion, or None with too little
+        parallax or no such plane.
+        """
         c, d = parallax_terms(pixels, target, motion.before, motion.after)
         focal = float(motion.after.K[0, 0])
         weight = (information > 0).to(c.dtype)
@@ -93,9 +106,13 @@ class DepthFromMotion:
 
 
 def parallax_terms(pixels: Tensor, target: Tensor, before: Camera, after: Camera) -> tuple[Tensor, Tensor]:
-    """[N, 2] each: c and d with w c = d for the inverse depth w of a point seen at `pixels` before and at `target` after, both [N, 2].
+    """Return c and d [N, 2] of the equation w c = d for inverse depths w, in units of the focal
+    length.
 
-    In units of the focal length. c is 0 where the camera only turned.
+    Args:
+        pixels: positions before [N, 2].
+        target: positions after [N, 2].
+        before, after: cameras of both frames. c is 0 if only the rotation differs.
     """
     between = after.world_to_camera @ np.linalg.inv(before.world_to_camera)
     rotation = beside(pixels, between[:3, :3])
@@ -107,14 +124,18 @@ def parallax_terms(pixels: Tensor, target: Tensor, before: Camera, after: Camera
 
 
 def inverse_depths(pixels: Tensor, target: Tensor, before: Camera, after: Camera) -> tuple[Tensor, Tensor]:
-    """Least-squares inverse depth [N] in the first camera, and its information [N]: the inverse of its variance for an error of one pixel."""
+    """Return least-squares inverse depths [N] in the first camera, and their information [N]
+    (inverse variance for an error of one pixel).
+    """
     c, d = parallax_terms(pixels, target, before, after)
     squared = (c * c).sum(dim=1)
     return (c * d).sum(dim=1) / squared.clamp(min=1e-20), squared * float(after.K[0, 0]) ** 2
 
 
 def translation_between(before: Camera, after: Camera) -> NDArray[np.float64]:
-    """Where the second camera sees the first one's centre [3]; exactly 0 where it only turned or stood still."""
+    """Return the first camera's centre in coordinates of the second [3]; exactly 0 without
+    translation.
+    """
     moved = before.position - after.position
     return np.asarray(after.world_to_camera[:3, :3] @ np.where(np.abs(moved) < SMALLEST_SHIFT, 0.0, moved))
 

@@ -1,7 +1,8 @@
-"""The picture that is expected next: the newest one moved on, with colours that return to their mean, and blurred as far as nobody can know.
+"""Prediction of the next picture from the newest, mean and blurred pictures and several motions.
 
-Highlights flicker, noise does not stay, and motion is not known exactly: the best guess of a colour lies between those of the newest, of earlier and
-of blurred pictures, and of what several motions would bring. How far, is learned place by place from what came of earlier guesses (`LocalShares`).
+Highlights flicker, noise is random and motion is uncertain. The best prediction of a colour is
+therefore a mixture of the moved newest picture, the mean of earlier ones, a blurred picture and
+other plausible motions. The mixture is learned locally from earlier predictions (`LocalShares`).
 """
 
 from __future__ import annotations
@@ -18,25 +19,27 @@ from gsplat_core.training.local_shares import Field, LocalShares, SharesSettings
 from gsplat_core.training.similar_moments import Weighted, weighted_mean
 
 FOLLOWS = 0.2
-"""How fast the mean of earlier pictures follows the newest one."""
+"""Weight of the newest picture in the moving mean."""
 BLUR_PX = 1.5
-"""Standard deviation of the blurred guess, in pixels."""
+"""Standard deviation of the blurred picture in pixels."""
 SHARES = SharesSettings(at_first=(0.0, 0.0, 0.0, 0.0), decay=0.95, around_cells=3.0, pull=200.0, ridge=30.0)
-"""Of the newest picture where it is, the mean, the blurred picture, and the mean of what other motions would bring. In squares of grey levels, 0..255."""
+"""Settings for the shares of the unmoved newest picture, the mean, the blurred picture, and the
+mean over other motions. Units are squared grey levels, 0 to 255.
+"""
 INVERSE_STEPS = 2
-"""Iterations to find where a cell came from, in a flow that says where cells go."""
+"""Fixed-point iterations for inverting a flow."""
 
 
 @dataclass(frozen=True)
 class _Guesses:
     moved: Field
-    """The newest picture moved on."""
+    """Newest picture moved by the expected motion, [h, w, 3]."""
     others: list[Field]
-    """Differences from it, [h, w, 3] each."""
+    """Differences of the other predictions from it, [h, w, 3] each."""
 
 
 class ExpectedPicture:
-    """The guesses at the next picture and the share of each."""
+    """Mixture of predictions of the next picture with learned shares."""
 
     def __init__(self) -> None:
         self._shares = LocalShares(SHARES)
@@ -45,12 +48,18 @@ class ExpectedPicture:
     def _restart(self) -> None:
         self._newest: Field | None = None
         self._mean: Field | None = None
-        """Of earlier pictures, moved to where the newest one shows the tissue."""
+        """Mean of earlier pictures, warped to the newest one."""
         self._guesses: _Guesses | None = None
 
     def take(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None, motion: Flow | None) -> None:
-        """The newest picture [H, W, 3], where it shows tissue, and how the one before moved to it. None: nobody knows, so that it has nothing to
-        do with those before; what was learned about shares stays."""
+        """Add the newest picture.
+
+        Args:
+            image: uint8 [H, W, 3].
+            mask: [H, W], non-zero on tissue, or None for all.
+            motion: flow from the previous picture, or None if unknown. The history then restarts,
+                but learned shares are kept.
+        """
         picture = image.astype(np.float32)
         if motion is None or self._newest is None or self._newest.shape != picture.shape:
             self._restart()
@@ -66,8 +75,15 @@ class ExpectedPicture:
         self._newest = picture
 
     def after(self, motion: Flow, others: Sequence[Weighted] = ()) -> Field | None:
-        """The expected picture [H, W, 3], in grey levels, after the newest one has moved so, where it may have moved by one of the `others`
-        too. None before there is a picture."""
+        """Predict the picture after a motion.
+
+        Args:
+            motion: most likely flow after the newest picture.
+            others: weighted alternative flows.
+
+        Returns:
+            float32 [H, W, 3] in grey levels, or None before the first picture.
+        """
         if self._newest is None or self._mean is None:
             return None
         newest, mean = moved(self._newest, motion), moved(self._mean, motion)
@@ -83,7 +99,9 @@ class ExpectedPicture:
 
 
 def origin(motion: Flow) -> Flow:
-    """For each cell by how many pixels its content was moved, where `motion` says for each cell by how many it will be."""
+    """Invert a flow: return for each cell the displacement in pixels that brought its content
+    there.
+    """
     came = motion
     for _ in range(INVERSE_STEPS):
         came = _looked_up(motion, np.asarray(came / CELL_PX, np.float32))
@@ -91,7 +109,7 @@ def origin(motion: Flow) -> Flow:
 
 
 def moved(picture: Field, motion: Flow) -> Field:
-    """A picture [h, w, channels] of any size after a motion."""
+    """Warp a picture [h, w, channels] of any size by a flow."""
     height, width = picture.shape[:2]
     came_from = cv2.resize(origin(motion), (width, height), interpolation=cv2.INTER_LINEAR)
     scale = width / (motion.shape[1] * CELL_PX)
@@ -99,7 +117,7 @@ def moved(picture: Field, motion: Flow) -> Field:
 
 
 def _looked_up(field: Field, back: Field) -> Field:
-    """The field at `back` [h, w, 2] to the left and above."""
+    """Sample a field at positions displaced by -`back` [h, w, 2]."""
     height, width = field.shape[:2]
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     looked_up = cv2.remap(

@@ -1,7 +1,8 @@
-"""How the colours of a stereo scope's two eyes differ: a straight line for each channel, taken out of the right picture.
+"""Colour matching of a stereo scope's eyes: a gain and an offset per channel, applied to the right
+picture.
 
-Two sensors, two light paths: one eye is brighter or redder than the other, by a little that changes slowly. Trained on as they come, the two pictures
-would pull every colour to and fro.
+Sensors and light paths differ slightly between the eyes, and the difference changes slowly. Without
+correction the two pictures would pull every colour back and forth.
 """
 
 from __future__ import annotations
@@ -13,37 +14,43 @@ from numpy.typing import NDArray
 from gsplat_core.scene.frames import Frame
 
 LOOKED_AT_PX = 80
-"""Width of the pictures that are compared."""
+"""Width of the compared pictures in pixels."""
 LOOK_EVERY = 10
-"""Frames from one comparison to the next."""
+"""Number of frames between comparisons."""
 FOLLOWS = 0.2
-"""How fast the line follows a new comparison."""
+"""Weight of a new comparison in the moving average."""
 SHIFT_STAYS = 4
-"""So far from the shift of the last comparison the next one is looked for first."""
+"""Search range around the last shift, in pixels of the compared pictures."""
 LEAST_OVERLAP = 0.4
-"""Of the picture's width, which both eyes see at least."""
+"""Smallest overlap of the two views, as a share of the width."""
 QUANTILES = (10, 50, 90)
-"""Per cent; highlights and shadows, which the eyes see at different places, lie beyond."""
+"""Compared quantiles in per cent; highlights and shadows, which differ between the eyes, are
+outside.
+"""
 FLAT_LEVELS = 8.0
-"""A channel whose outer quantiles are less far apart says nothing about a factor."""
+"""Distance of the outer quantiles in levels below which a channel gives no gain."""
 MOST_GAIN = 2.0
 NOISE_LEVELS = 1.5
-"""A line that changes no level between the outer quantiles by more is left out: that is as exactly as it is known."""
+"""Largest change of a quantile in levels that counts as estimation noise; such a correction is not
+applied.
+"""
 
 
 class EyeColours:
-    """Of one stream, frame after frame."""
+    """Colour matching of one stream."""
 
     def __init__(self) -> None:
         self._gain, self._offset = np.ones(3), np.zeros(3)
         self._line: NDArray[np.float32] | None = None
-        """Factors and offsets of the channels as a matrix [3, 4]; None: nothing is changed."""
+        """Gains and offsets as a matrix [3, 4], or None for no correction."""
         self._frames = 0
         self.shift: float | None = None
-        """By how much of its width the right picture shows the scene farther to the left, at the newest look; None before it."""
+        """Shift of the right picture to the left, as a share of its width, at the last comparison;
+        None before it.
+        """
 
     def corrected(self, frame: Frame) -> NDArray[np.uint8]:
-        """The right picture of a frame that has one, in the colours of the left one."""
+        """Return the right picture of a stereo frame in the colours of the left one."""
         assert frame.right_image is not None
         if self._frames % LOOK_EVERY == 0:
             self._look(frame.image, frame.right_image, frame.mask)
@@ -75,7 +82,9 @@ class EyeColours:
 
 
 def typical_shift(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> float:
-    """By how much of its width the right picture as a whole shows the scene farther to the left, to a few pixels."""
+    """Return the overall shift of the right picture to the left, as a share of its width, accurate
+    to a few pixels.
+    """
     first, second = _small(left), _small(right)
     return best_shift(first.mean(-1), second.mean(-1)) / first.shape[1]
 
@@ -87,8 +96,12 @@ def _small(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def best_shift(left: NDArray[np.float32], right: NDArray[np.float32], before: int | None = None) -> int:
-    """By how many pixels the right picture [h, w] shows the same farther to the left: where the two correlate best. before: what it was lately; it is
-    looked for around it then, and everywhere where the best is at the end of that."""
+    """Return the shift of the right picture [h, w] to the left in pixels that maximises the
+    correlation.
+
+    With `before`, a recent shift, only its neighbourhood is searched unless the maximum is at its
+    end.
+    """
     most = int((1 - LEAST_OVERLAP) * left.shape[1])
     matches = _correlations(left, right, most)
     if before is not None:
@@ -100,11 +113,13 @@ def best_shift(left: NDArray[np.float32], right: NDArray[np.float32], before: in
 
 
 def _correlations(left: NDArray[np.float32], right: NDArray[np.float32], most: int) -> NDArray[np.float64]:
-    """How well the pictures [h, w] correlate where they overlap, for each shift of the right one from -`most` to `most` [2 most + 1]."""
+    """Return the correlation of the overlap for each shift of the right picture from -`most` to
+    `most`, [2 most + 1].
+    """
     a, b = left.astype(np.float64), right.astype(np.float64)
     height, width = a.shape
     shifts = np.arange(-most, most + 1)
-    # The products of all columns of one with all of the other; those that lie upon each other are on one diagonal.
+    # Products of all column pairs; overlapping columns of one shift are on one diagonal.
     products = a.T @ b
     together = np.array([np.trace(products, offset=-shift) for shift in shifts])
     begins = np.maximum(shifts, 0), np.maximum(-shifts, 0)
@@ -118,13 +133,15 @@ def _correlations(left: NDArray[np.float32], right: NDArray[np.float32], most: i
 
 
 def _sums(picture: NDArray[np.float64], begins: NDArray, widths: NDArray) -> NDArray[np.float64]:
-    """Sums over `widths` columns of a picture from `begins` on."""
+    """Return sums over `widths` columns of a picture, starting at `begins`."""
     upto = np.concatenate([[0.0], picture.sum(0).cumsum()])
     return np.asarray(upto[begins + widths] - upto[begins])
 
 
 def overlap(left: NDArray, right: NDArray, shift: int) -> tuple[NDArray, NDArray]:
-    """What both pictures show, where the right one shows it `shift` pixels farther to the left."""
+    """Return the parts of both pictures that overlap if the right one is shifted `shift` pixels to
+    the left.
+    """
     width = left.shape[1]
     if shift >= 0:
         return left[:, shift:], right[:, : width - shift]
@@ -132,10 +149,11 @@ def overlap(left: NDArray, right: NDArray, shift: int) -> tuple[NDArray, NDArray
 
 
 def line_between(left: NDArray[np.float32], right: NDArray[np.float32]) -> tuple[NDArray, NDArray, NDArray]:
-    """Factor and offset [3] that bring the quantiles of the right colours [N, 3] to those of the left ones, and those quantiles [3, 3].
+    """Return gain and offset [3] that map the quantiles of the right colours [N, 3] to those of the
+    left ones, and the right quantiles [3, 3].
 
-    Quantiles need no pixel that matches another one exactly, and the ratio of their distances is not made smaller by noise, as a slope fitted by
-    least squares would be.
+    Quantiles need no pixel correspondence. Unlike a least-squares slope, their ratio is not biased
+    by noise.
     """
     ours, theirs = (np.percentile(colours, QUANTILES, axis=0) for colours in (left, right))
     spread_left, spread_right = ours[2] - ours[0], theirs[2] - theirs[0]

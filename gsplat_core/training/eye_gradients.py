@@ -1,7 +1,8 @@
-"""Whose colours a step trains where the two eyes of a stereo scope see different ones.
+"""Assignment of colour gradients to the eyes of a stereo scope.
 
-Geometry is that of both. Each eye's colours are trained by its own pictures alone: what the eyes see differently, highlights above all, would
-otherwise pull every colour to and fro. Where colours change over time, that is learned from the left eye, and holds for both.
+Both eyes train the geometry. Each eye's colours are trained by its own pictures only, because
+view-dependent differences such as highlights would otherwise pull every colour back and forth.
+Temporal colour changes are learned from the left eye and apply to both.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ import torch
 from torch import Tensor
 
 LEFT, RIGHT = "sh", "right_sh"
-"""Names of the tensors of `Gaussians`; the right eye sees their sum."""
+"""Tensor names in `Gaussians`. The right eye sees the sum of both."""
 
 
 def with_eye(gradients: Mapping[str, Tensor], of_right: bool) -> dict[str, Tensor]:
-    """The gradients of a picture with those of both eyes' colours, 0 for the eye that did not see it."""
+    """Return the gradients of a picture extended to the colours of both eyes, with 0 for the other
+    eye.
+    """
     nothing = torch.zeros_like(gradients[LEFT])
     colours = (nothing, gradients[LEFT]) if of_right else (gradients[LEFT], nothing)
     return {**gradients, **dict(zip((LEFT, RIGHT), colours, strict=True))}

@@ -1,4 +1,4 @@
-"""Training a deformation field of any kind through autograd."""
+"""Training of any deformation field through autograd."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from gsplat_core.training.optimiser import FusedAdam
 
 
 class AutogradTraining:
-    """Takes the gradient at the deformed Gaussians back through `field.forward`, to the field's parameters and the canonical Gaussians.
+    """Backpropagates gradients at the deformed Gaussians through `field.forward` to the field's
+    parameters and the canonical Gaussians.
 
-    Works for every field, on every device. Parameters may be replaced by larger ones when Gaussians join: moments of rows that were there
-    are kept.
+    Works for every field on every device. Parameters may be replaced by larger ones when Gaussians
+    are added; moments of existing rows are kept.
     """
 
     def __init__(self, field: DeformationField, rates: FieldRates) -> None:
@@ -28,7 +29,7 @@ class AutogradTraining:
         self._deformed: Gaussians | None = None
 
     def deform(self, gaussians: Gaussians, time_s: float) -> Gaussians:
-        """The Gaussians at `time_s`; the graph from the canonical ones to them is kept for `update`."""
+        """Return the Gaussians at `time_s`, keeping the autograd graph for `update`."""
         self._canonical = gaussians.detach().requires_grad_()
         with torch.enable_grad():
             self._deformed = self._field(self._canonical, time_s)
@@ -36,7 +37,9 @@ class AutogradTraining:
         return self._deformed.detach()
 
     def update(self, gradients: Mapping[str, Tensor], rates: Mapping[str, float]) -> Mapping[str, Tensor | None]:
-        """One step of Adam over the field's parameters; returns the gradients of the canonical Gaussians."""
+        """Do one Adam step for the field's parameters and return the gradients of the canonical
+        Gaussians.
+        """
         assert self._canonical is not None and self._deformed is not None
         pairs = [(tensor, gradients[name]) for name, tensor in self._deformed.tensors().items() if tensor.requires_grad]
         torch.autograd.backward([tensor for tensor, _ in pairs], [gradient for _, gradient in pairs])

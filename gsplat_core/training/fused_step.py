@@ -1,4 +1,6 @@
-"""The training step on an NVIDIA GPU: deform, render, compare, go back and update in one CUDA graph, without a wait of the host."""
+"""Training step on an NVIDIA GPU as one CUDA graph without host synchronisation: deformation,
+rendering, loss, backward pass and Adam.
+"""
 
 from __future__ import annotations
 
@@ -26,13 +28,14 @@ from gsplat_core.training.step_inputs import StepInputs
 
 
 class FusedStep:
-    """Training steps for one set of tensors and one camera size, captured once and replayed.
+    """Training step for one set of tensors and one camera size, captured once and replayed.
 
-    Parameters, moments and the field's state change in place. Where any of them was replaced by another tensor (Gaussians added, the
-    field's window moved), the next step captures a new graph.
+    Parameters, moments and the field's state are updated in place. If any tensor is replaced
+    (Gaussians added, the field's window moved), the next step captures a new graph.
 
-    A frame whose splats do not fit its lists changes nothing: the device sees it and leaves every parameter and moment alone. `settle`
-    notices, raises the capacity and returns how many steps had no effect, which the caller then takes again.
+    A frame that overflows the tile lists changes no parameter or moment; the device checks this.
+    `settle` detects it, raises the capacity and returns the number of ineffective steps, which the
+    caller repeats.
     """
 
     def __init__(
@@ -42,26 +45,31 @@ class FusedStep:
         self._gaussians, self._field, self._adam = gaussians, field, adam
         self._in_use: tuple[object, object, object] = None, None, None
         self._addresses: tuple[int, ...] = ()
-        """Of all tensors when the graph was captured."""
+        """Addresses of all tensors at the time of the capture."""
         self._weights = weights
         self._camera = camera
         self._inputs = {False: StepInputs(camera, device, with_depth=weights.depth > 0)}
-        """What graphs read, by whether they are the right eye's own: eyes that take turns are each copied once."""
+        """Graph inputs by whether they belong to the right eye, so alternating eyes are each copied
+        once.
+        """
         self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + 1 + field.rates + 1)
-        """Among them the learning rates: of the Gaussians in the frame's backward pass, of the positions after it, of the field; and how
-        much of the residual colours take."""
+        """Controls that include the learning rates of the Gaussians in the backward pass, of
+        positions after it, and of the field, followed by the colour relaxation.
+        """
         self._corrects = False
         self._step = torch.full((1,), adam.steps, dtype=torch.int64, device=device)
         self._skipped = torch.zeros(len(GAUSSIAN_TENSORS), dtype=torch.int64, device=device)
         self._totals = torch.zeros(4, dtype=torch.int32, device=device)
-        """The frames' status since the last `settle`, as `accumulate_status_` folds it."""
+        """Accumulated frame status since the last `settle` (see `accumulate_status_`)."""
         self._unread: tuple[Tensor, Tensor] | None = None
         self._status = FrameStatusCopy()
         self._memory = GraphMemory(device)
         self._capacity = capacity_for(4 * gaussians.count)
         self._captured: dict[tuple[bool, bool], CapturedSequence[Tensor]] = {}
-        """By whether colours are corrected, and whether they are the right eye's own. One never runs beside another, and none reads what another left
-        in the memory that they share."""
+        """Graphs by whether colours are corrected and whether they are the right eye's. They share
+        memory, which is safe because they never run concurrently and read nothing from each other's
+        buffers.
+        """
         self._warm: set[tuple[bool, bool]] = set()
         self._of_right = False
 
@@ -74,16 +82,20 @@ class FusedStep:
         field_rates: Sequence[float],
         colour_relaxation: float = 0.0,
     ) -> Tensor:
-        """Queue one step on the current stream; returns the loss before the update, [] on the device.
+        """Queue one step on the current stream.
 
         Args:
-            gaussians: what is trained, in place.
-            observation: of the camera's size; on the device, else it is copied there.
-            time: the field's own, of `DeformationField.frame_time`.
-            gaussian_rates: Adam's learning rates of the Gaussians' tensors, by name.
-            field_rates: those of the field, as many as it takes.
-            colour_relaxation: above 0 colours are corrected (`colour_correction`), which a field that takes no colours does not allow, and depth
-                is not compared: the channel of its gradient is taken by what the correction needs.
+            gaussians: parameters, updated in place.
+            observation: picture of the camera's size; copied to the device if needed.
+            time: the field's own time, from `DeformationField.frame_time`.
+            gaussian_rates: Adam's learning rates of the Gaussians' tensors by name.
+            field_rates: learning rates of the field.
+            colour_relaxation: above 0, colours are corrected (`colour_correction`) and depth is not
+                compared, because the correction uses the channel of its gradient. Not possible for
+                a field without colours.
+
+        Returns:
+            Loss before the update, [] on the device.
         """
         self._corrects = corrects = colour_relaxation > 0
         self._of_right = observation.of_right and gaussians.right_sh is not None
@@ -96,23 +108,25 @@ class FusedStep:
         self._gaussians = gaussians
         self._adam.steps += 1
         kind = corrects, self._of_right
-        if kind not in self._warm:  # kernels are loaded by their first launch, which is not possible during a capture
+        if kind not in self._warm:  # the first launch loads kernels, which is impossible during a capture
             self._warm.add(kind)
             return self._sequence()
         if self._was_replaced():
-            self._captured.clear()  # their memory serves the next captures
+            self._captured.clear()  # their memory is reused by the next captures
         if kind not in self._captured:
             self._captured[kind] = CapturedSequence(self._sequence, self._step.device, self._memory, warm_up=False)
         return self._captured[kind].replay().clone()
 
     def restart(self) -> None:
-        """The tensors hold another scene and Adam counts its steps from 1 again; nothing is captured anew."""
+        """Restart Adam's step count after the tensors were overwritten with another scene. Graphs
+        stay valid.
+        """
         self._step.fill_(self._adam.steps)
 
     def settle(self) -> int:
-        """Wait for the steps since the last call; returns how many of them changed nothing because their splats did not fit.
+        """Wait for all queued steps and return how many had no effect because of an overflow.
 
-        The tile lists have more capacity now: take those steps again.
+        The tile lists have more capacity afterwards; the caller repeats those steps.
         """
         self._status.queue(self._totals)
         self._status.launched(self._totals.device)
@@ -125,10 +139,10 @@ class FusedStep:
         return needs.overflowed
 
     def _was_replaced(self) -> bool:
-        """Whether any tensor lies at another address, or has another size, than when the graph was captured."""
+        """Return True if any tensor has another address or size than at the capture."""
         in_use = self._gaussians, self._adam.first_moments["means"], self._field.tensors()
         if all(now is before for now, before in zip(in_use, self._in_use, strict=True)):
-            return False  # the same objects: they need not be asked for their addresses
+            return False  # the same objects need no comparison of addresses
         self._in_use = in_use
         moments = (*self._adam.first_moments.values(), *self._adam.second_moments.values())
         before = self._addresses
@@ -180,12 +194,15 @@ class FusedStep:
 
     @property
     def _names(self) -> tuple[str, ...]:
-        """Of the tensors that a step trains, as the ops take them: with the colours of its eye."""
+        """Names of the trained tensors in the order of the ops, with the colours of the current
+        eye.
+        """
         return (*GAUSSIAN_TENSORS[:-1], RIGHT if self._of_right else LEFT)
 
     def _moments(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Adam's moments of the Gaussians in the frame's pass. Where the field has a part in the positions' gradient, they do not move
-        there: their rate is 0, and the moments are others that nobody reads."""
+        """Return Adam's moments for the backward pass. If the field contributes to the positions'
+        gradient, positions are not updated there: their rate is 0 and scratch moments are passed.
+        """
         first = [self._adam.first_moments[name] for name in self._names]
         second = [self._adam.second_moments[name] for name in self._names]
         if self._field.reads_positions:
@@ -195,8 +212,8 @@ class FusedStep:
         return first, second
 
     def _move(self, means: Tensor, gradient: Tensor, rate: Tensor, fits: Tensor) -> None:
-        """Adam over the positions, whose gradient the field has completed."""
-        # NaN where the frame did not fit its tile lists: Adam leaves such rows and their moments alone.
+        """Apply Adam to the positions with the complete gradient."""
+        # NaN if the frame overflowed its tile lists: Adam skips such rows and their moments.
         complete = gradient[:, :3] / fits
         first, second = self._adam.first_moments["means"], self._adam.second_moments["means"]
         adam_step_at_(

@@ -1,4 +1,4 @@
-"""New Gaussians where a frame shows tissue that the model does not cover yet."""
+"""Creation of Gaussians where a frame shows tissue that the model does not cover."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from gsplat_core.transfers import HostCopy
 
 
 def grid_spacing(pixels: int, gaussians: int) -> float:
-    """Pixels between neighbours where so many Gaussians are spread evenly over a picture of so many pixels."""
+    """Return the grid spacing in pixels for an even spread of Gaussians over a picture."""
     return math.sqrt(pixels / gaussians)
 
 
 def grid_of(height_px: int, width_px: int, spacing: float) -> tuple[NDArray[np.float64], tuple[int, int]]:
-    """Pixel coordinates [rows * columns, 2] of a grid over the picture, and (rows, columns)."""
+    """Return pixel coordinates [rows * columns, 2] of a grid over the picture, and (rows, columns)."""
     columns = np.arange(spacing / 2, width_px, spacing)
     rows = np.arange(spacing / 2, height_px, spacing)
     return np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2), (len(rows), len(columns))
@@ -34,18 +34,31 @@ def grid_of(height_px: int, width_px: int, spacing: float) -> tuple[NDArray[np.f
 
 @dataclass(frozen=True)
 class Uncovered:
-    """Tissue of one frame that a scene does not cover, on its way to the host."""
+    """Uncovered tissue of one frame, being copied to the host."""
 
     pixels: HostCopy
-    """bool [H, W]."""
+    """Uncovered pixels, bool [H, W]."""
     depth: HostCopy | None
-    """What the scene shows around it, float32 [H, W]; 0 where it shows nothing. None: the frame has depth of its own."""
+    """Depth of the scene, float32 [H, W], 0 where uncovered; None if the frame's own depth is used.
+    """
 
     def gaussians(
         self, frame: Frame, observation: Observation, config: ReconstructorConfig, most: int
     ) -> Gaussians | None:
-        """Gaussians for it, at most `most`, as dense as the first frame's. Their depth is measured where the frame has depth, else that of the
-        nearest covered pixel. They are on the observation's device. Waits for the copies; None where no place is left for one."""
+        """Create Gaussians for the uncovered tissue on the observation's device, with the density
+        of the first frame.
+
+        Their depth is the frame's own or that of the nearest covered pixel. Waits for the copies.
+
+        Args:
+            frame: frame that provides colours and depth.
+            observation: the same view as tensors.
+            config: settings.
+            most: largest number of Gaussians.
+
+        Returns:
+            The Gaussians, or None if there are none to create.
+        """
         height, width = frame.image.shape[:2]
         grid, _ = grid_of(height, width, grid_spacing(height * width, config.gaussians))
         is_uncovered = self.pixels.numpy()
@@ -58,10 +71,17 @@ class Uncovered:
 
 
 def uncovered_tissue(observation: Observation, current: Gaussians, *, has_depth: bool = False) -> Uncovered | None:
-    """The tissue of a frame that `current`, the scene at its time, leaves uncovered; None where that is not worth filling. has_depth: the frame has it,
-    and not the scene's is taken.
+    """Find tissue of an observation that the scene does not cover.
 
-    It is looked for on the observation's device, and costs the host one number where there is little.
+    The search runs on the observation's device and transfers a single number if there is little.
+
+    Args:
+        observation: the view.
+        current: the scene at the observation's time.
+        has_depth: True if the frame has depth, so that the scene's depth is not needed.
+
+    Returns:
+        The uncovered tissue, or None if it is not worth filling.
     """
     with torch.no_grad():
         output = render(current, observation.camera, depth=not has_depth)
@@ -80,8 +100,11 @@ def gaussians_beside(
     config: ReconstructorConfig,
     most: int,
 ) -> Gaussians | None:
-    """One Gaussian at each of the pixels `wanted` [M, 2], or at `most` of them, coloured by the frame and at the nearest depth that is known
-    in `depth_mm` [H, W] (0: unknown)."""
+    """Create one Gaussian at each of the pixels `wanted` [M, 2], or at a subset of at most `most`.
+
+    Colours come from the frame, depths from the nearest known depth in `depth_mm` [H, W] (0 =
+    unknown).
+    """
     if len(wanted) == 0 or most <= 0:
         return None
     height, width = frame.image.shape[:2]

@@ -1,4 +1,4 @@
-"""Holes of a picture on any device, filled smoothly from what is known around them."""
+"""Smooth filling of holes in a picture, on any device."""
 
 from __future__ import annotations
 
@@ -6,13 +6,20 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
 COARSE = 4
-"""What lies under a tool is filled in at this part of the size, as it is on the host."""
+"""Reduction factor at which tissue under tools is filled, equal to that of the host's in-painting.
+"""
 
 
 def filled(picture: Tensor, known: Tensor, coarse: int = COARSE) -> Tensor:
-    """`picture` [C, H, W] with the pixels whose `known` [1, H, W] is 0 taken from the known ones around them, smoothly, and all of it coarser by a factor.
+    """Fill the holes of a picture and smooth all of it at a reduced resolution.
 
-    A pyramid of means over what is known ("push and pull": Gortler et al., "The Lumigraph", 1996): each level fills the holes of the finer one.
+    A pyramid of means over known pixels is used ("push and pull": Gortler et al., "The Lumigraph",
+    1996); each level fills the holes of the finer one.
+
+    Args:
+        picture: [C, H, W].
+        known: [1, H, W], 0 in holes.
+        coarse: factor of the reduction.
     """
     height, width = known.shape[1:]
     levels = [_shrunk((picture * known)[None], known[None], coarse)]
@@ -28,7 +35,7 @@ def filled(picture: Tensor, known: Tensor, coarse: int = COARSE) -> Tensor:
 
 
 def _shrunk(total: Tensor, weight: Tensor, factor: int) -> tuple[Tensor, Tensor]:
-    """Sums over what is known, and how much that is, as means over cells of `factor` squared."""
+    """Return values and weights averaged over cells of `factor` squared pixels."""
     height, width = weight.shape[2:]
     beyond = (0, -width % factor, 0, -height % factor)
     return avg_pool2d(pad(total, beyond), factor), avg_pool2d(pad(weight, beyond), factor)

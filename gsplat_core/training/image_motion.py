@@ -1,4 +1,6 @@
-"""How a picture moved since the one before: dense optical flow of the tissue, smooth where there is none."""
+"""Dense optical flow of the tissue between consecutive pictures, extrapolated smoothly where no
+tissue is visible.
+"""
 
 from __future__ import annotations
 
@@ -9,29 +11,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 Flow: TypeAlias = NDArray[np.float32]
-"""[h, w, 2]: how many pixels of the full picture its content moves to the right and down, for cells of `CELL_PX` squared."""
+"""Displacement of the content to the right and down in pixels of the full picture, float32 [h, w,
+2], for cells of `CELL_PX` squared.
+"""
 
 CELL_PX = 4
-"""Side of a flow cell."""
+"""Side of a flow cell in pixels."""
 SMALLEST_PX = 48
-"""A picture with a shorter side has no flow: the method works on patches of 8 pixels, in a pyramid."""
+"""Shortest side of a picture for which flow is computed; the method needs patches of 8 pixels in a
+pyramid.
+"""
 WIDE_CELLS = 6.0
-"""Where no tissue is seen, as below a tool, motion is taken from this far around (standard deviation, in cells)."""
+"""Standard deviation of the neighbourhood used where no tissue is visible, in cells."""
 WIDE_WEIGHT = 0.02
-"""Weight of that beside the tissue's own motion."""
+"""Weight of the neighbourhood relative to a cell's own flow."""
 
 
 Detail: TypeAlias = Literal["full", "half"]
-"""`full`: pictures as they are, a thorough search (some 12 to 40 ms for 640x512). `half`: a quick search (1 to 3 ms), of pictures of more than
-`SMALL_PIXELS` at half their size."""
+"""Resolution of the flow. `full` is a thorough search at full size. `half` is a quick search that
+halves pictures of more than `SMALL_PIXELS`.
+"""
 SMALL_PIXELS = 150_000
-"""Halved, so small a picture would lose the details that the search follows, and it is quick without that."""
+"""Number of pixels up to which pictures are not halved, since that would lose detail and save
+little time.
+"""
 
 
 class ImageMotion:
-    """Flow from each picture to the next one, by DIS (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", 2016).
+    """Flow between consecutive pictures by DIS (Kroeger et al., "Fast Optical Flow using Dense
+    Inverse Search", 2016).
 
-    Keeps the last picture only. OpenCV's result does not depend on the number of its threads.
+    Only the last picture is kept. The result does not depend on the number of threads.
     """
 
     def __init__(self, detail: Detail = "full") -> None:
@@ -42,9 +52,15 @@ class ImageMotion:
         self._mask_before: NDArray[np.uint8] | None = None
 
     def follow(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> Flow | None:
-        """Take the next picture [H, W, 3]; returns how the one before moves to it. None for the first one and after a change of size.
+        """Add the next picture and return the flow from the previous one to it.
 
-        `mask` [H, W] is 1 where tissue can be followed; None: everywhere. What is not tissue in both pictures moves as the tissue around it.
+        Args:
+            image: RGB uint8 [H, W, 3].
+            mask: [H, W], non-zero on tissue, or None for all. Other pixels get the flow of the
+                surrounding tissue.
+
+        Returns:
+            The flow, or None for the first picture and after a change of size.
         """
         shape, mask_before = image.shape[:2], self._mask_before
         flow = self._pixel_flow(image)
@@ -58,7 +74,9 @@ class ImageMotion:
         return smoothed(flow, tissue)
 
     def _pixel_flow(self, image: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-        """As `follow`, without the tissue: [h, w, 2] in pixels of the full picture, h and w its own size or half of it where that is searched."""
+        """Return the raw flow [h, w, 2] in pixels of the full picture; h and w are halved if the
+        search was.
+        """
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
         height, width = grey.shape
         if self._shrinks and height * width > SMALL_PIXELS:
@@ -70,12 +88,14 @@ class ImageMotion:
         return flow if grey.shape[1] == width else flow * (width / grey.shape[1])
 
     def forget(self) -> None:
-        """The next picture is the first one."""
+        """Restart with the next picture."""
         self._before = self._mask_before = None
 
 
 def smoothed(flow: NDArray[np.float32], tissue: NDArray[np.uint8]) -> Flow:
-    """Flow [h, w, 2] as means over the tissue [H, W] in each cell, and where there is little of it over a wide neighbourhood."""
+    """Average flow [h, w, 2] over the tissue [H, W] of each cell, and over a wide neighbourhood
+    where there is little tissue.
+    """
     height, width = tissue.shape
     followed = tissue
     if flow.shape[:2] != tissue.shape:
@@ -90,11 +110,13 @@ def smoothed(flow: NDArray[np.float32], tissue: NDArray[np.uint8]) -> Flow:
 
 
 def typical_px(flow: Flow) -> float:
-    """The median length of the motion, in pixels."""
+    """Return the median length of the flow in pixels."""
     return float(np.median(np.linalg.norm(flow, axis=2)))
 
 
 def revealed_px(flow: Flow) -> float:
-    """How far the picture's content moved inwards, away from the edge where it did so most: a strip of that width shows something new."""
+    """Return the width in pixels of the largest strip revealed by inward motion at any edge of the
+    picture.
+    """
     inwards = (flow[:, 0, 0], -flow[:, -1, 0], flow[0, :, 1], -flow[-1, :, 1])
     return max(float(np.maximum(each, 0).mean()) for each in inwards)

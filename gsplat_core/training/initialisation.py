@@ -1,4 +1,6 @@
-"""Gaussians from the pixels of one frame: a jittered grid at the tissue's depth, coloured by the picture."""
+"""Creation of Gaussians from one frame: a jittered pixel grid at the tissue's depth, coloured by
+the picture.
+"""
 
 from __future__ import annotations
 
@@ -16,29 +18,32 @@ from gsplat_core.scene.frames import DepthOrigin, Frame
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 SIGMA_IN_SPACINGS = 0.7
-"""Standard deviation of a fresh Gaussian in grid spacings: neighbours overlap and leave no holes."""
+"""Standard deviation of a new Gaussian in grid spacings; neighbours overlap without holes."""
 THICKNESS = 0.3
-"""Depth of a fresh Gaussian relative to its width: tissue is a surface."""
+"""Thickness of a new Gaussian relative to its width, since tissue is a surface."""
 
 FIRST_OPACITY = 0.9
 TOOL_MARGIN_PX = 2
-"""So much around a tool is painted over with it: masks end a little early."""
+"""Margin around tools that is in-painted with them, since masks end slightly early, in pixels."""
 HOLE_MARGIN_PX = 2
-"""Beside what two eyes could not match, depth is not learned from; half as far from it a scene does not start."""
+"""Margin around unmatched stereo pixels, in pixels, within which depth is not learned. Half of it
+applies to start depths.
+"""
 BESIDE_TOOL_PX = 4
-"""Beside a tool matched depth may be the tool's."""
+"""Margin around tools, in pixels, within which stereo depth may belong to the tool."""
 
 MAX_ANGLE_RAD = math.radians(85)
-"""Widest angle from the axis at which a fisheye pixel is placed; what lies farther out is placed there."""
+"""Largest angle to the axis at which a fisheye pixel is placed; larger ones are clamped."""
 
 
 def gaussians_from_frame(
     frame: Frame, camera: Camera, count: int, *, sh_degree: int, default_depth_mm: float, seed: int = 0
 ) -> Gaussians:
-    """About `count` Gaussians that cover the whole frame, tools included.
+    """Create about `count` Gaussians that cover the whole frame including tools.
 
-    Pixels under a tool take colour and depth from the tissue around them (Telea 2004 in-painting), so that tissue which a tool uncovers
-    has Gaussians to learn with. Depth comes from the frame where it is known, else from the plane z = `default_depth_mm`.
+    Pixels under tools get in-painted colours (Telea 2004) and extrapolated depth, so that tissue
+    uncovered later has Gaussians. Without depth, Gaussians are placed on the plane z =
+    `default_depth_mm`.
     """
     height, width = frame.image.shape[:2]
     pixels, spacing_px = jittered_grid(width, height, count, seed)
@@ -48,7 +53,9 @@ def gaussians_from_frame(
 
 
 def jittered_grid(width: int, height: int, count: int, seed: int) -> tuple[NDArray[np.float64], float]:
-    """About `count` pixels [M, 2] (x, y) that cover a picture evenly, and how far they are apart."""
+    """Return about `count` pixels [M, 2] (x, y) spread evenly over a picture, and their spacing in
+    pixels.
+    """
     spacing = math.sqrt(height * width / count)
     columns, rows = max(1, round(width / spacing)), max(1, round(height / spacing))
     jitter = np.random.default_rng(seed).uniform(-0.15, 0.15, (2, rows, columns))
@@ -58,7 +65,9 @@ def jittered_grid(width: int, height: int, count: int, seed: int) -> tuple[NDArr
 
 
 def blur_sigma_px(spacing_px: float) -> float:
-    """How much a picture is blurred before Gaussians so far apart take their colours from it."""
+    """Return the blur (standard deviation in pixels) of a picture from which Gaussians of this
+    spacing take colours.
+    """
     return max(0.3, 0.3 * spacing_px)
 
 
@@ -71,7 +80,16 @@ def gaussians_at_pixels(
     *,
     sh_degree: int,
 ) -> Gaussians:
-    """One Gaussian at each of `pixels` [M, 2] (x, y; pixel centres at +0.5), `spacing_px` wide, at `depth_mm` [H, W], coloured by `image`."""
+    """Create one Gaussian per pixel.
+
+    Args:
+        pixels: positions [M, 2] as x, y; pixel centres at +0.5.
+        spacing_px: width of the Gaussians in pixels.
+        image: RGB uint8 [H, W, 3], source of colours.
+        depth_mm: float32 [H, W].
+        camera: camera of the picture, with its pose.
+        sh_degree: degree of the spherical harmonics.
+    """
     height, width = depth_mm.shape
     column = np.clip(pixels[:, 0].astype(np.int64), 0, width - 1)
     row = np.clip(pixels[:, 1].astype(np.int64), 0, height - 1)
@@ -86,7 +104,7 @@ def gaussians_at_pixels(
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (colour - 0.5) / SH_C0
     quat = facing(np.asarray(camera_to_world[:3, :3], np.float64)).astype(np.float32)
-    # Arrays become tensors without a copy: a stream's first picture waits for this.
+    # Tensors share memory with the arrays; the first picture of a stream waits for this.
     return Gaussians(
         means=torch.from_numpy(points.astype(np.float32)),
         quats=torch.from_numpy(np.tile(quat, (count, 1))),
@@ -99,13 +117,16 @@ def gaussians_at_pixels(
 def unprojected(
     pixels: NDArray[np.float64], z: NDArray[np.float64], camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The camera model inverted: points [M, 3] in camera space at depth `z` [M], and how long a pixel is there [M]."""
+    """Unproject pixels [M, 2] at depths `z` [M]. Returns points in camera coordinates [M, 3] and
+    the size of a pixel there [M].
+    """
     plane = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
     if camera.model == "ortho":
         return np.concatenate([plane, z[:, None]], 1), np.full_like(z, 1 / camera.K[0, 0])
     pixel = z / camera.K[0, 0]
     if camera.model == "fisheye":
-        # So far the plane holds the angle. A pixel is 1 / cos² long outwards and tan / angle across: their geometric mean.
+        # The plane holds angles here. A pixel is stretched by 1 / cos² radially and tan / angle
+        # tangentially; use the geometric mean.
         angle = np.clip(np.linalg.norm(plane, axis=1), 1e-9, MAX_ANGLE_RAD)
         stretch = np.tan(angle) / np.maximum(np.linalg.norm(plane, axis=1), 1e-9)
         plane = plane * stretch[:, None]
@@ -114,7 +135,9 @@ def unprojected(
 
 
 def facing(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternion wxyz of a rotation matrix [3, 3] (Shepperd 1978, the stable branch for any rotation)."""
+    """Return the unit quaternion wxyz of a rotation matrix [3, 3] (Shepperd 1978, numerically
+    stable for any rotation).
+    """
     trace_terms = np.array([np.trace(rotation), *np.diag(rotation)])
     largest = int(np.argmax(trace_terms))
     if largest == 0:
@@ -138,7 +161,7 @@ def facing(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
-    """The image with tools painted over by the tissue around them; RGB uint8 [H, W, 3]."""
+    """Return the picture with tools in-painted from the surrounding tissue, RGB uint8 [H, W, 3]."""
     if frame.mask is None or frame.mask.all() or not frame.mask.any():
         return frame.image
     bare_tool = (frame.mask == 0).astype(np.uint8)
@@ -149,11 +172,13 @@ def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
 
 
 def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Fill `hole` (non-zero) of `image`. At a quarter of the size: what lies under a tool is a guess, and large holes take seconds at full size."""
+    """In-paint non-zero pixels of `hole`. It works at a quarter of the size, because large holes
+    take seconds at full size.
+    """
     height, width = hole.shape
     small = (max(1, width // 4), max(1, height // 4))
     small_hole = (cv2.resize((hole > 0).astype(np.float32), small, interpolation=cv2.INTER_AREA) > 0).astype(np.uint8)
-    if small_hole.all():  # nothing is left to grow from at this size
+    if small_hole.all():  # no known pixel at this size
         outside = image[hole == 0] if not hole.all() else image.reshape(-1, 3)
         return np.where(hole[..., None] > 0, np.rint(outside.mean(0)), image).astype(np.uint8)
     filled = cv2.inpaint(cv2.resize(image, small, interpolation=cv2.INTER_AREA), small_hole, 3, cv2.INPAINT_TELEA)
@@ -162,17 +187,17 @@ def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> N
 
 
 def believed_depth(frame: Frame) -> NDArray[np.float32]:
-    """The frame's depth [H, W] where it is to be believed, 0 elsewhere and where the frame has none.
-
-    What two eyes were matched by is not sharp at edges: beside what could not be matched, or is not believed, it is left out.
+    """Return the frame's confident depth [H, W], 0 elsewhere. Stereo depth next to unmatched or
+    unconfident pixels is excluded, because it is inaccurate at edges.
     """
     return _depth_from(frame, BELIEVED, HOLE_MARGIN_PX)
 
 
 def possible_depth(frame: Frame) -> NDArray[np.float32]:
-    """The frame's depth [H, W] of tissue where it is better than a guess by what lies around it, 0 elsewhere: something to start from.
+    """Return depth [H, W] of tissue that is a better start value than extrapolation, 0 elsewhere.
 
-    Of two eyes that is more than what is believed, but not what lies close to a tool, which may have been given the tool's depth.
+    For stereo this includes less confident depth, but excludes pixels near a tool, which may have
+    the tool's depth.
     """
     if frame.depth_origin is not DepthOrigin.STEREO:
         depth = believed_depth(frame)
@@ -193,13 +218,15 @@ def _depth_from(frame: Frame, least: float, margin_px: int) -> NDArray[np.float3
 
 
 def _inner(where: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
-    """The pixels [H, W] with nothing else so near."""
+    """Erode a mask [H, W] by a margin."""
     side = 2 * margin_px + 1
     return np.asarray(cv2.erode(where.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
-    """z in millimetres for every pixel [H, W]: measured where known and not a tool, the surface around it continued elsewhere, else the default."""
+    """Return z in millimetres for every pixel [H, W]: measured on tissue, extrapolated elsewhere,
+    or the default without any depth.
+    """
     height, width = frame.image.shape[:2]
     if frame.depth is None:
         return np.full((height, width), default_depth_mm, np.float32)

@@ -1,4 +1,6 @@
-"""Tissue that a moving camera brings into view: which of it the scene has nothing for, before training on the frame stretches what lies beside it."""
+"""Handling of tissue that a moving camera brings into view. It is filled before training, which
+would otherwise stretch neighbouring Gaussians over it.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +23,20 @@ from gsplat_core.training.unseen import pixels_of, value_at
 from gsplat_core.transfers import HostCopy, tensor_of
 
 USUAL_DENSITY = 0.3
-"""Share of the usual number of Gaussians around a cell below which the scene has nothing there."""
+"""Share of the usual Gaussian density below which a cell counts as empty."""
 
 LOOKS_AFTER = 0.02
-"""A picture that has moved by this part of its width since the last look is looked at again: each look takes some milliseconds."""
+"""Motion of the picture, as a share of its width, after which new tissue is searched again; each
+search takes some milliseconds.
+"""
 EDGE_CELLS = 1.0
-"""What the camera before had this close to its edge, in cells, counts as new, so that a slow camera leaves nothing out."""
+"""Margin in cells at the previous picture's edge that counts as new, so that slow motion leaves no
+gap.
+"""
 
 
 def has_moved(camera: Camera, before: Camera, distance: float) -> bool:
-    """Whether what lies at that distance has moved far enough in the picture since `before` for another look."""
+    """Return True if content at a distance has moved far enough since `before` for another search."""
     sides = np.array([0.0, 0.5, 1.0])
     pixels = np.stack(np.meshgrid(sides * camera.width_px, sides * camera.height_px), -1).reshape(-1, 2)
     earlier = pixels_of(_points_of(pixels, camera, distance), before)[0].numpy()
@@ -38,7 +44,7 @@ def has_moved(camera: Camera, before: Camera, distance: float) -> bool:
 
 
 def _points_of(pixels: NDArray[np.float64], camera: Camera, distance: float) -> Tensor:
-    """The points [M, 3] in the world that a camera has at `pixels` [M, 2] and at that distance."""
+    """Return world points [M, 3] at `pixels` [M, 2] and a distance from a camera."""
     points, _ = unprojected(pixels, np.full(len(pixels), distance), camera)
     to_world = np.linalg.inv(camera.world_to_camera)
     return torch.from_numpy((points @ to_world[:3, :3].T + to_world[:3, 3]).astype(np.float32))
@@ -47,13 +53,14 @@ def _points_of(pixels: NDArray[np.float64], camera: Camera, distance: float) -> 
 def entered(
     pixels: NDArray[np.float64], camera: Camera, before: Camera, distance: float, edge_px: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Which of `pixels` [M, 2] show something, at that distance from the camera, that the camera `before` did not have in its picture,
-    or only this close to its edge."""
+    """Return which pixels [M, 2] show content at a distance that was outside the picture of the
+    camera `before`, or within `edge_px` of its edge.
+    """
     return ~pixels_of(_points_of(pixels, camera, distance), before, -edge_px)[1].numpy()
 
 
 class NewTissue:
-    """Cells of a grid over the picture that came into view with the newest frame."""
+    """Grid cells of the picture that came into view with the newest frame."""
 
     def __init__(self, observation: Observation, before: Camera, spacing: float, distance: float) -> None:
         self._camera, self._spacing = observation.camera, spacing
@@ -64,19 +71,22 @@ class NewTissue:
         return bool(self._entered.any())
 
     def _empty(self, now: Gaussians) -> tuple[Tensor, Tensor]:
-        """Which cells the scene has next to nothing for, bool [rows, columns], and how deep it is around each."""
+        """Return which new cells are almost empty of Gaussians, bool [rows, columns], and the mean
+        depth around each.
+        """
         count, depth = around_cells(now, self._camera, self._spacing, self._shape)
         return tensor_of(self._entered.reshape(self._shape), now.device) & (count < 9 * USUAL_DENSITY), depth
 
     def pixels(self, now: Gaussians) -> Tensor:
-        """Marks, bool [H, W], of the pixels in cells for which the scene `now` has no Gaussians. Nothing waits."""
+        """Mark pixels of new cells without Gaussians, bool [H, W]. Does not synchronise."""
         return self._of_cells(self._empty(now)[0])
 
     def unfilled(self, now: Gaussians, mask: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """The middles [M, 2] of those cells that lie on tissue, `mask` [H, W], and the scene's depth [H, W], 0 where there is nothing yet.
+        """Return the centres [M, 2] of empty new cells on tissue, and the scene's depth [H, W], 0
+        where unknown.
 
-        It is the mean of what lies there. A picture's depth is that of what lies in front, and tissue that is placed by it comes nearer and
-        nearer as the camera moves on. Waits for the device.
+        Depth is the mean over Gaussians. A rendered depth is biased to the front, so tissue placed
+        by it would come nearer and nearer as the camera moves. Synchronises with the device.
         """
         empty, depth = self._empty(now)
         wanted = HostCopy(empty.flatten() & (value_at(mask, tensor_of(self._grid, mask.device)) > 0))
@@ -84,7 +94,7 @@ class NewTissue:
         return self._grid[wanted.numpy()], depth_mm.numpy()
 
     def _of_cells(self, values: Tensor) -> Tensor:
-        """Values of cells [rows, columns] as those of their pixels [H, W]."""
+        """Expand cell values [rows, columns] to pixels [H, W]."""
         size = self._camera.height_px, self._camera.width_px
         row, column = (
             (torch.arange(pixels, device=values.device) / self._spacing).long().clamp(max=cells - 1)
@@ -101,9 +111,11 @@ def fill_new_tissue(
     config: ReconstructorConfig,
     out_of_view: OutOfView | None,
 ) -> None:
-    """Before the first step on a frame whose camera moved: what comes into view is there already, from the archive or as new Gaussians.
+    """Fill tissue that came into view before the first step on a frame, from the archive or with
+    new Gaussians.
 
-    Else training would stretch the Gaussians beside it over it, and they would follow the picture for as long as the camera moves.
+    Otherwise training would stretch neighbouring Gaussians over it, which would follow the
+    picture's edge as the camera moves.
     """
     camera = observation.camera
     spacing = grid_spacing(camera.width_px * camera.height_px, config.gaussians)

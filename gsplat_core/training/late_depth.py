@@ -1,4 +1,4 @@
-"""What a model learns of depth that was found after its frame was trained on."""
+"""Depth that becomes available after its frame was trained on."""
 
 from __future__ import annotations
 
@@ -13,25 +13,30 @@ from gsplat_core.training.observations import Observation, known_depth, learned_
 from gsplat_core.transfers import tensor_of
 
 MOST_LATE = 30
-"""Depth of a frame is taken as long as there are fewer newer ones."""
+"""Largest number of newer frames for which late depth is still used."""
 
 
 @dataclass(frozen=True)
 class LateDepth:
-    """A frame's depth as it is learned, on the device that trains: made beside training, where depth is found."""
+    """Depth of a frame as tensors on the training device, prepared concurrently with training."""
 
     believed: Tensor | None
-    """What the loss compares with, float32 [H, W], 0 where it is not believed; None where the loss takes none of that origin."""
+    """Target of the depth loss, float32 [H, W], 0 where not confident; None if the loss ignores
+    this depth source.
+    """
     possible: Tensor | None
-    """What the scene is moved by, float32 [H, W], 0 where nothing is known; None where that is everywhere."""
+    """Depth for correcting the scene, float32 [H, W], 0 where unknown; None if unknown everywhere.
+    """
     everywhere: Tensor | None
-    """The same, continued where nothing is known: what a whole scene is placed by. None: whoever needs it makes it."""
+    """`possible` extrapolated to all pixels, for placing a whole scene; None if not yet computed.
+    """
 
     @staticmethod
     def of(frame: Frame, device: torch.device | str, *, places: bool = False) -> LateDepth:
-        """That of a frame with depth. places: the scene is likely to be placed by it.
+        """Prepare the depth of a frame. `places` also computes `everywhere`.
 
-        Copies to a GPU are queued on the thread's current stream, which must be that of the training.
+        Copies to a GPU are queued on the thread's current stream, which must be the training
+        stream.
         """
         possible = possible_depth(frame)
         is_known = bool(possible.any())
@@ -43,10 +48,10 @@ class LateDepth:
 
     @staticmethod
     def for_placement(frame: Frame, device: torch.device | str) -> LateDepth:
-        """That of a frame which was trained on with its depth: what the scene is moved by, alone."""
+        """Prepare only the correction of the scene, for a frame that was trained on with its depth."""
         possible = possible_depth(frame)
         return LateDepth(None, known_depth(possible, device) if possible.any() else None, None)
 
     def added_to(self, seen: Observation) -> Observation:
-        """The frame as it was trained on, with the depth that the loss compares with."""
+        """Return the observation with the target of the depth loss."""
         return replace(seen, depth=self.believed)

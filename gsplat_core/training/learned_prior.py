@@ -1,4 +1,4 @@
-"""A motion prior that learns from the stream how its pictures go on: the beat of the heart, and what of a picture does not stay."""
+"""Motion prior that learns periodic motion and temporal colour changes from the stream."""
 
 from __future__ import annotations
 
@@ -23,31 +23,35 @@ from gsplat_core.training.surface_motion import SurfaceMotion
 from gsplat_core.transfers import tensor_of
 
 REFERENCE_S = 1 / 30
-"""Motions are kept in pixels per so long."""
+"""Unit interval of stored motions in seconds."""
 SHARES = SharesSettings(at_first=(AT_FIRST, 0.0), decay=0.97, around_cells=3.0, pull=4.0, ridge=0.2)
-"""Of the last motion, and of what followed similar moments; in squares of pixels."""
+"""Settings for the shares of the last motion and of motions after similar moments, in squared
+pixels.
+"""
 
 
 COLOUR_STEPS = 16
-"""Steps in which the colours of the moved Gaussians are fitted to the expected picture."""
+"""Iterations of the colour fit of moved Gaussians to the expected picture."""
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """The next frame as an interval will bring it, on the device."""
+    """Expected next frame, on the device."""
 
     motion: SurfaceMotion
     picture: Tensor
-    """[H, W, 3], 0 to 1."""
+    """Colours [H, W, 3], 0 to 1."""
     tissue: Tensor
-    """[H, W], 1 where the picture shows tissue."""
+    """Weights [H, W], 1 on tissue."""
 
 
 class LearnedPrior(FlowPrior):
-    """The next motion is a mixture of the last one and of those that followed earlier moments like now; colours return to their mean.
+    """Motion prior that mixes the last motion with those after earlier similar moments, and lets
+    colours return to their mean.
 
-    The shares are learned in the pictures, on the host, from what came of earlier expectations, and put onto the Gaussians on the device. That
-    holds for a camera that stands still: where it is known to move, the motion goes on as for `FlowPrior`.
+    The mixture is learned on the host from earlier predictions in the picture, and applied to
+    Gaussians on the device. It assumes a static camera; for a moving one it behaves like
+    `FlowPrior`.
     """
 
     def forget(self) -> None:
@@ -57,12 +61,12 @@ class LearnedPrior(FlowPrior):
         self._shares = LocalShares(SHARES)
         self._picture = ExpectedPicture()
         self._guesses: list[Flow] = []
-        """At the next motion."""
+        """Predictions of the next motion."""
         self._expected: Expectation | None = None
 
     @property
     def horizon_s(self) -> float:
-        """See `MotionPrior.horizon_s`. What was learned is said about the next frame only."""
+        """See `MotionPrior.horizon_s`. Learned predictions cover the next frame only."""
         return HORIZON_S if self._expected is None else min(HORIZON_S, self._interval_s)
 
     def velocity(self, step: TrainingStep, deltas: Tensor | None = None) -> Tensor | None:
@@ -98,8 +102,9 @@ class LearnedPrior(FlowPrior):
             self._expected = Expectation(there, tensor_of(picture / 255, device), tensor_of(tissue, device))
 
     def _next_motion(self, flow: Flow, guesses: list[Flow]) -> tuple[Flow, list[Weighted]]:
-        """Learn from the newest motion, and from what was expected of it; guess at the next one: what is expected, and what followed similar
-        moments. In pixels an interval."""
+        """Learn from the newest motion and predict the next one. Returns the prediction and the
+        weighted motions after similar moments, in pixels per interval.
+        """
         scale = np.float32(self._interval_s / REFERENCE_S)
         motion = np.asarray(flow / scale, np.float32)
         if guesses:
@@ -107,7 +112,7 @@ class LearnedPrior(FlowPrior):
         self._moments.take(motion)
         similar = [(weight, np.asarray(each * scale, np.float32)) for weight, each in self._moments.next_motions()]
         of_similar = weighted_mean(similar) if similar else np.zeros_like(flow)
-        # Guesses are learned from in the unit in which motions are kept.
+        # Predictions are stored in the unit of the learned motions.
         self._guesses = [np.asarray(each / scale, np.float32) for each in (moved(flow, flow), of_similar)]
         shares = self._shares.local(motion.shape)
         ahead = np.zeros_like(motion)
