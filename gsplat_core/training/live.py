@@ -1,4 +1,6 @@
-"""Training beside a live stream: first the newest frame, until it is to be shown; then what came before it, until the next one comes."""
+"""Training concurrent with a live stream: on the newest frame until its display time, then on
+earlier frames until the next one arrives.
+"""
 
 from __future__ import annotations
 
@@ -31,19 +33,22 @@ from gsplat_core.training.upkeep import Upkeep
 from gsplat_core.transfers import HostCopy
 
 REHEARSED_IN_FLIGHT = 2
-"""Rehearsal steps that may be queued on a GPU and not finished: the next frame's first step waits for them."""
+"""Rehearsal steps that may be queued on a GPU; the next frame's first step waits for them."""
 REVEALED_SHARE = 0.01
-"""Of the picture's width: when so wide a strip has come into view, new tissue is looked for before the first step."""
+"""Width of a newly revealed strip, as a share of the picture's width, from which new tissue is
+searched before the first step.
+"""
 LONGER_STEP_DECAY = 0.1
-"""How fast the usual time of a step follows longer ones."""
+"""Weight of longer steps in the estimated step time."""
 
 
 class LiveReconstructor(Reconstructor):
-    """A `Reconstructor` for a stream that does not wait: `observe` within the time until a frame is to be shown, then `publish`, then
-    `rehearse` until the next frame comes.
+    """`Reconstructor` for a stream that does not wait. For each frame, call `observe` until its
+    display time, then `publish`, then `rehearse` until the next frame.
 
-    All steps of `observe` go to the newest frame. Those of `rehearse` are what keeps the past: they go to frames of the window. Which ones
-    depends on the seed and on the numbers of steps alone, not on the clock, so a run is repeated by giving it the same numbers again.
+    All steps of `observe` train on the newest frame. Steps of `rehearse` train on frames of the
+    window to prevent forgetting. The choice of frames depends only on the seed and the numbers of
+    steps, not on the clock, so a run is reproducible with the same numbers.
     """
 
     _covers_beside = True
@@ -61,36 +66,39 @@ class LiveReconstructor(Reconstructor):
         super().__init__(config, camera, seed=seed, recording_digest=recording_digest, device=device)
         self._live = live or LiveTraining()
         check_colours(self._live.colour_relaxation, config, self.device)
-        # Where training starts from the motion, it has to be known before.
+        # If training starts from the predicted motion, the prior must process each frame first.
         self._follows_at_once = config.start_from_motion
         self._to_follow: deque[tuple[Frame, Observation]] = deque(maxlen=2)
-        """The newest frames that were trained on, where the motion prior does not see each of them."""
+        """Newest trained frames, kept for the motion prior if it does not process each frame at
+        once.
+        """
         self._start_here: StartOnDevice | None = None
         self._kept_size: tuple[int, int] | None = None
         self._kept: TrainingStep | None = None
-        """That of the scene before, whose memory the next scene takes over."""
+        """Step of the previous scene, whose memory the next scene reuses."""
         self._rehearsing = StepsInFlight(self.device, most=REHEARSED_IN_FLIGHT)
         self._rehearsed = 0
         self._places = Places()
         self._taken_up: tuple[int, Place] | None = None
-        """The number of a frame and the place that it shows, from which its scene starts."""
+        """Frame number and the recognised place from which its scene starts."""
         self._camera_before: Camera | None = None
-        """As it was when the scene was last looked at for what came into view."""
+        """Camera at the last search for tissue that came into view."""
         self._upkeep: Upkeep | None = None
         self._out_of_view = OutOfView(config.max_gaussians, self.device) if config.preallocate else None
 
     def kept(self) -> dict[str, int]:
-        """How much of the stream is held, by what holds it; none of it grows without end."""
+        """Return the sizes of all stream-dependent stores; each is bounded."""
         columns = 0 if self._step is None else getattr(self._step.field, "bumps", 0)
         archived = 0 if self._out_of_view is None else len(self._out_of_view.archive)
         held = {"window_frames": len(self._window), "columns": columns, "places": len(self._places)}
         return {**held, "archived": archived}
 
     def publish(self) -> Model | Snapshot:
-        """The model as it is now, for showing the time of the newest frame that was trained on and what follows, with the next version number.
+        """Return the model for displaying the time of the newest trained frame and later, with the
+        next version number.
 
-        On a CPU, where a motion prior says how it goes on, that is all that is copied; `whole_model` has the past as well. A GPU's snapshots
-        are whole.
+        On a CPU with a motion prior only this current state is copied; `whole_model` includes the
+        past. Snapshots on a GPU are always complete.
         """
         step, prior = self._step, self._prior
         if step is None or prior is None or self.device.type != "cpu":
@@ -101,23 +109,28 @@ class LiveReconstructor(Reconstructor):
         return Model(gaussians=gaussians, field=field, **facts)
 
     def whole_model(self, shown: Model | Snapshot) -> Model:
-        """The model with its past, in memory of its own; `shown` is what was published last."""
+        """Return the model with its past in its own memory. `shown` is the last published model."""
         return shown.as_model() if isinstance(shown, Snapshot) else self.snapshot()
 
     @property
     def parameter_count(self) -> int:
-        """Numbers in all tensors of the whole model; 0 before there is one."""
+        """Number of parameters of the whole model; 0 before there is one."""
         if self._step is None:
             return 0
         return sum(t.numel() for t in self._step.gaussians.tensors().values()) + self._step.field.parameter_count
 
     def rehearse(self, steps: int) -> None:
-        """So many steps on frames of the window. On a GPU they are queued, and at most `REHEARSED_IN_FLIGHT` of them are not finished when
-        this returns, so that the next frame need not wait long. Raises InvalidInput before the first frame."""
+        """Train on frames of the window.
+
+        On a GPU the steps are queued, and at most `REHEARSED_IN_FLIGHT` are unfinished on return.
+
+        Raises:
+            InvalidInput: before the first frame.
+        """
         if self._step is None:
             raise InvalidInput("there is nothing to rehearse yet: observe a frame first")
         for _ in range(steps):
-            # The right eye first: steps on the newest frame begin with the left one.
+            # Start with the right eye, since steps on the newest frame begin with the left one.
             self._rehearsed += 1
             observation = self._window.draw(self._live.recent_share).by_turns(self._rehearsed)
             or_depth = observation.depth is not None and self.device.type == "cuda"
@@ -126,9 +139,17 @@ class LiveReconstructor(Reconstructor):
             self._rehearsing.queued()
 
     def take_depth(self, frame: Frame, late: LateDepth | None = None) -> bool:
-        """Learn how far away is what `frame` shows, which was trained on before its depth was found: rehearsal looks at it from now on, and the scene
-        is placed by it. False, with nothing changed, where the frame is of another scene, was not trained on, or has `MOST_LATE` newer ones.
-        late: `LateDepth.of` the frame on this device, where another thread has made it."""
+        """Use the depth of a frame that was trained on before its depth was available, for
+        rehearsal and for placing the scene.
+
+        Args:
+            frame: the frame, with its depth.
+            late: `LateDepth.of` the frame on this device, if another thread has prepared it.
+
+        Returns:
+            False, with nothing changed, if the frame belongs to another scene, was not trained on,
+                or has `MOST_LATE` newer ones.
+        """
         if self._step is None or (seen := self._window.find(frame.seq, MOST_LATE)) is None:
             return False
         self._settle()
@@ -141,18 +162,22 @@ class LiveReconstructor(Reconstructor):
         return True
 
     def rehearsal_ns(self, steps: int) -> float:
-        """How long so many rehearsal steps usually take, together with those that are still under way; 0 before anything was timed."""
+        """Return the usual duration of rehearsal steps in nanoseconds, including unfinished ones; 0
+        if unknown.
+        """
         under_way = REHEARSED_IN_FLIGHT if self.device.type == "cuda" else 0
         return (steps + under_way) * self.step_ns
 
     @property
     def step_ns(self) -> float:
-        """How long a step usually takes; 0 before anything was timed."""
+        """Usual duration of a step in nanoseconds; 0 if unknown."""
         return (self._step_s or 0.0) * 1e9
 
     def grow(self, frame: Frame) -> None:
-        """What `observe` leaves for the time after `frame`, the newest one that was trained on, was shown: its depth corrects the scene, Gaussians are
-        added where it shows tissue that the model does not cover, those out of view make room and come back."""
+        """Do the work that `observe` postpones until `frame`, the newest trained one, has been
+        displayed. The scene is corrected by its depth, Gaussians are added for uncovered tissue,
+        and Gaussians are archived or restored.
+        """
         assert self._step is not None
         observation = self._window.newest
         self._placement.catch_up(self._step)
@@ -163,7 +188,9 @@ class LiveReconstructor(Reconstructor):
         self._add_uncovered(frame, observation)
 
     def look_after_once(self) -> None:
-        """All that `grow` does from time to time, now, and as if something had to leave: what takes long the first time has been done then."""
+        """Run every periodic growth step of `grow` immediately, forcing eviction. For warm-up,
+        since the first run of each is slow.
+        """
         if self._step is not None and self._upkeep is not None:
             last_seen = None if self._out_of_view is None else self._out_of_view.last_seen
             self._upkeep.once(self._step, self._window.newest, last_seen)
@@ -182,9 +209,10 @@ class LiveReconstructor(Reconstructor):
         return super().observe(frame, budget=budget, steps=steps, train=train)
 
     def _follow_last(self) -> None:
-        """Let the motion prior see the newest frames, of which nothing is to be trained on now: what is shown goes on as they moved.
+        """Feed skipped frames to the motion prior so the published scene keeps moving.
 
-        Seeing every frame takes longer than some steps on it, and a picture that was just trained on needs no prior.
+        Processing every frame takes longer than some training steps, and a picture that was just
+        trained on needs no prior.
         """
         if len(self._to_follow) == 2 and self._prior is not None:
             self._prior.forget()
@@ -195,7 +223,7 @@ class LiveReconstructor(Reconstructor):
     def _grow(self, frame: Frame, observation: Observation, first: bool = False) -> None:
         if first:
             return
-        # `grow` adds what is missing to the picture, later.
+        # `grow` adds missing tissue after the display.
         if not self._follows_at_once:
             self._to_follow.append((frame, observation))
         assert self._step is not None
@@ -205,13 +233,15 @@ class LiveReconstructor(Reconstructor):
         elif before != camera and has_moved(camera, before, self._step.distance(camera)):
             self._camera_before = camera
             fill_new_tissue(self._step, frame, observation, before, self.config, self._out_of_view)
-        # The scene has been moved by the flow: at an edge that it left there is nothing to train.
+        # After the scene was moved by the flow, a revealed edge contains nothing to train.
         prior = self._prior
         if prior is not None and self._follows_at_once and prior.revealed_px >= REVEALED_SHARE * camera.width_px:
             self._add_uncovered(frame, observation)
 
     def forget(self) -> None:
-        """As if no frame had been observed, but for what is known about the device: the memory that was taken, how long a step takes."""
+        """Reset to the state before the first frame, but keep the allocated memory and the
+        estimated step time.
+        """
         self._settle()
         self._kept = self._step or self._kept
         self._step = self._taken_up = self._camera_before = None
@@ -223,10 +253,14 @@ class LiveReconstructor(Reconstructor):
         self._window = ObservationWindow(self.config.window_frames, self.config.newest_share, self._seed)
 
     def begin_scene(self, frame: Frame) -> bool:
-        """Leave the scene: `frame`, which is observed next, starts another one, or one that was left before; says whether it is such.
+        """Leave the scene. The next observed frame, `frame`, starts a new scene or one that was
+        left before.
 
-        Places that were left are kept as they were last, in host memory; their number is bounded. The frame may be of another size. Versions
-        go on counting.
+        A bounded number of left scenes is kept in host memory in their last state. The frame may
+        have another size. Version numbers continue.
+
+        Returns:
+            True if the frame shows a place that was left before.
         """
         version, places = self._version, self._places
         if self._step is not None:
@@ -274,7 +308,9 @@ class LiveReconstructor(Reconstructor):
         return super()._facts() | {"unseen_s": unseen_s}
 
     def _learn_step_time(self, spending: Spending) -> None:
-        """Soon when steps are found to be shorter; slowly when they seem longer, for the first ones on a device take far longer."""
+        """Update the estimated step time, quickly if steps are shorter and slowly if they are
+        longer, since the first steps on a device are slow.
+        """
         spending.all_finished()
         known = self._step_s
         if known is None or spending.step_s < known:
@@ -284,7 +320,7 @@ class LiveReconstructor(Reconstructor):
 
     def _train_on(self, observation: Observation, budget: Budget, first: bool) -> ObserveReport:
         assert self._step is not None
-        self._placement.postpones = True  # from the second frame on, until `grow`
+        self._placement.postpones = True  # until `grow`, from the second frame on
         spending = Spending(budget, self._step_s)
         loss = None
         while spending.allows_step(by_turns=observation.right_eye is not None):

@@ -1,4 +1,4 @@
-"""How the training steps beside a live stream are taken."""
+"""Settings of training steps during a live stream."""
 
 from __future__ import annotations
 
@@ -8,28 +8,42 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.colour_correction import MOST_RELAXATION
 
 REHEARSED_CORRECTION = 0.5
-"""Share of `colour_relaxation` in a rehearsal step: what is corrected at one time shows at the times around it, which had their turn."""
+"""Share of `colour_relaxation` in rehearsal steps. A correction at one time also affects
+neighbouring times, which are corrected themselves.
+"""
 DEPTH_EVERY = 4
-"""On a GPU every so many-th rehearsal step, of the left eye's, looks at depth where a frame has it, and trains colours in place of correcting them. Steps
-of `observe` do not: what they change last is what is shown."""
+"""On a GPU, every n-th rehearsal step, counted over both eyes, compares depth if its frame has it
+and trains colours instead of correcting them. Steps of `observe` never do, because their last
+changes are displayed.
+"""
 
 
 @dataclass(frozen=True)
 class LiveTraining:
-    """How the steps beside a live stream are taken. Raises InvalidSetting for a value out of its range."""
+    """Settings of training steps during a live stream.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     first_rate: float = 2.0
-    """Factor of all learning rates in a frame's first step: large steps follow a large motion."""
+    """Factor of all learning rates in a frame's first step; large steps follow large motion."""
     last_rate: float = 0.5
-    """The factor that they end with: small steps settle."""
+    """Factor of all learning rates at the end; small steps converge."""
     rate_steps: int = 30
-    """Steps from the first factor to the last, in equal ratios; a frame that gets more goes on with the last one."""
+    """Number of steps from the first to the last factor in equal ratios; further steps use the last
+    factor.
+    """
     recent_share: float = 0.6
-    """Share of the rehearsal steps that go to the newest frame; the others are spread evenly over the window."""
+    """Share of the rehearsal steps on the newest frame; the others are spread evenly over the
+    window.
+    """
     colour_relaxation: float = 0.0
-    """Above 0 colours are not trained with a rate but corrected by what the picture is off by, by so many times the mean over the pixels that
-    show them (`colour_correction`), where the field takes colours at one time. On a GPU with harmonics of degree 0 only, and depth is looked at by
-    some of the rehearsal steps alone (`DEPTH_EVERY`)."""
+    """Above 0, colours are corrected by this multiple of the mean residual (`colour_correction`)
+    instead of trained with a learning rate, if the field has temporal colours. On a GPU this
+    requires spherical harmonics of degree 0, and depth is compared only in some rehearsal steps
+    (`DEPTH_EVERY`).
+    """
 
     def __post_init__(self) -> None:
         for name in ("first_rate", "last_rate"):
@@ -45,12 +59,13 @@ class LiveTraining:
             )
 
     def rate_at(self, step: int) -> float:
-        """The factor of a frame's step, counted from 0."""
+        """Return the factor of the learning rates in a frame's step, counted from 0."""
         progress = min(1.0, step / max(1, self.rate_steps - 1))
         return self.first_rate * (self.last_rate / self.first_rate) ** progress
 
     def rehearsed_relaxation(self, number: int, or_depth: bool) -> float:
-        """How much colours are corrected in the rehearsal step with this number. or_depth: a step either corrects them or looks at depth, which its frame
-        has."""
+        """Return the colour relaxation of a rehearsal step. `or_depth` is True if its frame has
+        depth and a step cannot correct colours and compare depth at once.
+        """
         looks_at_depth = or_depth and number % DEPTH_EVERY == 0
         return 0.0 if looks_at_depth else REHEARSED_CORRECTION * self.colour_relaxation

@@ -1,4 +1,4 @@
-"""Which shares of several guesses make what comes, learned place by place from what came of earlier ones."""
+"""Locally learned mixture of several predictions."""
 
 from __future__ import annotations
 
@@ -10,41 +10,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 Field = NDArray[np.float32]
-"""[h, w, channels]: a picture or a flow."""
+"""Picture or flow, float32 [h, w, channels]."""
 
 MOST_CELLS = 40
-"""Cells along the longer side, within which one share is learned."""
+"""Number of cells along the longer side with separate shares."""
 
 
 @dataclass(frozen=True)
 class SharesSettings:
-    """How shares are learned. Units are squares of those of the fields."""
+    """Settings of the learning; units are squares of the fields' units."""
 
     at_first: tuple[float, ...]
-    """Before anything was learned."""
+    """Shares before anything was learned."""
     decay: float
-    """Weight of a frame's sums at the next frame: 1 / (1 - decay) frames are remembered."""
+    """Weight of accumulated sums at each new frame; about 1 / (1 - decay) frames are remembered."""
     around_cells: float
-    """Standard deviation of the neighbourhood that a cell learns with."""
+    """Standard deviation of a cell's neighbourhood, in cells."""
     pull: float
-    """How strongly a cell's shares are pulled to those of the whole picture."""
+    """Strength with which a cell's shares are pulled to those of the whole picture."""
     ridge: float
-    """How strongly those are pulled to the first ones."""
+    """Strength with which shares of the whole picture are pulled to the initial ones."""
 
 
 class LocalShares:
-    """Recursive least squares with forgetting: what came = sum of share * guess, for each cell, pulled towards the fit of the whole picture.
+    """Recursive least squares with forgetting: observation = sum of share * prediction in each
+    cell, regularised towards the fit of the whole picture.
 
-    Its memory is that of K * (K + 1) numbers a cell for K guesses, whatever the length of the stream.
+    Memory is K * (K + 1) numbers per cell for K predictions, independent of the stream's length.
     """
 
     def __init__(self, settings: SharesSettings) -> None:
         self._settings = settings
         self._products: NDArray[np.float32] | None = None
-        """[h, w, K, K + 1]: products of the guesses with one another, and with what came."""
+        """Products of the predictions with each other and with the observation, [h, w, K, K + 1].
+        """
 
     def learn(self, guesses: Sequence[Field], came: Field, weight: NDArray[np.float32]) -> None:
-        """Take what came, [h, w, channels], and how much each pixel [h, w] of it says."""
+        """Add an observation `came` [h, w, channels] of earlier predictions, with pixel weights [h,
+        w].
+        """
         fields = [*guesses, came]
         count, size = len(guesses), cells_for(came.shape)
         products = np.empty((size[1], size[0], count, count + 1), np.float32)
@@ -59,7 +63,7 @@ class LocalShares:
         self._products = products
 
     def whole(self) -> NDArray[np.float64]:
-        """The shares [K] that fit the whole picture."""
+        """Return the shares [K] that fit the whole picture."""
         settings, first = self._settings, np.asarray(self._settings.at_first)
         if self._products is None:
             return first
@@ -67,7 +71,7 @@ class LocalShares:
         return np.linalg.solve(mean[:, :-1] + settings.ridge * np.eye(len(first)), mean[:, -1] + settings.ridge * first)
 
     def local(self, shape: Sequence[int]) -> Field:
-        """The shares of each place, [h, w, K], for fields of that shape."""
+        """Return the local shares [h, w, K] for fields of a shape."""
         settings, whole, size = self._settings, self.whole(), (shape[1], shape[0])
         if self._products is None:
             return np.broadcast_to(whole.astype(np.float32), (shape[0], shape[1], len(whole))).copy()
@@ -82,12 +86,12 @@ class LocalShares:
 
 
 def cells_for(shape: Sequence[int]) -> tuple[int, int]:
-    """Columns and rows of cells for fields [h, w, ...]."""
+    """Return columns and rows of cells for fields [h, w, ...]."""
     height, width = shape[:2]
     shrink = min(1.0, MOST_CELLS / max(height, width))
     return max(1, round(width * shrink)), max(1, round(height * shrink))
 
 
 def blurred(field: NDArray[np.float32], deviation: float) -> NDArray[np.float32]:
-    """Smoothed along rows and columns, whatever the number of channels."""
+    """Blur a field of any number of channels."""
     return np.asarray(cv2.GaussianBlur(field, (0, 0), deviation), np.float32).reshape(field.shape)

@@ -1,10 +1,9 @@
-"""Image quality in the field's measures: PSNR over tissue, PSNR over the frame, SSIM of masked images.
+"""Image quality measures: PSNR over tissue, PSNR over the frame, and SSIM of masked images.
 
-Three facts that a table of such figures needs:
-
-* Equal images have no finite PSNR; it is capped at `PSNR_CAP_DB`, so that reports stay valid JSON.
-* A frame without one tissue pixel has no quality: the functions return NaN, and `QualityTracker` leaves it out of its means.
-* A pixel that is not finite counts as black: a broken picture scores badly, and is not left out.
+* Equal images have no finite PSNR; it is capped at `PSNR_CAP_DB` so that reports are valid JSON.
+* A frame without tissue has no quality: the functions return NaN, and `QualityTracker` excludes it
+from its means.
+* Non-finite pixels count as black, so broken pictures score badly instead of being excluded.
 """
 
 from __future__ import annotations
@@ -23,64 +22,68 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.ssim.ssim import ssim_map
 
 ImageLike: TypeAlias = NDArray[np.generic] | Tensor
-"""RGB [H, W, 3]: uint8, or floats in 0..1."""
+"""RGB [H, W, 3], uint8 or floats in 0..1."""
 
 PSNR_CAP_DB = 100.0
-"""PSNR of equal images, and the highest that is reported (a mean squared error of 1e-10)."""
+"""PSNR of equal images and highest reported value, corresponding to a mean squared error of 1e-10.
+"""
 
 
 _UNIT_OF_BYTE: NDArray[np.float32] = (torch.arange(256, dtype=torch.float32) / 255).numpy()
-"""What each byte stands for."""
+"""Float value of each byte."""
 
 
 @dataclass(frozen=True)
 class _MaskedPair:
-    """Two images [H, W, 3], both uint8, or both float32 in 0..1, and what counts of them.
+    """Two images [H, W, 3], both uint8 or both float32 in 0..1, with a tissue mask.
 
-    Bytes are compared as they are. OpenCV lets other threads run meanwhile, which counts beside a GPU: there a thread scores frames while
-    another one queues the training on the next.
+    Bytes are compared directly. OpenCV releases the interpreter lock, so a scoring thread does not
+    delay the thread that queues training on a GPU.
     """
 
     image: NDArray[Any]
     target: NDArray[Any]
     tissue: NDArray[np.uint8] | None
-    """[H, W], 0 where there is no tissue; None where all is tissue."""
+    """Mask [H, W], 0 outside the tissue; None if all pixels are tissue."""
     tissue_pixels: int
 
     @property
     def pixels(self) -> int:
-        """Of the whole frame."""
+        """Number of pixels of the frame."""
         return int(self.image.shape[0] * self.image.shape[1])
 
     def masked(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Both images, 0 where there is no tissue."""
+        """Return both images with 0 outside the tissue."""
         if self.tissue is None:
             return self.image, self.target
-        # Without a destination, what the mask leaves out is 0.
+        # Without a destination, OpenCV sets masked-out pixels to 0.
         return cv2.copyTo(self.image, self.tissue), cv2.copyTo(self.target, self.tissue)
 
     def squared_error(self) -> float:
-        """Sum over all pixels and channels of tissue, for values in 0..1; exact for bytes."""
+        """Return the squared error summed over tissue pixels and channels, for values in 0..1;
+        exact for bytes.
+        """
         if self.image.dtype == np.uint8:
             return float(cv2.norm(self.image, self.target, cv2.NORM_L2SQR, self.tissue)) / 255**2
         image, target = (torch.from_numpy(values) for values in self.masked())
-        # Summed in float64: a frame has a million terms.
+        # Summed in float64, since a frame has a million terms.
         return float((image - target).square_().sum(dtype=torch.float64))
 
     def psnrs_db(self) -> tuple[float, float]:
-        """Over tissue, and over the whole frame; NaN where there is no tissue."""
+        """Return the PSNR over tissue and over the whole frame; NaN without tissue."""
         error = self.squared_error()
         return _psnr_db(error, self.tissue_pixels), _psnr_db(error, self.pixels if self.tissue_pixels else 0)
 
     def mean_ssim(self) -> float:
-        """Mean of the similarity of every pixel and channel."""
+        """Return the mean similarity over all pixels and channels."""
         image, target = (torch.from_numpy(unit_image(values)) for values in self.masked())
-        # OpenCV sums in float64 as it reads; torch first makes a float64 copy of the map, for many times as long.
+        # OpenCV accumulates in float64 directly; torch would first copy the map to float64, which
+        # is much slower.
         return sum(cv2.mean(ssim_map(image, target).numpy())[:3]) / 3
 
 
 def _image(image: ImageLike, name: str) -> NDArray[Any]:
-    """The image [H, W, 3] on the CPU, uint8 or floating point."""
+    """Return the image [H, W, 3] on the CPU as uint8 or floating point."""
     array = _host_array(image)
     if array.ndim != 3 or array.shape[2] != 3:
         raise InvalidInput(f"{name} must be RGB [H, W, 3], got {list(array.shape)}")
@@ -94,7 +97,7 @@ def _host_array(values: ImageLike) -> NDArray[Any]:
 
 
 def unit_image(image: NDArray[Any]) -> NDArray[np.float32]:
-    """The image as float32 in 0..1."""
+    """Convert an image to float32 in 0..1."""
     if image.dtype == np.uint8:
         return np.asarray(cv2.LUT(image, _UNIT_OF_BYTE), dtype=np.float32)
     return np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
@@ -118,7 +121,7 @@ def _masked_pair(image: ImageLike, target: ImageLike, mask: ImageLike | None) ->
 
 
 def _psnr_db(squared_error: float, pixels: int) -> float:
-    """PSNR of the squared error shared out over `pixels`; NaN over none."""
+    """Return the PSNR of a squared error averaged over `pixels`; NaN for none."""
     return _decibels(squared_error / (3 * pixels)) if pixels else math.nan
 
 
@@ -129,40 +132,44 @@ def _decibels(mean_squared_error: float) -> float:
 
 
 def psnr_tissue_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
-    """PSNR in dB over tissue pixels only: squared error over tissue / (3 x tissue pixels). EndoGaussian's PSNR*.
+    """Return the PSNR in dB over tissue pixels: squared error over tissue / (3 x tissue pixels).
+    EndoGaussian calls it PSNR*.
 
     Args:
         image: [H, W, 3], uint8 or floats in 0..1.
         target: [H, W, 3], uint8 or floats in 0..1.
-        mask: [H, W], non-zero = tissue; None = all of it.
+        mask: [H, W], non-zero = tissue; None = all pixels.
 
     Returns:
-        At most PSNR_CAP_DB; NaN when the mask has no tissue.
+        At most PSNR_CAP_DB; NaN if the mask has no tissue.
     """
     pair = _masked_pair(image, target, mask)
     return _psnr_db(pair.squared_error(), pair.tissue_pixels)
 
 
 def psnr_frame_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
-    """PSNR in dB of masked images over the whole frame: squared error over tissue / (3 x all pixels).
+    """Return the PSNR in dB of masked images over the whole frame: squared error over tissue / (3 x
+    all pixels).
 
-    The variant that most papers print; it rises with the tool's size, so it stands beside `psnr_tissue_db`, never alone.
-    Arguments and return as there.
+    Most papers print this variant. It rises with the tool's size, so report it only together with
+    `psnr_tissue_db`. Arguments and return value are the same as there.
     """
     pair = _masked_pair(image, target, mask)
     return _psnr_db(pair.squared_error(), pair.pixels if pair.tissue_pixels else 0)
 
 
 def psnrs_db(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> tuple[float, float]:
-    """`psnr_tissue_db` and `psnr_frame_db` of one pair of images, which are compared once."""
+    """Return `psnr_tissue_db` and `psnr_frame_db` of one pair of images, compared once."""
     return _masked_pair(image, target, mask).psnrs_db()
 
 
 def ssim(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> float:
-    """Mean structural similarity of the masked images over the whole frame (Wang et al. 2004).
+    """Return the mean structural similarity of the masked images over the whole frame (Wang et al.
+    2004).
 
-    11x11 Gaussian of sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, range 1: the convention of the field's tables. The masked-out
-    part counts as equal. Arguments as in `psnr_tissue_db`; NaN when the mask has no tissue.
+    It uses the usual convention: 11x11 Gaussian of sigma 1.5, zero padding, C1 = 0.01^2, C2 =
+    0.03^2, range 1. Masked-out pixels count as equal. Arguments as in `psnr_tissue_db`; NaN if the
+    mask has no tissue.
     """
     pair = _masked_pair(image, target, mask)
     return pair.mean_ssim() if pair.tissue_pixels else math.nan
@@ -170,7 +177,7 @@ def ssim(image: ImageLike, target: ImageLike, mask: ImageLike | None = None) -> 
 
 @dataclass(frozen=True)
 class FrameQuality:
-    """The measures of one frame; NaN where the frame has no tissue."""
+    """Quality measures of one frame; NaN if the frame has no tissue."""
 
     seq: int
     psnr_tissue_db: float
@@ -182,19 +189,19 @@ MEASURES = ("psnr_tissue_db", "psnr_frame_db", "ssim")
 
 
 class ScoredMean:
-    """The mean of a stream of values, leaving out those that are not finite; correctly rounded, in memory of fixed size.
+    """Correctly rounded mean of the finite values of a stream, in constant memory.
 
-    The sum is kept as a few floats that do not overlap (Shewchuk, "Adaptive Precision Floating-Point Arithmetic", 1997), so that the mean
-    does not depend on the order of the values.
+    The sum is kept as non-overlapping floats (Shewchuk, "Adaptive Precision Floating-Point
+    Arithmetic", 1997), so the mean does not depend on the order of the values.
     """
 
     def __init__(self) -> None:
         self.count = 0
-        """How many finite values there were."""
+        """Number of finite values."""
         self._parts: list[float] = []
 
     def add(self, value: float) -> None:
-        """Take one value."""
+        """Add a value; non-finite ones are ignored."""
         if not math.isfinite(value):
             return
         self.count += 1
@@ -211,16 +218,15 @@ class ScoredMean:
 
     @property
     def mean(self) -> float | None:
-        """The mean so far; None without any finite value."""
+        """Mean of the values so far; None without any."""
         return math.fsum(self._parts) / self.count if self.count else None
 
 
 def frame_quality(
     seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None, *, similarity: bool = True
 ) -> FrameQuality:
-    """All measures of one frame, whose images are compared once; arguments as in `psnr_tissue_db`.
-
-    Without `similarity` SSIM, which takes longest, is left out.
+    """Compute all measures of one frame. Arguments as in `psnr_tissue_db`; without `similarity` the
+    slow SSIM is NaN.
     """
     pair = _masked_pair(image, target, mask)
     measured = similarity and pair.tissue_pixels
@@ -228,27 +234,29 @@ def frame_quality(
 
 
 class QualityTracker:
-    """Means over the frames that were displayed, in memory of fixed size."""
+    """Means of the quality measures over displayed frames, in constant memory."""
 
     def __init__(self) -> None:
         self.count = 0
-        """Frames observed, those without tissue among them."""
+        """Number of frames observed, including those without tissue."""
         self._means = {name: ScoredMean() for name in MEASURES}
 
     def observe(
         self, seq: int, image: ImageLike, target: ImageLike, mask: ImageLike | None = None, *, similarity: bool = True
     ) -> FrameQuality:
-        """Score one frame and take the result into the means; arguments as in `frame_quality`."""
+        """Score one frame and add it to the means; arguments as in `frame_quality`."""
         quality = frame_quality(seq, image, target, mask, similarity=similarity)
         self.take(quality)
         return quality
 
     def take(self, quality: FrameQuality) -> None:
-        """Take a frame's measures into the means; those that are not finite are left out."""
+        """Add a frame's measures to the means; non-finite ones are ignored."""
         self.count += 1
         for name, mean in self._means.items():
             mean.add(getattr(quality, name))
 
     def means(self) -> dict[str, float | None]:
-        """Mean of each measure over the frames that have one (PSNR averaged in dB, as the field does); None without any."""
+        """Return the mean of each measure over frames that have it (PSNR averaged in dB), or None
+        without any.
+        """
         return {name: mean.mean for name, mean in self._means.items()}

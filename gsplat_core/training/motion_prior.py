@@ -1,7 +1,8 @@
-"""What is assumed about motion after the newest frame: how the model is shown between frames, and where training on the next one starts.
+"""Prediction of motion after the newest frame, for display between frames and as start of training
+on the next frame.
 
-A `MotionPrior` sees each frame before the model is trained on it, and is asked for the velocity after it. Others than those of `MOTION_PRIORS`
-are a module and a line there.
+A `MotionPrior` processes each frame before the model is trained on it, and predicts the velocity
+after it. Further priors are added as modules registered in `MOTION_PRIORS`.
 """
 
 from __future__ import annotations
@@ -31,50 +32,60 @@ from gsplat_core.training.surface_motion import SurfaceMotion
 from gsplat_core.transfers import tensor_of
 
 HORIZON_S = 0.15
-"""How long after the newest frame its motion goes on at most; then the model holds still."""
+"""Longest time after the newest frame for which its motion is extrapolated, in seconds; then the
+model is static.
+"""
 LONGEST_GAP_S = 0.15
-"""Frames further apart do not show a velocity."""
+"""Longest interval between frames that gives a velocity, in seconds."""
 UNCERTAINTY = 0.05
-"""Variance of where a Gaussian will be, in squares of the length of its last motion."""
+"""Variance of a Gaussian's predicted position, relative to the squared length of its last motion.
+"""
 MOST_WIDENED = 0.7
-"""Bound of what is added to a log-scale from one frame to the next."""
+"""Largest change of a log-scale from one frame to the next."""
 SUDDEN = 5.0
-"""A motion so many times the usual one, and more than `SUDDEN_PX`, is a jump of the picture and does not go on."""
+"""Ratio to the usual motion above which a motion of more than `SUDDEN_PX` pixels is a jump and is
+not extrapolated.
+"""
 SUDDEN_PX = 1.0
 USUAL_DECAY = 0.1
-"""How fast the usual motion follows the newest one."""
+"""Weight of the newest motion in the usual motion."""
 
 
 class MotionPrior(Protocol):
-    """One stream's assumption about motion. Its memory and the time of a call do not grow with the stream."""
+    """Motion prediction of one stream. Memory and time per call do not grow with the stream."""
 
     def observe(self, frame: Frame, time_s: float, camera: Camera, step: TrainingStep) -> None:
-        """Take the next frame before the model is trained on it; the field covers `time_s` already. The scene may be moved to where the
-        frame shows it."""
+        """Process the next frame before the model is trained on it. The field must already cover
+        `time_s`. The prior may move the scene to match the frame.
+        """
 
     def velocity(self, step: TrainingStep, deltas: Tensor | None = None) -> Tensor | None:
-        """What the raw parameters change by per second after the newest frame, [N, 16]; None for nothing. `deltas` are what the field adds
-        at that frame's time, where they are known already."""
+        """Return the rate of change of the raw parameters after the newest frame per second, [N,
+        16], or None for none. `deltas` are the field's raw deltas at that frame's time, if already
+        computed.
+        """
 
     @property
     def newest_s(self) -> float:
-        """Time of the newest frame that was observed."""
+        """Time of the newest frame processed, in seconds."""
 
     @property
     def horizon_s(self) -> float:
-        """How long after the newest frame its velocity goes on; then the model holds still."""
+        """Time after the newest frame for which the velocity applies, in seconds."""
 
     revealed_px: float
-    """How wide a strip at an edge the picture shows that it did not show when this was set to 0 last."""
+    """Width in pixels of the strip revealed at an edge since this was last set to 0."""
 
     def forget(self) -> None:
-        """A new scene begins."""
+        """Reset for a new scene."""
 
 
 class FlowPrior:
-    """The motion between the last two frames goes on, as much of it as went on before. It is measured in the pictures, as optical flow of the tissue.
+    """Motion prior that continues the motion between the last two frames, damped by its observed
+    persistence. The motion is measured as optical flow of the tissue.
 
-    That is more exact than the model's own past: bumps in time average over several frames.
+    Flow is more accurate than the model's own past, since temporal basis functions average over
+    several frames.
     """
 
     def __init__(self, config: ReconstructorConfig) -> None:
@@ -125,7 +136,8 @@ class FlowPrior:
             if last is not None and learns:
                 self._damping.learn(last.arrived(points) / last_interval_s, ahead / self._interval_s)
             if self._starts_there:
-                # The scene at `time_s` is its state at `before_s`, moved on by the flow, in place of what the bumps go on with.
+                # Replace the field's extrapolation at `time_s` by the state at `before_s` moved by
+                # the flow.
                 held[:, POSITION] += ahead
                 step.field.move_to(time_s, held)
 
@@ -143,54 +155,67 @@ class FlowPrior:
         return velocity / self._interval_s
 
     def _take(self, frame: Frame, flow: Flow | None, device: torch.device) -> None:
-        """What else is to be learned from a frame, and from how the picture before moved to it; None where that is not known."""
+        """Learn further properties of a frame in subclasses. `flow` is the motion from the previous
+        picture, or None if unknown.
+        """
 
     def _usable_motion(self) -> SurfaceMotion | None:
-        """The newest motion where it says how the next frame will be."""
+        """Return the newest motion if it predicts the next frame, else None."""
         return self._motion if 0 < self._interval_s <= LONGEST_GAP_S and not self._is_sudden else None
 
     def _judge(self, moved_px: float) -> None:
-        """Whether the motion is a jump; learn the usual one."""
+        """Detect a jump and update the usual motion."""
         usual = moved_px if self._usual_px is None else self._usual_px
         self._is_sudden = moved_px > max(SUDDEN * usual, SUDDEN_PX)
         self._usual_px = usual + USUAL_DECAY * (min(moved_px, SUDDEN * usual) - usual)
 
 
 def widened(log_scales: Tensor, moved: Tensor) -> Tensor:
-    """What makes Gaussians [N, 3] as wide as the places [N, 3] where they may be by the next frame: added to their log-scales.
+    """Return the increase of log-scales [N, 3] that accounts for the uncertainty of the next
+    motion.
 
-    The picture that is nearest to all that may come is their mean, and the mean of a Gaussian over normally distributed places is a wider
-    one. The spread is taken in proportion to the last motion.
+    The least-squares prediction of an uncertain picture is its mean, and the mean of a Gaussian
+    over normally distributed positions is a wider Gaussian. The standard deviation is proportional
+    to the last motion `moved` [N, 3].
     """
     variance = UNCERTAINTY * moved.square().sum(dim=1, keepdim=True)
     return (0.5 * torch.log1p(variance * torch.exp(-2 * log_scales))).clamp(max=MOST_WIDENED)
 
 
 def followed(frame: Frame) -> NDArray[np.uint8] | None:
-    """Where the frame shows tissue that can be followed; None: everywhere."""
+    """Return the mask of trackable tissue, or None if all pixels are."""
     if frame.mask is None or frame.loss_mask is None:
         return frame.mask if frame.loss_mask is None else frame.loss_mask
     return frame.mask & frame.loss_mask
 
 
 def no_prior(config: ReconstructorConfig) -> None:
-    """The field's bumps go on as they do."""
+    """Return no prior; the field's own extrapolation is used."""
 
 
 def new_motion_prior(config: ReconstructorConfig, field: DeformationField) -> MotionPrior | None:
-    """The prior that is configured, where the field can be continued. Raises InvalidSetting for an unknown name."""
+    """Create the configured prior, or None if the field has no continuation.
+
+    Raises:
+        InvalidSetting: for an unknown name.
+    """
     prior: MotionPrior | None = MOTION_PRIORS[config.motion_prior](config)
     return prior if field.continues else None
 
 
 @contextmanager
 def continued(step: TrainingStep, prior: MotionPrior | None, learned_s: float) -> Iterator[None]:
-    """For the time of a copy for publishing the scene goes on as the prior says after `learned_s`, the time of the newest frame that was
-    trained on; training knows nothing of it. The scene holds still there where the prior has not seen that frame yet."""
+    """Set the prior's continuation on the field while a copy is published; training is not
+    affected.
+
+    The scene is static after `learned_s`, the time of the newest trained frame, if the prior has
+    not processed that frame.
+    """
     if prior is None:
         yield
         return
-    # Also without a velocity: slots whose fields have a continuation from the start need no other memory later.
+    # Also without a velocity, so that slots whose fields have a continuation from the start need no
+    # other memory later.
     velocity = prior.velocity(step) if prior.newest_s == learned_s else None
     still = step.gaussians.means.new_zeros(0, RAW_COLUMNS)
     step.field.continue_with(still if velocity is None else velocity, learned_s, prior.horizon_s)
@@ -201,8 +226,9 @@ def continued(step: TrainingStep, prior: MotionPrior | None, learned_s: float) -
 
 
 def newest_state(step: TrainingStep, prior: MotionPrior, learned_s: float) -> tuple[Gaussians, NewestState]:
-    """The scene at `learned_s`, the time of the newest frame that was trained on, and how the prior lets it go on: what `continued` copies
-    shows from then on, without the past, in memory of its own."""
+    """Return the scene at `learned_s`, the time of the newest trained frame, with the prior's
+    continuation, without the past and in its own memory.
+    """
     with torch.no_grad():
         deltas = step.field.deltas(learned_s)
         velocity = prior.velocity(step, deltas) if prior.newest_s == learned_s else None
@@ -210,7 +236,8 @@ def newest_state(step: TrainingStep, prior: MotionPrior, learned_s: float) -> tu
         continuation = Continuation(step.gaussians.count, step.gaussians.device)
         continuation.write(still if velocity is None else velocity, learned_s, prior.horizon_s)
         now = displaced(step.gaussians, deltas)
-        # The field adds nothing to opacities, so that these are still those that training changes.
+        # The field does not change opacities, so the displaced scene shares them with training and
+        # they must be copied.
         right = None if now.right_sh is None else now.right_sh.clone()
         own = replace(now, logit_opacities=now.logit_opacities.clone(), right_sh=right)
         return own, NewestState(learned_s, continuation)

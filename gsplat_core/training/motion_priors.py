@@ -1,4 +1,4 @@
-"""The motion priors by name. Another one is a class that follows `MotionPrior`, and a line here."""
+"""Registry of motion priors. A new one is a class that implements `MotionPrior` and an entry here."""
 
 from __future__ import annotations
 
@@ -15,4 +15,6 @@ MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
         "learned": "gsplat_core.training.learned_prior:LearnedPrior",
     },
 )
-"""Made from a `ReconstructorConfig`. `bumps` is none: the field's bumps simply go on."""
+"""Factories that take a `ReconstructorConfig`. `bumps` uses no prior, only the field's own
+extrapolation.
+"""

@@ -1,4 +1,4 @@
-"""What lies around each cell of a grid over the picture, by the centres of Gaussians."""
+"""Density and depth of Gaussians around the cells of a picture grid."""
 
 from __future__ import annotations
 
@@ -10,21 +10,24 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.unseen import depth_of, pixels_of
 
 DEPTH_STEPS = 2**24
-"""As finely as float32, depths are counted in parts of the largest one."""
+"""Quantisation steps of the largest depth, as fine as float32."""
 
 
 def around_cells(
     now: Gaussians, camera: Camera, spacing: float, shape: tuple[int, int], reach: int = 1
 ) -> tuple[Tensor, Tensor]:
-    """How many centres of Gaussians lie in each cell of a grid and in the cells up to `reach` beside it, and how deep they lie on average
-    (0: there are none); float32 [rows, columns] each. What lies just beyond the picture's edge counts."""
+    """Return the number and mean depth (0 for none) of Gaussian centres around each cell, float32
+    [rows, columns] each.
+
+    The neighbourhood includes cells up to `reach` away, also just beyond the picture's edge.
+    """
     rows, columns = (cells + 2 * reach for cells in shape)
     pixels, near = pixels_of(now.means, camera, margin_px=reach * spacing)
     cells = torch.floor(pixels / spacing).long() + reach
     inside = near & (cells[:, 0] < columns) & (cells[:, 1] < rows) & (cells >= 0).all(1)
     index = torch.where(inside, cells[:, 1] * columns + cells[:, 0], 0)
     depth = depth_of(now.means, camera)
-    # Whole numbers: on a GPU their sums do not depend on the order in which they come.
+    # Integer sums on a GPU do not depend on the order of summation.
     quantum = depth.abs().amax().clamp(min=1e-30) / DEPTH_STEPS if len(depth) else depth.new_ones(())
     each = torch.stack([torch.ones_like(index), torch.round(depth / quantum).long()]) * inside
     sums = each.new_zeros(2, rows * columns).index_add_(1, index, each).to(torch.float32)

@@ -1,4 +1,4 @@
-"""The frames that a reconstructor may train on, and which of them a step takes."""
+"""Frames available for training, and the selection of one for each step."""
 
 from __future__ import annotations
 
@@ -22,50 +22,58 @@ from gsplat_core.transfers import HostCopy, tensor_of
 
 @dataclass(frozen=True)
 class Observation:
-    """One frame in the types of the training step, on the device that trains."""
+    """Frame as tensors on the training device."""
 
     seq: int
     time_s: float
     camera: Camera
     image: Tensor
-    """uint8 [H, W, 3]."""
+    """RGB uint8 [H, W, 3]."""
     mask: Tensor
-    """uint8 [H, W]; 1 = tissue."""
+    """Mask uint8 [H, W]; 1 = tissue."""
     depth: Tensor | None
-    """float32 [H, W] in millimetres; 0 = unknown."""
+    """Depth float32 [H, W] in millimetres; 0 = unknown."""
     rehearsal_mask: Tensor | None = None
-    """uint8 [H, W]; 0 = left out when the frame is trained on again later."""
+    """Mask uint8 [H, W]; 0 = ignored when the frame is trained on again later."""
     right_eye: RightEye | None = None
-    """What the right eye saw at the same time, where it is trained on as well (`BothEyes`)."""
+    """Right eye's picture of the same time, if it is trained on (`BothEyes`)."""
     of_right: bool = False
-    """Whether it is such an observation of the right eye."""
+    """True if this is an observation of the right eye."""
 
     @property
     def right(self) -> Observation | None:
-        """The right eye's observation; made when it is first asked for, which takes the host as long as some steps take a GPU."""
+        """Observation of the right eye, created on first use, which costs host time of several GPU
+        steps.
+        """
         return None if self.right_eye is None else self.right_eye.observation
 
     def to_rehearse(self) -> Observation:
-        """The frame as it is trained on again later."""
+        """Return the observation as it is trained on again later."""
         right = None if self.right_eye is None else self.right_eye.to_rehearse()
         if self.rehearsal_mask is None:
             return self if right is None else replace(self, right_eye=right)
         return replace(self, mask=self.mask & self.rehearsal_mask, rehearsal_mask=None, right_eye=right)
 
     def by_turns(self, turn: int) -> Observation:
-        """The eye whose turn it is: the left one at even turns, the right one, if there is one, at odd ones."""
+        """Return the left eye at even turns, the right eye, if any, at odd ones."""
         return self if self.right_eye is None or turn % 2 == 0 else self.right_eye.observation
 
     def as_frame(self) -> Frame:
-        """The frame as training sees it. Waits for the device."""
+        """Return the frame as training sees it. Synchronises with the device."""
         image, mask = HostCopy(self.image).numpy(), HostCopy(self.mask).numpy()
         return Frame(self.seq, round(self.time_s * 1e9), image, mask=mask, pose=self.camera.world_to_camera)
 
     @staticmethod
     def of(frame: Frame, camera: Camera, device: torch.device | str = "cpu") -> Observation:
-        """A frame seen by `camera`, which has the frame's size; the frame's own pose wins over the camera's, and its exposure is taken out.
+        """Create an observation of a frame.
 
-        The copy to another `device` than the CPU is queued on its current stream.
+        Args:
+            frame: frame; its own pose overrides the camera's, and its exposure is removed.
+            camera: camera of the frame's size.
+            device: target device; the copy is queued on its current stream.
+
+        Raises:
+            InvalidInput: for a camera of another size.
         """
         if (frame.width_px, frame.height_px) != (camera.width_px, camera.height_px):
             raise InvalidInput(
@@ -87,45 +95,48 @@ class Observation:
 
 
 class RightEye:
-    """An observation of the right eye that is made when it is first asked for."""
+    """Observation of the right eye, created on first use."""
 
     def __init__(self, make: Callable[[], Observation]) -> None:
         self._make = make
 
     @cached_property
     def observation(self) -> Observation:
-        """It."""
         return self._make()
 
     def to_rehearse(self) -> RightEye:
-        """As it is trained on again later."""
+        """Return the eye as it is trained on again later."""
         return RightEye(lambda: self.observation.to_rehearse())
 
 
 def scene_colours(image: NDArray[np.uint8], exposure: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """The picture without its exposure."""
+    """Remove the exposure from a picture."""
     if exposure == (1.0, 1.0, 1.0):
         return image
     return np.rint(np.clip(image / np.array(exposure, np.float32), 0, 255)).astype(np.uint8)
 
 
 def learned_depth(frame: Frame, device: torch.device | str = "cpu") -> Tensor | None:
-    """The frame's depth [H, W] that the loss takes, 0 where it is not believed; None where it takes none. The scene starts from depth of a single picture,
-    by light or learned, and is not held to it: it is rough, and right up to a factor that no two frames need to share."""
+    """Return the depth [H, W] compared by the loss, 0 where not confident, or None for no
+    comparison.
+
+    Shading and network depth only initialise the scene. They are inaccurate, and their scale may
+    differ between frames.
+    """
     if frame.depth is None or frame.depth_origin in (DepthOrigin.LIGHT, DepthOrigin.LEARNED):
         return None
     return known_depth(believed_depth(frame), device)
 
 
 def known_depth(depth_mm: NDArray[np.floating], device: torch.device | str = "cpu") -> Tensor:
-    """The depth map [H, W] as float32 on `device`, with 0 (unknown) where it holds no positive finite number."""
-    # Looked at where it is used: on the host that takes longer than some steps on a GPU.
+    """Return a depth map [H, W] as float32 on `device`, with 0 where it is not positive and finite."""
+    # Checked on the device; on the host it would take longer than some GPU steps.
     depth = tensor_of(depth_mm.astype(np.float32, copy=False), device)
     return torch.where(torch.isfinite(depth) & (depth > 0), depth, 0.0)
 
 
 class ObservationWindow:
-    """The newest frames, bounded; draws the newest one or an older one by a seeded generator."""
+    """Bounded window of the newest frames with seeded random selection."""
 
     def __init__(self, capacity: int, newest_share: float, seed: int) -> None:
         self._frames: deque[Observation] = deque(maxlen=capacity)
@@ -133,21 +144,25 @@ class ObservationWindow:
         self._random = np.random.default_rng(seed)
 
     def add(self, observation: Observation) -> None:
-        """Make `observation` the newest; the oldest leaves a full window."""
+        """Add an observation as the newest; a full window drops the oldest."""
         self._frames.append(observation.to_rehearse())
 
     @property
     def newest(self) -> Observation:
-        """The frame that was added last."""
+        """Frame added last."""
         return self._frames[-1]
 
     def find(self, seq: int, among: int) -> Observation | None:
-        """The frame with this number, if it is there and one of so many newest ones."""
+        """Return the frame with number `seq` if it is one of the `among` newest ones."""
         newest = islice(reversed(self._frames), among)
         return next((each for each in newest if each.seq == seq), None)
 
     def replace(self, observation: Observation) -> None:
-        """Put `observation` in the place of the frame with its number. Raises InvalidInput where there is none."""
+        """Replace the frame with the same number.
+
+        Raises:
+            InvalidInput: if there is none.
+        """
         for index in reversed(range(len(self._frames))):
             if self._frames[index].seq == observation.seq:
                 self._frames[index] = observation
@@ -155,7 +170,7 @@ class ObservationWindow:
         raise InvalidInput(f"frame {observation.seq} is not in the window of {len(self._frames)} frames")
 
     def forget_before(self, time_s: float) -> None:
-        """Drop frames that are older, all but the newest: the field no longer tells their times apart."""
+        """Drop frames before `time_s`, whose times the field no longer resolves, except the newest."""
         while len(self._frames) > 1 and self._frames[0].time_s < time_s:
             self._frames.popleft()
 
@@ -163,12 +178,16 @@ class ObservationWindow:
         return len(self._frames)
 
     def draw(self, newest_share: float) -> Observation:
-        """The newest frame with that probability, else any frame of the window."""
+        """Return the newest frame with probability `newest_share`, else a random frame of the
+        window.
+        """
         newest = self._random.random() < newest_share
         return self._frames[-1 if newest else int(self._random.integers(0, len(self._frames)))]
 
     def schedule(self, steps: int) -> list[Observation]:
-        """Observations for the next `steps` steps. The last one is the newest frame, which is about to be shown."""
+        """Return observations for the next steps, ending with the newest frame, which is displayed
+        next.
+        """
         if steps < 0:
             raise InvalidInput(f"steps is {steps}; it must be at least 0")
         if steps == 0:

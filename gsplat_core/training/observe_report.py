@@ -1,4 +1,4 @@
-"""What training on one frame did."""
+"""Report of training on one frame."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from gsplat_core.transfers import HostCopy
 
 @dataclass(frozen=True)
 class ObserveReport:
-    """What one frame changed."""
+    """Training result of one frame."""
 
     seq: int
     steps: int
     arriving_loss: HostCopy | None
-    """Loss of the last step, which a GPU may not have finished; None when the frame was not trained on."""
+    """Loss of the last step, possibly unfinished on a GPU; None if the frame was not trained on."""
     gaussians: int
     ending: Ending = "steps"
-    """Why training on the frame ended."""
+    """Reason why training on the frame ended."""
 
     @property
     def loss(self) -> float | None:

@@ -1,5 +1,6 @@
-"""Training on all frames of a recording at once: where the scene starts, the frames' order, the learning rates' decay, smoothing, and when
-Gaussians are split."""
+"""Training on all frames of a recording: frame order, decay of learning rates, temporal smoothing
+and densification.
+"""
 
 from __future__ import annotations
 
@@ -21,30 +22,39 @@ from gsplat_core.training.steadiness import steadiness
 from gsplat_core.training.step import TrainingStep
 
 SMOOTH_EVERY = 20
-"""Steps from one smoothing to the next: it touches all columns, a step only those near its time."""
+"""Steps between two smoothings, which process all columns, unlike a step."""
 MOST_AT_ONCE = 0.5
-"""Of the way to the neighbours' mean."""
+"""Largest share of the way to the neighbours' mean in one smoothing."""
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How `Reconstructor.fit` goes through its steps. Raises InvalidSetting for a value out of its range."""
+    """Settings of `Reconstructor.fit`.
+
+    Raises:
+        InvalidSetting: for a value out of its range.
+    """
 
     final_rate: float = 0.02
-    """What is left of every learning rate at the end, as a share; on the way there they follow half a cosine."""
+    """Final learning rates as a share of the initial ones; they decay along half a cosine."""
     smoothing: float = 1.5
-    """How far, in a pass over all frames, what the field learned for each time is moved to the mean of its neighbours in time, times the
-    factor of the learning rates: a frame between two others is then shown between them, not with the noise of both. Where frames are not
-    between their neighbours, because things move fast, it is less (`steadiness`). 0: not at all."""
+    """Strength of temporal smoothing: share of the way to the mean of the temporal neighbours per
+    pass over all frames, scaled by the learning rates' factor. It suppresses noise of single frames
+    and is reduced for fast motion (`steadiness`). 0 disables it.
+    """
     rigidity: float = 1.0
-    """How far, in a pass over all frames, the motion of each Gaussian is moved to the mean of its neighbours', times the factor of the learning rates: tissue moves
-    as one piece, and what moves by itself is most often noise. Less where things move fast, by the root of `steadiness`. 0: not at all."""
+    """Strength of spatial smoothing: share of the way of a Gaussian's motion to its neighbours'
+    mean per pass over all frames, scaled by the learning rates' factor. It is reduced for fast
+    motion by the root of `steadiness`. 0 disables it.
+    """
     densify_rounds: int = 6
-    """How often Gaussians that nobody sees are dropped and those with the largest error are split; 0: never."""
+    """Number of densification rounds, which remove invisible Gaussians and split those with large
+    errors; 0 for none.
+    """
     densify_until: float = 0.7
-    """Share of the steps after which the last of these rounds is; the rounds are spread evenly."""
+    """Share of the steps after which the last round takes place; rounds are spread evenly."""
     densify_frames: int = 12
-    """Frames, chosen at random for each round, in which the error is looked for."""
+    """Number of random frames in which each round measures the error."""
 
     def __post_init__(self) -> None:
         for name in ("final_rate", "densify_until"):
@@ -59,16 +69,20 @@ class FitSettings:
             )
 
     def rate_at(self, share: float) -> float:
-        """The factor of the learning rates after this share of the steps."""
+        """Return the factor of the learning rates after this share of the steps."""
         return self.final_rate + (1 - self.final_rate) * 0.5 * (1 + math.cos(math.pi * share))
 
     def rounds(self, steps: int) -> list[int]:
-        """After how many of the steps each round of densification is."""
+        """Return the step numbers of the densification rounds."""
         return [round(steps * self.densify_until * (k + 1) / self.densify_rounds) for k in range(self.densify_rounds)]
 
 
 def observed(frames: Sequence[Frame], observation_of: Callable[[Frame], Observation]) -> list[Observation]:
-    """The frames in the types of training, in order. Raises InvalidInput when there are none, or when they are not in order."""
+    """Convert frames to observations.
+
+    Raises:
+        InvalidInput: if there are no frames, or if they are out of temporal order.
+    """
     if not frames:
         raise InvalidInput("there are no frames to train on")
     for before, frame in pairwise(frames):
@@ -81,7 +95,7 @@ def observed(frames: Sequence[Frame], observation_of: Callable[[Frame], Observat
 
 
 class OfflineTraining:
-    """The steps of one `fit`."""
+    """Training loop of one `fit`."""
 
     def __init__(
         self,
@@ -95,19 +109,22 @@ class OfflineTraining:
         self._step, self._settings = step, settings
         rights = [one.right for one in observations if one.right is not None]
         self._observations = [*observations, *rights]
-        """Of both eyes."""
+        """Observations of both eyes."""
         self._first_count, self._most = step.gaussians.count, most_gaussians
         steady = steadiness(observations) if settings.smoothing or settings.rigidity else 0.0
-        # A ratio of squares; what neighbours' motions differ by goes with its root.
+        # `steadiness` is a ratio of squares; differences between neighbouring motions scale with
+        # its root.
         self._smoothing, self._rigidity = settings.smoothing * steady, settings.rigidity * math.sqrt(steady)
         self._random = np.random.default_rng(seed)
         self._order: list[int] = []
         self._rate = 1.0
         self._neighbours: Tensor | None = None
-        """Of each Gaussian; None: to be looked for, as they are others now."""
+        """Neighbours of each Gaussian, or None if they must be searched again."""
 
     def __call__(self, steps: int, progress: Callable[[int, Tensor], None] | None) -> Tensor:
-        """Take `steps` steps; `progress` is called after each one. Returns the last one's loss, a tensor [] on the device."""
+        """Run `steps` steps, calling `progress` after each. Returns the last loss, [] on the
+        device.
+        """
         rounds = self._settings.rounds(steps)
         loss = torch.zeros(())
         for number in range(steps):
@@ -124,13 +141,13 @@ class OfflineTraining:
         return loss
 
     def _next(self) -> Observation:
-        """Every observation once in random order, then again."""
+        """Return the next observation in a random order of all."""
         if not self._order:
             self._order = self._random.permutation(len(self._observations)).tolist()
         return self._observations[self._order.pop()]
 
     def _smooth(self) -> None:
-        """As much as belongs to the steps since the last time."""
+        """Smooth by the amount that belongs to the steps since the last time."""
         each = self._rate * SMOOTH_EVERY / len(self._observations)
         if self._smoothing:
             self._step.field.smooth_in_time(min(self._smoothing * each, MOST_AT_ONCE))
@@ -140,7 +157,9 @@ class OfflineTraining:
             self._step.field.share_motion(self._neighbours, min(self._rigidity * each, MOST_AT_ONCE))
 
     def _densify(self, share: float) -> None:
-        """A round; `share` of all rounds is over with it, and their number grows from the first to the most along with that."""
+        """Run a densification round. `share` of all rounds is complete with it, and the number of
+        Gaussians grows accordingly.
+        """
         self._step.settle(self._observations[-1], rate_scale=self._rate)
         self._neighbours = None
         order = self._random.permutation(len(self._observations)).tolist()
@@ -149,7 +168,7 @@ class OfflineTraining:
             for part in (order[: self._settings.densify_frames], order[self._settings.densify_frames :])
         )
         shares = shares_of(self._step, chosen)
-        # What a tool hides in all of the chosen pictures, or what lies outside of them, others may show.
+        # Gaussians hidden in all chosen pictures may be visible in others.
         hidden = ~on_tissue(self._step, chosen)
         if bool(hidden.any()):
             seen_px = torch.where(

@@ -1,4 +1,4 @@
-"""Adam over the Gaussians' tensors, whose number of rows changes as they are added and pruned."""
+"""Adam for the Gaussians' tensors, with rows that can be added and removed."""
 
 from __future__ import annotations
 
@@ -13,23 +13,26 @@ from gsplat_core.scene.rows import RowMoves
 
 
 class FusedAdam:
-    """Adam (Kingma and Ba 2015) over named tensors, with a learning rate each, as torch.optim.Adam computes it.
+    """Adam (Kingma and Ba 2015) over named tensors with one learning rate each, numerically equal
+    to torch.optim.Adam.
 
-    It holds the moments and not the parameters: those are passed to every step, so they may be replaced between steps as long as
-    their rows are those of the moments (`select`, `append`).
+    It holds moments but no parameters. Parameters are passed to every step, so they may be replaced
+    between steps as long as their rows match the moments (`select`, `append`).
 
-    A NaN or infinite gradient never reaches a parameter or a moment. With `rows=True` (Gaussians: dimension 0 counts them) it
-    leaves its whole row of that tensor as it was, with `rows=False` (planes, weights) just its element; `skipped` counts them.
+    A non-finite gradient never changes a parameter or a moment. With `rows=True` (Gaussians along
+    dimension 0) it skips the whole row of that tensor, with `rows=False` (planes, weights) only its
+    element. `skipped` counts them.
 
     Args:
-        parameters: the tensors to be updated, float32; only their shapes and devices are kept.
-        learning_rates: one per name, which `step` can replace at any time; None: the first step brings them.
+        parameters: float32 tensors to update; only their shapes and devices are kept.
+        learning_rates: one per name, replaceable in `step`; None: set by the first step.
         betas: decay of the first and second moment.
         epsilon: added to the denominator.
-        rows: whether dimension 0 of every tensor counts Gaussians.
+        rows: True if dimension 0 of every tensor counts Gaussians.
 
     Raises:
-        InvalidInput: rates and tensors differ in their names, or tensors in their number of rows.
+        InvalidInput: if the names of rates and tensors differ, or the tensors have different
+            numbers of rows.
     """
 
     def __init__(
@@ -45,10 +48,10 @@ class FusedAdam:
         self.epsilon = epsilon
         self.rows = rows
         self.steps = 0
-        """Steps taken."""
+        """Number of steps taken."""
         self._skipped: int | Tensor = 0
         self._spare_rows = 0
-        """Rows at the end of the moments that no Gaussian has yet; see `reserve`."""
+        """Allocated but unused rows at the end of the moments; see `reserve`."""
         self.first_moments = {name: _zeros(tensor) for name, tensor in parameters.items()}
         self.second_moments = {name: _zeros(tensor) for name, tensor in parameters.items()}
         self.learning_rates = self._checked_rates(learning_rates) if learning_rates is not None else {}
@@ -60,7 +63,9 @@ class FusedAdam:
 
     @property
     def skipped(self) -> int:
-        """Rows (or elements) left alone so far because their gradient was not finite. On CUDA the host waits for it."""
+        """Number of rows (or elements) skipped so far because of non-finite gradients. Synchronises
+        on CUDA.
+        """
         return int(self._skipped)
 
     def _checked_rates(self, learning_rates: Mapping[str, float]) -> dict[str, float]:
@@ -76,19 +81,20 @@ class FusedAdam:
         gradients: Mapping[str, Tensor | None] | None = None,
         learning_rates: Mapping[str, float] | None = None,
     ) -> int | Tensor:
-        """Update the parameters in place; on CUDA the host does not wait.
+        """Update the parameters in place, without synchronisation on CUDA.
 
         Args:
-            parameters: every named tensor, contiguous, of the moments' shapes.
-            gradients: by name; one that is None or missing leaves its tensor and moments alone. None: each tensor's `.grad`.
-            learning_rates: replace those in use, from this step on; some names or all.
+            parameters: all named tensors, contiguous, with the shapes of the moments.
+            gradients: gradients by name; a tensor whose gradient is None or missing is unchanged.
+                None: each tensor's `.grad`.
+            learning_rates: new rates from this step on, for some or all names.
 
         Returns:
-            Rows (or elements) left alone in this step because their gradient was not finite: a number, but on CUDA an int64 []
-            there, which the host only waits for when it is read.
+            Number of rows (or elements) skipped in this step because of non-finite gradients; on
+                CUDA an int64 [] tensor, so that only reading it synchronises.
 
         Raises:
-            InvalidInput: a tensor or its rate is missing, or its shape is not that of its moments.
+            InvalidInput: if a tensor or its rate is missing, or its shape differs from its moments.
         """
         self.learning_rates = self._checked_rates({**self.learning_rates, **(learning_rates or {})})
         first_moments, second_moments = (self._in_use(each) for each in (self.first_moments, self.second_moments))
@@ -132,7 +138,9 @@ class FusedAdam:
         return rows - self._spare_rows
 
     def reserve(self, rows: int) -> None:
-        """Take the memory for `rows` Gaussians now: `append` and `close_gaps` then move no tensor until there are more."""
+        """Allocate memory for `rows` Gaussians, so that `append` and `close_gaps` move no tensor
+        below that number.
+        """
         added = rows - self.count - self._spare_rows
         if added > 0:
             for moments in (self.first_moments, self.second_moments):
@@ -141,7 +149,7 @@ class FusedAdam:
             self._spare_rows += added
 
     def close_gaps(self, moves: RowMoves) -> None:
-        """Let Gaussians leave, as the rows that they were in are closed."""
+        """Remove Gaussians by the same row moves as their parameters."""
         self._need_rows()
         for moments in (self.first_moments, self.second_moments):
             for moment in moments.values():
@@ -149,7 +157,7 @@ class FusedAdam:
         self._spare_rows += moves.before - moves.count
 
     def restart(self, count: int) -> None:
-        """Forget everything, for `count` other Gaussians; the tensors stay where they are."""
+        """Reset all moments for `count` other Gaussians, keeping tensor addresses."""
         self.reserve(count)
         self._spare_rows += self.count - count
         self.steps = 0
@@ -158,7 +166,9 @@ class FusedAdam:
                 moment.zero_()
 
     def select(self, index: Tensor) -> None:
-        """Keep the moments of some rows, as `Gaussians.select(index)` does: booleans [N] or indices, in their order."""
+        """Keep the moments of some rows in the order of `index`, a mask [N] or indices, as
+        `Gaussians.select(index)` does.
+        """
         self._need_rows()
         for moments in (self.first_moments, self.second_moments):
             for name, moment in self._in_use(moments).items():
@@ -166,8 +176,11 @@ class FusedAdam:
         self._spare_rows = 0
 
     def append(self, count: int, *, usual: bool = False) -> None:
-        """Add rows at the end, which share the step count. Their moments are zero: then their first steps are 3 to 6 times the usual ones,
-        the more so the longer the others have been trained. With `usual` their second moments are the mean of the others'."""
+        """Append rows that share the step count.
+
+        With zero moments their first steps are 3 to 6 times as large as usual, increasing with the
+        step count. With `usual`, their second moments are the mean of the others.
+        """
         self._need_rows()
         if count < 0:
             raise InvalidInput(f"cannot append {count} rows")
@@ -179,9 +192,10 @@ class FusedAdam:
                 moment[used : used + count] = moment[:used].mean(0)
 
     def follow(self, parameters: Mapping[str, Tensor]) -> None:
-        """Make the moments fit tensors that were replaced by others of another shape.
+        """Adapt the moments to replaced parameters of other shapes.
 
-        Where dimension 0 alone grew, the new rows' moments start at zero; for any other shape all of them do.
+        If only dimension 0 grew, moments of the new rows start at zero; otherwise all moments of
+        the tensor do.
         """
         for moments in (self.first_moments, self.second_moments):
             for name, moment in moments.items():
@@ -194,7 +208,7 @@ class FusedAdam:
                 moments[name] = fresh
 
     def reset(self, name: str, index: Tensor | None = None) -> None:
-        """Forget the moments of one tensor, or of some of its rows: after its values were set otherwise (opacity reset, relocation)."""
+        """Reset the moments of a tensor, or of some of its rows, after its values were replaced."""
         for moments in (self.first_moments, self.second_moments):
             if index is None:
                 moments[name].zero_()
@@ -202,7 +216,7 @@ class FusedAdam:
                 moments[name][index] = 0
 
     def _in_use(self, moments: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The moments without the spare rows."""
+        """Return the moments without unused rows."""
         if self._spare_rows == 0:
             return dict(moments)
         return {name: moment[: moment.shape[0] - self._spare_rows] for name, moment in moments.items()}

@@ -1,4 +1,6 @@
-"""Room in a scene of fixed size: what was not seen for long makes place for new tissue, and comes back when the camera does."""
+"""Archive of Gaussians that have been out of view, to free capacity in a scene of fixed size. They
+are restored when the camera returns.
+"""
 
 from __future__ import annotations
 
@@ -16,21 +18,24 @@ from gsplat_core.training.unseen import Archive, LastSeen, pixels_of
 from gsplat_core.transfers import HostCopy
 
 SEE_EVERY = 8
-"""Frames between two looks at which Gaussians are seen; while rows are short, every frame is looked at."""
+"""Number of frames between two visibility tests; with little free capacity every frame is tested.
+"""
 ROOM_SHARE = 0.1
-"""Share of the rows that is kept free for new tissue, where there is anything unseen that can leave."""
+"""Share of the capacity kept free for new tissue, if there are Gaussians to archive."""
 UNSEEN_S = 0.5
-"""Seconds after which a Gaussian that nobody saw may leave."""
+"""Seconds out of view after which a Gaussian may be archived."""
 MARGIN_SHARE = 0.1
-"""Gaussians this close to the picture, in widths of it, stay: their extent may reach into it."""
+"""Distance from the picture, as a share of its width, within which Gaussians stay because their
+extent may reach into it.
+"""
 ARCHIVED_SCENES = 8
-"""The archive's capacity, in multiples of the scene's."""
+"""Capacity of the archive, in multiples of the scene's."""
 REACH_PX = 5
-"""Archived Gaussians come back this close to where something is uncovered: their centre may lie where tissue is still shown."""
+"""Distance from an uncovered pixel, in pixels, within which archived Gaussians are restored."""
 
 
 class OutOfView:
-    """Keeps the books of one scene: who was seen when, and who is archived."""
+    """Visibility times and archive of one scene."""
 
     def __init__(self, capacity: int, device: torch.device) -> None:
         self._capacity = capacity
@@ -38,25 +43,29 @@ class OutOfView:
         self.archive = Archive(ARCHIVED_SCENES * capacity)
         self._looks = 0
         self._looked_from: Camera | None = None
-        """Where the archive was last searched from."""
+        """Camera of the last search in the archive."""
         self._unseen_s: torch.Tensor | None = None
-        """What was handed out since the last look."""
+        """Cached result of `unseen_s` since the last test."""
 
     def restart(self) -> None:
-        """Another scene begins."""
+        """Reset for another scene."""
         self.last_seen.restart()
         self._unseen_s = None
         self.archive = Archive(ARCHIVED_SCENES * self._capacity)
         self._looks = 0
 
     def unseen_s(self, count: int) -> torch.Tensor:
-        """How long each of the `count` Gaussians that there are now had not been seen at the last look (`Model.unseen_s`); it stays as it is."""
+        """Return for each of the `count` Gaussians how long it was out of view at the last test, in
+        seconds (`Model.unseen_s`). The returned tensor is never modified.
+        """
         if self._unseen_s is None or len(self._unseen_s) != count:
             self._unseen_s = self.last_seen.unseen_s(count)
         return self._unseen_s
 
     def follow(self, step: TrainingStep, observation: Observation) -> None:
-        """Look at the newest observation, make room where it is short, and bring back what comes into view. Before the scene grows."""
+        """Process the newest observation before the scene grows: test visibility, archive Gaussians
+        if capacity is short, and restore those that come into view.
+        """
         self._unseen_s = None
         kept_free = round(ROOM_SHARE * self._capacity)
         if self._looks % SEE_EVERY == 0 or self._capacity - step.gaussians.count < kept_free // 2:
@@ -71,13 +80,14 @@ class OutOfView:
                 self.bring_back(step, observation, uncovered_pixels(alpha, torch.ones_like(observation.mask)))
 
     def has_in_view(self, camera: Camera) -> bool:
-        """Whether anything that is archived lies in a camera's picture."""
+        """Return True if any archived Gaussian projects into a camera's picture."""
         return bool(self.archive.in_view(camera).any())
 
     def make_room(self, step: TrainingStep, observation: Observation, wanted: int, unseen_s: float) -> None:
-        """Let Gaussians leave until `wanted` rows are free, as far as there are any outside of the picture that were not seen for `unseen_s`.
+        """Archive Gaussians until `wanted` rows are free, as far as possible.
 
-        What a tool hides stays: it can be uncovered at any moment.
+        Only Gaussians outside the picture that were not seen for `unseen_s` seconds are archived.
+        Those hidden by a tool stay, since they can be uncovered at any moment.
         """
         short = wanted - (self._capacity - step.gaussians.count)
         if short <= 0:
@@ -91,7 +101,9 @@ class OutOfView:
             self.last_seen.close_gaps(step.remove(leaving))
 
     def bring_back(self, step: TrainingStep, observation: Observation, wanted: Tensor) -> None:
-        """Let what is archived come back where its centre is near a pixel of `wanted`, bool [H, W]. Waits for the device."""
+        """Restore archived Gaussians whose centre is near a marked pixel of `wanted`, bool [H, W].
+        Synchronises with the device.
+        """
         marks = HostCopy(wanted).numpy().astype(np.uint8)
         if not marks.any():
             return

@@ -1,7 +1,7 @@
-"""Depth for the frames of a recording before training on all of them, most of all where its camera moves.
+"""Preparation of depth for offline training, mainly for recordings with a moving camera.
 
-Without depth a scene starts on a plane. Where the camera moves, a plane at the wrong distance makes the camera's motion look like motion of
-the tissue, which has to be learned anew for every time and says nothing about times between.
+Without depth a scene starts on a plane. A plane at the wrong distance turns camera motion into
+apparent tissue motion, which must be learned separately for every time and does not interpolate.
 """
 
 from __future__ import annotations
@@ -27,28 +27,34 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.training.offline import observed
 
 MOST_KEY_FRAMES = 32
-"""Frames that get depth, spread evenly over the recording."""
+"""Number of frames that get depth, spread evenly over the recording."""
 WINDOW_S = 3.0
-"""A frame is compared with others that are at most so long before or after it: tissue does not stay as it is."""
+"""Largest time difference in seconds of compared frames, limited because tissue deforms."""
 MOVES = 0.5
-"""Share of the key frames whose pictures contradict tissue that stands still, from which on it is looked for how it moves."""
+"""Share of key frames that contradict static tissue from which a moving-tissue model is tried."""
 MOST_PIXELS = 64_000_000
-"""Of all frames with depth together: 12 bytes each of them here, and in what is learned from."""
+"""Largest total number of pixels of frames with depth. Each takes 12 bytes here and again in the
+observations.
+"""
 
 
 class WithParallax(NamedTuple):
-    """Frames of a moving camera, and what was found out about them."""
+    """Frames of a moving camera with estimated depth."""
 
     frames: list[Frame]
-    """Key frames among them have depth in the unit of the cameras' positions."""
+    """Frames; key frames have depth in the unit of the camera positions."""
     doubts: Mapping[str, int]
-    """Why others of these have none, in sentences."""
+    """Reasons why other key frames have none, as sentences with numbers of frames."""
     at_rest: bool = False
-    """Whether depth is that of tissue that stands still: frames then differ by what is uncertain, not by motion."""
+    """True if depth was estimated for static tissue; differences between frames are then errors,
+    not motion.
+    """
 
 
 def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> WithParallax:
-    """Depth for frames that the `cameras` saw. Nothing is done where frames have depth already, or no camera moves."""
+    """Estimate depth by parallax for key frames of a recording. Frames are unchanged if they have
+    depth already or no camera moves.
+    """
     moves = any(not np.array_equal(camera.world_to_camera, cameras[0].world_to_camera) for camera in cameras)
     if not moves or cameras[0].model != "pinhole" or any(frame.depth is not None for frame in frames):
         return WithParallax(list(frames), {})
@@ -65,17 +71,18 @@ def frames_with_parallax(frames: Sequence[Frame], cameras: Sequence[Camera]) -> 
             uncertain[found.doubt] += 1
         else:
             breathing[number] = _with(frames[number], found)
-    # Where no motion is found, a rough depth on which frames agree is better to start from than none.
+    # If no motion is found, a rough depth on which frames agree is a better start than none.
     if uncertain.total() == count:
         return _confirmed(given, cameras, doubts)
     return WithParallax(breathing, uncertain)
 
 
 def _confirmed(frames: list[Frame], cameras: Sequence[Camera], doubts: Counter[str]) -> WithParallax:
-    """Return the frames with their depth where most looks are confirmed by a neighbour, and without any depth elsewhere.
+    """Keep the depth of all frames if most are confirmed by a neighbour, else of none.
 
-    The decision is one for the recording: frames that keep depth next to frames that lose it start at different distances. `depth_agreement`
-    says when two looks confirm each other. `doubts` are added to.
+    One decision is made for the whole recording, because frames with and without depth would start
+    at different distances. `depth_agreement` compares two depth maps. Reasons are added to
+    `doubts`.
     """
     numbers = [number for number, frame in enumerate(frames) if frame.depth is not None]
     looks = [
@@ -95,7 +102,9 @@ def _confirmed(frames: list[Frame], cameras: Sequence[Camera], doubts: Counter[s
 
 
 def _compared(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[Frame], Counter[str]]:
-    """The frames, key frames among them with depth by comparing pictures as if tissue stood still, and doubts."""
+    """Estimate depth for key frames assuming static tissue. Returns all frames and the reasons for
+    rejected depth.
+    """
     given, doubts = list(frames), Counter[str]()
     views = [view_of(frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
     count = min(MOST_KEY_FRAMES, len(frames))
@@ -120,24 +129,27 @@ def _with(frame: Frame, found: DepthMap) -> Frame:
 
 
 class ToFit(NamedTuple):
-    """What a recording is trained on."""
+    """Input of offline training."""
 
     frames: list[Frame]
-    """Those that a scene starts and grows from."""
+    """Frames from which the scene is created and grown."""
     seen: list[Observation]
-    """What is learned from them."""
+    """Observations to train on."""
     doubts: Mapping[str, int]
-    """Of `frames_with_parallax`, as `at_rest`."""
+    """Results of `frames_with_parallax`: reasons for rejected depth, and `at_rest`."""
     at_rest: bool = False
     light_shows_motion: bool = False
-    """Of `frames_with_light`."""
+    """Result of `frames_with_light`: True if shading depth shows the tissue's motion."""
 
 
 def to_fit(frames: list[Frame], observation_of: Callable[[Frame], Observation], finds_depth: bool) -> ToFit:
-    """What to train on; `frames` are changed. Matched depth becomes a surface; by light it is found anew from all frames; by parallax, if `finds_depth`, where
-    there is no other.
+    """Prepare frames for offline training; `frames` is modified.
 
-    Raises InvalidInput where there are no frames, or they are not in order.
+    Stereo depth is replaced by a reconstructed surface, shading depth is re-estimated from all
+    frames, and with `finds_depth` parallax depth is estimated if there is no other.
+
+    Raises:
+        InvalidInput: if there are no frames, or if they are out of temporal order.
     """
     seen = observed(frames, observation_of)
     cameras = [each.camera for each in seen]
@@ -149,7 +161,7 @@ def to_fit(frames: list[Frame], observation_of: Callable[[Frame], Observation], 
     if not finds_depth:
         return ToFit(frames, seen, {}, light_shows_motion=light_shows_motion)
     found = frames_with_parallax(frames, cameras)
-    # What is not sure continues what is: that is something to start from, and nothing to learn.
+    # Unconfident depth is an extrapolation: it initialises the scene but is not trained on.
     start = [
         frame.with_fields(depth_confidence=None) if frame.depth_origin is DepthOrigin.PARALLAX else frame
         for frame in found.frames

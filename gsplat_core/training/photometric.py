@@ -1,4 +1,6 @@
-"""The loss of one rendered frame and its gradient at the Gaussians, straight through the ops."""
+"""Loss of a rendered frame and its gradient at the Gaussians, computed directly by ops without
+autograd.
+"""
 
 from __future__ import annotations
 
@@ -22,38 +24,43 @@ from gsplat_core.training.observations import Observation
 
 @dataclass(frozen=True)
 class LossWeights:
-    """(1 - ssim) L1 + ssim (1 - SSIM) + depth * inverse-depth L1, each over tissue pixels."""
+    """Weights of the loss (1 - ssim) L1 + ssim (1 - SSIM) + depth * inverse-depth L1, each over
+    tissue pixels.
+    """
 
     ssim: float = 0.0
     depth: float = 0.0
     squared: bool = False
-    """The squared error in place of L1, see `image_loss`."""
+    """Use the squared error instead of L1, see `image_loss`."""
 
     @property
     def show_residuals(self) -> bool:
-        """Whether the gradient at the picture's colours is the residual times a constant."""
+        """True if the gradient at the picture's colours is proportional to the residual."""
         return self.squared and self.ssim == 0
 
 
 class Compared(NamedTuple):
-    """A rendered frame beside an observation."""
+    """Result of comparing a rendered frame with an observation."""
 
     loss: Tensor
-    """[], on the device: whoever wants the number waits for it."""
+    """Loss, [] on the device; reading it synchronises."""
     gradients: dict[str, Tensor]
-    """Of the loss, for each of the Gaussians' five raw tensors."""
+    """Gradients of the loss by each of the Gaussians' five raw tensors."""
     colour_change: Tensor | None = None
-    """[N, 3] to add to the colours of degree 0, `sh[:, 0]`, whose gradient is 0 then; None: they are left to the gradient."""
+    """Correction [N, 3] of the colours of degree 0, `sh[:, 0]`, whose gradient is then 0; None
+    without a correction.
+    """
 
 
 @torch.no_grad()
 def loss_and_gradients(
     gaussians: Gaussians, observation: Observation, weights: LossWeights, colour_relaxation: float = 0.0
 ) -> Compared:
-    """Loss against `observation`, and its gradient for the Gaussians.
+    """Compute the loss against an observation and its gradients.
 
-    Equals `render`, `image_loss` and `backward()`, without an autograd graph: this is the inner loop of training. With a `colour_relaxation`
-    above 0 the same passes also compute the change of the colours, see `colour_correction`.
+    The result equals `render`, `image_loss` and `backward()` without the cost of an autograd graph.
+    With `colour_relaxation` above 0 the same passes also compute the colour correction
+    (`colour_correction`).
     """
     camera = observation.camera
     viewmat, intrinsics = (matrix[None] for matrix in camera.matrices(gaussians.device))
@@ -105,7 +112,9 @@ def loss_and_gradients(
 def _loss_of_picture(
     splats: RenderedSplats, observation: Observation, weights: LossWeights, use_depth: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The loss, and its gradients for the blended channels [1, H, W, D] and alphas [1, H, W, 1]."""
+    """Return the loss, and its gradients by the blended channels [1, H, W, D] and alphas [1, H, W,
+    1].
+    """
     picture, alphas = splats.image, splats.alphas
     image, alpha = picture[0, ..., :3].contiguous(), alphas[0, ..., 0]
     expected = picture[0, ..., 3] / alpha.clamp(min=1e-10) if use_depth else None
@@ -122,7 +131,9 @@ def _loss_of_picture(
 
 
 def _to_weigh(splats: RenderedSplats, observation: Observation, weights: LossWeights, tissue: Tensor) -> Tensor:
-    """Return the pictures [H, W, D] that `colour_correction` needs summed per splat: the residuals, unless the loss's gradient holds them, then the tissue."""
+    """Return the pictures [H, W, D] to sum per splat for `colour_correction`: the tissue mask,
+    preceded by the residuals unless the loss gradient contains them.
+    """
     if weights.show_residuals:
         return tissue[..., None]
     residuals = (observation.image.float() / 255 - splats.image[0, ..., :3]) * tissue[..., None]
@@ -133,7 +144,7 @@ def _composite(
     means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int, tile_size: int,
     isect_offsets: Tensor, flatten_ids: Tensor, **_: object,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """`rasterize_to_pixels` of one image, and what its gradient needs: the last splat of every pixel."""
+    """Composite one image and return also the last splat of every pixel, which the gradient needs."""
     splats = (means2d[0], conics[0], colors[0], opacities[0])
     return torch.ops.gsplat_core.composite(
         *splats, isect_offsets, flatten_ids, None, None, None, width, height, tile_size
@@ -143,13 +154,15 @@ def _composite(
 def _composite_backward(
     splats: RenderedSplats, v_picture: Tensor, v_alphas: Tensor, settings: RenderSettings, weighed: Tensor | None
 ) -> tuple[Tensor, ...]:
-    """Gradients of the splats' means2d [N, 2], conics [N, 3], channels [N, D] and opacities [N].
+    """Return gradients of the splats' means2d [N, 2], conics [N, 3], channels [N, D] and opacities
+    [N].
 
-    With `weighed` [H, W, E] there are E more channels, at the end: the sums over pixels of blending weight times each of these pictures.
+    With `weighed` [H, W, E], E channels are appended: sums over pixels of blending weight times
+    each of these pictures.
     """
     channels = splats.channels[0]
     if weighed is not None:
-        # Channels in which every splat is 0: no other gradient sees them.
+        # Appended channels are 0 for every splat, so they do not affect other gradients.
         channels = torch.nn.functional.pad(channels, (0, weighed.shape[-1]))
         v_picture = torch.cat([v_picture, weighed[None]], -1)
     blended = (splats.rows.means2d[0], splats.rows.conics[0], channels, splats.opacities[0])
@@ -165,7 +178,7 @@ _STEPS = StepOperations(fully_fused_projection, spherical_harmonics, bin_splats,
 
 
 def _colours(gaussians: Gaussians, position: object) -> tuple[Tensor, Tensor | None]:
-    """Colours [N, 3] before they are clamped at 0, and the viewing directions [N, 3] that they depend on, if they do."""
+    """Return unclamped colours [N, 3], and the viewing directions [N, 3] if colours depend on them."""
     if gaussians.sh_degree == 0:
         return gaussians.sh[:, 0] * SH_C0 + 0.5, None
     centre = torch.as_tensor(position, dtype=torch.float32).to(gaussians.device, non_blocking=True)

@@ -1,9 +1,10 @@
-"""Moving a scene to where depth of a frame says it is.
+"""Correction of the scene's geometry by the depth of frames.
 
-Pictures of one eye hardly tell how far away tissue is, nor how it moves along the line of sight; the loss alone would take thousands of steps for that
-way. So each Gaussian is moved along its ray of the camera that shows it, which sees the same picture as before: by the first depth the whole scene, which
-had started on a plane at an arbitrary distance, because its scope had not moved yet or its eyes had not been matched; then by depth that was found by
-parallax at all times, because that takes tissue to be at rest, and by measured or matched depth at one time.
+Pictures of one eye hardly constrain distance or motion along the line of sight, so the loss alone
+would need thousands of steps. Each Gaussian is therefore moved along its ray of the current camera,
+which sees the same picture as before. The first depth places the whole scene, which started on a
+plane. Later depth by parallax corrects all times, since it assumes static tissue. Later measured or
+stereo depth corrects a single time.
 """
 
 from __future__ import annotations
@@ -28,27 +29,33 @@ from gsplat_core.transfers import tensor_of
 
 CORRECTS_ALL_TIMES = (DepthOrigin.PARALLAX,)
 CORRECTS_ONE_TIME = (None, DepthOrigin.MEASURED, DepthOrigin.STEREO)
-"""Origins of depth that goes on correcting the scene; that of a frame which does not say is measured. Other depth is only started from."""
+"""Depth sources trusted to refine geometry after initialisation, at all times or at the frame's
+time. None is an unspecified source, treated as measured. Other sources only initialise the scene.
+"""
 
 
 class Placement:
-    """Of one scene after another: the first depth places all of it, later ones correct what they are sure of."""
+    """Depth corrections of consecutive scenes: the first depth places the whole scene, later ones
+    refine it.
+    """
 
     def __init__(self) -> None:
         self._captured: CapturedCorrection | None = None
         self.begin(None)
 
     def begin(self, first: Frame | None) -> None:
-        """Another scene, which starts from the frame `first`."""
+        """Start another scene from the frame `first`, or None."""
         self._first = first
         self.is_placed = _has_depth(first)
-        """Whether the scene is where a depth says."""
+        """True once the scene was placed by a depth."""
         self.postpones = False
-        """Whether depth that a frame comes with corrects the scene when `catch_up` is called: pictures do not wait for it then."""
+        """Postpone corrections by a frame's own depth to `catch_up`, so that the displayed picture
+        does not wait for them.
+        """
         self._postponed: tuple[Frame, Observation] | None = None
 
     def catch_up(self, step: TrainingStep) -> None:
-        """What the newest frame's depth corrects, if that was postponed."""
+        """Apply a postponed correction by the newest frame's depth."""
         if self._postponed is not None:
             frame, observation = self._postponed
             self._postponed = None
@@ -62,10 +69,16 @@ class Placement:
         shown_s: float | None = None,
         late: LateDepth | None = None,
     ) -> None:
-        """Correct the scene by the depth of a frame, if it has any and the field takes positions; the field covers its time already.
+        """Correct the scene by a frame's depth, if it has any and the field supports it. The field
+        must cover the frame's time.
 
-        shown_s: the time at which motion is corrected; None: the frame's own. Later where depth is found after newer frames were trained on.
-        late: the frame's, where that was made ready.
+        Args:
+            step: training step of the scene.
+            frame: frame with depth.
+            observation: the same frame as tensors.
+            shown_s: time at which motion is corrected, in seconds; None for the frame's own. Later
+                for late depth.
+            late: prepared depth of the frame, if any.
         """
         if self.postpones and self.is_placed and shown_s is None:
             self._postponed = frame, observation
@@ -76,7 +89,7 @@ class Placement:
             return
         if self.is_placed and frame.depth_origin not in CORRECTS_ALL_TIMES + CORRECTS_ONE_TIME:
             return
-        # Depth by light is in no observation: the loss does not see it.
+        # The loss ignores shading depth, so observations do not contain it.
         late = late or LateDepth.for_placement(frame, observation.image.device)
         possible = late.possible
         if possible is None:
@@ -90,7 +103,7 @@ class Placement:
                 self.is_placed = _place(step, frame, observation, late)
 
     def _correct(self, step: TrainingStep, observation: Observation, depth: Tensor, shown_s: float) -> None:
-        """Move the scene nearer to a frame's depth [H, W] (0: unknown) at one time."""
+        """Move the scene at one time towards a frame's depth [H, W] (0 = unknown)."""
         rows, field = step.fixed_rows, step.field
         if rows is None or rows.device.type != "cuda" or not isinstance(field, BasisField):
             _correct_at(step, observation, depth, shown_s)
@@ -101,14 +114,17 @@ class Placement:
 
 
 def _place(step: TrainingStep, frame: Frame, observation: Observation, late: LateDepth) -> bool:
-    """Move the whole scene to where its first depth says it is; False where the scene shows nothing of that."""
+    """Move the whole scene to the distance of its first depth. Returns False if the depth covers
+    none of the scene.
+    """
     assert late.possible is not None
     seen = _shown_now(step, observation)
     inside, now, there = seen.inside[:, 0], seen.depth[:, 0], seen.read(late.possible)
     known = inside & (there > 0)
     if not bool(known.any()):
         return False
-    # What is not sure goes along with what is sure beside it, and what the picture does not show with all of it.
+    # Gaussians without depth move with their neighbours, and those outside the picture with the
+    # median.
     everywhere = late.everywhere
     if everywhere is None:
         everywhere = tensor_of(tissue_depth(frame, float(now.median())), now.device)
@@ -120,11 +136,11 @@ def _place(step: TrainingStep, frame: Frame, observation: Observation, late: Lat
 
 
 def _correct_all_times(step: TrainingStep, observation: Observation, possible: Tensor) -> None:
-    """Move each Gaussian nearer to the depth [H, W] (0: unknown) of tissue that is at rest."""
+    """Move each Gaussian at all times towards the depth [H, W] (0 = unknown) of static tissue."""
     seen = _shown_now(step, observation)
     now, there = seen.depth[:, 0], seen.read(possible)
-    told = torch.where(seen.inside[:, 0] & (there > 0), there, now)
-    factor = (told / now).pow(SHARE).clamp(1 / LARGEST_STEP, LARGEST_STEP)
+    target = torch.where(seen.inside[:, 0] & (there > 0), there, now)
+    factor = (target / now).pow(SHARE).clamp(1 / LARGEST_STEP, LARGEST_STEP)
     step.scale_about(observation.camera, factor)
 
 
@@ -134,7 +150,7 @@ def _shown_now(step: TrainingStep, observation: Observation) -> Seen:
 
 
 def _correct_at(step: TrainingStep, observation: Observation, depth: Tensor, shown_s: float) -> None:
-    """As `CapturedCorrection`, launch by launch and on any device."""
+    """Apply the correction of `CapturedCorrection` with separate launches, on any device."""
     camera = observation.camera
     now = step.at(observation.time_s)
     shown = render(now, camera, depth=True)

@@ -1,4 +1,4 @@
-"""Places that a stream has left: what was learned there is kept, and found again when the stream shows one of them."""
+"""Scenes that a stream has left, kept for recognition when the stream shows one of them again."""
 
 from __future__ import annotations
 
@@ -15,34 +15,38 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 
 MOST_PLACES = 8
-"""Places that are kept; beyond them the one that was left first is forgotten."""
+"""Largest number of kept places; the one left first is dropped."""
 RENDERED_PX = 160
-"""Width at which a place is rendered to be compared."""
+"""Width at which a place is rendered for comparison, in pixels."""
 COMPARED_PX = 64
-"""Width at which pictures are compared: tissue that moved by a few pixels still lies in the same place then."""
+"""Width at which pictures are compared, in pixels; small enough to tolerate motion of a few pixels.
+"""
 FINE_PX, COARSE_PX = 1.0, 16.0
-"""Standard deviations, in pixels of that size, between which structure is compared: not noise, and not where the light falls."""
+"""Standard deviations, in pixels of that size, of the band-pass filter that removes noise and
+illumination.
+"""
 SAME_PLACE = 0.75
-"""Correlation from which on a picture shows a place. On four recordings it stays above that while the view is kept (0.9 after 3 s of cutting,
-0.7 to 0.8 within seconds of a beating heart); pictures of different places, and mirrored ones of the same place, reach 0.6."""
+"""Correlation from which a picture shows a place. See benchmarks/notes/constants.md."""
 LEAST_SHARE = 0.3
-"""Share of the picture that must be both tissue and part of the place."""
+"""Share of the picture that must be both tissue and covered by the place."""
 
 
 @dataclass
 class Place:
-    """What a stream left behind, in host memory."""
+    """Scene left by a stream, in host memory."""
 
     gaussians: Gaussians
-    """As they were last: what does not move any more needs no field."""
+    """Last state of the Gaussians, without a deformation field."""
     camera: Camera
-    """That saw it last."""
+    """Camera that saw the place last."""
     left_s: float
-    """When the stream left it."""
+    """Time when the stream left it, in seconds."""
     _looks: dict[Camera, tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=dict, repr=False)
 
     def look(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The place seen by a camera: colours [H, W, 3] and opacity [H, W], `COMPARED_PX` wide. The last camera's are remembered."""
+        """Render the place `COMPARED_PX` wide: colours [H, W, 3] and opacity [H, W]. The last
+        result is cached.
+        """
         if camera not in self._looks:
             with torch.no_grad():
                 output = render(self.gaussians, camera.scaled(RENDERED_PX / camera.width_px), depth=False)
@@ -54,7 +58,7 @@ class Place:
 
 
 class Places:
-    """The places that were left last."""
+    """Places left most recently."""
 
     def __init__(self, most: int = MOST_PLACES) -> None:
         self._most = most
@@ -64,15 +68,15 @@ class Places:
         return len(self._left)
 
     def leave(self, gaussians: Gaussians, camera: Camera, time_s: float) -> None:
-        """Keep a scene as it is now. They are copied to the host."""
+        """Keep a copy of a scene in host memory."""
         kept = gaussians.map(lambda tensor: tensor.detach().to("cpu", torch.float32, copy=True))
         self._left = [*self._left, Place(kept, camera, time_s)][-self._most :] if self._most else []
 
     def take(self, frame: Frame) -> Place | None:
-        """The kept place that a frame shows, which is no longer kept then; None where it shows none of them.
+        """Remove and return the place that a frame shows, or None.
 
-        It is looked at from the frame's pose, or where the frame has none from where it was seen last. Exposure and white balance of the
-        frame play no part.
+        Each place is rendered from the frame's pose or, without a pose, from its last camera. The
+        comparison ignores the frame's exposure and white balance.
         """
         likeness = [self._likeness(place, frame) for place in self._left]
         best = int(np.argmax(likeness)) if likeness else 0
@@ -91,14 +95,15 @@ class Places:
 
 
 def compared_size(width_px: int, height_px: int) -> tuple[int, int]:
-    """Width and height at which pictures of this shape are compared."""
+    """Return width and height at which pictures of this aspect ratio are compared."""
     return COMPARED_PX, max(1, round(COMPARED_PX * height_px / width_px))
 
 
 def likeness_of(first: NDArray[np.float32], second: NDArray[np.float32], known: NDArray[np.bool_]) -> float:
-    """Correlation, -1 to 1, of the structure of two pictures [H, W, 3] where `known` [H, W]; 0 where too little is known of them.
+    """Return the correlation, -1 to 1, of the structure of two pictures [H, W, 3] where `known` [H,
+    W]; 0 if too little is known.
 
-    Each channel counts by itself, so a factor and an offset for each make no difference.
+    Channels are compared separately, so gain and offset per channel have no effect.
     """
     if np.count_nonzero(known) < LEAST_SHARE * known.size:
         return 0.0
