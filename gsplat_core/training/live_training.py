@@ -12,9 +12,9 @@ REHEARSED_CORRECTION = 0.5
 neighbouring times, which are corrected themselves.
 """
 DEPTH_EVERY = 4
-"""On a GPU, every n-th rehearsal step, counted over both eyes, compares depth if its frame has it
-and trains colours instead of correcting them. Steps of `observe` never do, because their last
-changes are displayed.
+"""On a GPU, every n-th rehearsal step compares depth if its frame has it, and trains colours
+instead of correcting them. The right eye has odd numbers, so these steps are on the left eye. Steps
+of `observe` never compare depth, because their last changes are displayed.
 """
 
 

@@ -1,4 +1,4 @@
-"""Learns a deforming scene from frames: online as they arrive, or offline from all of them."""
+"""Learning of a deforming scene from frames, online as they arrive or offline from all of them."""
 
 from __future__ import annotations
 
@@ -36,19 +36,21 @@ from gsplat_core.training.surface_tracks import SurfaceTracks
 from gsplat_core.transfers import HostCopy
 
 USUAL_DECAY = 0.1
-"""How fast the usual loss of a new frame follows the newest ones."""
+"""Weight of the newest frames in the usual first loss."""
 STEP_TIME_DECAY = 0.3
-"""How fast the usual time of a step follows the newest frames', where budgets are timed."""
+"""Weight of the newest frames in the estimated step time of timed budgets."""
 
 
 class Reconstructor:
-    """Owns the model that is being learned.
+    """Owner of the model that is being learned.
 
-    Online: `observe` each frame in order, `snapshot` whenever the result is to be shown. Offline: `fit`. Deterministic: the same frames,
-    settings and seed give the same model. With the basis field that holds for any number of threads; the HexPlane's network is
-    trained by torch's matrix products, which round differently with another number.
+    Online: call `observe` for each frame in order, and `snapshot` for a copy to display. Offline:
+    call `fit`. The result is deterministic for equal frames, settings and seed. With the basis
+    field it is also independent of the number of threads. The HexPlane's network uses torch's
+    matrix products, which round differently with other numbers of threads.
 
-    Everything is kept and trained on `device`. A GPU works through a frame's steps while the host prepares the next frame.
+    All tensors are kept and trained on `device`. A GPU works on a frame's steps while the host
+    prepares the next frame.
     """
 
     def __init__(
@@ -70,7 +72,7 @@ class Reconstructor:
         self._placement = Placement()
         self._covering = Covering(config, beside=self._covers_beside and self.device.type == "cuda")
         self._unsettled: Observation | None = None
-        """The frame whose steps are queued; whether their splats fitted the tile lists is not known yet."""
+        """Frame whose steps are queued and not yet checked for overflow of the tile lists."""
         self._in_flight = StepsInFlight(self.device)
         self._step_s: float | None = None
         self._slots, self._version = SnapshotSlots(self.device, rows=self._fixed_rows), 0
@@ -78,26 +80,30 @@ class Reconstructor:
         self._first_time_s = self._last_time_s = self._learned_s = 0.0
         self._depth_source: DepthSource | None = None
         self._scope_path: ScopePath | None = None
-        self.depth_doubts: Mapping[str, int] = {}  # why `fit` found no depth, and in how many frames of a moving camera
+        self.depth_doubts: Mapping[
+            str, int
+        ] = {}  # reasons why `fit` found no depth, with numbers of frames of a moving camera
 
     _covers_beside = False
-    """Whether new Gaussians are made beside training, where that is on a GPU."""
+    """Create new Gaussians concurrently with training on a GPU."""
     _follows_at_once = True
-    """Whether the motion prior sees a frame before the model is trained on it."""
+    """Let the motion prior process a frame before the model is trained on it."""
 
     @property
     def gaussians(self) -> int:
-        """How many Gaussians the model has now."""
+        """Current number of Gaussians."""
         return 0 if self._step is None else self._step.gaussians.count
 
     @property
     def _fixed_rows(self) -> int:
-        """Gaussians that memory is taken for at once; 0: for those that there are."""
+        """Number of Gaussians for which memory is allocated at the start; 0 for the current number."""
         return self.config.max_gaussians if self.config.preallocate else 0
 
     @property
     def _time_window_s(self) -> tuple[float, float]:
-        """What the model shows: since the first frame, or as far back as the field reaches."""
+        """Times that the model covers in seconds, from the first frame or as far back as the field
+        reaches.
+        """
         start = self._first_time_s
         if self._step is not None and self.config.history_s is not None:
             start = min(max(start, self._step.field.time_window_s[0]), self._last_time_s)
@@ -106,14 +112,17 @@ class Reconstructor:
     def observe(
         self, frame: Frame, *, budget: Budget | None = None, steps: int | None = None, train: bool = True
     ) -> ObserveReport:
-        """Take the next frame in order and train on it; with `train=False` only move on to its time.
+        """Process the next frame in order and train on it.
 
         Args:
-            budget: the work that the frame may take; None: the configured number of steps.
+            frame: next frame.
+            budget: training budget of the frame; None for the configured number of steps.
             steps: short for `budget=Budget.of_steps(steps)`.
+            train: False only advances the time.
 
-        Raises InvalidInput when the first frame is not to be trained on (there is nothing to show yet), when time runs backwards, or when
-        the frame does not fit the camera.
+        Raises:
+            InvalidInput: if the first frame is not trained on, if time runs backwards, or if the
+                frame does not fit the camera.
         """
         budget = Budget.given(budget, steps)
         observation = self.eyes.observation(frame, self.camera, trains=train)
@@ -147,7 +156,9 @@ class Reconstructor:
         return self._train_on(observation, budget, first)
 
     def _train_on(self, observation: Observation, budget: Budget, first: bool) -> ObserveReport:
-        """Spend a budget on the newest frame and the window. A jump gets more steps, or with a deadline all that are left."""
+        """Spend a budget on the newest frame and the window. A jump gets extra steps, or with a
+        deadline all remaining ones.
+        """
         assert self._step is not None
         spending = Spending(budget, self._step_s)
         plan: list[Observation] = [observation]
@@ -165,7 +176,8 @@ class Reconstructor:
         if first_loss is None:
             return ObserveReport(observation.seq, 0, None, self.gaussians, spending.ending)
         extra = 0
-        # Asked for only now, so that a GPU need not be waited for before its queue is filled.
+        # Read the loss only now, so that the host does not wait for a GPU before its queue is
+        # filled.
         if not budget.is_timed and self._is_jump(first_loss, first):
             extra = spending.made * self.config.jump_extra
         for turn in range(extra):
@@ -180,13 +192,13 @@ class Reconstructor:
         return ObserveReport(observation.seq, spending.made + extra, HostCopy(loss), self.gaussians, spending.ending)
 
     def _settle(self) -> None:
-        """Wait for the queued steps, and take again those whose splats did not fit the tile lists."""
+        """Wait for the queued steps and repeat those that overflowed the tile lists."""
         if self._step is not None and self._unsettled is not None:
             self._step.settle(self._unsettled)
         self._unsettled = None
 
     def _is_jump(self, first_loss: HostCopy | None, first: bool) -> bool:
-        """Whether a frame's first loss shows a cut between shots or a sudden motion. Waits for it."""
+        """Return True if a frame's first loss shows a cut or a sudden motion. Waits for the loss."""
         usual = self.config.jump_ratio * self._usual_first_loss
         return not first and first_loss is not None and first_loss.item() > usual
 
@@ -206,9 +218,17 @@ class Reconstructor:
         progress: Callable[[int, Tensor], None] | None = None,
         settings: FitSettings | None = None,
     ) -> ObserveReport:
-        """Train offline on all of `frames`, as `settings` say; `ReconstructorConfig.offline` is the configuration for it.
+        """Train offline on all frames. `ReconstructorConfig.offline` is a suitable configuration.
 
-        `progress(step, loss)` is called after each step; reading the loss, a tensor [] on the device, waits for it. All frames are in its memory.
+        Args:
+            frames: frames in temporal order; all are kept in memory.
+            steps: number of training steps.
+            progress: called as `progress(step, loss)` after each step; reading the loss, [] on the
+                device, waits for it.
+            settings: training schedule; None for the defaults.
+
+        Raises:
+            InvalidInput: for less than one step, no frames, or frames out of order.
         """
         if steps < 1:
             raise InvalidInput(f"steps is {steps}; it must be at least 1")
@@ -229,7 +249,11 @@ class Reconstructor:
         return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)
 
     def snapshot(self) -> Model:
-        """An immutable copy of the model as it is now; each one has the next version number."""
+        """Return an immutable copy of the current model with the next version number.
+
+        Raises:
+            InvalidInput: before the first frame.
+        """
         if self._step is None:
             raise InvalidInput("there is no model yet: observe a frame first")
         self._settle()
@@ -239,9 +263,10 @@ class Reconstructor:
         return Model(gaussians=gaussians, field=field, scope_path=self._scope_path, **self._facts())
 
     def publish(self) -> Model | Snapshot:
-        """The model as it is now, for showing it, with the next version number. As `snapshot`, but on a GPU it is copied into a slot.
+        """Return the current model for display with the next version number.
 
-        Nothing is allocated then and the host does not wait; see `gsplat_core.scene.snapshots`.
+        On a GPU it is copied into a preallocated slot without allocation or synchronisation, see
+        `gsplat_core.scene.snapshots`. Otherwise it equals `snapshot`.
         """
         if self._step is None or self.device.type != "cuda" or not SnapshotSlots.can_hold(self._step.field):
             return self.snapshot()
@@ -250,12 +275,12 @@ class Reconstructor:
             return self._slots.publish(self._step.gaussians, self._step.field, **self._facts())
 
     def _facts(self) -> dict[str, Any]:
-        """What a model or snapshot states beside its tensors."""
+        """Return the metadata of a model or snapshot."""
         known = dict(training_digest=self._recording_digest, depth_source=self._depth_source)
         return dict(version=self._version, camera=self.camera, time_window_s=self._time_window_s, **known)
 
     def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
-        """The Gaussians that a scene starts with; its camera and first time are those of the frame."""
+        """Create the first Gaussians of a scene, and set its camera and start time from the frame."""
         self._first_time_s, self.camera = observation.time_s, observation.camera
         self._depth_source = DepthSource.of_first(frame)
         count, degree, plane = self.config.gaussians, self.config.sh_degree, self.config.default_depth_mm
@@ -266,7 +291,7 @@ class Reconstructor:
     def _start(self, frame: Frame, observation: Observation, end_s: float | None = None) -> None:
         gaussians = for_eyes(self._first_gaussians(frame, observation), observation)
         wanted = NewField(gaussians, observation.time_s, end_s, self.config.bump_spacing_s, self.config.history_s)
-        with torch.random.fork_rng(devices=[]):  # planes and layers start random
+        with torch.random.fork_rng(devices=[]):  # planes and layers are initialised randomly
             torch.manual_seed(self._seed)
             field = FIELDS[self.config.field].made_for(wanted).to(self.device)
         self._step = TrainingStep(gaussians, field, self.config.starting_from(frame, end_s is not None), self.camera)
@@ -275,13 +300,14 @@ class Reconstructor:
         self._covering.begin(self.camera if is_captured else None, self.device, self._fixed_rows)
 
     def _follow(self, frame: Frame, observation: Observation) -> None:
-        """Let the motion prior see the next frame."""
+        """Let the motion prior process the next frame."""
         if self._prior is not None and self._step is not None:
             self._prior.observe(frame, observation.time_s, observation.camera, self._step)
 
     def _grow(self, frame: Frame, observation: Observation, first: bool = False) -> None:
-        """Add Gaussians where the frame shows tissue that the model does not cover, each eye in turn; the first left picture is what they were
-        made from."""
+        """Add Gaussians where an eye of the frame shows uncovered tissue. The first left picture is
+        skipped, since the scene was created from it.
+        """
         assert self._step is not None
         self._covering.join(self._step)
         if not first:

@@ -1,4 +1,4 @@
-"""The second eye of a stereo scope as an observation of its own: its camera, its colours, and what of it may be learned from."""
+"""Observations of a stereo scope's right eye: camera pose, colour matching and tissue mask."""
 
 from __future__ import annotations
 
@@ -25,64 +25,74 @@ from gsplat_core.training.unseen import pixels_of
 from gsplat_core.transfers import tensor_of
 
 CELL_PX = 4
-"""Tools are looked for in the right picture by cells of so many pixels."""
+"""Side of the cells in which tools are mapped to the right picture, in pixels."""
 TYPICAL_OF = 500
-"""The typical disparity is the median of so many cells, or up to twice as many."""
+"""Number of cells (up to twice as many) whose median is the typical disparity."""
 NEAREST, FARTHEST = 2.0, 0.75
-"""Where a tool's depth is not known, its disparity is between these multiples of what is typical of the picture: tools are nearer than tissue."""
+"""Range of a tool's disparity without depth, as multiples of the typical one; tools are nearer than
+tissue.
+"""
 
 
 class PreparedPicture(NamedTuple):
-    """A right picture in the left one's colours, on the host."""
+    """Right picture in the left one's colours, on the host."""
 
     image: NDArray[np.uint8]
     """RGB [H, W, 3]."""
     mask: NDArray[np.uint8]
-    """[H, W]; 1 = tissue."""
+    """Mask [H, W]; 1 = tissue."""
     steady: NDArray[np.uint8] | None
-    """[H, W]; 0 = left out of rehearsal; None: nothing is."""
+    """Mask [H, W] for rehearsal; 0 = ignored. None for no restriction."""
 
 
 class BothEyes:
-    """What is trained on of each frame of one stream: the left eye's picture, and beside it the right one's, where that is wanted and can be."""
+    """Observations of one stream: the left eye's picture and, if requested and calibrated, the
+    right one's.
+    """
 
     def __init__(self, eyes: Eyes, device: torch.device | str = "cpu") -> None:
         self._with_right, self._device = eyes == "both", device
         self._highlights = HighlightFinder()
         self._beside: ThreadPoolExecutor | None = None
-        """Makes right pictures ready, one after another, where steps are launched meanwhile."""
+        """Thread that prepares right pictures in order, for GPU training only."""
         if self._with_right and torch.device(device).type == "cuda":
             self._beside = ThreadPoolExecutor(1, thread_name_prefix="right eye")
         self.trained: Eyes = "left"
-        """Which eyes there was something of so far."""
+        """Eyes with trained pictures so far."""
         self.forget()
 
     def forget(self) -> None:
-        """Another stream begins."""
+        """Reset for another stream."""
         self._colours = EyeColours()
 
     def observation(self, frame: Frame, camera: Camera, *, trains: bool = True) -> Observation:
-        """As `Observation.of`, with the right eye's unless nothing is trained."""
+        """Create the observation of a frame, including the right eye unless nothing is trained."""
         left = Observation.of(frame, camera, self._device)
         return self.beside(left, frame) if self._with_right and trains else left
 
     def beside(self, left: Observation, frame: Frame) -> Observation:
-        """`left`, which is what `frame` shows the left eye, with the right one's observation; as it is where the frame has no right picture
-        or nobody knows where its camera is. Raises InvalidInput for a camera of another model than the left one."""
+        """Add the right eye's observation to the left one of `frame`, if the frame has a calibrated
+        right picture.
+
+        Raises:
+            InvalidInput: if the camera models of the eyes differ.
+        """
         right = frame.right_camera
         if frame.right_image is None or right is None:
             return left
         if right.model != left.camera.model:
             raise InvalidInput(
-                f"frame {frame.seq}: the right camera is {right.model}, the left one {left.camera.model}; training takes two of one model"
+                f"frame {frame.seq}: the right camera is {right.model}, the left one {left.camera.model}; both must be the same for training"
             )
         self.trained = "both"
         prepared = self._prepared(frame, left.camera, right)
         return replace(left, right_eye=RightEye(lambda: self._on_device(prepared(), left, right)))
 
     def _prepared(self, frame: Frame, camera: Camera, right: Camera) -> Callable[[], PreparedPicture]:
-        """What the right picture is made into, once it is asked for. For a GPU it is made meanwhile, beside the thread that launches steps."""
-        colours = self._colours  # of this stream, also if another one begins meanwhile
+        """Return a function that yields the prepared right picture. For a GPU the preparation
+        starts at once in another thread.
+        """
+        colours = self._colours  # of this stream, even if another one starts meanwhile
         if self._beside is None:
             return lambda: self._prepare(frame, camera, right, colours)
         return self._beside.submit(self._prepare, frame, camera, right, colours).result
@@ -110,16 +120,22 @@ class BothEyes:
 
 
 def for_eyes(gaussians: Gaussians, observation: Observation) -> Gaussians:
-    """What a scene starts with: Gaussians with colours for the right eye, where it is trained on."""
+    """Add right-eye colours to Gaussians if the right eye is trained on."""
     return gaussians.with_right(observation.right_eye is not None)
 
 
 def right_tissue(frame: Frame, camera: Camera, right: Camera, shift_px: float) -> NDArray[np.uint8]:
-    """Which pixels of the right picture show tissue, uint8 [H, W]: those at which the left eye's tools do not appear.
+    """Return the tissue mask of the right picture, uint8 [H, W], from the left eye's tool mask.
 
-    A tool's pixel goes to where its depth puts it. Where depth is unknown it takes everything from `FARTHEST` to `NEAREST` times the typical
-    disparity: that of the known depth, or else `shift_px`, by how much the right picture as a whole is shifted to the left. A tool that only the right
-    eye sees is not found.
+    Tool pixels are mapped by their depth. Without depth they cover the range from `FARTHEST` to
+    `NEAREST` times the typical disparity, which is that of the known depth or else `shift_px`.
+    Tools visible only to the right eye are not masked.
+
+    Args:
+        frame: stereo frame.
+        camera: left camera.
+        right: right camera.
+        shift_px: overall shift of the right picture to the left in pixels.
     """
     height, width = frame.image.shape[:2]
     if frame.mask is None or cv2.countNonZero(frame.mask) == frame.mask.size:
@@ -148,19 +164,19 @@ def right_tissue(frame: Frame, camera: Camera, right: Camera, shift_px: float) -
     hidden |= _smeared(
         tool & ~known, sorted((FARTHEST * shift_px * columns / width, NEAREST * shift_px * columns / width))
     )
-    # Cells around, as what was one cell wide may fall between two, and masks end a little early.
+    # Dilate by a cell, since narrow parts may fall between cells and masks end slightly early.
     hidden = np.asarray(cv2.dilate(hidden, np.ones((3, 3), np.uint8)), np.uint8)
     return np.asarray(cv2.resize(1 - hidden, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
 def _seen_by_right(pixels: NDArray[np.float64], z: NDArray, camera: Camera, right: Camera) -> NDArray[np.float64]:
-    """Where the right eye sees what the left one sees at `pixels` [N, 2] in depth `z` [N]."""
+    """Project points seen by the left eye at `pixels` [N, 2] and depth `z` [N] to the right eye."""
     points, _ = unprojected(pixels, z.astype(np.float64), camera)
     return np.asarray(pixels_of(torch.from_numpy(points), right)[0].numpy())
 
 
 def _smeared(cells: NDArray[np.bool_], shifts: list[float]) -> NDArray[np.uint8]:
-    """The cells [rows, columns], moved to the left by everything between two shifts."""
+    """Return cells [rows, columns] shifted to the left by all values between two shifts."""
     found = np.zeros(cells.shape, np.uint8)
     if not cells.any():
         return found

@@ -1,6 +1,8 @@
-"""The Gaussians that a scene starts with, made on the device: the same as `initialisation` makes on the host, in a few milliseconds on a GPU.
+"""Creation of a scene's first Gaussians on the device, equal to that of `initialisation` but in a
+few milliseconds on a GPU.
 
-Neither cuBLAS nor cuDNN is used: each takes tens of milliseconds for its first work in a thread, and a stream's first picture waits for this.
+cuBLAS and cuDNN are avoided: each takes tens of milliseconds for its first use in a thread, which
+would delay a stream's first picture.
 """
 
 from __future__ import annotations
@@ -33,28 +35,31 @@ from gsplat_core.transfers import tensor_of
 
 
 class StartOnDevice:
-    """The jittered grid of one size and camera, laid out before the first frame comes."""
+    """Jittered grid for one size and camera, prepared before the first frame."""
 
     def __init__(self, camera: Camera, count: int, device: torch.device, seed: int = 0) -> None:
-        """As `gaussians_from_frame`; only the camera's pose may be another one later."""
+        """Prepare the grid as `gaussians_from_frame` does. Only the camera's pose may differ later."""
         self.camera, self._device = camera, device
         pixels, self._spacing_px = jittered_grid(camera.width_px, camera.height_px, count, seed)
         columns = np.clip(pixels[:, 0].astype(np.int64), 0, camera.width_px - 1)
         rows = np.clip(pixels[:, 1].astype(np.int64), 0, camera.height_px - 1)
         self._cells = torch.from_numpy(rows * camera.width_px + columns).to(device)
-        # Every camera model places a pixel on a straight line, so that two depths give all of them.
+        # In every camera model the points of a pixel are linear in depth, so two depths determine
+        # all.
         at_zero, at_one = (unprojected(pixels, np.full(len(pixels), z), camera) for z in (0.0, 1.0))
         self._points = self._float32(at_zero[0]), self._float32(at_one[0] - at_zero[0])
         self._pixel_mm = self._float32(at_zero[1]), self._float32(at_one[1] - at_zero[1])
 
     def fits(self, camera: Camera) -> bool:
-        """Whether it is laid out for that camera; the pose does not matter."""
+        """Return True if the grid fits a camera, ignoring its pose."""
         mine = self.camera
         same_size = (mine.width_px, mine.height_px, mine.model) == (camera.width_px, camera.height_px, camera.model)
         return same_size and bool((mine.K == camera.K).all())
 
     def __call__(self, frame: Frame, observation: Observation, *, sh_degree: int, default_depth_mm: float) -> Gaussians:
-        """The Gaussians of `frame`, which is `observation` on the device. Nothing waits for the device."""
+        """Create the Gaussians of `frame`, which is `observation` on the device, without
+        synchronisation.
+        """
         image, camera = observation.image, observation.camera
         z = image.new_full((len(self._cells),), default_depth_mm, dtype=torch.float32)
         if frame.depth is not None:
@@ -82,7 +87,7 @@ class StartOnDevice:
 
 
 def _without_tools(frame: Frame, image: Tensor) -> Tensor:
-    """The picture as float [3, H, W] in 0..1, tools painted over by the tissue around them."""
+    """Return the picture as float [3, H, W] in 0..1 with tools filled from the surrounding tissue."""
     picture = image.permute(2, 0, 1).float() / 255
     if frame.mask is None or frame.mask.all() or not frame.mask.any():
         return picture
@@ -90,12 +95,12 @@ def _without_tools(frame: Frame, image: Tensor) -> Tensor:
     bare = (tissue == 0).float()[None, None]
     margin = 2 * TOOL_MARGIN_PX + 1
     tool = max_pool2d(bare, margin, stride=1, padding=TOOL_MARGIN_PX)
-    tool = torch.where(tool.min() > 0, bare, tool)[0]  # with the margin no tissue would be left
+    tool = torch.where(tool.min() > 0, bare, tool)[0]  # the margin would leave no tissue
     return torch.where(tool > 0, filled(picture, 1 - tool), picture)
 
 
 def _blurred(picture: Tensor, sigma_px: float) -> Tensor:
-    """`picture` [C, H, W] under a Gaussian of that width, the picture reflected beyond its edge."""
+    """Blur `picture` [C, H, W] with a Gaussian and reflected borders."""
     reach = max(1, math.ceil(3 * sigma_px))
     height, width = picture.shape[1:]
     if min(height, width) <= reach:

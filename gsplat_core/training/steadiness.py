@@ -1,4 +1,4 @@
-"""How evenly the pictures of a recording change: whether a frame is half-way between its neighbours, up to noise."""
+"""Measure of how evenly a recording's pictures change, which limits temporal smoothing."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from gsplat_core.training.observations import Observation
 NOISE_LEVELS = 2.5
 """Standard deviation of noise in compressed video, in grey levels of 255."""
 MOST_FRAMES = 32
-"""Frames that are looked at, spread over the recording."""
+"""Number of frames examined, spread over the recording."""
 
 
 def steadiness(observations: Sequence[Observation]) -> float:
-    """1 where frames differ from what is between their neighbours by no more than noise, and less in proportion to the squared difference.
+    """Return the ratio of noise to the deviation of frames from the interpolation of their
+    neighbours, 0 to 1.
 
-    What is smoothed along time loses that difference, so this is how much smoothing a recording bears. Only tissue counts; without three
-    frames that show some it is 1. Whole numbers are summed: the result does not depend on the order. The host waits once.
+    The value is 1 if the deviation is at most noise, and decreases with its square. Temporal
+    smoothing removes this deviation, so the ratio is the admissible amount of smoothing. Only
+    tissue counts; without three frames with tissue it is 1. Integer sums make the result
+    independent of the order. Synchronises once.
     """
     inner = range(1, len(observations) - 1)
     squared = torch.zeros(2, dtype=torch.int64, device=observations[0].image.device)
@@ -31,6 +34,6 @@ def steadiness(observations: Sequence[Observation]) -> float:
         off = (now.image.float() - between).to(torch.int64).square().sum(-1) * tissue
         squared += torch.stack([off.sum(), 3 * tissue.sum()])
     total, values = squared.tolist()
-    # The noise of a frame and of the mean of two others.
+    # Noise of a frame plus that of the mean of two others.
     noise = 1.5 * NOISE_LEVELS**2
     return min(1.0, noise * values / total) if total else 1.0

@@ -1,4 +1,4 @@
-"""One optimiser step: deform, render, compare, go back, update."""
+"""Optimiser step of a scene: deformation, rendering, loss, backward pass and update."""
 
 from __future__ import annotations
 
@@ -23,11 +23,15 @@ from gsplat_core.training.photometric import LossWeights, loss_and_gradients
 from gsplat_core.training.unseen import depth_of
 
 SETTLE_EVERY = 32
-"""Captured steps after which the host waits for them, so that tile lists beyond their capacity are noticed soon; also after the first."""
+"""Captured steps after which the host synchronises to detect overflowing tile lists; also after the
+first step.
+"""
 
 
 def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
-    """World units per pixel at the scene's typical distance: rates given in pixels become rates in millimetres."""
+    """Return world units per pixel at the scene's median distance, to convert learning rates in
+    pixels.
+    """
     if not gaussians.count:
         return 1 / float(camera.K[0, 0])
     distance = depth_of(gaussians.means, camera).abs().median()
@@ -35,10 +39,11 @@ def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
 
 
 class TrainingStep:
-    """The scene being learned, its optimiser, and the step that improves it by one frame.
+    """Scene being learned with its optimiser.
 
-    On a GPU, where the kind of field allows it, the step is captured as a CUDA graph (`FusedStep`). Otherwise the picture's gradient is
-    taken at the deformed Gaussians, and the field's own training takes it back to the field and to the canonical Gaussians.
+    On a GPU the step is captured as a CUDA graph (`FusedStep`) if the field supports it. Otherwise
+    the gradient is computed at the deformed Gaussians, and the field's training propagates it to
+    the field and the canonical Gaussians.
     """
 
     def __init__(
@@ -48,18 +53,19 @@ class TrainingStep:
         self._rates = config.rates
         self._has_no_end = config.history_s is not None
         self._mm_per_px = mm_per_px(gaussians, camera)
-        # Inverse depths times the distance have no unit: the term weighs the same whatever lengths are measured in.
+        # Inverse depth times distance has no unit, so the weight is independent of the unit of
+        # length.
         depth_weight = config.depth_weight * self.distance(camera) if config.depth_weight else 0.0
         self._weights = LossWeights(config.ssim_weight, depth_weight, config.squared_error)
         self._adam = FusedAdam(gaussians.tensors())
         self._rows: GaussianRows | None = None
-        """Where Gaussians join and leave without a tensor moving."""
+        """Preallocated rows in which Gaussians are added and removed without moving tensors."""
         if config.preallocate and field.reserve(config.max_gaussians):
             self._rows = GaussianRows(gaussians, config.max_gaussians)
             self._adam.reserve(config.max_gaussians)
             gaussians = self._rows.used
         self.gaussians = gaussians
-        """Those in use."""
+        """Gaussians in use."""
         kind = kind_of(field.kind)
         self._field_rates = config.rates.field or kind.rates
         if not isinstance(self._field_rates, type(kind.rates)):
@@ -71,7 +77,7 @@ class TrainingStep:
         self._unsettled_steps = 0
         self._has_settled = False
         self._relaxation = 0.0
-        """That of the newest captured step."""
+        """Colour relaxation of the newest captured step."""
         self._scaled_for: float | None = None
         self._scaled_rates: tuple[dict[str, float], Sequence[float]] = {}, ()
         if gaussians.device.type == "cuda" and kind.captured_training is not None:
@@ -84,11 +90,18 @@ class TrainingStep:
         )
 
     def __call__(self, observation: Observation, rate_scale: float = 1.0, colour_relaxation: float = 0.0) -> Tensor:
-        """Train on one observation; returns its loss before the update, [] on the Gaussians' device.
+        """Train on one observation.
 
-        With a `colour_relaxation` above 0 colours are not trained but corrected (`colour_correction`) at the observation's time, if the field
-        takes colours; a captured step does not look at depth then. A captured step only queues: ask for the loss's value, or `settle`, to wait for
-        it.
+        Args:
+            observation: target.
+            rate_scale: factor of all learning rates.
+            colour_relaxation: above 0, colours at the observation's time are corrected
+                (`colour_correction`) instead of trained, if the field supports it. A captured step
+                then ignores depth.
+
+        Returns:
+            Loss before the update, [] on the device. A captured step is only queued; reading the
+                loss or `settle` waits for it.
         """
         if self._captured is not None:
             self._relaxation = colour_relaxation if self.field.takes_colours else 0.0
@@ -101,7 +114,7 @@ class TrainingStep:
         gradients = compared.gradients if right_sh is None else with_eye(compared.gradients, of_right)
         own = self._training.update(gradients, self._field_rates.scaled(self._mm_per_px, rate_scale))
         if right_sh is not None:
-            own = {**own, LEFT if of_right else RIGHT: None}  # the other eye's colours stay as they are
+            own = {**own, LEFT if of_right else RIGHT: None}  # the other eye's colours are unchanged
         self._adam.step(self.gaussians.tensors(), own, self._gaussian_rates(rate_scale))
         if compared.colour_change is not None:
             if of_right and right_sh is not None:
@@ -111,8 +124,12 @@ class TrainingStep:
         return compared.loss
 
     def scale_about(self, camera: Camera, factor: Tensor) -> None:
-        """Move every Gaussian to `factor` [N] times its distance from the camera's centre, at all times, and scale it with that: the camera
-        sees the same picture. Adam's moments follow, the rates with `take_distance`."""
+        """Move every Gaussian at all times to `factor` [N] times its distance from the camera's
+        centre, and scale it accordingly.
+
+        The camera sees the same picture. Adam's moments are converted; learning rates follow with
+        `take_distance`.
+        """
         with torch.no_grad():
             scene, each = self.gaussians, factor[:, None]
             centre = torch.as_tensor(camera.position, dtype=scene.means.dtype).to(scene.device, non_blocking=True)
@@ -125,12 +142,14 @@ class TrainingStep:
 
     @property
     def steps(self) -> int:
-        """Steps taken on this scene."""
+        """Number of steps on this scene."""
         return self._adam.steps
 
     def shorten_rotations(self) -> None:
-        """Give every rotation the length 1, the field's part of it in proportion: the scene is the same at all times. Steps across it make a
-        quaternion longer and longer, and then turn it less and less. Nothing changes where the field cannot follow."""
+        """Normalise all quaternions, including the field's part, without changing the scene.
+        Training lengthens quaternions, which slows further rotation. Nothing changes if the field
+        does not support it.
+        """
         quats, count = self.gaussians.quats, self.gaussians.count
         factor = 1 / quats.norm(dim=1).clamp(min=1e-6)
         if not self.field.scale_rotations(factor):
@@ -140,48 +159,55 @@ class TrainingStep:
         self._adam.second_moments["quats"][:count].div_(factor.square()[:, None])
 
     def idle(self, part: float) -> Tensor:
-        """Marks, bool [N], of Gaussians whose squared gradients are on average below this part of the usual ones."""
+        """Return which Gaussians have mean squared gradients below `part` times the usual ones,
+        bool [N].
+        """
         squared = self._adam.second_moments["logit_opacities"][: self.gaussians.count]
         return squared < part * squared.mean()
 
     def busiest(self, count: int, among: Tensor) -> Tensor:
-        """The indices, int64 [at most count], of the Gaussians in `among`, bool [N], whose positions have the largest gradients."""
+        """Return indices, int64 [at most count], of the Gaussians in `among`, bool [N], with the
+        largest position gradients.
+        """
         squared = self._adam.second_moments["means"][: self.gaussians.count].sum(1).masked_fill(~among, -1.0)
         order = squared.argsort(descending=True, stable=True)[:count]
         return order[among[order]]
 
     def take_distance(self, camera: Camera) -> None:
-        """Let rates that are given in pixels follow the scene's distance from the camera. Waits for it."""
+        """Update learning rates given in pixels to the scene's distance from the camera.
+        Synchronises.
+        """
         self._mm_per_px, self._scaled_for = mm_per_px(self.gaussians, camera), None
 
     def distance(self, camera: Camera) -> float:
-        """How far away the scene typically is, in its own units, as far as the host knows."""
+        """Return the scene's typical distance in its own units, as last computed."""
         return self._mm_per_px * float(camera.K[0, 0])
 
     def settle(self, observation: Observation, rate_scale: float = 1.0) -> None:
-        """Wait for the captured steps. Those that changed nothing, because a tile list was beyond its capacity, are taken again on
-        `observation`."""
+        """Wait for captured steps, and repeat on `observation` those that had no effect because of
+        an overflow.
+        """
         self._unsettled_steps, self._has_settled = 0, True
         while self._captured is not None and (lost := self._captured.settle()):
             for _ in range(lost):
                 self._captured_step(self._captured, observation, rate_scale)
 
     def at(self, time_s: float) -> Gaussians:
-        """The scene at a time, as it is now."""
+        """Return the current scene at a time."""
         with torch.no_grad():
             deformed: Gaussians = self.field(self.gaussians, time_s)
         return deformed
 
     def seen_by(self, observation: Observation) -> Gaussians:
-        """The scene at an observation's time, in the colours that its eye sees."""
+        """Return the scene at an observation's time in the colours of its eye."""
         return _seen_by(self.at(observation.time_s), observation)
 
     def copy(self) -> tuple[Gaussians, DeformationField]:
-        """Gaussians and field with memory of their own, free of training state."""
+        """Return copies of Gaussians and field without training state."""
         return self.gaussians.detach().clone(), self.field.detached_copy()
 
     def append(self, added: Gaussians, parents: Tensor | None = None) -> None:
-        """Add Gaussians, which start still, or move as those at `parents` (int64 indices) do."""
+        """Add Gaussians that are static, or move like those at `parents` (int64 indices)."""
         if self._rows is not None:
             self._rows.append(added)
             self.gaussians = self._rows.used
@@ -191,9 +217,11 @@ class TrainingStep:
         self._adam.append(added.count, usual=self._has_no_end)
 
     def split(self, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
-        """Put two Gaussians, made by `halves`, in the place of each of those at `parents` (int64 indices); both move as their parent does.
+        """Replace each Gaussian at `parents` (int64 indices) by two made by `halves`, which move
+        like their parent.
 
-        The second ones come last. All of them start with fresh moments; in a stream without an end the first ones keep their parent's.
+        The second ones are appended. All start with fresh moments, except that in an endless stream
+        the first ones keep their parent's.
         """
         first, second = halves(self.gaussians.select(parents))
         for name, tensor in self.gaussians.tensors().items():
@@ -203,7 +231,9 @@ class TrainingStep:
         self.append(second, parents)
 
     def remove(self, leaving: Tensor) -> RowMoves:
-        """Let the Gaussians marked in `leaving`, bool [N], go; returns how the others moved. Waits for the device."""
+        """Remove the Gaussians marked in `leaving`, bool [N]. Returns the row moves of the others.
+        Synchronises.
+        """
         moves = RowMoves.without(leaving)
         if self._rows is not None:
             self._rows.close_gaps(moves)
@@ -217,7 +247,9 @@ class TrainingStep:
         return moves
 
     def restart(self, gaussians: Gaussians, time_s: float, camera: Camera) -> bool:
-        """Begin with another scene of the same camera size in the same memory; False, with nothing changed, where that cannot be."""
+        """Start another scene of the same camera size in the same memory. Returns False, with
+        nothing changed, if that is impossible.
+        """
         count = gaussians.count
         if gaussians.tensors().keys() != self.gaussians.tensors().keys():
             return False
@@ -233,7 +265,7 @@ class TrainingStep:
 
     @property
     def fixed_rows(self) -> Gaussians | None:
-        """All that there is memory for, where Gaussians join and leave without a tensor moving; None where tensors are replaced."""
+        """All preallocated rows, or None if tensors are replaced when Gaussians are added."""
         return None if self._rows is None else self._rows.all
 
     @property
@@ -242,7 +274,7 @@ class TrainingStep:
 
     def _captured_step(self, captured: FusedStep, observation: Observation, rate_scale: float) -> Tensor:
         if rate_scale != self._scaled_for:
-            # Online the scale is always 1: worked out once, not for every step.
+            # Online the scale is always 1, so it is computed once.
             self._scaled_for = rate_scale
             self._scaled_rates = (
                 self._gaussian_rates(rate_scale),

@@ -1,4 +1,4 @@
-"""An observation at fixed addresses, where a captured training step reads it."""
+"""Inputs of a captured training step at fixed addresses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsplat_core.training.observations import Observation
 
 
 class StepInputs:
-    """Picture, mask and depth of one camera size on one device."""
+    """Picture, mask and depth buffers for one camera size and device."""
 
     def __init__(self, camera: Camera, device: torch.device, *, with_depth: bool) -> None:
         shape = (camera.height_px, camera.width_px)
@@ -19,12 +19,14 @@ class StepInputs:
         self.mask = torch.ones(shape, dtype=torch.uint8, device=device)
         self.depth = torch.zeros(shape, device=device) if with_depth else None
         self.target: ResidualTarget | None = None
-        """Once colours were corrected."""
+        """Residual target, created when colours are first corrected."""
         self._taken: Observation | None = None
         self._corrects = False
 
     def take(self, observation: Observation, corrects: bool) -> None:
-        """Queue the copy of an observation, for a step that corrects colours or one that does not; nothing where it is here already."""
+        """Queue the copy of an observation for a step with or without colour correction; skipped if
+        it is already here.
+        """
         if corrects and self.target is None:
             self.target = ResidualTarget(self.image)
         if observation is self._taken and corrects == self._corrects:
@@ -35,6 +37,6 @@ class StepInputs:
             self.target.take(self.image, self.mask)
         elif self.depth is not None:
             if observation.depth is None:
-                self.depth.zero_()  # unknown everywhere: the term is 0
+                self.depth.zero_()  # unknown everywhere, so the loss term is 0
             else:
                 self.depth.copy_(observation.depth, non_blocking=True)

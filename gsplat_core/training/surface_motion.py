@@ -1,7 +1,8 @@
-"""From flow in the picture to motion of the Gaussians that the picture shows.
+"""Conversion of optical flow to 3D motion of visible Gaussians.
 
-A surface point's depth is taken not to change between two frames: pictures of one camera do not show motion along the line of sight.
-Float32 points on the CPU take one compiled op; the same in plain torch is for all others, and what that op is tested against.
+Depth is assumed constant between two frames, since one camera does not show motion along the line
+of sight. Float32 points on the CPU use one compiled op. Other points use plain torch, which also
+serves as the op's reference in tests.
 """
 
 from __future__ import annotations
@@ -18,25 +19,29 @@ from gsplat_core.ops.surface_motion.surface_motion import surface_motion
 from gsplat_core.scene.cameras import Camera
 
 NEAREST = 1e-6
-"""Depth in world units below which a point is not in front of a camera."""
+"""Smallest depth in world units of a point in front of a camera."""
 INVERSE_STEPS = 2
-"""Iterations to find where a pixel came from, in a flow that says where pixels go."""
+"""Fixed-point iterations for inverting a flow."""
 
 
 @dataclass(frozen=True)
 class SurfaceMotion:
-    """How the surface moved from one frame to the next, as flow [h, w, 2] in pixels, on the device, and the cameras that saw both."""
+    """Motion of the surface between two frames: flow [h, w, 2] in pixels on the device, and both
+    cameras.
+    """
 
     flow: Tensor
     before: Camera
     after: Camera
 
     def seen_before(self, points: Tensor) -> Seen:
-        """Points [N, 3] as the first frame's camera sees them."""
+        """Project points [N, 3] to the first frame's camera."""
         return Seen(self.before, points)
 
     def ahead(self, points: Tensor) -> Tensor:
-        """World-space motion [N, 3] of `points` [N, 3] from where they are in the first frame to the second one; 0 outside the picture."""
+        """Return the world-space motion [N, 3] of points [N, 3] from the first frame to the second;
+        0 outside the picture.
+        """
         if self._is_compiled_for(points):
             return surface_motion(points, self.flow, self.before, self.after, arrived=False)
         seen = Seen(self.before, points)
@@ -44,7 +49,9 @@ class SurfaceMotion:
         return later.to_world(seen.pixels + self.at(seen.pixels) - later.pixels, seen.inside)
 
     def arrived(self, points: Tensor) -> Tensor:
-        """World-space motion [N, 3] by which points came to be where they are in the second frame, `points` [N, 3]."""
+        """Return the world-space motion [N, 3] that brought points to their positions [N, 3] in the
+        second frame.
+        """
         if self._is_compiled_for(points):
             return surface_motion(points, self.flow, self.before, self.after, arrived=True)
         seen = Seen(self.after, points)
@@ -55,7 +62,7 @@ class SurfaceMotion:
         return earlier.to_world(earlier.pixels - came_from, seen.inside)
 
     def at(self, pixels: Tensor) -> Tensor:
-        """The flow at pixels [N, 2], bilinear; beyond the picture's edge that of the edge."""
+        """Sample the flow at pixels [N, 2] bilinearly, clamped at the picture's edge."""
         size = beside(pixels, [self.after.width_px, self.after.height_px])
         grid = (2 * pixels / size - 1).clamp(-2, 2)
         sampled = torch.nn.functional.grid_sample(
@@ -64,15 +71,15 @@ class SurfaceMotion:
         return sampled[0, :, 0].T
 
     def _is_compiled_for(self, points: Tensor) -> bool:
-        """Whether the compiled op takes such points and this flow; it is not differentiable."""
+        """Return True if the compiled op supports these points; it is not differentiable."""
         return all(t.is_cpu and t.dtype == torch.float32 and not t.requires_grad for t in (points, self.flow))
 
 
 class Seen:
-    """Points as a pinhole camera sees them."""
+    """Projection of points by a pinhole camera."""
 
     def __init__(self, camera: Camera, points: Tensor) -> None:
-        """`pixels` [N, 2], `depth` [N, 1], and whether each is `inside` the picture [N, 1]."""
+        """Compute `pixels` [N, 2], `depth` [N, 1] and `inside` (in the picture) [N, 1]."""
         view, intrinsics = camera.matrices(points.device, points.dtype)
         self._rotation = view[:3, :3]
         self._focal = intrinsics[[0, 1], [0, 1]]
@@ -84,17 +91,23 @@ class Seen:
         self.inside = in_picture & (local[:, 2:] > NEAREST)
 
     def read(self, plane: Tensor) -> Tensor:
-        """What a plane [H, W] of the camera's picture holds at the points' pixels [N]; for points that are not `inside`, what its edge holds."""
+        """Sample a plane [H, W] at the points' pixels [N]; points outside get the value at the
+        edge.
+        """
         column, row = self.pixels.long().clamp(min=0).unbind(1)
         height, width = plane.shape
         return plane[row.clamp(max=height - 1), column.clamp(max=width - 1)]
 
     def to_world(self, moved_px: Tensor, inside: Tensor) -> Tensor:
-        """Motion [N, 2] in pixels as motion in the world at the points' depth; none for points that are not `inside` [N, 1]."""
+        """Convert motion [N, 2] in pixels to world motion at the points' depth; 0 for points that
+        are not `inside` [N, 1].
+        """
         moved = torch.where(inside, moved_px * self.depth / self._focal, torch.zeros_like(moved_px))
         return moved @ self._rotation[:2]
 
 
 def beside(tensor: Tensor, values: Sequence[float] | NDArray[np.floating]) -> Tensor:
-    """A few numbers on the device of `tensor` and of its type; the host does not wait for the copy (see `Camera.matrices`)."""
+    """Return a few numbers as a tensor on the device and of the type of `tensor`, copied without
+    synchronisation (see `Camera.matrices`).
+    """
     return torch.tensor(np.asarray(values), dtype=tensor.dtype).to(tensor.device, non_blocking=True)

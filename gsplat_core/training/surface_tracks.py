@@ -1,7 +1,8 @@
-"""Where the surface goes over a recording of which all frames are known and have depth: a trajectory for every Gaussian, before the first step.
+"""Trajectories of Gaussians over a recording with depth in all frames, estimated before training.
 
-Pictures of one eye hardly tell how tissue moves along the line of sight, so that the loss alone would leave each Gaussian about as far away as it was
-when it was made. Where its point goes across the picture is followed by optical flow from frame to frame, and how far away it is, is read there.
+One eye's pictures hardly show motion along the line of sight, so the loss alone would leave each
+Gaussian near its initial distance. Optical flow tracks each surface point from frame to frame, and
+the depth is read at its position.
 """
 
 from __future__ import annotations
@@ -28,16 +29,17 @@ from gsplat_core.training.surface_motion import Seen, SurfaceMotion, beside
 from gsplat_core.transfers import tensor_of
 
 OF_ONE_PICTURE = (DepthOrigin.LIGHT, DepthOrigin.LEARNED)
-"""Depth whose differences from frame to frame are no motion: it is right up to a factor that no two frames need to share. Depth by light is more where the
-tissue was followed (`light_of_recording`)."""
+"""Depth sources whose differences between frames are not motion, because their scale varies from
+frame to frame. Shading depth is an exception if the tissue was tracked (`light_of_recording`).
+"""
 EDGE_PX = 1
-"""Beside a tool or a hole depth is not read: a point that is followed is not exact to the pixel."""
+"""Margin around tools and holes in pixels where depth is not read, since tracks are inaccurate."""
 ROWS_AT_ONCE = 1 << 14
-"""Bounds the memory for trajectories: Gaussians times frames."""
+"""Number of trajectories computed at once, to limit memory."""
 
 
 class SurfaceTracks:
-    """The motion of the surface that the frames of a recording show; nothing where they do not show it."""
+    """Surface motion shown by the frames of a recording, if they show it."""
 
     def __init__(
         self,
@@ -46,16 +48,24 @@ class SurfaceTracks:
         at_rest: bool = False,
         light_shows_motion: bool = False,
     ) -> None:
-        """As many of both. at_rest: the frames' depth is that of tissue that stands still, see `WithParallax`. light_shows_motion: depth by light was
-        found by following the tissue through all frames."""
+        """Prepare the trajectories.
+
+        Args:
+            frames: all frames.
+            observations: the same frames as tensors.
+            at_rest: depth was estimated for static tissue, see `WithParallax`.
+            light_shows_motion: shading depth was estimated by tracking tissue through all frames.
+        """
         self._at_rest, self._followed = at_rest, (DepthOrigin.LIGHT,) if light_shows_motion else ()
         self._frames, self._seen = frames, observations
         self._device = observations[0].image.device
         self._times = observations[0].image.new_tensor([one.time_s for one in observations], dtype=torch.float32)
 
     def apply(self, step: TrainingStep, number: int, first_row: int) -> None:
-        """Let the Gaussians from `first_row` on, which are where frame `number` shows the surface, follow it at all times. Nothing changes where
-        the field does not take positions, or the frames do not show the motion."""
+        """Set the trajectories of the Gaussians from `first_row` on, which are on the surface shown
+        by frame `number`. Nothing changes if the field does not support it or the frames do not
+        show the motion.
+        """
         if not step.field.takes_positions or not self._show_motion:
             return
         times = [one.time_s for one in self._seen]
@@ -66,7 +76,9 @@ class SurfaceTracks:
                 step.field.follow(rows, times, self.trajectories(points, number) - points[:, None])
 
     def trajectories(self, points: Tensor, number: int) -> Tensor:
-        """Where `points` [N, 3] of the surface that frame `number` shows are in every frame [N, T, 3]."""
+        """Return the positions in every frame [N, T, 3] of points [N, 3] on the surface shown by
+        frame `number`.
+        """
         if self._at_rest:
             return self._across(points, number)
         pixels = self._pixels(points, number)
@@ -76,14 +88,15 @@ class SurfaceTracks:
             for depth, here in zip(self._depths, pixels, strict=True)
         ]
         smooth, relief = (torch.stack(each, dim=1) for each in zip(*read, strict=True))
-        # What a tool hides for a while stands out from what is around it as it did before and does afterwards.
+        # Interpolate the ratio to the surrounding surface while a tool hides a point.
         depth = smooth * between_known(relief, torch.ones_like(relief), self._times)
         depth = 1 / steady_course(1 / between_known(depth, depth, self._times), self._times)
         return torch.stack([_world(pixels[k], depth[:, k], one) for k, one in enumerate(self._seen)], dim=1)
 
     def _across(self, points: Tensor, number: int) -> Tensor:
-        """As `trajectories`, with motion across each picture alone: depths of tissue at rest differ from frame to frame by what is uncertain, and a
-        point that came nearer by that would stand before all others."""
+        """Return trajectories with motion across the picture only. Depth differences of static
+        tissue are errors, which would move points in front of others.
+        """
         after, before = [points], [points]
         for motion in self._ahead[number:]:
             after.append(after[-1] + motion.ahead(after[-1]))
@@ -93,8 +106,9 @@ class SurfaceTracks:
 
     @cached_property
     def _show_motion(self) -> bool:
-        """Whether half of the frames at least have depth whose differences are motion, a pinhole camera saw them, and flow can be found in
-        pictures of their size."""
+        """True if at least half of the frames have depth that shows motion, the camera is a
+        pinhole, and pictures are large enough for flow.
+        """
         sizes = {frame.image.shape[:2] for frame in self._frames}
         pinhole = all(one.camera.model == "pinhole" for one in self._seen)
         if not pinhole or len(self._frames) < 2 or len(sizes) > 1 or min(min(sizes)) < SMALLEST_PX:
@@ -103,25 +117,25 @@ class SurfaceTracks:
 
     @cached_property
     def _depths(self) -> list[SurfaceDepth | None]:
-        """Of each frame; None where nothing is believed, or it shows no motion."""
+        """Depth of each frame; None if it is not confident or shows no motion."""
         return [
             None if not self._shows_surface(frame, one) else SurfaceDepth.of(possible_depth(frame), self._device)
             for frame, one in zip(self._frames, self._seen, strict=True)
         ]
 
     def _shows_surface(self, frame: Frame, one: Observation) -> bool:
-        if frame.depth_origin in self._followed:  # the loss does not see it, so that it is in no observation
+        if frame.depth_origin in self._followed:  # the loss ignores this depth, so no observation contains it
             return frame.depth is not None and bool(frame.depth.any())
         return frame.depth_origin not in OF_ONE_PICTURE and one.depth is not None and bool(one.depth.any())
 
     @cached_property
     def _ahead(self) -> list[SurfaceMotion]:
-        """From each frame to the next."""
+        """Motion from each frame to the next."""
         return self._motions(_flows(self._frames), self._seen)
 
     @cached_property
     def _back(self) -> list[SurfaceMotion]:
-        """From each frame but the first to the one before."""
+        """Motion from each frame but the first to the previous one."""
         return self._motions(_flows(self._frames[::-1]), self._seen[::-1])[::-1]
 
     def _motions(self, flows: Sequence[Flow], seen: Sequence[Observation]) -> list[SurfaceMotion]:
@@ -131,7 +145,7 @@ class SurfaceTracks:
         ]
 
     def _pixels(self, points: Tensor, number: int) -> list[Tensor]:
-        """Where each frame shows the points: T times [N, 2]."""
+        """Return the points' positions in each frame: T times [N, 2]."""
         here = Seen(self._seen[number].camera, points).pixels
         after, before = [here], [here]
         for motion in self._ahead[number:]:
@@ -143,15 +157,16 @@ class SurfaceTracks:
 
 @dataclass(frozen=True)
 class SurfaceDepth:
-    """One frame's depth, read at points that are followed."""
+    """Depth of one frame for reading at tracked points."""
 
     planes: Tensor
-    """[3, H, W]: depth where tissue and depth are known and nothing else is near, 0 elsewhere; whether that is so; the surface continued smoothly
-    everywhere."""
+    """Planes [3, H, W]: depth away from edges, 0 elsewhere; validity of it; surface extrapolated
+    everywhere.
+    """
 
     @staticmethod
     def of(depth: NDArray[np.float32], device: torch.device) -> SurfaceDepth | None:
-        """depth: of tissue [H, W], 0 where it is not known. None where nothing is known."""
+        """Prepare tissue depth [H, W], 0 where unknown. Returns None if it is unknown everywhere."""
         known = np.isfinite(depth) & (depth > 0)
         if not known.any():
             return None
@@ -161,7 +176,9 @@ class SurfaceDepth:
         return SurfaceDepth(tensor_of(planes, device))
 
     def at(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """At pixels [N, 2], bilinear: the smooth depth [N], and the share of it that the depth itself is [N], 0 where that is not known."""
+        """Sample at pixels [N, 2] bilinearly. Returns the smooth depth [N], and the ratio of the
+        depth to it [N], 0 where unknown.
+        """
         size = beside(pixels, [self.planes.shape[2], self.planes.shape[1]])
         grid = (2 * pixels / size - 1)[None, None]
         found, known, smooth = torch.nn.functional.grid_sample(
@@ -171,8 +188,14 @@ class SurfaceDepth:
 
 
 def between_known(values: Tensor, otherwise: Tensor, times: Tensor) -> Tensor:
-    """`values` [N, T], of which 0 are not known, with these on the straight line in time [T] between the known ones before and after, at either end
-    like the nearest one, and in a row without any as in `otherwise` [N, T]."""
+    """Interpolate unknown values linearly in time.
+
+    Args:
+        values: [N, T], 0 where unknown. Values before the first and after the last known one are
+            constant.
+        otherwise: [N, T], used for rows without any known value.
+        times: [T].
+    """
     known = values > 0
     index = torch.arange(values.shape[1], device=values.device).expand_as(values)
     last = torch.where(known, index, -1).cummax(dim=1).values
@@ -187,10 +210,12 @@ def between_known(values: Tensor, otherwise: Tensor, times: Tensor) -> Tensor:
 
 
 def steady_course(values: Tensor, times: Tensor) -> Tensor:
-    """Return each row of `values` [N, T] with the share of its changes over `times` [T] that noise does not explain; the rest stays at the row's median.
+    """Shrink each row of `values` [N, T] towards its median by the share of its variation over
+    `times` [T] that noise explains.
 
-    The noise is what a value differs by from the line between its two neighbours in time, as in `steadiness`. The share is that of a Wiener filter. Two
-    values or fewer are no evidence of motion. No result lies outside of the range of its row.
+    Noise is estimated from deviations of values from the line between their temporal neighbours, as
+    in `steadiness`; the share is that of a Wiener filter. With fewer than three values the result
+    is the median. Results stay within the range of their row.
     """
     middle = values.median(dim=1, keepdim=True).values
     if values.shape[1] < 3:
@@ -198,21 +223,21 @@ def steady_course(values: Tensor, times: Tensor) -> Tensor:
     span = times[2:] - times[:-2]
     share = torch.where(span > 0, (times[1:-1] - times[:-2]) / span.clamp(min=1e-9), 0.5)
     off = values[:, 1:-1] - torch.lerp(values[:, :-2], values[:, 2:], share)
-    # The variance of a value and that of the line between two others add up.
+    # The variances of a value and of the interpolation of two others add up.
     noise = (off.square() / (1 + share.square() + (1 - share).square())).mean(dim=1, keepdim=True)
     found = (values - middle).square().mean(dim=1, keepdim=True)
     return middle + (1 - noise / found.clamp(min=torch.finfo(found.dtype).tiny)).clamp(0, 1) * (values - middle)
 
 
 def _flows(frames: Sequence[Frame]) -> list[Flow]:
-    """From each frame to the next."""
+    """Return the flow from each frame to the next."""
     motion = ImageMotion()
     flows = [motion.follow(frame.image, followed(frame)) for frame in frames]
     return [flow for flow in flows[1:] if flow is not None]
 
 
 def _world(pixels: Tensor, depth: Tensor, one: Observation) -> Tensor:
-    """The points [N, 3] that a frame's camera sees at pixels [N, 2] in depth [N]."""
+    """Return the points [N, 3] that a frame's camera sees at pixels [N, 2] and depth [N]."""
     view, intrinsics = one.camera.matrices(pixels.device, pixels.dtype)
     slopes = (pixels - intrinsics[:2, 2]) / intrinsics[[0, 1], [0, 1]]
     local = torch.cat([slopes, torch.ones_like(slopes[:, :1])], dim=1) * depth[:, None]

@@ -1,4 +1,4 @@
-"""Gaussians that nobody has seen for long: when each one was seen last, and where they are kept while the scene needs their rows."""
+"""Visibility times of Gaussians, and the archive of those removed from the scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from gsplat_core.training.observations import Observation
 
 
 def pixels_of(means: Tensor, camera: Camera, margin_px: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Where the camera sees points [N, 3]: pixel coordinates [N, 2], and bool [N] whether that is in the picture or this close to it."""
+    """Project points [N, 3]. Returns pixel coordinates [N, 2], and which are in the picture or
+    within `margin_px` of it, bool [N].
+    """
     viewmat, intrinsics = camera.matrices(means.device, means.dtype)
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     plane, z = points[:, :2], points[:, 2:]
@@ -27,21 +29,22 @@ def pixels_of(means: Tensor, camera: Camera, margin_px: float = 0.0) -> tuple[Te
 
 
 def depth_of(means: Tensor, camera: Camera) -> Tensor:
-    """How far points [N, 3] lie from the camera along its axis, [N]."""
-    # Not a matrix product: cuBLAS takes tens of milliseconds for its first one in a thread, and a stream's first picture waits for this.
+    """Return the depth of points [N, 3] along the camera's axis, [N]."""
+    # A matrix product would delay a stream's first picture: cuBLAS takes tens of milliseconds for
+    # its first use in a thread.
     x, y, z, offset = camera.world_to_camera[2].tolist()
     return x * means[:, 0] + y * means[:, 1] + z * means[:, 2] + offset
 
 
 def value_at(plane: Tensor, pixels: Tensor) -> Tensor:
-    """The values of a plane [H, W] at pixel coordinates [N, 2], those outside at the nearest pixel."""
+    """Sample a plane [H, W] at pixel coordinates [N, 2], clamped to the edge."""
     column = pixels[:, 0].long().clamp(0, plane.shape[1] - 1)
     row = pixels[:, 1].long().clamp(0, plane.shape[0] - 1)
     return plane[row, column]
 
 
 class LastSeen:
-    """When each Gaussian of a scene was seen last, in seconds of the stream; in memory of fixed size."""
+    """Time at which each Gaussian was last visible, in seconds of the stream, in constant memory."""
 
     def __init__(self, capacity: int, device: torch.device) -> None:
         self._times = torch.zeros(capacity, dtype=torch.float64, device=device)
@@ -49,29 +52,31 @@ class LastSeen:
         self._looked_s = 0.0
 
     def times(self) -> Tensor:
-        """For the Gaussians in use, float64 [N]; the same memory."""
+        """Return the times of the Gaussians in use, float64 [N], without a copy."""
         return self._times[: self._count]
 
     def join(self, count: int, time_s: float) -> None:
-        """There are `count` Gaussians now; those that have joined are seen."""
+        """Set the number of Gaussians; added ones count as visible at `time_s`."""
         self._times[self._count : count] = time_s
         self._count = count
 
     def unseen_s(self, count: int) -> Tensor:
-        """How long each of `count` Gaussians had not been seen at the last look, float64 [count], in memory of its own; 0 for those that were
-        seen and for those that have joined since."""
+        """Return for each of `count` Gaussians how long it was out of view at the last update,
+        float64 [count] seconds, as a copy. Visible and newly added ones get 0.
+        """
         unseen = torch.zeros(count, dtype=self._times.dtype, device=self._times.device)
         unseen[: self._count] = (self._looked_s - self.times()).clamp(min=0)
         return unseen
 
     def restart(self) -> None:
-        """There are other Gaussians from here on."""
+        """Reset for other Gaussians."""
         self._count = 0
 
     def see(self, now: Gaussians, observation: Observation) -> None:
-        """Gaussians whose centre lies on tissue of the observation are seen now, and so are those that have joined.
+        """Mark Gaussians as visible whose centre is on tissue of the observation, and newly added
+        ones.
 
-        `now` are the scene's Gaussians at the observation's time. What lies behind other tissue counts as seen.
+        `now` is the scene at the observation's time. Occluded Gaussians count as visible.
         """
         self.join(now.count, observation.time_s)
         self._looked_s = observation.time_s
@@ -80,13 +85,14 @@ class LastSeen:
         self.times().masked_fill_(seen, observation.time_s)
 
     def close_gaps(self, moves: RowMoves) -> None:
-        """Gaussians leave."""
+        """Remove Gaussians by their row moves."""
         moves.apply(self._times, 0.0)
         self._count = moves.count
 
     def longest_unseen(self, count: int, before_s: float, among: Tensor) -> Tensor:
-        """Marks, bool [N], at most `count` of the Gaussians in `among`, bool [N], that were not seen since `before_s`; those unseen for the
-        longest first."""
+        """Mark at most `count` Gaussians in `among`, bool [N], that were not visible since
+        `before_s`, longest first. Returns bool [N].
+        """
         times = self.times().masked_fill(~among, torch.inf)
         marks = torch.zeros(self._count, dtype=torch.bool, device=times.device)
         oldest = torch.argsort(times, stable=True)[:count]
@@ -95,30 +101,32 @@ class LastSeen:
 
 
 class Archive:
-    """Gaussians that had to make room, as they were then, in host memory of bounded size."""
+    """Gaussians removed from the scene in their last state, in bounded host memory."""
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._kept: Gaussians | None = None
         self.forgotten = 0
-        """Gaussians that were dropped because there were more than `capacity`; those archived first."""
+        """Number of Gaussians dropped because of the capacity, oldest first."""
 
     def __len__(self) -> int:
         return 0 if self._kept is None else self._kept.count
 
     def put(self, gaussians: Gaussians) -> None:
-        """Keep Gaussians; they are copied to the host."""
+        """Copy Gaussians to the archive."""
         added = gaussians.map(lambda tensor: tensor.detach().to("cpu"))
         kept = added if self._kept is None else self._kept.append(added)
         self.forgotten += max(0, kept.count - self._capacity)
         self._kept = kept.map(lambda tensor: tensor[-self._capacity :].clone()) if self._capacity else None
 
     def in_view(self, camera: Camera) -> Tensor:
-        """Marks, bool [len], of those whose centre the camera has in its picture."""
+        """Return which archived Gaussians have their centre in a camera's picture, bool [len]."""
         return torch.zeros(0, dtype=torch.bool) if self._kept is None else pixels_of(self._kept.means, camera)[1]
 
     def take_uncovered(self, camera: Camera, uncovered: Tensor, most: int) -> Gaussians | None:
-        """At most `most` of those whose centre lies on a pixel of `uncovered`, bool [H, W], newest first; they are no longer kept then."""
+        """Remove and return at most `most` Gaussians whose centre is on a marked pixel of
+        `uncovered`, bool [H, W], newest first; None without any.
+        """
         if self._kept is None or most <= 0:
             return None
         pixels, inside = pixels_of(self._kept.means, camera)

@@ -1,9 +1,10 @@
-"""What keeps a scene sound that is trained without an end.
+"""Maintenance of a scene that is trained without end.
 
-Adam moves every parameter by about its learning rate, however little a picture says about it. What no picture shows therefore wanders: thin
-Gaussians become needles, opacities and colours drift apart, rotations become long, depths spread along the line of sight of a camera that does not
-move, and Gaussians that wandered to where no tissue is seen, below a tool or out of the picture, find no way back. The tissue grows holes, these are filled by new Gaussians, and when there is no room for more
-quality falls.
+Adam moves every parameter by about its learning rate even if pictures hardly constrain it.
+Unconstrained parameters therefore drift. Thin Gaussians become needles, opacities and colours
+diverge, quaternions grow, depths spread along the line of sight of a static camera, and Gaussians
+that drift off the tissue never return. The tissue then gets holes, which new Gaussians fill until
+the capacity is exhausted and the quality falls.
 """
 
 from __future__ import annotations
@@ -26,43 +27,53 @@ from gsplat_core.training.step import TrainingStep
 from gsplat_core.training.unseen import LastSeen, depth_of, pixels_of, value_at
 
 RELAX_EVERY = 128
-"""Training steps between two rounds of relaxing."""
+"""Training steps between two relaxation rounds."""
 RENEW_EVERY = 512
-"""Training steps between two looks for Gaussians that are of no use, and for tissue that has too few: on a GPU that takes some milliseconds."""
+"""Training steps between two searches for useless Gaussians and sparse tissue, which take
+milliseconds on a GPU.
+"""
 RELAXING_STEPS = 3600
-"""Steps within which sizes, opacities and colours fall back to usual ones by 1 - 1/e where training does not hold them."""
+"""Time constant in steps with which sizes, opacities and colours relax to default values where
+training does not hold them.
+"""
 THINNEST_PX = 0.2
-"""What is thinner looks the same: a picture's blur is 0.55 px (standard deviation)."""
+"""Smallest standard deviation in pixels; smaller ones look alike because of the renderer's blur of
+0.55 px.
+"""
 WIDEST = 8.0
-"""In usual sizes."""
+"""Largest size, in multiples of the default size."""
 MOST_SPLIT = 0.02
-"""Share of the Gaussians that are split in one round."""
+"""Share of the Gaussians split in one round."""
 SURFACE_STEPS = 100_000
-"""Steps within which depths come back to those around them. Far more than above: order along a line of sight is something to be learned, too."""
+"""Time constant in steps with which depths relax to those around them; long, because the order
+along a line of sight is also learned.
+"""
 SURFACE_CELL = 2.0
-"""Width of the cells whose depths are averaged, in the usual spacing of Gaussians."""
+"""Side of the cells with averaged depth, in default spacings of Gaussians."""
 SURFACE_REACH = 2
-"""So many cells on each side count, too."""
+"""Number of neighbouring cells on each side that are included."""
 IDLE = 1e-3
-"""A Gaussian is idle where the mean of its squared gradients has fallen to this part of the scene's: no picture has shown it for 7,000 steps."""
+"""Ratio of a Gaussian's mean squared gradient to the scene's mean below which it counts as idle. It
+is reached after about 7,000 steps without visibility.
+"""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """A scene as a frame sees it."""
+    """Projection of a scene in a frame."""
 
     now: Gaussians
-    """At the frame's time."""
+    """Scene at the frame's time."""
     pixels: Tensor
-    """Of the centres, [N, 2]."""
+    """Projected centres, [N, 2]."""
     inside: Tensor
-    """bool [N]: in the picture."""
+    """Marks of centres in the picture, bool [N]."""
     shown: Tensor
-    """bool [N]: in the picture, and on tissue."""
+    """Marks of centres in the picture and on tissue, bool [N]."""
 
 
 class Upkeep:
-    """Of one scene, which `camera` sees first."""
+    """Maintenance of one scene, whose first camera is `camera`."""
 
     def __init__(self, camera: Camera, config: ReconstructorConfig) -> None:
         self._first_camera, self._capacity = camera, config.max_gaussians
@@ -71,7 +82,9 @@ class Upkeep:
         self._has_moved = False
 
     def __call__(self, step: TrainingStep, observation: Observation, last_seen: LastSeen | None = None) -> None:
-        """Look after the scene where it is time. Waits for the device then. `last_seen` follows the rows."""
+        """Run the maintenance that is due, which synchronises with the device. `last_seen` is
+        updated with the rows.
+        """
         self._has_moved = self._has_moved or observation.camera != self._first_camera
         if step.steps - self._relaxed_at < RELAX_EVERY:
             return
@@ -82,7 +95,7 @@ class Upkeep:
                 self._renew(step, seen, observation, last_seen, self._useless(step, seen))
 
     def once(self, step: TrainingStep, observation: Observation, last_seen: LastSeen | None = None) -> None:
-        """Everything, though it is not time, and as if the first Gaussian were of no use: what takes long the first time has been done then."""
+        """Run all maintenance immediately, as if the first Gaussian were useless. For warm-up."""
         with torch.no_grad():
             seen = self._look(step, observation)
             self._relax(step, seen, observation.camera)
@@ -103,7 +116,9 @@ class Upkeep:
     def _renew(
         self, step: TrainingStep, seen: Seen, observation: Observation, last_seen: LastSeen | None, leaving: Tensor
     ) -> None:
-        """Bring depths and rotations back where the field can follow, remove those `leaving`, bool [N], and split what has too much to do."""
+        """Relax depths and rotations if the field supports it, remove Gaussians in `leaving`, bool
+        [N], and split others in sparse tissue.
+        """
         since, self._renewed_at = step.steps - self._renewed_at, step.steps
         if step.field.takes_positions:
             step.scale_about(observation.camera, self._towards_surface(step, seen, since, observation))
@@ -121,7 +136,9 @@ class Upkeep:
             last_seen.join(step.gaussians.count, observation.time_s)
 
     def _relax(self, step: TrainingStep, seen: Seen, camera: Camera) -> None:
-        """Towards the state of a Gaussian of which nothing is known, for those that are shown. The others are what is remembered."""
+        """Relax visible Gaussians towards default sizes, opacities and colours. Others are kept as
+        memory.
+        """
         share = 1 - math.exp((self._relaxed_at - step.steps) / RELAXING_STEPS)
         self._relaxed_at = step.steps
         scene, pixel = step.gaussians, step.distance(camera) / float(camera.K[0, 0])
@@ -135,11 +152,14 @@ class Upkeep:
                 colours.sub_(part[:, None, None] * colours)
 
     def _towards_surface(self, step: TrainingStep, seen: Seen, since: int, observation: Observation) -> Tensor:
-        """Factors [N] of the distances from the camera that bring what is shown nearer to the depth of what lies around it, `since` so many steps.
-        The camera sees the same picture; where it moves or depth is known, training holds against it.
+        """Return distance factors [N] that relax visible Gaussians to the depth around them, for
+        `since` steps.
 
-        Where neither is so all depths together drift, too: steps along the line of sight that are equally long are not equally far in a picture.
-        What is shown then keeps its typical distance."""
+        The camera sees the same picture. If it moves or depth is known, training counteracts
+        errors. Otherwise all depths would drift together, because equal steps along the line of
+        sight are unequal in the picture. The median distance of visible Gaussians is then kept
+        constant.
+        """
         camera = observation.camera
         spacing = SURFACE_CELL * self._spacing_px
         cells = math.ceil(camera.height_px / spacing), math.ceil(camera.width_px / spacing)
@@ -152,15 +172,19 @@ class Upkeep:
         return torch.where(seen.shown, factor, 1.0)
 
     def _useless(self, step: TrainingStep, seen: Seen) -> Tensor:
-        """Marks, bool [N], of idle Gaussians that can go: where the camera never moved, those outside of the picture; inside, all but one of
-        those in the same cell of the grid, for a tool that hides them may leave."""
+        """Return which idle Gaussians can be removed, bool [N]: those outside the picture if the
+        camera never moved, and all but one per grid cell inside, since a tool that hides them may
+        leave.
+        """
         idle = step.idle(IDLE)
         inside = idle & seen.inside
         crowded = inside & _repeated(torch.floor(seen.pixels / self._spacing_px), inside)
         return crowded if self._has_moved else crowded | (idle & ~seen.inside)
 
     def _fill_up(self, step: TrainingStep, observation: Observation, shown: Tensor) -> None:
-        """Split Gaussians where tissue has fewer than it began with: those of the `shown`, bool [N], whose gradients are largest."""
+        """Split visible Gaussians (`shown`, bool [N]) with the largest gradients if tissue has
+        fewer than at the start.
+        """
         wanted = torch.count_nonzero(observation.mask) / self._spacing_px**2
         missing = int(wanted - torch.count_nonzero(shown))
         count = min(missing, round(MOST_SPLIT * step.gaussians.count), self._capacity - step.gaussians.count)
@@ -169,10 +193,10 @@ class Upkeep:
 
 
 def _repeated(cells: Tensor, counted: Tensor) -> Tensor:
-    """Marks, bool [N], of those `counted` whose cell [N, 2], whole numbers, an earlier one of them has."""
+    """Mark the `counted` elements whose integer cell [N, 2] occurs earlier, bool [N]."""
     count = len(cells)
     number = cells[:, 1].double() * 2**20 + cells[:, 0].double()
-    # Each of the others has a cell of its own.
+    # Give each of the others a unique cell.
     number = torch.where(counted, number, -1.0 - torch.arange(count, device=cells.device))
     ordered, order = number.sort(stable=True)
     marks = torch.zeros(count, dtype=torch.bool, device=cells.device)
